@@ -1,0 +1,60 @@
+# The one way in: `make help`.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eo pipefail -c
+.DEFAULT_GOAL := help
+MAKEFLAGS += --no-print-directory
+export PYTHON PIP_ARGS
+
+ENTER := . scripts/environment.bash
+# A domain of its own, so that other ROS nodes on this machine neither hear nor disturb a run.
+DOMAIN := export ROS_DOMAIN_ID=$${ROS_DOMAIN_ID:-$$((1 + $$$$ % 100))}
+
+WHEELS := requirements.txt requirements-dev.txt requirements-ros.txt constraints.txt \
+  scripts/setup.bash scripts/mend_wheels.py
+SOURCES := package.xml setup.py setup.cfg resource/tap_ros $(wildcard config/*.yaml launch/*.py) \
+  tap_msgs/CMakeLists.txt tap_msgs/package.xml $(wildcard tap_msgs/*/*.msg tap_msgs/*/*.srv \
+  tap_msgs/*/*.action)
+
+# An environment that was copied or moved here from elsewhere names the old place everywhere.
+$(shell [ "$$(head -n 1 .venv/place 2>/dev/null)" = "$$(pwd -P)" ] || rm -f .venv/*.done)
+
+.PHONY: help demo test build lint bench clean
+
+help:
+	@echo 'make demo    push two objects to where a goal picture shows them, three scenes'
+	@echo '             SCENES=20: that many scenes; ARGS=...: more options of the demo'
+	@echo 'make test    all tests; ARGS="-k warp" chooses'
+	@echo 'make bench   measure the speed of each part; ARGS=...'
+	@echo 'make lint    check the style of the code'
+	@echo 'make build   only the set-up: .venv, install/; then, to work in it:'
+	@echo '             . scripts/environment.bash'
+	@echo 'make clean   remove what the set-up made'
+	@echo 'Each sets up what it needs first. PYTHON=python3.12 chooses the interpreter,'
+	@echo 'PIP_ARGS=... adds options to pip install.'
+
+demo: build
+	@$(ENTER); $(DOMAIN); python -m tap_ros demo $(if $(SCENES),--scenes $(SCENES)) $(ARGS)
+
+test: build
+	@$(ENTER); $(DOMAIN); python -m pytest $(ARGS)
+
+bench: build
+	@$(ENTER); $(DOMAIN); python -m tap_ros bench $(ARGS)
+
+lint: build
+	@$(ENTER); ruff check .
+
+build: .venv/build.done
+	@:
+
+.venv/wheels.done: $(WHEELS)
+	@scripts/setup.bash wheels
+	@touch $@
+
+.venv/build.done: .venv/wheels.done $(SOURCES)
+	@scripts/setup.bash build
+	@touch $@
+
+clean:
+	rm -rf .venv build install log

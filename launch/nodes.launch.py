@@ -1,0 +1,64 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Start the simulation, the predictor, the planner and, if a folder is given, the recorder.
+
+Parameters come from config/params.yaml of the package or from params_file; for a real camera and
+arm start with sim:=false.
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
+from launch.substitutions import (
+    LaunchConfiguration, NotEqualsSubstitution, PathJoinSubstitution)
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+
+def generate_launch_description():
+    """Describe the four nodes and the arguments of this file."""
+    record = LaunchConfiguration('record')
+    return LaunchDescription([
+        DeclareLaunchArgument(
+            'params_file',
+            default_value=PathJoinSubstitution(
+                [FindPackageShare('tap_ros'), 'config', 'params.yaml']),
+            description='YAML file with the parameters of the nodes.'),
+        DeclareLaunchArgument(
+            'namespace', default_value='', description='Namespace of all nodes and topics.'),
+        DeclareLaunchArgument(
+            'sim', default_value='true', choices=['true', 'false'],
+            description='Start the simulation; false with a real camera and arm.'),
+        DeclareLaunchArgument(
+            'lock_step', default_value='false', choices=['true', 'false'],
+            description='Simulated time passes only with commands, so that runs repeat exactly.'),
+        DeclareLaunchArgument(
+            'record', default_value='', description='Folder to record into; empty: no recorder.'),
+        start('sim_node', {'lock_step': typed('lock_step', bool)},
+              condition=IfCondition(LaunchConfiguration('sim'))),
+        start('predictor_node'),
+        start('visual_mpc_node'),
+        start('recorder_node', {'folder': typed('record', str)},
+              condition=IfCondition(NotEqualsSubstitution(record, ''))),
+    ])
+
+
+def start(executable, parameters=None, condition=None):
+    """
+    Return the action that starts a node.
+
+    :param executable: one of this package.
+    :param parameters: dict of those that override the parameter file.
+    :param condition: launch condition, None for always.
+    """
+    return Node(
+        package='tap_ros', executable=executable, namespace=LaunchConfiguration('namespace'),
+        parameters=[LaunchConfiguration('params_file'), *([parameters] if parameters else [])],
+        condition=condition, output='screen', emulate_tty=True)
+
+
+def typed(argument, value_type):
+    """Return a launch argument as a parameter value of a type."""
+    return ParameterValue(LaunchConfiguration(argument), value_type=value_type)

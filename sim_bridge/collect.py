@@ -1,0 +1,216 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Collect episodes of the expert on all cores into one recording: a rosbag2 bag split into files.
+
+Episode i has seed + i and goes into file i // episodes_per_file, whichever worker makes it, so the
+files do not depend on the number of workers. A finished file has its final name; an interrupted
+collection goes on with the files that are not there yet.
+"""
+
+from concurrent.futures import ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass
+import json
+import multiprocessing
+import os
+from pathlib import Path
+import time
+
+import numpy as np
+from tqdm import tqdm
+
+from sim_bridge.expert import ExpertConfig, run_episode
+from sim_bridge.simulator import Simulator
+from sim_bridge.tasks import get_task, TASKS
+from tap_ros.errors import ConfigError
+from tap_ros.recording.episode import Episode
+from tap_ros.recording.writer import EpisodeWriter, write_metadata
+
+EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
+SETTINGS_FILE = 'collection.json'
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """What to collect; two collections with equal settings are equal to the byte."""
+
+    task: str = 'push2'
+    episodes: int = 1000
+    seed: int = 0
+    image_size: int = 64
+    episodes_per_file: int = 25
+    expert: ExpertConfig = ExpertConfig()
+
+
+def collect(folder, config, workers=None, progress=True):
+    """
+    Collect a recording, or go on with one that was interrupted.
+
+    :param folder: of the recording; made if it is not there.
+    :param config: CollectConfig.
+    :param workers: processes; by default one a core.
+    :param progress: show a progress bar.
+    :return: dict of episodes, frames, seconds (wall and by part, summed over workers), success
+        rate and mean final distance in metres, of the episodes collected by this call.
+    :raises ConfigError: when the folder holds a recording made with other settings.
+    """
+    get_task(config.task)
+    if min(config.episodes, config.episodes_per_file) < 1:
+        raise ConfigError('episodes and episodes_per_file must be at least 1')
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    _check_settings(folder, config)
+    shards = -(-config.episodes // config.episodes_per_file)
+    missing = [i for i in range(shards) if not _shard_path(folder, i).exists()]
+    workers = min(workers or len(os.sched_getaffinity(0)), max(len(missing), 1))
+    context = multiprocessing.get_context('spawn')
+    done = context.Value('i', 0)
+    total = sum(len(_episodes(config, i)) for i in missing)
+    start = time.perf_counter()
+    stats = []
+    with ProcessPoolExecutor(workers, context, _start_worker, (done,)) as pool, \
+            tqdm(total=total, unit='episode', disable=not progress) as bar:
+        waiting = {pool.submit(_collect_shard, str(folder), config, i) for i in missing}
+        while waiting:
+            finished, waiting = wait(waiting, timeout=0.5)
+            bar.update(done.value - bar.n)
+            stats += [future.result() for future in finished]
+    write_metadata(folder)
+    return _summary(stats, time.perf_counter() - start)
+
+
+def _summary(stats, wall):
+    """Add up what the workers measured."""
+    distances = np.concatenate([s['distances'] for s in stats]) if stats else np.zeros((0, 1))
+    seconds = {
+        part: sum(s['seconds'][part] for s in stats) for part in ('search', 'step', 'write')}
+    return {
+        'episodes': len(distances), 'frames': sum(s['frames'] for s in stats),
+        'success_rate': float(np.mean([o == 'success' for s in stats for o in s['outcomes']]))
+        if stats else float('nan'),
+        'mean_final_distance': float(distances.mean()) if stats else float('nan'),
+        'seconds': {'wall': wall, **seconds}}
+
+
+def _check_settings(folder, config):
+    """Keep the settings beside the recording and refuse to mix it with other ones."""
+    path = folder / SETTINGS_FILE
+    settings = json.loads(json.dumps(asdict(config)))
+    if path.exists():
+        before = json.loads(path.read_text())
+        changed = [k for k in settings if k != 'episodes' and before.get(k) != settings[k]]
+        if changed:
+            raise ConfigError(
+                f'{folder} holds a recording made with other settings ({", ".join(changed)}); '
+                f'choose another folder or the settings in {path}')
+        if settings['episodes'] < before['episodes']:
+            return
+        if before['episodes'] % config.episodes_per_file and settings != before:
+            # The last file was not full: it is made anew with its missing episodes.
+            _shard_path(folder, before['episodes'] // config.episodes_per_file).unlink(
+                missing_ok=True)
+    path.write_text(json.dumps(settings, indent=2) + '\n')
+
+
+def _shard_path(folder, shard):
+    """Return the path of one file, named as rosbag2 names the files of a split bag."""
+    return Path(folder) / f'{Path(folder).resolve().name}_{shard}.mcap'
+
+
+def _episodes(config, shard):
+    """Return the numbers of the episodes in one file."""
+    first = shard * config.episodes_per_file
+    return range(first, min(first + config.episodes_per_file, config.episodes))
+
+
+def _start_worker(done):
+    """Give a worker process the counter of finished episodes."""
+    global _done
+    _done = done
+
+
+def _collect_shard(folder, config, shard):
+    """Collect one file; runs in a worker process."""
+    simulator = Simulator(config.task, config.image_size)
+    stats = {
+        'frames': 0, 'outcomes': [], 'distances': [],
+        'seconds': {'search': 0.0, 'step': 0.0, 'write': 0.0}}
+    path = _shard_path(folder, shard)
+    with EpisodeWriter(path, camera_matrix=simulator.camera.K) as writer:
+        for i in _episodes(config, shard):
+            seed = config.seed + i
+            observations, actions, outcome, seconds = run_episode(simulator, seed, config.expert)
+            begin = time.perf_counter()
+            writer.write(make_episode(
+                simulator, observations, actions, outcome, (i + 1) * EPISODE_SPACING_NS))
+            stats['seconds']['write'] += time.perf_counter() - begin
+            for part in seconds:
+                stats['seconds'][part] += seconds[part]
+            stats['frames'] += len(observations)
+            stats['outcomes'].append(outcome)
+            stats['distances'].append(simulator.distances())
+            with _done.get_lock():
+                _done.value += 1
+    simulator.close()
+    return stats
+
+
+def make_episode(simulator, observations, actions, outcome, start_ns=0):
+    """
+    Put what was observed and done into an Episode.
+
+    :param simulator: Simulator that made it; its goal is kept with the episode.
+    :param observations: list of T Observations.
+    :param actions: (T, 4) float32.
+    :param outcome: 'success', 'failure' or 'interrupted'.
+    :param start_ns: added to the stamps.
+    :return: Episode.
+    """
+    goal = simulator.goal()
+    return Episode(
+        frames=np.stack([o.image for o in observations]),
+        stamps=np.array([o.stamp_ns + start_ns for o in observations], np.int64),
+        actions=actions,
+        grippers=np.stack([o.gripper for o in observations]),
+        object_names=observations[0].object_names,
+        object_pixels=np.stack([o.object_pixels for o in observations]),
+        object_poses=np.stack([o.object_poses for o in observations]),
+        goal_frame=goal.image, goal_pixels=goal.object_pixels, goal_poses=goal.object_poses,
+        task=simulator.task.name, seed=simulator.scene.seed, outcome=outcome)
+
+
+def add_arguments(parser):
+    """Add the options of the command."""
+    default = CollectConfig()
+    parser.add_argument('--out', required=True, help='folder of the recording, say bags/push2')
+    parser.add_argument(
+        '--task', default=default.task, choices=list(TASKS), help='(default: %(default)s)')
+    parser.add_argument(
+        '--episodes', type=int, default=default.episodes,
+        help='how many in all; a larger number later adds to the same folder '
+        '(default: %(default)s)')
+    parser.add_argument(
+        '--seed', type=int, default=default.seed,
+        help='of the first episode; the others count on from it (default: %(default)s)')
+    parser.add_argument(
+        '--image-size', type=int, default=default.image_size,
+        help='width and height in pixels (default: %(default)s)')
+    parser.add_argument(
+        '--episodes-per-file', type=int, default=default.episodes_per_file,
+        help='the bag is split into files of so many (default: %(default)s)')
+    parser.add_argument('--workers', type=int, help='processes (default: one a core)')
+
+
+def run(args):
+    """Collect and say what was collected."""
+    config = CollectConfig(
+        task=args.task, episodes=args.episodes, seed=args.seed, image_size=args.image_size,
+        episodes_per_file=args.episodes_per_file)
+    result = collect(args.out, config, args.workers)
+    if not result['episodes']:
+        print(f'{args.out}: all {args.episodes} episodes were there already')
+        return
+    print(f"{args.out}: {result['episodes']} episodes, {result['frames']} frames in "
+          f"{result['seconds']['wall']:.0f} s; objects end "
+          f"{100 * result['mean_final_distance']:.1f} cm from their goals on average, "
+          f"{result['success_rate']:.0%} of the episodes succeed")

@@ -1,0 +1,162 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A random tabletop with a Cartesian gripper, one to n objects and one camera, as a MuJoCo model.
+
+The scene follows the cartgripper world of the paper's data: slide joints, objects made of boxes in
+L or T form, random colours. Ours differ in three ways: bars and discs are added to the shapes, the
+origin of an object is its centre of area, and the camera's field of view is 34 degrees instead of
+32 and tilted a little lower, so that the whole workspace is in a square picture.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+SHAPES = ('L', 'T', 'bar', 'disc')
+HALF_HEIGHT = 0.03  # m, of every object
+HALF_THICKNESS = 0.025  # m, of the boxes an object is made of
+WORKSPACE_LOW = np.array([-0.45, -0.45, 0.0])  # m, of the fingertips; z = 0 just clears the table
+WORKSPACE_HIGH = np.array([0.45, 0.45, 0.15])
+FINGER_CLEARANCE = 0.006  # m between fingertips and table at z = 0
+FINGER_TRAVEL = 0.04  # m each finger moves from closed (0) to open (1)
+TIMESTEP = 0.0125  # s; a control period is a whole number of these, see simulator.py
+ARM_GEOM_GROUP = 1  # so that the renderer can leave the arm out of a picture
+CAMERA_POSITION = (0.0, -1.1, 1.3)
+CAMERA_TILT = 0.68  # rad from straight down
+CAMERA_FOVY = 34.0  # degrees
+
+
+@dataclass(frozen=True)
+class ObjectShape:
+    """The boxes or disc that make one object: sizes and places in metres, colours in [0, 1]."""
+
+    kind: str
+    half_sizes: tuple  # per part: (x, y, z) of a box, or (radius, half height) of a disc
+    centres: tuple  # per part: (x, y)
+    colours: tuple  # per part: (r, g, b)
+
+
+def random_shape(rng):
+    """
+    Draw a shape and its colours.
+
+    :param rng: numpy Generator.
+    :return: ObjectShape with its centre of area at the origin.
+    """
+    kind = SHAPES[rng.choice(len(SHAPES), p=(0.35, 0.35, 0.15, 0.15))]
+    colours = tuple(tuple(rng.uniform(0.3, 1.0, 3)) for _ in range(2))
+    if kind == 'disc':
+        return ObjectShape(kind, ((rng.uniform(0.04, 0.06), HALF_HEIGHT),), ((0, 0),), colours[:1])
+    t, a, b = HALF_THICKNESS, rng.uniform(0.05, 0.09), rng.uniform(0.02, 0.05)
+    bar = (t, a, HALF_HEIGHT)
+    if kind == 'bar':
+        return ObjectShape(kind, (bar,), ((0, 0),), colours[:1])
+    arm = (b, t, HALF_HEIGHT)  # sticks out from the bar's side: at its end for L, its middle for T
+    arm_centre = np.array([t + b, a - t if kind == 'L' else 0.0])
+    areas = np.array([bar[0] * bar[1], arm[0] * arm[1]])
+    centroid = arm_centre * areas[1] / areas.sum()
+    centres = (tuple(-centroid), tuple(arm_centre - centroid))
+    return ObjectShape(kind, (bar, arm), centres, colours)
+
+
+def object_names(count):
+    """Return the names of the objects, in order: object_0, object_1, ..."""
+    return tuple(f'object_{i}' for i in range(count))
+
+
+def build_scene(shapes, image_size=64):
+    """
+    Compile the MuJoCo model of a table with a gripper and the given objects.
+
+    Generalised positions: gripper x, y, z, left and right finger (5 slide joints), then one free
+    joint for each object. Controls: targets of gripper x, y, z and of the two fingers, in metres.
+
+    :param shapes: sequence of ObjectShape.
+    :param image_size: pixels of the square off-screen picture.
+    :return: mujoco.MjModel.
+    """
+    spec = mujoco.MjSpec()
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    spec.option.iterations = 20
+    spec.option.ls_iterations = 8
+    # Shadows and multi-sampling are most of the cost of a small picture on a CPU.
+    spec.visual.quality.shadowsize = 0
+    spec.visual.quality.offsamples = 0
+    spec.visual.global_.offwidth = image_size
+    spec.visual.global_.offheight = image_size
+    spec.visual.headlight.ambient = [0.55, 0.55, 0.55]
+    spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
+    spec.visual.headlight.specular = [0, 0, 0]
+    world = spec.worldbody
+    world.add_geom(
+        name='table', type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1],
+        rgba=[0.26, 0.21, 0.18, 1], friction=[1, 0.01, 0.0002])
+    _add_camera(world)
+    _add_gripper(spec, world)
+    for name, shape in zip(object_names(len(shapes)), shapes):
+        _add_object(world, name, shape)
+    return spec.compile()
+
+
+def _add_camera(world):
+    """Add the one camera, looking from the front down onto the table."""
+    half = CAMERA_TILT / 2
+    world.add_camera(
+        name='camera', pos=list(CAMERA_POSITION), quat=[np.cos(half), np.sin(half), 0, 0],
+        fovy=CAMERA_FOVY)
+
+
+def _add_gripper(spec, world):
+    """Add the gripper on its three slide joints, with two fingers that open along x."""
+    gripper = world.add_body(name='gripper', pos=[0, 0, FINGER_CLEARANCE], gravcomp=1)
+    arm = {'group': ARM_GEOM_GROUP, 'friction': [1, 0.01, 0.0002], 'density': 0}
+    gripper.add_geom(
+        name='palm', type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, 0.03, 0.02],
+        pos=[0, 0, 0.14], rgba=[0.55, 0.55, 0.58, 1], contype=0, conaffinity=0, **arm)
+    gripper.mass, gripper.inertia, gripper.explicitinertial = 0.5, [1e-3, 1e-3, 1e-3], True
+    for i, axis in enumerate('xyz'):
+        gripper.add_joint(
+            name=f'gripper_{axis}', type=mujoco.mjtJoint.mjJNT_SLIDE, axis=list(np.eye(3)[i]))
+        # Weak downwards: fingers that come down on an object rest on it instead of shooting it away.
+        _add_servo(spec, f'gripper_{axis}', kp=1500, kv=60, limit=8 if axis == 'z' else 30)
+    for side, sign in (('left', -1), ('right', 1)):
+        finger = gripper.add_body(
+            name=f'{side}_finger', pos=[sign * 0.011, 0, 0.06], gravcomp=1)
+        finger.mass, finger.inertia, finger.explicitinertial = 0.05, [1e-4, 1e-4, 1e-4], True
+        # Fingers touch objects (bit 1), neither each other nor the table.
+        finger.add_geom(
+            name=f'{side}_finger', type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.01, 0.02, 0.06],
+            rgba=[1, 1, 1, 1], contype=2, conaffinity=0, **arm)
+        finger.add_joint(
+            name=f'{side}_finger', type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[sign, 0, 0])
+        _add_servo(spec, f'{side}_finger', kp=400, kv=10, limit=20)
+
+
+def _add_servo(spec, joint, kp, kv, limit):
+    """Add a position servo on a joint: force = kp (target - position) - kv velocity."""
+    actuator = spec.add_actuator(
+        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE)
+    actuator.gainprm[0] = kp
+    actuator.biasprm[1] = -kp
+    actuator.biasprm[2] = -kv
+    actuator.forcelimited = True
+    actuator.forcerange = [-limit, limit]
+
+
+def _add_object(world, name, shape):
+    """Add one free object; its parts share a body."""
+    body = world.add_body(name=name, pos=[0, 0, HALF_HEIGHT])
+    body.add_freejoint(name=name)
+    for i, (size, centre, colour) in enumerate(
+            zip(shape.half_sizes, shape.centres, shape.colours)):
+        disc = shape.kind == 'disc'
+        body.add_geom(
+            name=f'{name}_part_{i}', pos=[*centre, 0],
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER if disc else mujoco.mjtGeom.mjGEOM_BOX,
+            size=[*size, 0] if disc else list(size), rgba=[*colour, 1],
+            density=300, friction=[1, 0.01, 0.0002], contype=1, conaffinity=3)

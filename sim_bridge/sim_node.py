@@ -1,0 +1,276 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulator as a ROS node: camera, objects and clock out, twist commands in."""
+
+import math
+import sys
+
+from geometry_msgs.msg import TwistStamped
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool
+
+from sim_bridge.simulator import ACTION_LIMIT, Simulator
+from sim_bridge.tasks import TASKS
+from tap_msgs.msg import Episode, ObjectStates
+from tap_msgs.srv import ResetScene, StepScene
+from tap_ros.errors import TapError
+from tap_ros.nodes.image_messages import encode_image
+from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
+from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.run import run_node
+from tap_ros.nodes.topics import (
+    CAMERA_FRAME, LATCHED, STREAM, to_nanoseconds, to_stamp, WORLD_FRAME)
+
+FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
+MAX_PERIODS = 100  # of one sim/step call: about a second
+
+
+class SimNode(Node):
+    """
+    Steps and renders in the thread that spins, to which the OpenGL context belongs.
+
+    Lock-step: a command stamped like the newest image, or unstamped, lets one control period pass.
+    Real time: a timer does, with the command that came since the last period, else standing still.
+    A zero twist without a stamp means stop in both modes and lets no time pass.
+    """
+
+    def __init__(self):
+        super().__init__('sim_node')
+        self.params = declare_parameters(self)
+        task = self.params['task']
+        self._sim = Simulator(task, self.params['image_size'])
+        self._hide_arm = False
+        self._opening = 0.0  # the newest gripper command
+        self._twist = None  # real time: the command for the next period
+        self._stamp_ns = FIRST_STAMP  # of the newest image; never goes back, unlike the physics
+        self._answered_ns = 0  # stamp of the newest image that was answered by a command
+        self._reset_ns = FIRST_STAMP
+        self._num_steps = 0
+        self._in_episode = False
+        self._paused = False
+        self._create_publishers()
+        # Subscribed before the twist, so that of two commands sent together it is taken first.
+        self.create_subscription(Float64, 'gripper/command', self._on_gripper, STREAM)
+        self.create_subscription(TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM)
+        self._reset(task, self.params['seed'], False)
+        self.create_service(ResetScene, 'sim/reset', self._on_reset)
+        self.create_service(StepScene, 'sim/step', self._on_step)
+        self.create_service(SetBool, 'sim/pause', self._on_pause)
+        mode = 'lock-step'
+        if not self.params['lock_step']:
+            factor = self.params['real_time_factor']
+            self.create_timer(self._sim.control_period / factor, self._on_timer,
+                              clock=Clock(clock_type=ClockType.STEADY_TIME))
+            mode = f'{factor:g} x real time'
+        self.get_logger().info(
+            f'ready: task {task}, seed {self.params["seed"]}, {mode}')
+
+    def close(self):
+        """End the episode."""
+        self._end_episode()
+        self._sim.close()
+
+    def _create_publishers(self):
+        self._image = self.create_publisher(Image, 'camera/image_raw', STREAM)
+        self._info = self.create_publisher(CameraInfo, 'camera/camera_info', STREAM)
+        self._objects = self.create_publisher(ObjectStates, 'objects', STREAM)
+        self._joints = self.create_publisher(JointState, 'joint_states', STREAM)
+        self._clock_time = self.create_publisher(ClockMessage, 'clock', STREAM)
+        self._episode = self.create_publisher(Episode, 'episode', STREAM)
+        self._goal_image = self.create_publisher(Image, 'goal/image', LATCHED)
+        self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
+
+    # Commands
+
+    def _on_gripper(self, message):
+        if not math.isfinite(message.data):
+            self.get_logger().warning(
+                f'gripper/command ignored: data is {message.data}; expected a number from '
+                '0 (closed) to 1 (open)')
+            return
+        self._opening = min(max(message.data, 0.0), 1.0)
+
+    def _on_twist(self, message):
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        move = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
+        reason = self._refuse_twist(message.twist, move, stamp_ns)
+        if reason:
+            self.get_logger().warning(f'arm/delta_twist_cmds ignored: {reason}')
+            return
+        if stamp_ns == 0 and not move.any():
+            self._twist = None
+            return
+        if (np.abs(move) > ACTION_LIMIT).any():
+            self.get_logger().warning(
+                f'arm/delta_twist_cmds limited: {move} to +-{ACTION_LIMIT} m per control period',
+                throttle_duration_sec=5.0)
+        self._answered_ns = max(stamp_ns, self._answered_ns)
+        if self.params['lock_step']:
+            self._step(move)
+        else:
+            self._twist = move
+
+    def _refuse_twist(self, twist, move, stamp_ns):
+        """Say why a command cannot be used; an empty string if it can."""
+        for axis, value in zip('xyz', move):
+            if not math.isfinite(value):
+                return f'twist.linear.{axis} is {value}; expected finite numbers'
+        if any(getattr(twist.angular, axis) != 0 for axis in 'xyz'):
+            return 'twist.angular is not zero; this gripper moves but cannot turn'
+        if self._paused:
+            return 'the simulation is paused; call sim/pause with data false'
+        if stamp_ns == 0:
+            return ''
+        if stamp_ns > self._stamp_ns:
+            return (f'its stamp {stamp_ns} ns is newer than the newest image '
+                    f'({self._stamp_ns} ns); use the stamp of the image it answers')
+        if stamp_ns <= self._answered_ns or stamp_ns < self._reset_ns:
+            return f'the image stamped {stamp_ns} ns was answered before, or is of an old scene'
+        if self.params['lock_step'] and stamp_ns < self._stamp_ns:
+            return (f'it answers the image stamped {stamp_ns} ns; '
+                    f'the newest is stamped {self._stamp_ns} ns')
+        return ''
+
+    def _on_timer(self):
+        if not self._paused:
+            move, self._twist = self._twist, None
+            self._step(np.zeros(3) if move is None else move)
+
+    # Services
+
+    def _on_reset(self, request, response):
+        try:
+            self._reset(request.task or 'push2', request.seed, request.hide_arm)
+        except TapError as error:
+            response.message = str(error)
+            return response
+        response.success = True
+        response.message = f'{self._sim.task.name}, seed {request.seed}'
+        return response
+
+    def _on_step(self, request, response):
+        periods = request.num_periods or 1
+        if periods > MAX_PERIODS:
+            response.message = (
+                f'num_periods is {periods}; expected 1 to {MAX_PERIODS}, call more often')
+        elif not (self._paused or self.params['lock_step']):
+            response.message = (
+                'time passes by itself; pause with sim/pause first, or start with lock_step')
+        else:
+            for _ in range(periods):
+                self._step(np.zeros(3))
+            response.success = True
+            response.message = f'{periods} control periods passed'
+        response.stamp = to_stamp(self._stamp_ns)
+        return response
+
+    def _on_pause(self, request, response):
+        self._paused = request.data
+        self._twist = None
+        response.success = True
+        response.message = 'paused' if request.data else 'running'
+        return response
+
+    # Simulation
+
+    def _reset(self, task, seed, hide_arm):
+        """Start a scene; if it cannot be, the present one stays as it is."""
+        if task == self._sim.task.name:
+            sim = self._sim
+        else:
+            sim = Simulator(task, self.params['image_size'])
+        self._end_episode()
+        observation = sim.reset(seed)
+        if sim is not self._sim:
+            self._sim.close()
+        self._sim, self._hide_arm = sim, hide_arm
+        self._opening, self._twist = 0.0, None
+        self._stamp_ns += self._period_ns()
+        self._reset_ns = self._stamp_ns
+        self._num_steps = 0
+        self._in_episode = True
+        self._publish_episode(Episode.START, '')
+        self._publish_goal(sim.goal(hide_arm or self.params['hide_arm_in_goal']))
+        self._publish(observation)
+
+    def _step(self, move):
+        """Let one control period pass and publish what the camera then sees."""
+        observation = self._sim.step(np.append(move, self._opening))
+        self._stamp_ns += self._period_ns()
+        self._num_steps += 1
+        self._publish(observation)
+
+    def _period_ns(self):
+        return round(self._sim.control_period * 1e9)
+
+    def _end_episode(self):
+        if self._in_episode:
+            self._in_episode = False
+            outcome = self._sim.outcome() if self._num_steps else 'interrupted'
+            self._publish_episode(Episode.END, outcome)
+
+    # Messages
+
+    def _publish(self, observation):
+        if self._hide_arm:
+            observation = self._sim.observe(hide_arm=True)
+        stamp = to_stamp(self._stamp_ns)
+        camera = self._sim.camera
+        self._clock_time.publish(ClockMessage(clock=stamp))
+        self._joints.publish(encode_gripper(observation.gripper, stamp, WORLD_FRAME))
+        self._objects.publish(encode_observed(observation, stamp))
+        self._info.publish(
+            encode_camera_info(camera.K, (camera.height, camera.width), stamp, CAMERA_FRAME))
+        self._image.publish(encode_image(observation.image, stamp, CAMERA_FRAME))
+
+    def _publish_goal(self, goal):
+        stamp = to_stamp(self._stamp_ns)
+        self._goal_objects.publish(encode_observed(goal, stamp))
+        self._goal_image.publish(encode_image(goal.image, stamp, CAMERA_FRAME))
+
+    def _publish_episode(self, event, outcome):
+        scene = self._sim.scene
+        message = Episode(event=event, task=scene.task.name, seed=scene.seed, outcome=outcome)
+        message.header.stamp = to_stamp(self._stamp_ns)
+        message.header.frame_id = WORLD_FRAME
+        self._episode.publish(message)
+
+
+def declare_parameters(node):
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('task', 'push2', 'Task of the first scene.', choices=list(TASKS))
+    parameters.declare('seed', 0, 'Seed of the first scene.', low=0, high=2**62)
+    parameters.declare('image_size', 64, 'Width and height of the pictures in pixels.',
+                       low=16, high=1024)
+    parameters.declare(
+        'lock_step', False,
+        'True: each twist command lets one control period pass, so that runs repeat exactly. '
+        'False: time passes by itself.')
+    parameters.declare('real_time_factor', 1.0,
+                       'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
+    parameters.declare('hide_arm_in_goal', False,
+                       'Leave the arm out of the goal picture, from the next reset on.',
+                       read_only=False)
+    return parameters
+
+
+def encode_observed(observation, stamp):
+    """Encode the objects of an Observation, which come from the simulator itself."""
+    return encode_objects(
+        observation.object_names, observation.object_pixels, observation.object_poses, stamp,
+        WORLD_FRAME, ObjectStates.SOURCE_GROUND_TRUTH)
+
+
+def main(args=None):
+    """Run the node; the answer is the exit code of the process."""
+    return run_node(SimNode, 'sim_node', args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

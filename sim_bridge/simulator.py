@@ -1,0 +1,186 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated world: reset, step, observe. Knows nothing of ROS."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from sim_bridge.camera import Camera, Renderer
+from sim_bridge.scene import (
+    build_scene, FINGER_TRAVEL, HALF_HEIGHT, object_names, TIMESTEP, WORKSPACE_HIGH, WORKSPACE_LOW)
+from sim_bridge.tasks import get_task, gripper_away_from, sample_scene, SUCCESS_DISTANCE
+from tap_ros.errors import SceneError
+
+CONTROL_PERIOD = 0.25  # s of simulated time for one action
+SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
+if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
+    raise SceneError(f'the control period {CONTROL_PERIOD} s is no multiple of {TIMESTEP} s')
+RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time to catch up
+ACTION_LIMIT = np.array([0.08, 0.08, 0.15])  # m per control period, x, y, z
+OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the camera and the sensors say at one moment; object poses are ground truth."""
+
+    image: np.ndarray  # (H, W, 3) uint8 rgb
+    stamp_ns: int  # simulated time
+    gripper: np.ndarray  # (4,) float32: x, y, z of the fingertips in m, opening in [0, 1]
+    object_names: tuple
+    object_pixels: np.ndarray  # (K, 2) float32 (u, v) of the object origins
+    object_poses: np.ndarray  # (K, 7) float64: x, y, z in m, quaternion x, y, z, w
+
+
+def clip_action(action):
+    """
+    Limit an action to what the arm does in one control period.
+
+    :param action: (4,) displacement x, y, z in m and gripper opening in [0, 1].
+    :return: (4,) float64.
+    :raises SceneError: for another shape or values that are not finite.
+    """
+    action = np.asarray(action, np.float64)
+    if action.shape != (4,) or not np.isfinite(action).all():
+        raise SceneError(f'action {action}: expected 4 finite numbers (dx, dy, dz, opening)')
+    return np.append(np.clip(action[:3], -ACTION_LIMIT, ACTION_LIMIT), np.clip(action[3], 0, 1))
+
+
+def ramp_controls(target, actions):
+    """
+    Turn actions into servo targets for every physics step.
+
+    :param target: (4,) the present target: x, y, z, opening.
+    :param actions: (..., T, 4) actions within the limits.
+    :return: controls (..., T * SUBSTEPS, 5) and the targets after each action (..., T, 4).
+    """
+    targets = np.empty(actions.shape)
+    targets[..., 3] = actions[..., 3]
+    position = np.broadcast_to(target[:3], actions[..., 0, :3].shape)
+    for t in range(actions.shape[-2]):
+        position = np.clip(position + actions[..., t, :3], WORKSPACE_LOW, WORKSPACE_HIGH)
+        targets[..., t, :3] = position
+    first = np.broadcast_to(target, targets[..., :1, :].shape)
+    before = np.concatenate([first, targets[..., :-1, :]], axis=-2)
+    share = np.minimum(np.arange(1, SUBSTEPS + 1) / RAMP_SUBSTEPS, 1)[:, None]
+    path = before[..., None, :] + share * (targets - before)[..., None, :]  # (..., T, S, 4)
+    fingers = path[..., 3:] * FINGER_TRAVEL
+    controls = np.concatenate([path[..., :3], fingers, fingers], axis=-1)
+    return controls.reshape(*actions.shape[:-2], -1, 5), targets
+
+
+class Simulator:
+    """
+    A table with a gripper, objects and a camera.
+
+    :param task: name of a task, see tasks.TASKS.
+    :param image_size: pixels of the square picture.
+    :raises SceneError: for an unknown task, a bad size, or when nothing can be rendered.
+    """
+
+    control_period = CONTROL_PERIOD
+
+    def __init__(self, task='push2', image_size=64):
+        self.task = get_task(task)
+        if not 16 <= image_size <= 1024:
+            raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')
+        self.camera = Camera(image_size, image_size)
+        self._renderer = None
+
+    def reset(self, seed):
+        """
+        Draw the scene of this seed and put everything at its start.
+
+        :param seed: non-negative integer.
+        :return: Observation.
+        :raises SceneError: for a bad seed.
+        """
+        self.scene = sample_scene(self.task, seed)
+        self.model = build_scene(self.scene.shapes, self.camera.height)
+        self.data = mujoco.MjData(self.model)
+        if self._renderer is None:
+            self._renderer = Renderer(self.model, self.camera.height)
+        else:
+            self._renderer.use(self.model)
+        rng = np.random.default_rng([self.scene.seed, 7])
+        gripper = gripper_away_from(rng, self.scene.goal_poses[:, :2])
+        self._place(self.scene.goal_poses, gripper)
+        self._goal = self.observe(), self.observe(hide_arm=True)
+        self.target = np.append(self.scene.gripper_start, 0.0)
+        self._place(self.scene.start_poses, self.scene.gripper_start)
+        return self.observe()
+
+    def goal(self, hide_arm=False):
+        """Return the Observation of the goal: objects in place, the arm somewhere beside them."""
+        return self._goal[1 if hide_arm else 0]
+
+    def step(self, action):
+        """
+        Act for one control period.
+
+        :param action: (4,) displacement x, y, z in m, limited to ACTION_LIMIT and to the
+            workspace, and gripper opening from 0 (closed) to 1.
+        :return: Observation.
+        :raises SceneError: for another shape or values that are not finite.
+        """
+        controls, targets = ramp_controls(self.target, clip_action(action)[None])
+        self.target = targets[0]
+        for control in controls:
+            self.data.ctrl[:] = control
+            mujoco.mj_step(self.model, self.data)
+        return self.observe()
+
+    def observe(self, hide_arm=False):
+        """Return the Observation of this moment."""
+        mujoco.mj_forward(self.model, self.data)
+        poses = self.object_poses()
+        opening = self.data.qpos[3:5].mean() / FINGER_TRAVEL
+        return Observation(
+            image=self._renderer.render(self.data, hide_arm),
+            stamp_ns=round(self.data.time * 1e9),
+            gripper=np.append(self.data.qpos[:3], opening).astype(np.float32),
+            object_names=object_names(self.task.num_objects),
+            object_pixels=self.camera.project(poses[:, :3]).astype(np.float32),
+            object_poses=poses)
+
+    def object_poses(self):
+        """Return (K, 7): x, y, z in m, quaternion x, y, z, w."""
+        poses = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
+        return poses[:, [0, 1, 2, 4, 5, 6, 3]].copy()
+
+    def distances(self):
+        """Return (K,) metres from each object's origin to its goal, in three dimensions."""
+        return np.linalg.norm(
+            self.object_poses()[:, :3] - self.goal().object_poses[:, :3], axis=1)
+
+    def outcome(self):
+        """Return 'success' when every object is within SUCCESS_DISTANCE, else 'failure'."""
+        return 'success' if (self.distances() < SUCCESS_DISTANCE).all() else 'failure'
+
+    def state(self):
+        """Return the full physics state, as mujoco.rollout takes it."""
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        state = np.empty(mujoco.mj_stateSize(self.model, kind))
+        mujoco.mj_getState(self.model, self.data, state, kind)
+        return state
+
+    def close(self):
+        """Free the OpenGL context."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _place(self, poses, gripper):
+        """Put objects at planar poses (K, 3) and the closed gripper at (3,), all at rest."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:3] = gripper
+        self.data.ctrl[:3] = gripper
+        objects = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
+        objects[:, :2] = poses[:, :2]
+        objects[:, 2] = HALF_HEIGHT
+        objects[:, 3:] = 0
+        objects[:, 3] = np.cos(poses[:, 2] / 2)
+        objects[:, 6] = np.sin(poses[:, 2] / 2)
+        mujoco.mj_forward(self.model, self.data)

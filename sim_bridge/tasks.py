@@ -1,0 +1,129 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The tasks: how many objects, how many frames, and where starts and goals may lie.
+
+The rules are those of the paper's authors (their cartgripper environment): object origins within
+0.35 m of the middle, starts at least 0.35 m apart (0.3 m with three objects), every goal exactly
+0.2 m from its start and at least 0.2 m from the other goals, yaw changed by at most 0.2 rad.
+Doing nothing therefore ends 20 cm from the goals.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_bridge.scene import random_shape
+from tap_ros.errors import SceneError
+
+OBJECT_RANGE = 0.35  # m, |x| and |y| of object origins at start and goal
+GOAL_DISTANCE = 0.2  # m from start to goal of every object
+GOAL_YAW_RANGE = 0.2  # rad
+GOAL_SEPARATION = 0.2  # m between goals
+GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
+GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
+GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the start
+SUCCESS_DISTANCE = 0.05  # m; an episode succeeds when every object ends nearer to its goal
+
+
+@dataclass(frozen=True)
+class Task:
+    """A kind of episode."""
+
+    name: str
+    num_objects: int
+    num_frames: int  # the longest episode
+    start_separation: float  # m between object origins at the start
+
+
+TASKS = {
+    'push2': Task('push2', num_objects=2, num_frames=40, start_separation=0.35),
+    'push3': Task('push3', num_objects=3, num_frames=75, start_separation=0.3),
+}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One draw of a task: planar poses are (x, y, yaw) in metres and radians."""
+
+    task: Task
+    seed: int
+    shapes: tuple
+    start_poses: np.ndarray  # (K, 3)
+    goal_poses: np.ndarray  # (K, 3)
+    gripper_start: np.ndarray  # (3,) m
+
+
+def get_task(name):
+    """
+    Look up a task.
+
+    :raises SceneError: for an unknown name.
+    """
+    if name not in TASKS:
+        raise SceneError(f'task {name!r} is unknown; valid tasks: {", ".join(TASKS)}')
+    return TASKS[name]
+
+
+def sample_scene(task, seed):
+    """
+    Draw shapes, starts, goals and the gripper's start.
+
+    :param task: Task.
+    :param seed: non-negative integer; the same seed gives the same scene.
+    :return: Scene.
+    :raises SceneError: for a seed that is negative or not an integer.
+    """
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise SceneError(f'seed {seed!r}: expected a non-negative integer')
+    rng = np.random.default_rng([int(seed), task.num_objects])
+    shapes = tuple(random_shape(rng) for _ in range(task.num_objects))
+    # Three separated starts may leave no room for separated goals: then both are drawn anew.
+    while True:
+        starts = _separated(
+            lambda: rng.uniform(-OBJECT_RANGE, OBJECT_RANGE, (task.num_objects, 2)),
+            task.start_separation)
+        goals = None if starts is None else _separated(
+            lambda: _goals_around(rng, starts), GOAL_SEPARATION)
+        if goals is not None:
+            break
+    yaws = rng.uniform(0, 2 * np.pi, task.num_objects)
+    goal_yaws = yaws + rng.uniform(-GOAL_YAW_RANGE, GOAL_YAW_RANGE, task.num_objects)
+    return Scene(
+        task=task, seed=int(seed), shapes=shapes,
+        start_poses=np.column_stack([starts, yaws]),
+        goal_poses=np.column_stack([goals, goal_yaws]),
+        gripper_start=gripper_away_from(rng, starts))
+
+
+def gripper_away_from(rng, positions):
+    """
+    Draw a place of the gripper that touches no object.
+
+    :param rng: numpy Generator.
+    :param positions: (K, 2) object origins in metres.
+    :return: (3,) metres.
+    """
+    while True:
+        xy = rng.uniform(-GRIPPER_RANGE, GRIPPER_RANGE, 2)
+        if np.linalg.norm(positions - xy, axis=1).min() > GRIPPER_MARGIN:
+            return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
+
+
+def _separated(draw, separation, attempts=1000):
+    """Draw positions until all pairs are apart; None after too many attempts."""
+    for _ in range(attempts):
+        positions = draw()
+        if positions is None:
+            continue
+        gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+        if (gaps[np.triu_indices(len(positions), 1)] >= separation).all():
+            return positions
+    return None
+
+
+def _goals_around(rng, starts):
+    """Draw a goal at the fixed distance from each start; None if one lies out of range."""
+    angles = rng.uniform(0, 2 * np.pi, len(starts))
+    goals = starts + GOAL_DISTANCE * np.column_stack([np.cos(angles), np.sin(angles)])
+    return goals if (np.abs(goals) <= OBJECT_RANGE).all() else None

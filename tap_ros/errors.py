@@ -1,0 +1,35 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The errors of this package.
+
+Every message names what was wrong and what would be right. Catch TapError to catch them all.
+"""
+
+
+class TapError(Exception):
+    """Base of all errors raised on purpose by this package."""
+
+
+class ConfigError(TapError):
+    """A setting, parameter or command-line argument cannot be used."""
+
+
+class ImageError(TapError):
+    """A picture has the wrong type, shape, size, encoding or length."""
+
+
+class RecordingError(TapError):
+    """A recording is missing, empty, damaged, or lacks a topic."""
+
+
+class WeightsError(TapError):
+    """A weights file is missing, damaged, or made for something else."""
+
+
+class SceneError(TapError):
+    """A task, seed or scene cannot be set up, or an action cannot be applied."""
+
+
+class PlanningError(TapError):
+    """The planner was given states, maps or goals that cannot be planned with."""

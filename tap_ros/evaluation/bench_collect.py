@@ -1,0 +1,55 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Benchmark of collecting: seconds per recorded episode, split into its parts."""
+
+import argparse
+import os
+from pathlib import Path
+import tempfile
+import time
+
+from sim_bridge.collect import collect, CollectConfig
+from sim_bridge.simulator import Simulator
+
+
+def run(args):
+    """Collect into a temporary folder and print where the time went."""
+    with tempfile.TemporaryDirectory() as folder:
+        config = CollectConfig(task=args.task, episodes=args.episodes, episodes_per_file=5)
+        result = collect(Path(folder) / 'bench', config, workers=args.workers)
+        size = sum(path.stat().st_size for path in Path(folder).rglob('*.mcap'))
+    simulator = Simulator(args.task)
+    simulator.reset(0)
+    begin = time.perf_counter()
+    for _ in range(200):
+        simulator.observe()
+    render = (time.perf_counter() - begin) / 200 * result['frames']
+    seconds, episodes = result['seconds'], result['episodes']
+    physics = seconds['search'] + seconds['step'] - render
+    busy = seconds['search'] + seconds['step'] + seconds['write']
+    workers = args.workers or len(os.sched_getaffinity(0))
+    print(f'''task {args.task}, seed 0, {episodes} episodes of {result['frames'] / episodes:.1f} \
+frames on average, {workers} workers
+seconds per episode (wall, workers side by side)  {seconds['wall'] / episodes:.2f}
+  scaled to 40 frames                             \
+{40 * seconds['wall'] / result['frames']:.2f}
+share of the workers' time: physics               {physics / busy:.0%}
+                            rendering             {render / busy:.0%}
+                            writing               {seconds['write'] / busy:.0%}
+mean final distance                               {100 * result['mean_final_distance']:.1f} cm
+success rate (all objects within 5 cm)            {result['success_rate']:.0%}
+size of the recording per frame                   {size / result['frames'] / 1024:.1f} KiB''')
+
+
+def add_arguments(parser):
+    """Add the options of this benchmark."""
+    parser.add_argument('--task', default='push2', help='task (default: %(default)s)')
+    parser.add_argument(
+        '--episodes', type=int, default=60, help='how many to collect (default: %(default)s)')
+    parser.add_argument('--workers', type=int, help='processes (default: one a core)')
+
+
+if __name__ == '__main__':
+    _parser = argparse.ArgumentParser(description=__doc__)
+    add_arguments(_parser)
+    run(_parser.parse_args())

@@ -1,0 +1,145 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""One self-contained HTML page about a few scenes, each pushed directly and by a subgoal."""
+
+import base64
+from dataclasses import dataclass
+import html
+import io
+from pathlib import Path
+
+from matplotlib.figure import Figure
+import numpy as np
+
+from tap_ros.evaluation.pictures import enlarge, film_strip, overlay_maps, png_bytes
+
+SCALE = 4
+MODE_NAMES = {'direct': 'straight to the goal', 'subgoal': 'by the subgoal'}
+MODE_COLOURS = {'direct': '#648fff', 'subgoal': '#dc267f'}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One attempt at a scene."""
+
+    frames: list  # T + 1 pictures (H, W, 3) uint8
+    distances: np.ndarray  # (T + 1, K) metres from each object to its goal
+    message: str  # how the planner said that it ended
+    planning_ms: float  # median time of one plan
+
+
+@dataclass(frozen=True)
+class SceneRuns:
+    """A scene, the subgoal predicted for it, and the attempts."""
+
+    seed: int
+    start: np.ndarray  # (H, W, 3) uint8
+    goal: np.ndarray
+    start_pixels: np.ndarray  # (K, 2)
+    goal_pixels: np.ndarray
+    subgoal: np.ndarray  # (H, W, 3) uint8
+    object_maps: np.ndarray  # (K, H, W)
+    runs: dict  # mode -> Run
+
+
+def results_table(scenes):
+    """
+    Say in plain text how far from their goals the objects ended.
+
+    :param scenes: list of SceneRuns with the same modes.
+    :return: lines of text; distances in cm, mean over the objects.
+    """
+    modes = list(scenes[0].runs)
+    rows = [_row(f'scene {scene.seed}', [
+        scene.runs[modes[0]].distances[0].mean(),
+        *(scene.runs[m].distances[-1].mean() for m in modes)]) for scene in scenes]
+    means = np.mean([[
+        s.runs[modes[0]].distances[0].mean(),
+        *(s.runs[m].distances[-1].mean() for m in modes)] for s in scenes], axis=0)
+    head = f'{"final mean distance, cm":<26}{"do nothing":>12}' + ''.join(
+        f'{m:>12}' for m in modes)
+    rule = '-' * len(head)
+    return '\n'.join([head, rule, *rows, rule, _row(f'mean of {len(scenes)}', means)])
+
+
+def _row(label, distances):
+    return f'{label:<26}' + ''.join(f'{100 * d:>12.1f}' for d in distances)
+
+
+def write_report(path, scenes, note=''):
+    """
+    Write the page; everything is inside the one file.
+
+    :param path: of the HTML file.
+    :param scenes: list of SceneRuns.
+    :param note: a sentence on how the numbers were made.
+    """
+    body = ''.join(_scene_section(scene) for scene in scenes)
+    page = f'''<!doctype html>
+<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
+<title>tap_ros: pushed by way of a predicted subgoal</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 1120px; margin: 2rem auto;
+  padding: 0 1rem; color: #222; background: #fff; }}
+h1 {{ font-size: 1.5rem; }} h2 {{ font-size: 1.15rem; margin: 2.2rem 0 .6rem; }}
+figure {{ display: inline-block; margin: 0 .8rem .8rem 0; vertical-align: top; }}
+figcaption {{ font-size: .85rem; color: #555; max-width: 16rem; }}
+img {{ image-rendering: pixelated; display: block; max-width: 100%; }}
+img.smooth {{ image-rendering: auto; }}
+pre {{ background: #f4f4f6; padding: 1rem; overflow-x: auto; }}
+</style>
+<h1>Two objects pushed to where a goal picture shows them, by way of a predicted subgoal</h1>
+<p>Each scene was pushed once straight towards its goal and once by the subgoal that
+<code>/predict_subgoal</code> answered: the picture of a moment on the way, with a probability map
+of where every object should then be. Doing nothing ends 20 cm from the goals.</p>
+<pre>{html.escape(results_table(scenes))}</pre>
+<p>{html.escape(note)}</p>
+{body}</html>
+'''
+    Path(path).write_text(page, encoding='utf-8')
+
+
+def _scene_section(scene):
+    """Return the HTML of one scene."""
+    k = len(scene.object_maps)
+    flat = np.full_like(scene.subgoal, 24)
+    pictures = [
+        ('start', enlarge(scene.start, SCALE)), ('goal', enlarge(scene.goal, SCALE)),
+        ('predicted subgoal', enlarge(scene.subgoal, SCALE)),
+        (f'its object maps: {k} colours; circles mark the starts, crosses the goals',
+         overlay_maps(flat, scene.object_maps, SCALE, scene.start_pixels, scene.goal_pixels))]
+    for mode, run in scene.runs.items():
+        final = 100 * run.distances[-1].mean()
+        pictures.append((
+            f'end, {MODE_NAMES[mode]}: {final:.1f} cm. {run.message}',
+            enlarge(run.frames[-1], SCALE)))
+    figures = ''.join(_figure(caption, png_bytes(image)) for caption, image in pictures)
+    strips = ''.join(
+        _figure(f'{MODE_NAMES[mode]}: frames 0 to {len(run.frames) - 1}, median planning time '
+                f'{run.planning_ms:.0f} ms', png_bytes(film_strip(run.frames)))
+        for mode, run in scene.runs.items())
+    return (f'<h2>Scene {scene.seed}</h2>{figures}'
+            f'{_figure("error over time", _error_plot(scene), "smooth")}{strips}')
+
+
+def _figure(caption, png, kind=''):
+    data = base64.b64encode(png).decode()
+    return (f'<figure><img class="{kind}" alt="{html.escape(caption)}" '
+            f'src="data:image/png;base64,{data}"><figcaption>{html.escape(caption)}'
+            '</figcaption></figure>')
+
+
+def _error_plot(scene):
+    """Plot the mean distance of the objects to their goals over time; return PNG bytes."""
+    figure = Figure(figsize=(5.2, 2.6), dpi=100, layout='constrained')
+    axes = figure.subplots()
+    for mode, run in scene.runs.items():
+        colour = MODE_COLOURS[mode]
+        axes.plot(100 * run.distances.mean(1), color=colour, label=MODE_NAMES[mode], lw=2)
+        axes.plot(100 * run.distances, color=colour, lw=0.7, alpha=0.6)
+    axes.axhline(20, color='#999', ls=':', label='do nothing')
+    axes.set(xlabel='step', ylabel='distance to the goal, cm', ylim=(0, None))
+    axes.legend(fontsize=8)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='png')
+    return buffer.getvalue()

@@ -1,0 +1,47 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Show what a recording or a weights file holds."""
+
+from collections import Counter
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from tap_ros.evaluation.pictures import film_strip
+from tap_ros.prediction.weights import load_tensors
+from tap_ros.recording.cache import open_recordings
+
+
+def add_arguments(parser):
+    """Add the options of the command."""
+    parser.add_argument('path', help='an .mcap file, a bag folder, or a .safetensors file')
+    parser.add_argument('--picture', help='write film strips of the first episodes to this PNG')
+    parser.add_argument(
+        '--episodes', type=int, default=8, help='episodes in the picture (default: %(default)s)')
+
+
+def run(args):
+    """Print a summary; write a picture when asked to."""
+    if Path(args.path).suffix == '.safetensors':
+        _, about = load_tensors(args.path)
+        print(json.dumps(about, indent=2))
+        return
+    store = open_recordings([args.path])
+    episodes = [store[i] for i in range(len(store))]
+    lengths = np.array([len(e.frames) for e in episodes])
+    objects = sorted({len(e.object_names) for e in episodes})
+    print(f'{args.path}: {len(episodes)} episodes, {lengths.sum()} frames of '
+          f'{store.image_size[1]}x{store.image_size[0]} pixels')
+    print(f'length      {lengths.min()} to {lengths.max()} frames, median {np.median(lengths):g}')
+    print(f'objects     {", ".join(map(str, objects))}')
+    for name, values in (('task', [e.task for e in episodes]),
+                         ('outcome', [e.outcome for e in episodes])):
+        counts = ', '.join(f'{k or "unknown"} {v}' for k, v in Counter(values).most_common())
+        print(f'{name:<11} {counts}')
+    print(f'data hash   {store.data_hash}')
+    if args.picture:
+        strips = np.vstack([film_strip(e.frames) for e in episodes[:args.episodes]])
+        cv2.imwrite(args.picture, strips[..., ::-1])
+        print(f'picture     {args.picture}')

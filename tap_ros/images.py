@@ -1,0 +1,59 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The one place that knows pixel conventions.
+
+Inside the networks: NCHW float32 in [-1, 1]. Outside: HWC uint8, rgb8.
+A pixel position is (u, v) = (column, row) with (0, 0) at the centre of the top-left pixel.
+"""
+
+import numpy as np
+import torch
+
+from tap_ros.errors import ImageError
+
+
+def to_float(images, dtype=torch.float32):
+    """
+    Turn pictures into network inputs.
+
+    :param images: uint8 (..., H, W, 3), numpy array or tensor.
+    :param dtype: the floating-point type of the answer.
+    :return: tensor (..., 3, H, W) in [-1, 1].
+    """
+    if isinstance(images, np.ndarray):
+        images = torch.from_numpy(np.ascontiguousarray(images))
+    return images.movedim(-1, -3).to(dtype).div_(127.5).sub_(1.0)
+
+
+def to_uint8(images):
+    """
+    Turn network outputs into pictures, rounding to the nearest value.
+
+    :param images: tensor (..., 3, H, W) in [-1, 1]; values beyond are clipped.
+    :return: uint8 numpy array (..., H, W, 3).
+    """
+    pixels = images.detach().float().add(1.0).mul(127.5).round_().clamp_(0, 255)
+    return pixels.to(torch.uint8).movedim(-3, -1).contiguous().cpu().numpy()
+
+
+def check_image(image, name, size=None):
+    """
+    Accept a picture or say what is wrong with it.
+
+    :param image: what should be a uint8 array (H, W, 3).
+    :param name: how the message calls it, for example 'goal'.
+    :param size: the only (height, width) accepted, or None for any.
+    :return: the same array.
+    :raises ImageError: for another type, shape or size.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        kind = getattr(image, 'dtype', type(image).__name__)
+        raise ImageError(f'{name}: expected a uint8 array of rgb pixels, got {kind}')
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ImageError(f'{name}: expected shape (height, width, 3), got {image.shape}')
+    if size is not None and image.shape[:2] != tuple(size):
+        raise ImageError(
+            f'{name}: expected {size[1]}x{size[0]} pixels (width x height), '
+            f'got {image.shape[1]}x{image.shape[0]}; resize it or use weights for that size')
+    return image

@@ -1,0 +1,175 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""For programs that use the nodes: calls with a time-out, goals, and the newest messages."""
+
+import threading
+import time
+
+from action_msgs.msg import GoalStatus
+from rclpy.executors import MultiThreadedExecutor
+
+from tap_ros.errors import TapError
+
+
+class CallError(TapError):
+    """A service, action or topic did not answer in time, or refused."""
+
+
+class Spinner:
+    """
+    Spin a node in the background, for as long as the with-block lasts.
+
+    A thread that keeps spinning answers ten times faster than spinning once per call.
+
+    :param node: rclpy Node; destroying it stays with the caller.
+    """
+
+    def __init__(self, node):
+        self._executor = MultiThreadedExecutor(num_threads=2, context=node.context)
+        self._executor.add_node(node)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._spin, name='spinner', daemon=True)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join(timeout=5.0)
+        self._executor.shutdown(timeout_sec=1.0)
+
+    def _spin(self):
+        while not self._stop.is_set():
+            self._executor.spin_once(timeout_sec=0.1)
+
+
+def call(client, request, timeout_s, give_up=lambda: False):
+    """
+    Call a service from a thread that does not spin the node.
+
+    :param client: rclpy Client of a node that another thread spins.
+    :param request: the service's request.
+    :param timeout_s: most seconds to wait for the service and its answer together.
+    :param give_up: asked several times a second whether to stop waiting.
+    :return: the response.
+    :raises CallError: when the service is not there, ends, or does not answer in time, or when
+        the wait was given up.
+    """
+    deadline = time.monotonic() + timeout_s
+    name = client.srv_name
+    while not client.wait_for_service(timeout_sec=min(0.25, timeout_s)):
+        if time.monotonic() >= deadline or give_up():
+            raise CallError(
+                f'service {name}: nobody offers it after {timeout_s:g} s; '
+                'start its node and wait until it says that it is ready')
+    future = client.call_async(request)
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    try:
+        while not done.wait(min(0.25, max(deadline - time.monotonic(), 0))):
+            if not client.service_is_ready():
+                raise CallError(f'service {name}: its node ended during the call')
+            if time.monotonic() >= deadline or give_up():
+                raise CallError(
+                    f'service {name}: no answer within {timeout_s:g} s; '
+                    'its node may be busy or stopped')
+    finally:
+        client.remove_pending_request(future)  # else a lost call stays pending for ever
+    return future.result()
+
+
+def wait_for_future(future, timeout_s):
+    """Wait until a future is done, without spinning; tell whether it is."""
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    return done.wait(max(timeout_s, 0.0))
+
+
+def send_goal(action_client, goal, timeout_s, on_feedback=None):
+    """
+    Send a goal and wait until it is accepted.
+
+    :param action_client: rclpy ActionClient of a node that another thread spins.
+    :param goal: the action's goal.
+    :param timeout_s: most seconds to wait.
+    :param on_feedback: called with each feedback message, or None.
+    :return: the client's goal handle.
+    :raises CallError: when no server answers in time, or it rejects the goal.
+    """
+    name = action_client._action_name
+    if not action_client.wait_for_server(timeout_sec=timeout_s):
+        raise CallError(f'action {name}: nobody offers it after {timeout_s:g} s')
+    future = action_client.send_goal_async(
+        goal, None if on_feedback is None else lambda message: on_feedback(message.feedback))
+    if not wait_for_future(future, timeout_s):
+        raise CallError(f'action {name}: no answer to the goal within {timeout_s:g} s')
+    handle = future.result()
+    if not handle.accepted:
+        raise CallError(
+            f'action {name}: the goal was rejected; the log of its node says why')
+    return handle
+
+
+def wait_for_result(handle, timeout_s):
+    """
+    Wait for the end of a goal; cancel it when it takes too long.
+
+    :param handle: goal handle of send_goal.
+    :param timeout_s: most seconds to wait.
+    :return: status, one of the STATUS_ constants of action_msgs/GoalStatus, and the result.
+    :raises CallError: when it has not ended in time.
+    """
+    future = handle.get_result_async()
+    if not wait_for_future(future, timeout_s):
+        wait_for_future(handle.cancel_goal_async(), 1.0)
+        raise CallError(f'the goal has not ended within {timeout_s:g} s and was cancelled')
+    answer = future.result()
+    if answer.status == GoalStatus.STATUS_UNKNOWN:
+        raise CallError('the action server does not know the goal; was it started anew?')
+    return answer.status, answer.result
+
+
+class Newest:
+    """
+    Keep the newest message of a topic.
+
+    :param node: rclpy Node that another thread spins.
+    :param message_type: type of the topic.
+    :param topic: its name.
+    :param qos: its QoSProfile.
+    """
+
+    def __init__(self, node, message_type, topic, qos):
+        self._topic = topic
+        self._condition = threading.Condition()
+        self._count = 0
+        self._message = None
+        node.create_subscription(message_type, topic, self._put, qos)
+
+    @property
+    def count(self):
+        """Number of messages received so far."""
+        return self._count
+
+    def wait(self, timeout_s, accept=lambda message: True):
+        """
+        Return the newest message once it is acceptable.
+
+        :param timeout_s: most seconds to wait.
+        :param accept: called with a message; whether it is the one waited for.
+        :return: the message.
+        :raises CallError: when none comes in time.
+        """
+        with self._condition:
+            if self._condition.wait_for(
+                    lambda: self._message is not None and accept(self._message), timeout_s):
+                return self._message
+        got = f'{self._count} messages, none of them as wanted' if self._count else 'no message'
+        raise CallError(f'topic {self._topic}: {got} within {timeout_s:g} s')
+
+    def _put(self, message):
+        with self._condition:
+            self._message = message
+            self._count += 1
+            self._condition.notify_all()

@@ -1,0 +1,273 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The demo: real nodes in processes of their own push objects to where a goal picture shows them.
+
+Each scene is pushed once straight to its goal and once by the subgoal that predict_subgoal
+answers. Everything goes through the topics, services and actions that any client would use.
+"""
+
+from pathlib import Path
+import time
+
+import numpy as np
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Image
+from tqdm import tqdm
+
+from tap_msgs.action import ReachGoal
+from tap_msgs.msg import ObjectStates
+from tap_msgs.srv import PredictSubgoal, ResetScene
+from tap_ros.errors import TapError
+from tap_ros.evaluation.demo_report import results_table, Run, SceneRuns, write_report
+from tap_ros.nodes.clients import call, send_goal, Spinner, wait_for_result
+from tap_ros.nodes.image_messages import decode_image, decode_map
+from tap_ros.nodes.node_processes import NodeProcesses
+from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+
+FIRST_SCENE = 1_000_000  # far from the seeds of the training recordings
+MODES = ('direct', 'subgoal')
+START_TIMEOUT_S = 90.0
+CALL_TIMEOUT_S = 20.0
+STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
+
+
+class Watch:
+    """
+    Keep every camera picture, and the objects in it, since the last call of begin.
+
+    :param node: rclpy Node that another thread spins.
+    """
+
+    def __init__(self, node):
+        self._kept = {}
+        self._topics = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')}
+        for topic, (message_type, name) in self._topics.items():
+            node.create_subscription(
+                message_type, name, lambda message, topic=topic: self._keep(topic, message),
+                STREAM)
+        self.begin()
+
+    def begin(self):
+        """Forget what was seen."""
+        self._kept = {topic: {} for topic in self._topics}
+
+    def seen(self):
+        """Return the images and the objects that belong to them, in order of their stamps."""
+        images, objects = (dict(found) for found in self._kept.values())
+        stamps = sorted(set(images) & set(objects))
+        return [images[stamp] for stamp in stamps], [objects[stamp] for stamp in stamps]
+
+    def _keep(self, topic, message):
+        self._kept[topic][to_nanoseconds(message.header.stamp)] = message
+
+
+class DemoClient:
+    """
+    The demo's own node: it resets the scene, asks for a subgoal and for pushes, and watches.
+
+    :param processes: NodeProcesses to keep an eye on.
+    """
+
+    def __init__(self, processes):
+        self.node = rclpy.create_node('demo')
+        self._processes = processes
+        self._reset = self.node.create_client(ResetScene, 'sim/reset')
+        self._predict = self.node.create_client(PredictSubgoal, 'predict_subgoal')
+        self._reach = ActionClient(self.node, ReachGoal, 'reach_goal')
+        self._camera = Watch(self.node)
+        self._goal = Observations('image', 'objects')
+        self._goal.subscribe(self.node, {
+            'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}, LATCHED)
+
+    def wait_until_ready(self):
+        """Wait until every node offers what it offers only when it is ready."""
+        deadline = time.monotonic() + START_TIMEOUT_S
+        waiting = {
+            'sim_node': self._reset.service_is_ready,
+            'predictor_node': self._predict.service_is_ready,
+            'visual_mpc_node': self._reach.server_is_ready}
+        while waiting:
+            self._processes.check()
+            for name in [name for name, ready in waiting.items() if ready()]:
+                print(f'  {name} is ready', flush=True)
+                del waiting[name]
+            if time.monotonic() > deadline:
+                raise TapError(
+                    f'{", ".join(waiting)} not ready after {START_TIMEOUT_S:g} s; see the logs')
+            time.sleep(0.1)
+
+    def reset(self, task, seed):
+        """Start a scene; return its goal as a dict of image and objects."""
+        before = self._goal.newest('image', 'objects')
+        after_ns = -1 if before is None else to_nanoseconds(before['image'].header.stamp)
+        self._camera.begin()
+        answer = call(self._reset, ResetScene.Request(task=task, seed=seed), CALL_TIMEOUT_S)
+        if not answer.success:
+            raise TapError(f'sim/reset: {answer.message}')
+        goal = self._goal.wait(('image', 'objects'), CALL_TIMEOUT_S, after_ns)
+        deadline = time.monotonic() + CALL_TIMEOUT_S
+        while goal is not None and not self._camera.seen()[0] and time.monotonic() < deadline:
+            time.sleep(0.01)
+        if goal is None or not self._camera.seen()[0]:
+            raise TapError(f'no camera or goal picture came within {CALL_TIMEOUT_S:g} s')
+        return goal
+
+    def start(self):
+        """Return the first picture of the scene and the objects in it."""
+        images, objects = self._camera.seen()
+        return images[0], objects[0]
+
+    def predict(self):
+        """Ask for a subgoal as a person would by hand: with an empty request."""
+        answer = call(self._predict, PredictSubgoal.Request(), CALL_TIMEOUT_S)
+        if not answer.success:
+            raise TapError(f'predict_subgoal: {answer.message}')
+        return answer.subgoals[0]
+
+    def push(self, mode, seed, step_budget, goal):
+        """
+        Have the arm push until the goal is reached or the budget spent.
+
+        :return: Run.
+        """
+        planning_ms = []
+        with tqdm(total=step_budget, desc=f'    {mode:<8}', unit='step', leave=False) as bar:
+            def on_feedback(feedback):
+                planning_ms.append(feedback.planning_ms)
+                bar.set_postfix_str(
+                    f'to the {feedback.stage}, {feedback.expected_distance:.1f} px expected')
+                bar.update(feedback.step - bar.n)
+            request = ReachGoal.Goal(mode=mode, step_budget=step_budget, seed=seed)
+            handle = send_goal(self._reach, request, CALL_TIMEOUT_S, on_feedback)
+            _, result = wait_for_result(handle, CALL_TIMEOUT_S + STEP_TIMEOUT_S * step_budget)
+        self._processes.check()
+        images, objects = self._camera.seen()
+        goals = positions(goal['objects'])
+        return Run(
+            frames=[decode_image(image, 'camera/image_raw') for image in images],
+            distances=np.array([np.linalg.norm(positions(o) - goals, axis=1) for o in objects]),
+            message=result.message, planning_ms=float(np.median(planning_ms or [np.nan])))
+
+
+def positions(message):
+    """Return (K, 3) metres of a tap_msgs/ObjectStates."""
+    points = [state.pose.position for state in message.objects]
+    return np.array([(p.x, p.y, p.z) for p in points])
+
+
+def pixels(message):
+    """Return (K, 2) (u, v) of a tap_msgs/ObjectStates."""
+    return np.array([(state.u, state.v) for state in message.objects])
+
+
+def run_scene(client, task, seed, step_budget):
+    """
+    Push one scene in every mode.
+
+    :return: SceneRuns.
+    """
+    runs = {}
+    for mode in MODES:
+        goal = client.reset(task, seed)
+        if not runs:
+            subgoal = client.predict()
+        begin = time.monotonic()
+        runs[mode] = client.push(mode, seed, step_budget, goal)
+        run = runs[mode]
+        print(f'    {mode:<8} {100 * run.distances[0].mean():5.1f} -> '
+              f'{100 * run.distances[-1].mean():5.1f} cm in {len(run.frames) - 1} steps, '
+              f'{time.monotonic() - begin:.0f} s ({run.planning_ms:.0f} ms a plan)', flush=True)
+    image, objects = client.start()
+    return SceneRuns(
+        seed=seed, start=decode_image(image, 'camera/image_raw'),
+        goal=decode_image(goal['image'], 'goal/image'), start_pixels=pixels(objects),
+        goal_pixels=pixels(goal['objects']), subgoal=decode_image(subgoal.image, 'subgoal'),
+        object_maps=np.stack([decode_map(m, 'object_maps') for m in subgoal.object_maps]),
+        runs=runs)
+
+
+def start_nodes(processes, folder, task):
+    """Start the three nodes and the recorder."""
+    processes.start('recorder_node', folder=folder / 'recording')
+    processes.start('sim_node', lock_step=True, task=task)
+    processes.start('predictor_node')
+    processes.start('visual_mpc_node')
+
+
+def run(args):
+    """
+    Run the demo and leave a recording, logs and a page.
+
+    :param args: parsed arguments of add_arguments.
+    :return: exit code.
+    """
+    folder = new_folder(args.out)
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    client = None
+    begin = time.monotonic()
+    try:
+        with NodeProcesses(folder / 'logs') as processes:
+            client = DemoClient(processes)
+            with Spinner(client.node):
+                if args.attach:
+                    print('Waiting for the nodes that run already', flush=True)
+                else:
+                    print(f'Starting four nodes; their logs are in {folder / "logs"}', flush=True)
+                    start_nodes(processes, folder, args.task)
+                client.wait_until_ready()
+                scenes = []
+                for i in range(args.scenes):
+                    print(f'  scene {args.seed + i} ({i + 1} of {args.scenes}): {args.task}',
+                          flush=True)
+                    scenes.append(run_scene(client, args.task, args.seed + i, args.step_budget))
+    finally:
+        if client is not None:
+            client.node.destroy_node()
+        rclpy.try_shutdown()
+    seconds = time.monotonic() - begin
+    print(f'\n{results_table(scenes)}\n')
+    write_report(
+        folder / 'report.html', scenes,
+        f'Task {args.task}, seeds {args.seed} to {args.seed + args.scenes - 1}, at most '
+        f'{args.step_budget} steps, {seconds:.0f} s in all. Object pixels at every step, and the '
+        'distances, are ground truth of the simulator.')
+    if not args.attach:
+        print(f'recording  {folder / "recording"}')
+    print(f'page       {folder / "report.html"}')
+    return 0
+
+
+def new_folder(wanted):
+    """Make a folder of this name, or with the next free number behind it."""
+    for number in range(1, 10000):
+        folder = Path(wanted if number == 1 else f'{wanted}-{number}')
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            continue
+    raise TapError(f'{wanted}: thousands of folders of that name; remove some')
+
+
+def add_arguments(parser):
+    """Add the options of the demo."""
+    parser.add_argument(
+        '--scenes', type=int, default=3, help='how many scenes (default: %(default)s)')
+    parser.add_argument(
+        '--seed', type=int, default=FIRST_SCENE,
+        help='seed of the first scene (default: %(default)s)')
+    parser.add_argument(
+        '--task', default='push2', choices=('push2', 'push3'), help='task (default: %(default)s)')
+    parser.add_argument(
+        '--step-budget', type=int, default=40,
+        help='most steps of one run (default: %(default)s)')
+    parser.add_argument(
+        '--out', default='runs/demo', help='folder for the page, the recording and the logs '
+        '(default: %(default)s; a number is added when it exists)')
+    parser.add_argument(
+        '--attach', action='store_true',
+        help='use nodes that run already, for example those of demo.launch.py')

@@ -1,0 +1,150 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""sensor_msgs/Image to arrays and back; what cannot be used is refused with the reason."""
+
+import array
+import sys
+
+import numpy as np
+from sensor_msgs.msg import Image
+import torch
+
+from tap_ros.errors import ImageError
+from tap_ros.images import check_image
+
+# Bytes per pixel, and which of them are red, green and blue.
+ENCODINGS = {
+    'rgb8': (3, (0, 1, 2)), 'bgr8': (3, (2, 1, 0)),
+    'rgba8': (4, (0, 1, 2)), 'bgra8': (4, (2, 1, 0)), 'mono8': (1, (0, 0, 0))}
+
+
+def is_empty(message):
+    """Tell whether an image field was left as it is by default."""
+    return message.width == 0 and message.height == 0 and len(message.data) == 0
+
+
+def encode_image(image, stamp, frame_id):
+    """
+    Turn a picture into a message.
+
+    :param image: uint8 (H, W, 3) rgb.
+    :param stamp: builtin_interfaces/Time, the moment of the snapshot.
+    :param frame_id: frame of the camera.
+    :return: sensor_msgs/Image, rgb8.
+    :raises ImageError: for another type or shape.
+    """
+    return _pack(check_image(image, 'image'), 'rgb8', stamp, frame_id)
+
+
+def encode_map(values, stamp, frame_id):
+    """
+    Turn one object map into a message.
+
+    :param values: float32 (H, W).
+    :param stamp: builtin_interfaces/Time.
+    :param frame_id: frame of the camera.
+    :return: sensor_msgs/Image, 32FC1.
+    """
+    return _pack(np.asarray(values, np.float32), '32FC1', stamp, frame_id)
+
+
+def decode_image(message, name, size=None, resize=False):
+    """
+    Turn a message into a picture.
+
+    :param message: sensor_msgs/Image in one of ENCODINGS; rows may be padded.
+    :param name: how an error calls it, for example 'goal'.
+    :param size: the (height, width) wanted, or None for any.
+    :param resize: resize to `size` instead of refusing another size.
+    :return: uint8 (H, W, 3) rgb.
+    :raises ImageError: for another encoding, size, step or length.
+    """
+    if message.encoding not in ENCODINGS:
+        raise ImageError(
+            f'{name}: encoding {message.encoding!r} cannot be used; '
+            f'valid encodings: {", ".join(ENCODINGS)}')
+    channels, order = ENCODINGS[message.encoding]
+    rows = _rows(message, name, channels)
+    image = rows.reshape(message.height, message.width, channels)[..., list(order)]
+    if resize and size is not None and image.shape[:2] != tuple(size):
+        return resize_image(image, size)
+    return check_image(np.ascontiguousarray(image), name, size)
+
+
+def decode_map(message, name):
+    """
+    Turn a 32FC1 message into an object map.
+
+    :param message: sensor_msgs/Image, 32FC1.
+    :param name: how an error calls it.
+    :return: float32 (H, W).
+    :raises ImageError: for another encoding, step or length, or values that are not finite.
+    """
+    if message.encoding != '32FC1':
+        raise ImageError(
+            f'{name}: encoding {message.encoding!r} cannot be used; valid encodings: 32FC1')
+    rows = np.ascontiguousarray(_rows(message, name, 4))
+    values = rows.view('>f4' if message.is_bigendian else '<f4').astype(np.float32)
+    if not np.isfinite(values).all():
+        raise ImageError(f'{name}: holds NaN or infinity; expected finite numbers')
+    return values
+
+
+def resize_image(image, size):
+    """
+    Resize a picture with antialiasing.
+
+    :param image: uint8 (H, W, 3).
+    :param size: (height, width) of the answer.
+    :return: uint8 (height, width, 3).
+    """
+    planes = torch.from_numpy(np.ascontiguousarray(image)).movedim(-1, 0)[None].float()
+    planes = torch.nn.functional.interpolate(
+        planes, tuple(size), mode='bilinear', antialias=True, align_corners=False)
+    return planes[0].round().clamp(0, 255).byte().movedim(0, -1).contiguous().numpy()
+
+
+def resize_pixels(pixels, old_size, new_size):
+    """
+    Move pixel positions along with a resized picture.
+
+    :param pixels: (..., 2) as (u, v); (0, 0) is the centre of the top-left pixel.
+    :param old_size: (height, width) of the picture they belong to.
+    :param new_size: (height, width) after resizing.
+    :return: float32 (..., 2).
+    """
+    scale = np.array([new_size[1] / old_size[1], new_size[0] / old_size[0]])
+    return ((np.asarray(pixels) + 0.5) * scale - 0.5).astype(np.float32)
+
+
+def _rows(message, name, bytes_per_pixel):
+    """Check the layout and return uint8 (height, width * bytes_per_pixel) without padding."""
+    height, width, step = message.height, message.width, message.step
+    if height == 0 or width == 0:
+        raise ImageError(f'{name}: is empty ({width}x{height} pixels); send a whole image')
+    row_bytes = width * bytes_per_pixel
+    if step < row_bytes:
+        raise ImageError(
+            f'{name}: step is {step} bytes, but {width} pixels of {message.encoding} take '
+            f'{row_bytes}; step must be at least that')
+    if len(message.data) != step * height:
+        raise ImageError(
+            f'{name}: data has {len(message.data)} bytes, expected step * height = '
+            f'{step} * {height} = {step * height}')
+    data = np.frombuffer(message.data, np.uint8).reshape(height, step)
+    return data[:, :row_bytes]
+
+
+def _pack(values, encoding, stamp, frame_id):
+    """Fill a message with rows that are not padded."""
+    values = np.ascontiguousarray(values)
+    message = Image()
+    message.header.stamp = stamp
+    message.header.frame_id = frame_id
+    message.height, message.width = values.shape[:2]
+    message.encoding = encoding
+    message.is_bigendian = int(sys.byteorder == 'big')
+    message.step = values.nbytes // values.shape[0]
+    # Any other type than array.array is checked byte by byte, which takes milliseconds.
+    message.data = array.array('B', values.tobytes())
+    return message

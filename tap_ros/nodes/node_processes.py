@@ -1,0 +1,86 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Start nodes as processes of their own, with logs, and end them all."""
+
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+from tap_ros.errors import TapError
+
+MODULES = {
+    'sim_node': 'sim_bridge.sim_node',
+    'predictor_node': 'tap_ros.nodes.predictor_node',
+    'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
+    'recorder_node': 'tap_ros.nodes.recorder_node',
+}
+
+
+class NodeEnded(TapError):
+    """A node's process ended by itself."""
+
+
+class NodeProcesses:
+    """
+    Processes of nodes, ended with the with-block; each logs into a file of its own.
+
+    :param log_folder: folder of the logs, made if it is not there.
+    """
+
+    def __init__(self, log_folder):
+        self._folder = Path(log_folder)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._processes = {}
+
+    def start(self, name, **parameters):
+        """
+        Start a node.
+
+        :param name: one of MODULES.
+        :param parameters: its ROS parameters.
+        """
+        command = [sys.executable, '-m', MODULES[name], '--ros-args']
+        for key, value in parameters.items():
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            command += ['-p', f'{key}:={text}']
+        with self._log(name).open('wb') as log:
+            # A session of its own: Ctrl-C reaches us, and we end the nodes in order.
+            self._processes[name] = subprocess.Popen(
+                command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
+                start_new_session=True)
+
+    def check(self):
+        """
+        Make sure that all still run.
+
+        :raises NodeEnded: naming the first that does not, with the end of its log.
+        """
+        for name, process in self._processes.items():
+            if process.poll() is not None:
+                lines = self._log(name).read_text(errors='replace').strip().splitlines()
+                raise NodeEnded(
+                    f'{name} ended with exit code {process.returncode}; the end of '
+                    f'{self._log(name)}:\n' + '\n'.join(lines[-5:]))
+
+    def stop(self, timeout_s=15):
+        """End all nodes, politely first; return the exit code of each."""
+        running = [p for p in self._processes.values() if p.poll() is None]
+        for process in running:
+            process.send_signal(signal.SIGINT)
+        for process in running:
+            try:
+                process.wait(timeout_s)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        return {name: process.returncode for name, process in self._processes.items()}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stop()
+
+    def _log(self, name):
+        return self._folder / f'{name}.log'

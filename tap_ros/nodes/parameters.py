@@ -1,0 +1,68 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Node parameters with a description and a range, refused with a reason when wrong."""
+
+from rcl_interfaces.msg import (
+    FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+
+from tap_ros.errors import ConfigError
+
+
+class Parameters:
+    """
+    The parameters of one node: declare each once, then read them by name.
+
+    :param node: rclpy Node.
+    """
+
+    def __init__(self, node):
+        self._node = node
+        self._choices = {}
+        node.add_on_set_parameters_callback(self._check_choices)
+
+    def __getitem__(self, name):
+        """Return the present value."""
+        return self._node.get_parameter(name).value
+
+    def declare(self, name, default, description, low=None, high=None, choices=None,
+                read_only=True):
+        """
+        Declare one parameter and return its value.
+
+        :param name: name of the parameter.
+        :param default: its value unless one is given at the start; also sets the type.
+        :param description: one sentence with the unit.
+        :param low: smallest value of a number; goes with `high`.
+        :param high: largest value of a number.
+        :param choices: the only values of a string.
+        :param read_only: False if a running node heeds a change.
+        :return: the value.
+        :raises ConfigError: when the value given at the start is of another type or out of range.
+        """
+        descriptor = ParameterDescriptor(description=description, read_only=read_only)
+        if low is not None and isinstance(default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(low), to_value=float(high))]
+        elif low is not None:
+            descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+        if choices is not None:
+            self._choices[name] = tuple(choices)
+            descriptor.additional_constraints = 'one of: ' + ', '.join(choices)
+        try:
+            return self._node.declare_parameter(name, default, descriptor).value
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            reason = str(error).split('Reason: ')[-1].removesuffix(f': {name}')
+            raise ConfigError(
+                f'parameter {name}: {reason}. {description} Default: {default!r}') from error
+
+    def _check_choices(self, parameters):
+        """Refuse strings that are none of the choices."""
+        for parameter in parameters:
+            choices = self._choices.get(parameter.name)
+            if choices is not None and parameter.value not in choices:
+                return SetParametersResult(
+                    successful=False,
+                    reason=f'{parameter.name} is {parameter.value!r}; '
+                           f'valid choices: {", ".join(choices)}')
+        return SetParametersResult(successful=True)

@@ -1,0 +1,251 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Records topics into an MCAP bag, as they come off the wire."""
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+import sys
+import time
+
+from mcap.exceptions import McapError
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from std_srvs.srv import SetBool
+
+from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.run import run_node
+from tap_ros.recording import topics
+from tap_ros.recording.writer import BagWriter
+
+DEPTH = 100  # messages that may wait while the disk is slow
+TYPES = {
+    **{name.lstrip('/'): kind for name, kind in topics.TYPES.items()},
+    'subgoal': 'tap_msgs/msg/Subgoal',
+    'subgoal/image': 'sensor_msgs/msg/Image',
+    'subgoal/overlay': 'sensor_msgs/msg/Image'}
+LATCHED = ('goal/image', 'goal/objects', 'subgoal', 'subgoal/image', 'subgoal/overlay')
+WRITE_ERRORS = (OSError, McapError, RecordingError)
+
+
+@dataclass
+class Source:
+    """A topic that is recorded."""
+
+    type_name: str
+    qos: QoSProfile
+    subscription: Subscription
+
+
+class RecorderNode(Node):
+    """
+    Writes serialized messages without looking into them; ends the bag properly on a signal.
+
+    When the disk is full or gone it says so, keeps what was written readable, and stays up.
+    """
+
+    def __init__(self):
+        super().__init__('recorder_node')
+        self.params = declare_parameters(self)
+        self._writer = None
+        self._count = self._unflushed = 0
+        self._sources = {}  # resolved topic -> Source
+        self._last = {}  # latched topic -> what write_raw takes, for bags that start later
+        self._mismatched = []  # (resolved topic, policy) to subscribe to anew
+        self._wanted = list(self.params['topics'])
+        if not self._wanted:
+            raise ConfigError('parameter topics: is empty; name at least one topic')
+        if self.params['record_on_start']:
+            self._start()
+        self._subscribe_known()
+        self.create_service(SetBool, 'recorder/record', self._on_record)
+        self.create_timer(0.5, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info(
+            f'ready: recording to {self._writer.folder}' if self._writer
+            else 'ready: call recorder/record with data true to start')
+
+    def close(self):
+        """Finish the bag."""
+        self._finish()
+
+    # Bags
+
+    def _start(self):
+        """
+        Begin a new bag.
+
+        :raises RecordingError: when it cannot be made.
+        """
+        self._writer = BagWriter(
+            free_folder(self.params['folder']), compression=self.params['compression'])
+        self._count = self._unflushed = 0
+        now = time.time_ns()
+        for topic, (type_name, data, qos) in self._last.items():
+            self._write(topic, type_name, data, now, now, qos)
+
+    def _finish(self):
+        """End the bag; tell what became of it."""
+        if self._writer is None:
+            return 'nothing was being recorded'
+        writer, self._writer = self._writer, None
+        try:
+            writer.close()
+        except WRITE_ERRORS as error:
+            text = f'{writer.folder}: the bag could not be finished: {error}'
+            self.get_logger().error(text)
+            return text
+        text = f'{self._count} messages in {writer.folder}'
+        self.get_logger().info(f'recorded {text}')
+        return text
+
+    def _write(self, topic, type_name, data, log_time_ns, publish_time_ns, qos):
+        try:
+            self._writer.write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
+        except WRITE_ERRORS as error:
+            self._give_up(error)
+            return
+        self._count += 1
+        self._unflushed += 1
+
+    def _give_up(self, error):
+        """Stop recording after a failed write."""
+        folder, self._writer = self._writer.folder, None
+        self.get_logger().error(
+            f'{folder}: cannot be written ({error}); recording has stopped after {self._count} '
+            'messages, those flushed before stay readable. Make room, then call recorder/record '
+            'with data true: it starts a new folder')
+
+    def _on_record(self, request, response):
+        try:
+            if not request.data:
+                response.message = self._finish()
+            elif self._writer is None:
+                self._start()
+            if request.data:
+                response.message = f'recording to {self._writer.folder}'
+            response.success = True
+        except WRITE_ERRORS as error:
+            response.message = str(error)
+        return response
+
+    # Topics
+
+    def _subscribe_known(self):
+        """Subscribe to wanted topics whose type is known, here or to the running system."""
+        found = dict(self.get_topic_names_and_types())
+        for name in list(self._wanted):
+            topic = self.resolve_topic_name(name)
+            type_name = TYPES.get(name.lstrip('/')) or next(iter(found.get(topic, [])), None)
+            if type_name is None:
+                continue
+            self._wanted.remove(name)
+            try:
+                self._subscribe(topic, type_name, QoSProfile(
+                    depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE,
+                    durability=DurabilityPolicy.TRANSIENT_LOCAL
+                    if name.lstrip('/') in LATCHED else DurabilityPolicy.VOLATILE))
+            except ConfigError as error:
+                self.get_logger().error(f'{topic} is not recorded: {error}')
+
+    def _subscribe(self, topic, type_name, qos):
+        def on_message(data, info):
+            self._on_message(topic, data, info)
+
+        def on_mismatch(info):
+            self._mismatched.append((topic, info.last_policy_kind))
+
+        subscription = self.create_subscription(
+            message_class(type_name), topic, on_message, qos, raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=on_mismatch, use_default_callbacks=False))
+        self._sources[topic] = Source(type_name, qos, subscription)
+
+    def _on_message(self, topic, data, info):
+        source = self._sources[topic]
+        latched = source.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        qos = topics.Qos(
+            depth=1 if latched else 10,
+            durability='transient_local' if latched else 'volatile',
+            reliability='reliable' if source.qos.reliability == ReliabilityPolicy.RELIABLE
+            else 'best_effort')
+        if latched:
+            self._last[topic] = (source.type_name, data, qos)
+        if self._writer is not None:
+            received = info['received_timestamp'] or time.time_ns()
+            self._write(topic, source.type_name, data, received,
+                        info['source_timestamp'] or received, qos)
+
+    def _on_timer(self):
+        """Bring what was written to the disk, and look after topics."""
+        if self._writer is not None and self._unflushed:
+            self._unflushed = 0
+            try:
+                self._writer.flush()
+            except WRITE_ERRORS as error:
+                self._give_up(error)
+        while self._mismatched:  # a publisher offers less than was asked for: ask for less
+            topic, policy = self._mismatched.pop()
+            source = self._sources[topic]
+            if policy == QoSPolicyKind.RELIABILITY:
+                source.qos.reliability, offered = ReliabilityPolicy.BEST_EFFORT, 'best effort'
+            elif policy == QoSPolicyKind.DURABILITY:
+                source.qos.durability, offered = DurabilityPolicy.VOLATILE, 'volatile'
+            else:
+                self.get_logger().error(f'{topic}: its publisher offers an unfit {policy.name}')
+                continue
+            self.get_logger().info(f'{topic}: recorded as {offered}, like it is published')
+            self.destroy_subscription(source.subscription)
+            self._subscribe(topic, source.type_name, source.qos)
+        if self._wanted:
+            self._subscribe_known()
+
+
+def declare_parameters(node):
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('folder', 'bags/recording',
+                       'Folder of the bag; if it exists, a number is added to the name.')
+    parameters.declare('topics', list(TYPES), 'Topics to record.')
+    parameters.declare('compression', 'zstd', 'Compression of chunks.',
+                       choices=['zstd', 'lz4', 'none'])
+    parameters.declare('record_on_start', True,
+                       'Record from the start; else from the call of recorder/record on.')
+    return parameters
+
+
+def free_folder(wanted):
+    """Return this folder, or the first one with a number added that does not exist."""
+    folder, number = Path(wanted), 1
+    while folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        number += 1
+        folder = Path(f'{wanted}-{number}')
+    return folder
+
+
+def message_class(type_name):
+    """
+    Import the class of a message type.
+
+    :param type_name: for example 'sensor_msgs/msg/Image'.
+    :raises ConfigError: when its package is not installed.
+    """
+    package, _, name = type_name.split('/')
+    try:
+        return getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f'message type {type_name} is not installed; source the workspace that has it'
+        ) from error
+
+
+def main(args=None):
+    """Run the node; the answer is the exit code of the process."""
+    return run_node(RecorderNode, 'recorder_node', args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

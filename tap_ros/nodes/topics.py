@@ -1,0 +1,27 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Topic qualities and times that several nodes share."""
+
+from builtin_interfaces.msg import Time
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+WORLD_FRAME = 'world'
+CAMERA_FRAME = 'camera'
+
+# Reliable and kept for late joiners: goals, the last subgoal.
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Reliable, for everything that happens at control rate.
+STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE,
+                    durability=DurabilityPolicy.VOLATILE)
+
+
+def to_stamp(nanoseconds):
+    """Return builtin_interfaces/Time."""
+    seconds, rest = divmod(int(nanoseconds), 10**9)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def to_nanoseconds(stamp):
+    """Return the nanoseconds of a builtin_interfaces/Time."""
+    return stamp.sec * 10**9 + stamp.nanosec

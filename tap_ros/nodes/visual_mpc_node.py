@@ -1,0 +1,292 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Serves reach_goal: asks for a subgoal, plans with VisualMPC, sends one command per image."""
+
+from pathlib import Path
+import sys
+import threading
+
+from geometry_msgs.msg import TwistStamped
+import numpy as np
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.node import Node
+from sensor_msgs.msg import Image, JointState
+from std_msgs.msg import Float64
+
+from tap_msgs.action import ReachGoal
+from tap_msgs.msg import ObjectStates
+from tap_msgs.srv import PredictSubgoal
+from tap_ros.errors import ConfigError, PlanningError, TapError
+from tap_ros.nodes.clients import call, CallError
+from tap_ros.nodes.image_messages import decode_image, decode_map, is_empty
+from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
+from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.run import run_node
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.planning.visual_mpc import VisualMPC
+
+DEFAULT_WEIGHTS = Path(__file__).parents[1] / 'weights' / 'forward_model_push.safetensors'
+MODES = ('subgoal', 'direct')
+DEFAULT_BUDGET, MAX_BUDGET = 40, 1000
+SENSORS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
+           'joints': (JointState, 'joint_states')}
+GOAL = {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}
+
+
+class Cancelled(TapError):
+    """The goal was cancelled, or the node is ending."""
+
+
+class VisualMpcNode(Node):
+    """
+    Executes one goal at a time, in a thread of the executor that is not needed for callbacks.
+
+    Whatever the way a goal ends, the last command is zero.
+    """
+
+    def __init__(self):
+        super().__init__('visual_mpc_node')
+        self.params = declare_parameters(self)
+        self._mpc = load_planner(self.params['weights'], self.params['device'])
+        self._ending = False
+        self._busy = threading.Lock()  # held from the acceptance of a goal to its end
+        self._sensors = Observations(*SENSORS)
+        self._sensors.subscribe(self, SENSORS, STREAM)
+        self._goal = Observations(*GOAL)
+        self._goal.subscribe(self, GOAL, LATCHED)
+        self._gripper = self.create_publisher(Float64, 'gripper/command', STREAM)
+        self._twist = self.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
+        group = ReentrantCallbackGroup()  # answers and cancels arrive while a goal is executed
+        self._predict = self.create_client(
+            PredictSubgoal, 'predict_subgoal', callback_group=group)
+        self._server = ActionServer(
+            self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
+            goal_callback=self._on_goal, cancel_callback=self._on_cancel)
+        self.get_logger().info(f'ready: {self.params["device"]}, {self.params["weights"]}')
+
+    def close(self):
+        """End the goal in progress, and see that the command to stop has left."""
+        self._ending = True
+        self._sensors.wake()
+        self._busy.acquire(timeout=5.0)
+        self._stop()
+        self._twist.wait_for_all_acked(Duration(seconds=1))
+
+    # The action
+
+    def _on_goal(self, _):
+        if self._ending or not self._busy.acquire(blocking=False):
+            self.get_logger().warning(
+                'reach_goal rejected: another goal is in progress; cancel it or wait for its end')
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
+
+    def _on_cancel(self, _):
+        self._sensors.wake()
+        return CancelResponse.ACCEPT
+
+    def _execute(self, handle):
+        """Run a goal to its end; runs in a thread of the executor."""
+        result = ReachGoal.Result()
+        try:
+            self._reach(handle, result)
+            handle.succeed()
+        except Cancelled as error:
+            result.message = str(error)
+            if handle.is_cancel_requested:
+                handle.canceled()
+            else:
+                handle.abort()
+        except TapError as error:
+            result.message = str(error)
+            handle.abort()
+        finally:
+            self._stop()
+            self._busy.release()
+        self.get_logger().info(f'reach_goal ended after {result.steps} steps: {result.message}')
+        return result
+
+    def _reach(self, handle, result):
+        """Plan and act until the goal is reached or the budget spent, filling the result."""
+        request = handle.request
+        mode, budget = check_request(request)
+
+        def cancelled():
+            return handle.is_cancel_requested or self._ending
+
+        goal, goal_names, goal_pixels = self._find_goal(request, mode)
+        seen = self._observe(-1, cancelled)
+        names, _ = decode_objects(seen['objects'], 'objects')
+        if not names:
+            raise PlanningError(
+                'objects: none are seen, so there is nothing to push; publish their pixels')
+        goal_pixels = match_objects(names, goal_names, goal_pixels, 'objects', 'goal_objects')
+        maps = None
+        if mode == 'subgoal':
+            maps = self._ask_for_subgoal(seen, goal, names, request.seed, cancelled)
+        self._mpc.reset(request.seed)
+        while True:
+            pixels = match_objects(
+                names, *decode_objects(seen['objects'], 'objects'), 'the first objects', 'objects')
+            distance = np.linalg.norm(pixels - goal_pixels, axis=1).mean()
+            result.expected_distance = float(distance)
+            result.success = bool(distance <= self.params['goal_tolerance'])
+            if result.success or result.steps >= budget:
+                break
+            stage = 'subgoal' if maps is not None and result.steps < budget // 2 else 'goal'
+            plan = self._mpc.act(
+                decode_image(seen['image'], 'camera/image_raw', self._mpc.image_size),
+                decode_gripper(seen['joints']), pixels,
+                goal_maps=maps if stage == 'subgoal' else None,
+                goal_pixels=None if stage == 'subgoal' else goal_pixels)
+            if cancelled():
+                raise Cancelled('cancelled')
+            sent_ns = self._send(plan.action, seen['image'].header)
+            result.steps += 1
+            handle.publish_feedback(ReachGoal.Feedback(
+                step=result.steps, stage=stage, expected_distance=float(plan.expected_distance),
+                planning_ms=float(plan.planning_ms)))
+            seen = self._observe(sent_ns, cancelled)
+        result.message = (
+            f'{distance:.1f} px from the goal, '
+            + ('reached' if result.success else f'step budget of {budget} spent'))
+
+    # What a goal needs
+
+    def _find_goal(self, request, mode):
+        """Return the goal's image and objects, and the latter's names and pixels."""
+        needed = [topic for topic, empty in (
+            ('image', mode == 'subgoal' and is_empty(request.goal_image)),
+            ('objects', not request.goal_objects.objects)) if empty]
+        found = {}
+        if needed:
+            found = self._goal.wait(needed, self.params['image_timeout'])
+        if found is None:
+            missing = self._goal.missing(needed) or needed
+            names = [self.resolve_topic_name(GOAL[topic][1]) for topic in missing]
+            raise PlanningError(
+                f'goal: nothing has come on {", ".join(names)}; publish there (the simulator does '
+                'at sim/reset), or send goal_image and goal_objects along')
+        goal = {'image': request.goal_image, 'objects': request.goal_objects}
+        goal.update({topic: found[topic] for topic in needed})
+        return goal, *decode_objects(goal['objects'], 'goal_objects')
+
+    def _observe(self, after_ns, cancelled):
+        """Wait for image, objects and joint states of one moment after `after_ns`."""
+        timeout = self.params['image_timeout']
+        seen = self._sensors.wait(SENSORS, timeout, after_ns, cancelled)
+        if cancelled():
+            raise Cancelled('cancelled')
+        if seen is None:
+            missing = self._sensors.missing(SENSORS)
+            names = [self.resolve_topic_name(SENSORS[topic][1]) for topic in missing or SENSORS]
+            raise PlanningError(
+                f'no observation for {timeout:g} s: '
+                + ('nothing has come on ' if missing else 'no new messages of the same stamp on ')
+                + ', '.join(names))
+        return seen
+
+    def _ask_for_subgoal(self, seen, goal, names, seed, cancelled):
+        """Return the subgoal's object maps (K, H, W) in the order of `names`."""
+        request = PredictSubgoal.Request(
+            start=seen['image'], goal=goal['image'], start_objects=seen['objects'],
+            goal_objects=goal['objects'], seed=seed)
+        try:
+            response = call(self._predict, request, self.params['predictor_timeout'], cancelled)
+        except CallError as error:
+            if cancelled():
+                raise Cancelled('cancelled') from error
+            raise
+        if not response.success:
+            raise PlanningError(f'service {self._predict.srv_name}: {response.message}')
+        subgoal = response.subgoals[0]
+        maps = np.stack([decode_map(message, f'object map of {name}') for name, message in zip(
+            subgoal.object_names, subgoal.object_maps)])
+        return match_objects(names, tuple(subgoal.object_names), maps, 'objects', 'subgoal')
+
+    # Commands
+
+    def _send(self, action, header):
+        """
+        Send one command within the limits, stamped like the image that it answers.
+
+        :return: images count from this stamp on, in ns: later than the newest image that had
+            already come, and with one control period between.
+        """
+        if not np.isfinite(action).all():
+            raise PlanningError(f'the planner chose {action}; expected finite numbers')
+        limit = np.array([self.params['max_step_xy']] * 2 + [self.params['max_step_z']])
+        move = np.clip(np.asarray(action[:3], np.float64), -limit, limit)
+        message = TwistStamped(header=header)
+        linear = message.twist.linear
+        linear.x, linear.y, linear.z = move.tolist()
+        newest = to_nanoseconds(self._sensors.newest('image')['image'].header.stamp)
+        self._gripper.publish(Float64(data=float(np.clip(action[3], 0, 1))))
+        self._twist.publish(message)
+        return newest + int(0.9e9 * self.params['control_period'])
+
+    def _stop(self):
+        """Send a zero command; it has no stamp, since it answers no image."""
+        self._twist.publish(TwistStamped())
+
+
+def declare_parameters(node):
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('weights', str(DEFAULT_WEIGHTS),
+                       'File of weights (.safetensors) of a forward model.')
+    parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
+                       choices=['cpu', 'cuda'])
+    parameters.declare('control_period', 0.25,
+                       'Seconds (of image stamps) that the arm takes for one command.',
+                       low=0.01, high=10.0)
+    for name, default, high, description in (
+            ('max_step_xy', 0.08, 0.08, 'Largest |dx| and |dy| of a command in metres.'),
+            ('max_step_z', 0.15, 0.15, 'Largest |dz| of a command in metres.'),
+            ('goal_tolerance', 1.0, 64.0,
+             'The goal is reached at this mean distance of the objects in pixels.')):
+        parameters.declare(name, default, description, low=0.0, high=high, read_only=False)
+    parameters.declare('image_timeout', 5.0, 'Seconds to wait for an image before giving up.',
+                       low=0.1, high=600.0, read_only=False)
+    parameters.declare('predictor_timeout', 20.0, 'Seconds to wait for a subgoal.',
+                       low=0.1, high=600.0, read_only=False)
+    return parameters
+
+
+def load_planner(path, device):
+    """Load weights, and plan once, so that the first command comes as fast as the others."""
+    mpc = VisualMPC.load(path, device=device)
+    height, width = mpc.image_size
+    pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
+    mpc.reset(0)
+    mpc.act(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels,
+            goal_maps=None, goal_pixels=pixels)
+    return mpc
+
+
+def check_request(request):
+    """
+    Return mode and step budget of a goal, defaults filled in.
+
+    :raises ConfigError: for an unknown mode or a budget out of range.
+    """
+    mode = request.mode or 'subgoal'
+    if mode not in MODES:
+        raise ConfigError(f'mode is {mode!r}; valid modes: {", ".join(MODES)}')
+    budget = request.step_budget or DEFAULT_BUDGET
+    if budget > MAX_BUDGET:
+        raise ConfigError(f'step_budget is {budget}; expected 1 to {MAX_BUDGET}, or 0 for '
+                          f'{DEFAULT_BUDGET}')
+    return mode, budget
+
+
+def main(args=None):
+    """Run the node; the answer is the exit code of the process."""
+    return run_node(VisualMpcNode, 'visual_mpc_node', args, num_threads=4)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

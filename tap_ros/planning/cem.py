@@ -1,0 +1,82 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The cross-entropy method, for any cost."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tap_ros.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class CEMConfig:
+    """
+    Settings of the search.
+
+    :param num_samples: per iteration; num_iterations; num_elites: that the next Gaussian fits.
+    :param smoothing: share of the old mean and deviation kept at each refit, 0..1.
+    :param min_std: floor of the deviation, as a share of the initial one.
+    :param keep_elites: how many elites of one iteration are judged again among the next's samples.
+    """
+
+    num_samples: int = 200
+    num_iterations: int = 3
+    num_elites: int = 10
+    smoothing: float = 0.0
+    min_std: float = 0.0
+    keep_elites: int = 0
+
+    def __post_init__(self):
+        if not 1 <= self.num_elites <= self.num_samples:
+            raise ConfigError(f'num_elites: expected 1..{self.num_samples} (num_samples), '
+                              f'got {self.num_elites}')
+        if self.num_iterations < 1:
+            raise ConfigError(f'num_iterations: expected at least 1, got {self.num_iterations}')
+        if not 0 <= self.keep_elites <= self.num_elites:
+            raise ConfigError(f'keep_elites: expected 0..{self.num_elites} (num_elites), '
+                              f'got {self.keep_elites}')
+        for name in ('smoothing', 'min_std'):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f'{name}: expected 0..1, got {getattr(self, name)}')
+
+
+def cem(cost, mean, std, config, rng, repair=None, proposals=None):
+    """
+    Search the minimum of a cost (cross-entropy method, App. F of the paper).
+
+    Repeat: draw samples from a Gaussian with diagonal covariance, judge them, refit mean and
+    standard deviation to the elites. The best sample ever judged wins. With fewer elites than
+    dimensions a full covariance has not full rank, which is why the diagonal is refitted.
+
+    :param cost: function of samples (N, D) to costs (N,); NaN counts as worst.
+    :param mean: (D,) of the first Gaussian; std (D,) or (D, ...).
+    :param config: CEMConfig.
+    :param rng: numpy Generator; all randomness comes from it, in an order that depends on the
+        configuration only.
+    :param repair: function that clips samples (N, D) to what is allowed, or None.
+    :param proposals: (P, D) that replace the first iteration's last samples, or None.
+    :return: best sample (D,), its cost, and the last mean (D,).
+    """
+    mean, std = np.array(mean, np.float64), np.array(std, np.float64)
+    floor, kept = config.min_std * std, np.empty((0, len(mean)))
+    best, best_cost = None, np.inf
+    for iteration in range(config.num_iterations):
+        # draw
+        samples = mean + std * rng.standard_normal((config.num_samples, len(mean)))
+        if iteration == 0 and proposals is not None and len(proposals):
+            samples[-len(proposals):] = proposals[:config.num_samples]
+        samples[:len(kept)] = kept
+        samples = samples if repair is None else repair(samples)
+        # judge
+        costs = np.nan_to_num(np.asarray(cost(samples), np.float64), nan=np.inf, posinf=np.inf)
+        order = np.argsort(costs, kind='stable')
+        if best is None or costs[order[0]] < best_cost:
+            best, best_cost = samples[order[0]].copy(), float(costs[order[0]])
+        # refit
+        elites = samples[order[:config.num_elites]]
+        mean = config.smoothing * mean + (1 - config.smoothing) * elites.mean(0)
+        std = np.maximum(
+            config.smoothing * std + (1 - config.smoothing) * elites.std(0), floor)
+        kept = elites[:config.keep_elites]
+    return best, best_cost, mean

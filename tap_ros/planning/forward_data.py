@@ -1,0 +1,121 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Windows of recordings for the forward model, and their augmentation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from tap_ros.errors import RecordingError
+from tap_ros.images import to_float
+from tap_ros.planning.table import mirror_table
+
+COLOUR_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
+
+
+@dataclass
+class Windows:
+    """A batch of B windows of T steps, that is T + 1 pictures."""
+
+    images: torch.Tensor  # (B, T + 1, 3, H, W) in [-1, 1]
+    grippers: torch.Tensor  # (B, T + 1, 4) metres and opening
+    actions: torch.Tensor  # (B, T, 4)
+    homography: torch.Tensor  # (B, 3, 3) table metres to pixels; differs where mirrored
+    mirrored: torch.Tensor  # (B,) bool
+    colours: torch.Tensor  # (B, 3) int64: channel i shows what was channel colours[i]
+
+
+def split_episodes(store, held_out, min_length):
+    """
+    Split a store into training and held-out episodes.
+
+    :param store: EpisodeStore.
+    :param held_out: share of the episodes, spread evenly over the store.
+    :param min_length: frames; shorter episodes are left out.
+    :return: two int arrays of episode indices.
+    :raises RecordingError: when a side would be empty.
+    """
+    usable = np.flatnonzero(np.asarray(store.lengths) >= min_length)
+    count = max(1, round(len(usable) * held_out))
+    if len(usable) < 2:
+        raise RecordingError(
+            f'{len(usable)} episodes of at least {min_length} frames in the recordings; '
+            'the forward model needs at least 2')
+    chosen = np.linspace(0, len(usable) - 1, count).round().astype(int)
+    mask = np.zeros(len(usable), bool)
+    mask[chosen] = True
+    return usable[~mask], usable[mask]
+
+
+def read_windows(store, episodes, starts, steps):
+    """
+    Read windows from a store.
+
+    :param episodes: (B,) episode indices; starts (B,) first frames; steps T.
+    :return: images uint8 (B, T + 1, H, W, 3), grippers (B, T + 1, 4), actions (B, T, 4).
+    :raises RecordingError: where gripper positions are missing.
+    """
+    images, grippers, actions = [], [], []
+    for i, start in zip(episodes, starts):
+        episode = store[int(i)]
+        images.append(episode.frames[start:start + steps + 1])
+        grippers.append(episode.grippers[start:start + steps + 1])
+        actions.append(episode.actions[start:start + steps])
+    grippers = np.stack(grippers).astype(np.float32)
+    if not np.isfinite(grippers).all():
+        bad = int(np.asarray(episodes)[~np.isfinite(grippers).all((1, 2))][0])
+        raise RecordingError(
+            f'/joint_states: episode {bad} lacks gripper positions; the forward model needs '
+            'gripper_x, gripper_y, gripper_z and gripper_opening at every picture')
+    return np.stack(images), grippers, np.stack(actions).astype(np.float32)
+
+
+def draw_windows(store, episodes, batch_size, steps, homography, rng, augment=True):
+    """
+    Draw a batch of windows at random and augment it.
+
+    :param episodes: episode indices to draw from, each with more than `steps` frames.
+    :param homography: (3, 3) tensor.
+    :param rng: numpy Generator.
+    :return: Windows.
+    """
+    chosen = rng.choice(episodes, batch_size)
+    lengths = np.asarray(store.lengths)[chosen]
+    starts = (rng.random(batch_size) * (lengths - steps)).astype(int)
+    images, grippers, actions = read_windows(store, chosen, starts, steps)
+    mirrored = rng.random(batch_size) < 0.5 * augment
+    orders = rng.integers(len(COLOUR_ORDERS), size=batch_size) * augment
+    return augment_windows(images, grippers, actions, homography, mirrored, orders)
+
+
+def augment_windows(images, grippers, actions, homography, mirrored, orders):
+    """
+    Mirror pictures left to right and swap their colour channels, everything else to match.
+
+    :param images: uint8 (B, T + 1, H, W, 3); grippers (B, T + 1, 4); actions (B, T, 4).
+    :param homography: (3, 3) tensor; mirrored (B,) bool; orders (B,) index to COLOUR_ORDERS.
+    :return: Windows; the grippers and actions of mirrored ones have x negated.
+    """
+    batch = Windows(
+        to_float(images), torch.from_numpy(grippers.copy()), torch.from_numpy(actions.copy()),
+        homography.expand(len(images), 3, 3).clone(), torch.from_numpy(np.asarray(mirrored)),
+        torch.tensor([COLOUR_ORDERS[i] for i in orders]))
+    batch.images = recolour(batch.images, batch.colours[:, None])
+    batch.images = mirror(batch.images, batch.mirrored)
+    batch.grippers[batch.mirrored, :, 0] *= -1
+    batch.actions[batch.mirrored, :, 0] *= -1
+    batch.homography[batch.mirrored] = mirror_table(homography, images.shape[3])
+    return batch
+
+
+def recolour(images, colours):
+    """Reorder the first three channels of images (B, ..., C, H, W) by colours (B, ..., 3)."""
+    index = colours[..., None, None].expand(*images.shape[:-3], 3, *images.shape[-2:])
+    return torch.cat([images[..., :3, :, :].gather(-3, index), images[..., 3:, :, :]], -3)
+
+
+def mirror(images, mirrored):
+    """Flip those images (B, ..., H, W) left to right that are mirrored (B,)."""
+    shape = [-1] + [1] * (images.ndim - 1)
+    return torch.where(mirrored.view(shape), images.flip(-1), images)

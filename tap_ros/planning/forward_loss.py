@@ -1,0 +1,81 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The forward model's training loss: pictures reconstructed along whole rollouts."""
+
+import torch
+from torch.nn import functional as F
+
+from tap_ros.planning.forward_data import mirror, recolour
+from tap_ros.planning.forward_model import Scene
+
+MOTION_THRESHOLD = 0.08  # of the range 2: mean channel difference that counts as change
+
+
+def draw_arm_like(model, grippers, mirrored, colours):
+    """
+    Draw the arm as it looks in augmented pictures.
+
+    :param grippers: (B, 4) as augmented; mirrored (B,) bool; colours (B, 3) channel orders.
+    :return: (B, 4, H, W), see ForwardModel.draw_arm.
+    """
+    sign = 1 - 2 * mirrored.float()
+    plain = torch.cat([grippers[:, :1] * sign[:, None], grippers[:, 1:]], 1)
+    return mirror(recolour(model.draw_arm(plain), colours), mirrored)
+
+
+def motion_weight(target, first, factor):
+    """
+    Weight pixels that differ from the first picture, and their neighbours, by 1 + factor.
+
+    Most of a picture never changes; without this weight, predicting no motion is nearly perfect.
+
+    :param target: (B, 3, H, W); first (B, 3, H, W).
+    :return: (B, 1, H, W).
+    """
+    changed = ((target - first).abs().mean(1, keepdim=True) > MOTION_THRESHOLD).float()
+    return 1 + factor * F.max_pool2d(changed, 3, 1, 1)
+
+
+def picture_loss(predicted, target, weight):
+    """
+    Weighted l1 at full, half and quarter resolution, so that flow finds objects pixels away.
+
+    :param predicted: (B, 3, H, W); target (B, 3, H, W); weight (B, 1, H, W).
+    :return: scalar.
+    """
+    total = 0
+    for scale in range(3):
+        if scale:
+            predicted, target = F.avg_pool2d(predicted, 2), F.avg_pool2d(target, 2)
+            weight = F.avg_pool2d(weight, 2)
+        total = total + (weight * (predicted - target).abs()).mean()
+    return total / 3
+
+
+def forward_loss(model, batch, picture_steps, config):
+    """
+    Roll the model along the windows and compare pictures at some of the steps.
+
+    :param model: ForwardModel.
+    :param batch: Windows.
+    :param picture_steps: indices in 1..T of the pictures compared.
+    :param config: with motion_factor and still_weight.
+    :return: loss, dict of its parts.
+    """
+    arms = draw_arm_like(model, batch.grippers[:, 0], batch.mirrored, batch.colours)
+    first = batch.images[:, 0]
+    scene = model.look(first, arms[:, 3:].detach(), batch.homography)
+    flow, gripper = model.still(len(first)), batch.grippers[:, 0]
+    pictures, moving, count = 0, 0, batch.actions.shape[1]
+    for t in range(1, count + 1):
+        flow, gripper, masks = model.advance(scene.features, flow, gripper, batch.actions[:, t - 1])
+        moving = moving + (1 - masks[:, 2]).mean()
+        if t in picture_steps:
+            arm = draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
+            predicted, _ = model.picture(scene, flow, arm, batch.homography)
+            target = batch.images[:, t]
+            weight = motion_weight(target, first, config.motion_factor)
+            pictures = pictures + picture_loss(predicted, target, weight)
+    parts = {'picture': pictures / len(picture_steps), 'moving': moving / count}
+    loss = parts['picture'] + config.still_weight * parts['moving']
+    return loss, {k: float(v.detach()) for k, v in parts.items()}

@@ -1,0 +1,443 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The learned forward model: where do objects go when the gripper moves? (App. F of the paper.)
+
+Fixed-time and action-conditioned: one step is one control period. The picture is encoded once,
+into table features and layers. Every step then
+
+1. reads the features around the gripper, where the flow so far has carried them, on a small crop
+   that turns with the motion (so what is learned for one place and direction holds for all);
+2. predicts the backward appearance flow of this step, metres on the table, from crop and action;
+3. composes it with the flow so far: phi_{t+1}(x) = f_t(x) + phi_t(x + f_t(x)).
+
+The flow warps the first picture's object layer and its mask, and by the very same rule the object
+maps: p_t(x) ~ p_0(x + phi_t(x)). Pictures are only composed in training, as
+arm over warped objects over background, three masks that sum to 1.
+
+Unlike the authors' ConvLSTM, nothing is decoded per step, and the arm, whose motion is commanded,
+is not predicted but drawn where its kinematics put it.
+"""
+
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.planning.table import (
+    grid_points, pixel_points, project, sample_picture, sample_table, splat_on_table)
+
+MOVE_LIMIT = (0.08, 0.08, 0.15)  # m per control period
+
+
+@dataclass(frozen=True)
+class ForwardModelConfig:
+    """What the forward model is; saved in its weights."""
+
+    table: tuple  # 9 numbers, row-major: homography from table metres to pixels
+    arm: tuple  # 12 numbers, row-major: camera from gripper metres to the arm's pixels
+    image_size: int = 64
+    workspace_low: tuple = (-0.45, -0.45, 0.0)  # m, of the gripper
+    workspace_high: tuple = (0.45, 0.45, 0.15)
+    table_half: float = 0.55  # m, half the side of the table grid
+    table_cells: int = 44
+    crop_cells: tuple = (20, 24)  # along the motion, across it
+    crop_cell: float = 0.02  # m
+    crop_back: float = 0.14  # m that the crop reaches behind the gripper
+    features: int = 8
+    width: int = 32
+    blocks: int = 3
+    encoder_width: int = 16
+    sprite_size: int = 24  # pixels, side of the picture of the arm
+
+    def __post_init__(self):
+        if len(self.table) != 9 or len(self.arm) != 12:
+            raise ConfigError(
+                f'forward model: expected 9 numbers for table and 12 for arm, got '
+                f'{len(self.table)} and {len(self.arm)}')
+        if self.image_size % 4 or any(n % 2 for n in self.crop_cells):
+            raise ConfigError(
+                f'forward model: image_size {self.image_size} must be a multiple of 4 and '
+                f'crop_cells {self.crop_cells} even')
+
+
+@dataclass
+class Scene:
+    """What one look at a picture gives; B pictures."""
+
+    features: torch.Tensor  # (B, C, n, n) on the table grid
+    objects: torch.Tensor  # (B, 4, H, W) layer of the objects: rgb in [-1, 1], mask in [0, 1]
+    background: torch.Tensor  # (B, 3, H, W) in [-1, 1]
+
+
+def convolution(channels_in, channels_out, stride=1):
+    """Return conv 3x3, group norm, ReLU."""
+    return nn.Sequential(
+        nn.Conv2d(channels_in, channels_out, 3, stride, 1),
+        nn.GroupNorm(max(1, channels_out // 8), channels_out), nn.ReLU(inplace=True))
+
+
+class SceneEncoder(nn.Module):
+    """A small U-Net: picture and arm mask in; features, object layer and background out."""
+
+    def __init__(self, width, features):
+        super().__init__()
+        self.fine = nn.Sequential(convolution(4, width), convolution(width, width))
+        self.middle = nn.Sequential(
+            convolution(width, 2 * width, 2), convolution(2 * width, 2 * width))
+        self.coarse = nn.Sequential(
+            convolution(2 * width, 3 * width, 2), convolution(3 * width, 3 * width))
+        self.lift_coarse = nn.Conv2d(3 * width, 2 * width, 1)
+        self.up_middle = convolution(2 * width, 2 * width)
+        self.lift_middle = nn.Conv2d(2 * width, width, 1)
+        self.up_fine = convolution(width, width)
+        self.head = nn.Conv2d(width, features + 9, 1)
+
+    def forward(self, image, arm_mask):
+        """
+        Look at a picture.
+
+        :param image: (B, 3, H, W) in [-1, 1].
+        :param arm_mask: (B, 1, H, W) in [0, 1], where the arm is.
+        :return: features (B, C, H, W), objects (B, 4, H, W), background (B, 3, H, W).
+        """
+        fine = self.fine(torch.cat([image, arm_mask], 1))
+        middle = self.middle(fine)
+        coarse = self.lift_coarse(self.coarse(middle))
+        middle = self.lift_middle(self.up_middle(F.interpolate(coarse, scale_factor=2) + middle))
+        fine = self.up_fine(F.interpolate(middle, scale_factor=2) + fine)
+        out = self.head(fine).float()
+        new_objects, new_background = out[:, 0:3].tanh(), out[:, 3:6].tanh()
+        fill_objects, fill_background, mask = out[:, 6:9].sigmoid().split(1, 1)
+        objects = torch.lerp(image, new_objects, fill_objects)
+        background = torch.lerp(image, new_background, fill_background)
+        features = torch.cat([out[:, 9:], mask], 1)
+        return features, torch.cat([objects, mask], 1), background
+
+
+def crop_points(cells, cell, back):
+    """Return (h, w, 2): along and across the motion, metres from the gripper."""
+    along = torch.arange(cells[0]) * cell - back
+    across = torch.arange(cells[1]) * cell
+    return torch.stack(torch.meshgrid(along, across - across.mean(), indexing='ij'), dim=-1)
+
+
+class PushNet(nn.Module):
+    """
+    Backward flow around the gripper from the crop of features and the action.
+
+    Objects are rigid: the flow is that of two planar rigid motions (what is pushed, and what that
+    pushes in turn), each where its mask says; the third mask is for what stays.
+
+    :param points: (2h, 2w, 2) places of the crop's cells, metres along and across the motion.
+    """
+
+    def __init__(self, features, width, blocks, points):
+        super().__init__()
+        cells = points.shape[0] // 2, points.shape[1] // 2
+        self.look = nn.Conv2d(features, width, 3, 2, 1)
+        self.action = nn.Linear(NUM_ACTION_TERMS, width)
+        self.place = nn.Parameter(torch.zeros(1, width, *cells))
+        self.squeeze = nn.Conv2d(width, 12, 1)
+        self.gather = nn.Linear(12 * cells[0] * cells[1], 2 * width)
+        self.spread = nn.Linear(2 * width, width)
+        self.blocks = nn.ModuleList(nn.Conv2d(width, width, 3, padding=1) for _ in range(blocks))
+        self.masks = nn.Conv2d(width, 3, 1)
+        self.twists = nn.Linear(2 * width, 2 * 3)
+        nn.init.normal_(self.place, std=0.1)
+        # at first everything ahead moves a little, with the gripper: masks need motion to learn
+        nn.init.normal_(self.twists.weight, std=0.01)
+        with torch.no_grad():
+            self.twists.bias.copy_(torch.tensor([-0.8, 0, 0, -0.8, 0, 0]))
+            self.masks.bias.copy_(torch.tensor([0, 0, 1.0]))
+        # each twist's field per unit: along, across, turning (one unit is 10 cm from the gripper)
+        at = points[::2, ::2].permute(2, 0, 1) / 0.1
+        fields = torch.zeros(3, 2, *cells)
+        fields[0, 0], fields[1, 1] = 1, 1
+        fields[2, 0], fields[2, 1] = -at[1], at[0]
+        self.register_buffer('fields', fields, persistent=False)
+
+    def forward(self, crop, action_terms):
+        """
+        Predict the flow in units of the gripper's displacement.
+
+        :param crop: (N, C, 2h, 2w).
+        :param action_terms: (N, NUM_ACTION_TERMS).
+        :return: flow (N, 2, h, w) along and across the motion, and masks (N, 3, h, w) of what is
+            pushed, what is pushed in turn, and what stays.
+        """
+        x = self.look(crop) + self.place
+        x = F.relu(x + self.action(action_terms)[..., None, None])
+        x = F.relu(self.blocks[0](x))
+        whole = F.relu(self.gather(F.relu(self.squeeze(x)).flatten(1)))
+        x = x + self.spread(whole)[..., None, None]
+        for block in self.blocks[1:]:
+            x = x + F.relu(block(x))
+        masks = self.masks(x).float().softmax(1)
+        N, _, h, w = masks.shape
+        rigid = (self.twists(whole).float().view(2 * N, 3) @ self.fields.flatten(1)).view(N, 2, 2, h, w)
+        return (masks[:, :2, None] * rigid).sum(1), masks
+
+
+NUM_ACTION_TERMS = 10
+
+
+def action_terms(gripper, following, direction, length):
+    """
+    Describe an action and where it happens, in numbers of order 1.
+
+    :param gripper: (N, 4) before and following (N, 4) after the step, metres.
+    :param direction: (N, 2) unit vector of the motion; length (N, 1) metres.
+    :return: (N, NUM_ACTION_TERMS).
+    """
+    cos, sin = direction[:, :1], direction[:, 1:]
+    low, next_low = gripper[:, 2:3], following[:, 2:3]
+    return torch.cat([
+        length / 0.05, low / 0.05, next_low / 0.05, (low < 0.06).to(low), (next_low < 0.06).to(low),
+        cos, sin, (cos * sin).abs() * 2, gripper[:, :2] / 0.3], 1)
+
+
+class ForwardModel(nn.Module):
+    """
+    The forward model; see the file's head.
+
+    :param config: ForwardModelConfig.
+    """
+
+    def __init__(self, config):
+        super().__init__()
+        self.config = config
+        self.encoder = SceneEncoder(config.encoder_width, config.features)
+        crop = crop_points(config.crop_cells, config.crop_cell, config.crop_back)
+        self.push = PushNet(config.features + 1, config.width, config.blocks, crop)
+        size = config.sprite_size
+        sprite = torch.zeros(4, 4, size, size)  # (basis 1 x y z, rgb and mask logit)
+        distance = (pixel_points((size, size)) - (size - 1) / 2).norm(dim=-1)
+        sprite[0, 3] = 2 - distance
+        self.sprite = nn.Parameter(sprite)
+        constant = self._constant
+        constant('homography', torch.tensor(config.table).view(3, 3).float())
+        constant('arm_camera', torch.tensor(config.arm).view(3, 4).float())
+        constant('points', grid_points(config.table_cells, config.table_half))
+        constant('pixels', pixel_points((config.image_size, config.image_size)))
+        constant('crop', crop)
+        low = torch.tensor([*config.workspace_low, 0.0])
+        high = torch.tensor([*config.workspace_high, 1.0])
+        constant('limits', torch.stack([low, high]))
+        constant('move_limit', torch.tensor(MOVE_LIMIT))
+
+    def _constant(self, name, value):
+        self.register_buffer(name, value, persistent=False)
+
+    def draw_arm(self, gripper):
+        """
+        Draw the arm where its kinematics put it.
+
+        :param gripper: (B, 4) metres.
+        :return: (B, 4, H, W): rgb in [-1, 1] and mask in [0, 1].
+        """
+        basis = torch.cat([torch.ones_like(gripper[:, :1]), gripper[:, :3]], 1)  # (B, 4)
+        sprites = torch.einsum('bi,icuv->bcuv', basis, self.sprite)
+        # a rim of masks near zero, so that nothing is drawn outside the sprite
+        rim = torch.full_like(sprites[:, 3:], -12.0)
+        rim[..., 1:-1, 1:-1] = sprites[:, 3:, 1:-1, 1:-1]
+        sprites = torch.cat([sprites[:, :3].tanh(), rim.sigmoid()], 1)
+        centre = project(self.arm_camera, gripper[:, None, :3])[:, :, None]  # (B, 1, 1, 2)
+        half = (self.config.sprite_size - 1) / 2
+        return sample_picture(sprites, self.pixels - centre + half)
+
+    def look(self, image, arm_mask, homography=None):
+        """
+        Look at pictures.
+
+        :param image: (B, 3, H, W) in [-1, 1].
+        :param arm_mask: (B, 1, H, W) from draw_arm; zeros where the arm is hidden.
+        :param homography: (B, 3, 3) where it differs from the model's.
+        :return: Scene.
+        """
+        if homography is None:
+            homography = self.homography.expand(len(image), 3, 3)
+        features, objects, background = self.encoder(image, arm_mask)
+        at = project(homography, self.points.flatten(0, 1)).unflatten(1, self.points.shape[:2])
+        return Scene(sample_picture(features, at), objects, background)
+
+    def still(self, count):
+        """Return the flow (count, 2, n, n) of a scene in which nothing has moved, metres."""
+        cells = self.config.table_cells
+        return self.points.new_zeros(count, 2, cells, cells)
+
+    def move_gripper(self, gripper, action):
+        """Return where the gripper is after an action: clipped to limits and workspace."""
+        step = torch.maximum(torch.minimum(action[:, :3], self.move_limit), -self.move_limit)
+        moved = torch.cat([gripper[:, :3] + step, action[:, 3:]], 1)
+        return torch.maximum(torch.minimum(moved, self.limits[1]), self.limits[0])
+
+    def advance(self, features, flow, gripper, action):
+        """
+        Predict one control period.
+
+        :param features: (N, C, n, n) of the Scene, expanded to the samples.
+        :param flow: (N, 2, n, n) backward flow from now to the first picture, metres.
+        :param gripper: (N, 4) metres; action: (N, 4) metres and opening.
+        :return: flow and gripper after the step, and the step's masks (N, 3, h, w), see PushNet.
+        """
+        half = self.config.table_half
+        following = self.move_gripper(gripper, action)
+        move = following[:, :2] - gripper[:, :2]
+        length = move.norm(dim=1, keepdim=True)
+        direction = torch.where(
+            length > 1e-4, move / length.clamp_min(1e-4), move.new_tensor([1.0, 0.0]))
+        cos, sin = direction[:, 0], direction[:, 1]
+        turn = torch.stack([cos, -sin, sin, cos], 1).view(-1, 2, 2)  # local to table
+        h, w = self.crop.shape[:2]
+        # 1. look at what is now around the gripper
+        at = (self.crop.view(1, h * w, 2) @ turn.mT + gripper[:, None, :2]).view(-1, h, w, 2)
+        at = at + sample_table(flow, at, half).permute(0, 2, 3, 1)
+        crop = sample_table(features, at, half)
+        # 2. predict the flow of this step, from new places back to old ones
+        local, masks = self.push(crop, action_terms(gripper, following, direction, length))
+        # 3. compose
+        flow = self.compose(flow, local, gripper, turn, length)
+        return flow, following, masks
+
+    def compose(self, flow, local, gripper, turn, length):
+        """Compose the flow so far with a step's local flow: phi' = f + phi(x + f)."""
+        config, n = self.config, self.config.table_cells
+        h, w = local.shape[2:]
+        # table points in the crop's own coordinates, scaled to [-1, 1] for grid_sample
+        near = (self.points.view(1, n * n, 2) - gripper[:, None, :2]) @ turn  # (N, n n, 2)
+        spans = near.new_tensor([2 * (h - 1), 2 * (w - 1)]) * config.crop_cell
+        middle = near.new_tensor([spans[0] / 2 - config.crop_back, 0.0])
+        near = ((near - middle) * (2 / spans)).flip(-1).view(-1, n, n, 2)
+        turned = (turn @ local.flatten(2)).view_as(local) * length[..., None, None]
+        step = F.grid_sample(turned, near, padding_mode='zeros', align_corners=True)
+        back = self.points + step.permute(0, 2, 3, 1)
+        return step + sample_table(flow, back, config.table_half)
+
+    def carry(self, maps, flow):
+        """
+        Carry object maps by the flow.
+
+        :param maps: (N, K, n, n) on the table grid, in the first picture.
+        :param flow: (N, 2, n, n).
+        :return: (N, K, n, n), each summing to 1; mass that left the table is gone.
+        """
+        back = self.points + flow.permute(0, 2, 3, 1)
+        carried = sample_table(maps, back, self.config.table_half, 'zeros')
+        return carried / carried.sum((-1, -2), keepdim=True).clamp_min(1e-6)
+
+    def picture(self, scene, flow, arm, homography=None):
+        """
+        Compose the picture that the flow leads to, for training and for people.
+
+        :param scene: Scene of B first pictures; flow (B, 2, n, n); arm (B, 4, H, W) as drawn.
+        :return: picture (B, 3, H, W) and masks (B, 3, 1, H, W) of arm, objects and background.
+        """
+        if homography is None:
+            homography = self.homography.expand(len(flow), 3, 3)
+        pixels = self.pixels
+        table = project(torch.linalg.inv(homography), pixels.flatten(0, 1))
+        table = table.unflatten(1, pixels.shape[:2])  # (B, H, W, 2)
+        moved = sample_table(flow, table, self.config.table_half, 'zeros').permute(0, 2, 3, 1)
+        source = project(homography, (table + moved).flatten(1, 2)).view_as(table)
+        objects = sample_picture(scene.objects, source)
+        arm_mask = arm[:, 3:]
+        object_mask = (1 - arm_mask) * objects[:, 3:]
+        rest = 1 - arm_mask - object_mask
+        picture = arm_mask * arm[:, :3] + object_mask * objects[:, :3] + rest * scene.background
+        return picture, torch.stack([arm_mask, object_mask, rest], 1)
+
+    def pixel_table(self):
+        """Return the pixel (n, n, 2) of every cell of the table grid."""
+        n = self.config.table_cells
+        return project(self.homography, self.points.view(n * n, 2)).view(n, n, 2)
+
+    def seed_maps(self, pixels):
+        """
+        Put each object's map at its pixel.
+
+        :param pixels: (K, 2) as (u, v).
+        :return: (K, n, n) on the table grid, each sums to 1.
+        """
+        config = self.config
+        return splat_on_table(
+            pixels[:, None], torch.ones(len(pixels), 1), self.homography,
+            config.table_cells, config.table_half)
+
+    def maps_on_table(self, maps):
+        """Bring maps (K, H, W) of the picture onto the table grid: (K, n, n), each sums to 1."""
+        config = self.config
+        return splat_on_table(
+            self.pixels.view(1, -1, 2).expand(len(maps), -1, 2), maps.flatten(1),
+            self.homography, config.table_cells, config.table_half)
+
+    @torch.inference_mode()
+    def rollout(self, image, gripper, maps, actions, arm_hidden=False):
+        """
+        Predict where the objects go under many action sequences.
+
+        :param image: (1, 3, H, W) in [-1, 1]; gripper (1, 4).
+        :param maps: (1, K, H, W), each sums to 1.
+        :param actions: (N, horizon, 4).
+        :return: expected pixels (N, horizon, K, 2).
+        """
+        features = self.begin(image, gripper, arm_hidden)
+        carried = self.carried_maps(features, gripper, self.maps_on_table(maps[0]), actions)
+        table = self.pixel_table().view(-1, 2)
+        return torch.stack([m.flatten(2) @ table for m in carried], 1)
+
+    def begin(self, image, gripper, arm_hidden=False):
+        """Look once at the picture (1, 3, H, W): features (1, C, n, n) for carried_maps."""
+        arm_mask = self.draw_arm(gripper)[:, 3:]
+        return self.look(image, torch.zeros_like(arm_mask) if arm_hidden else arm_mask).features
+
+    def carried_maps(self, features, gripper, maps, actions):
+        """
+        Yield the maps (N, K, n, n) after each step of N action sequences.
+
+        :param features: (1, C, n, n) from begin; gripper (1, 4); maps (K, n, n) on the table grid.
+        :param actions: (N, horizon, 4).
+        """
+        count = len(actions)
+        features = features.expand(count, -1, -1, -1)
+        maps = maps.expand(count, -1, -1, -1)
+        gripper = gripper.expand(count, -1)
+        flow = self.still(count)
+        for action in actions.unbind(1):
+            flow, gripper, _ = self.advance(features, flow, gripper, action)
+            yield self.carry(maps, flow)
+
+
+def config_from_dict(values):
+    """Rebuild a ForwardModelConfig from what was saved, lists becoming tuples."""
+    try:
+        return ForwardModelConfig(
+            **{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    except TypeError as error:
+        raise WeightsError(f'forward model: its saved configuration does not fit: {error}') from error
+
+
+def config_to_dict(config):
+    """Return the configuration as plain values."""
+    return asdict(config)
+
+
+def load_forward_model(path, device='cpu'):
+    """
+    Load a trained forward model, ready to predict.
+
+    :param path: safetensors file of kind 'forward_model'.
+    :return: ForwardModel in evaluation mode.
+    :raises WeightsError: for a missing or damaged file, or one of another kind.
+    """
+    from tap_ros.prediction.weights import load_weights
+    values, state, _ = load_weights(path, 'forward_model')
+    model = ForwardModel(config_from_dict(values))
+    missing, unexpected = model.load_state_dict(state, strict=False)
+    if missing or unexpected:
+        raise WeightsError(
+            f'{path}: not the weights of this forward model; missing {missing[:3]}, '
+            f'unexpected {unexpected[:3]}')
+    return model.to(device).eval()

@@ -1,0 +1,228 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Training of the forward model from recordings.
+
+Everything random is drawn from (seed, step), so that a run that was interrupted goes on to the
+same result.
+"""
+
+from dataclasses import asdict, dataclass
+import json
+import os
+from pathlib import Path
+import platform
+import time
+
+import numpy as np
+import torch
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from tap_ros.errors import ConfigError
+from tap_ros.images import to_uint8
+from tap_ros.planning.forward_data import draw_windows
+from tap_ros.planning.forward_loss import draw_arm_like, forward_loss
+from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
+from tap_ros.planning.forward_scores import map_errors
+from tap_ros.planning.table import fit_arm, fit_table
+from tap_ros.prediction.batches import split_episodes
+from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
+from tap_ros.prediction.pictures import grid, grey_panels
+from tap_ros.prediction.training import learning_rate, pick_device
+from tap_ros.prediction.weights import save_weights
+from tap_ros.recording import open_recordings
+
+FITTED_EPISODES = 100  # enough for the homography and the arm's camera
+
+
+@dataclass(frozen=True)
+class ForwardTrainingConfig:
+    """
+    Settings of a training run.
+
+    :param recordings: bag folders or .mcap files.
+    :param out: folder of the run.
+    :param steps: optimiser steps in all.
+    :param batch_size: windows per step.
+    :param horizon: control periods of the longest windows.
+    :param grow: share of the steps over which windows grow from 2 periods to the horizon.
+    :param pictures: pictures compared per window.
+    :param motion_factor: extra weight of pixels that changed since the window's first picture.
+    :param still_weight: weight of the mean share of the crop that is said to move.
+    :param width: channels of the recurrence; features: channels it reads.
+    :param augment: mirror and recolour.
+    :param test_fraction: share of episodes held out, by seed.
+    :param device: 'auto', 'cpu', 'cuda'; threads: of the CPU, 0: as many as there are.
+    """
+
+    recordings: tuple
+    out: str
+    steps: int = 6000
+    batch_size: int = 16
+    horizon: int = 15
+    grow: float = 0.4
+    pictures: int = 4
+    learning_rate: float = 2e-3
+    warmup: int = 100
+    gradient_clip: float = 1.0
+    average_decay: float = 0.995
+    motion_factor: float = 8.0
+    still_weight: float = 1e-3
+    width: int = 32
+    features: int = 8
+    augment: bool = True
+    test_fraction: float = 0.05
+    seed: int = 0
+    device: str = 'auto'
+    threads: int = 0
+    log_every: int = 20
+    save_every: int = 500
+
+    def __post_init__(self):
+        for name in ('steps', 'batch_size', 'horizon', 'pictures', 'width', 'features',
+                     'log_every', 'save_every'):
+            if getattr(self, name) < 1:
+                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
+        for name, low, high in (('grow', 0, 1), ('test_fraction', 0, 0.9),
+                                ('average_decay', 0, 0.99999), ('learning_rate', 0, 1)):
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(f'{name}: expected {low}..{high}, got {getattr(self, name)}')
+
+
+def train(config, stop_at=None, progress=True):
+    """
+    Train a forward model, or go on with a run that was interrupted.
+
+    Leaves in the run's folder: config.json, run.json, scores.json, checkpoint.safetensors,
+    forward_model.safetensors and TensorBoard curves with sample pictures.
+
+    :param config: ForwardTrainingConfig.
+    :param stop_at: stop (and save) at this step instead of the last.
+    :param progress: whether to show a progress bar.
+    :return: path of the weights file.
+    :raises ConfigError: if the folder holds a run with other settings or recordings.
+    :raises RecordingError: if the recordings cannot be trained on.
+    """
+    device = pick_device(config.device)
+    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    store = open_recordings(list(config.recordings), progress=progress)
+    training, held_out = split_episodes(store, config.test_fraction, config.horizon + 1)
+    torch.manual_seed(config.seed)
+    state = start(
+        ForwardModel(model_config(config, store, training)), config.learning_rate, device)
+    checkpoint = Path(config.out) / 'checkpoint.safetensors'
+    load_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+    last = min(config.steps, stop_at or config.steps)
+    bar = tqdm(total=config.steps, initial=state.step, desc='forward model', unit='step',
+               disable=not progress)
+    with SummaryWriter(config.out, purge_step=state.step) as curves, bar:
+        began = time.monotonic() - state.seconds
+        for step in range(state.step, last):
+            rate = learning_rate(step, config)
+            for group in state.optimizer.param_groups:
+                group['lr'] = rate
+            # One step of Adam towards the recorded pictures.
+            batch, shown = draw_step(config, store, training, step, state.network.homography)
+            loss, parts = forward_loss(state.network, batch, shown, config)
+            state.optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(state.network.parameters(), config.gradient_clip)
+            state.optimizer.step()
+            state.update_average(config.average_decay)
+            state.step = step + 1
+            # Tell and save.
+            bar.update()
+            if state.step % config.log_every == 0:
+                for name, value in parts.items():
+                    curves.add_scalar(f'train/{name}', value, state.step)
+                bar.set_postfix(picture=f'{parts["picture"]:.4f}', horizon=len(batch.actions[0]))
+            if state.step % config.save_every == 0 or state.step == last:
+                state.seconds = time.monotonic() - began
+                save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+                _report(state, curves, config, store, training, held_out)
+    return str(Path(config.out) / 'forward_model.safetensors')
+
+
+def model_config(config, store, training):
+    """
+    Say which network the recordings need, fitting its geometry to them.
+
+    :param config: ForwardTrainingConfig.
+    :param store: EpisodeStore; training: indices of its training episodes.
+    :return: ForwardModelConfig.
+    :raises ConfigError: if the pictures are not square.
+    :raises RecordingError: if gripper positions are missing.
+    """
+    height, width = store.image_size
+    if height != width:
+        raise ConfigError(f'recordings: pictures are {width}x{height} pixels, the forward model '
+                          'needs square ones such as 64x64; record or crop them so')
+    chosen = training[np.linspace(0, len(training) - 1, FITTED_EPISODES).astype(int)]
+    episodes = [store[int(i)] for i in np.unique(chosen)]
+    arm = fit_arm(episodes)
+    return ForwardModelConfig(
+        table=tuple(fit_table(episodes, arm).ravel().tolist()), arm=tuple(arm.ravel().tolist()),
+        image_size=height, width=config.width, features=config.features)
+
+
+def draw_step(config, store, training, step, homography):
+    """
+    Draw the windows of one step, and which of their pictures are compared.
+
+    :return: Windows, set of picture indices from 1 to their length.
+    """
+    rng = np.random.default_rng([config.seed, step])
+    growth = min(1.0, (step + 1) / max(1, config.grow * config.steps))
+    length = max(1, round(min(2, config.horizon) + growth * (config.horizon - 2)))
+    batch = draw_windows(
+        store, training, config.batch_size, length, homography, rng, config.augment)
+    return batch, set((rng.permutation(length)[:config.pictures] + 1).tolist())
+
+
+def _report(state, curves, config, store, training, held_out):
+    """Score the averaged network on held-out episodes; write weights, scores and pictures."""
+    scores = map_errors(state.average, store, held_out)
+    for name, value in scores.items():
+        curves.add_scalar(f'held_out/{name}', value, state.step)
+    for name, episodes in (('training', training), ('held_out', held_out)):
+        if len(episodes):
+            picture = sample_grid(state.average, store, episodes, config)
+            curves.add_image(name, picture, state.step, dataformats='HWC')
+    about = {
+        'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
+        'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
+        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {config.device}',
+        'torch': torch.__version__, 'python': platform.python_version()}
+    for name, values in (('config', asdict(config)), ('run', about), ('scores', scores)):
+        path = Path(config.out) / f'{name}.json'
+        path.write_text(json.dumps(values, indent=2) + '\n')
+    save_weights(
+        Path(config.out) / 'forward_model.safetensors', state.average, 'forward_model',
+        state.network.config, about | {'settings': asdict(config), 'scores': scores})
+
+
+@torch.no_grad()
+def sample_grid(model, store, episodes, config, rows=6, seed=0):
+    """
+    Show windows: first picture, its objects' mask and background, then true beside predicted.
+
+    :return: uint8 (height, width, 3).
+    """
+    batch = draw_windows(
+        store, episodes, rows, config.horizon, model.homography, np.random.default_rng(seed),
+        augment=False)
+
+    def arm(t):
+        return draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
+
+    scene = model.look(batch.images[:, 0], arm(0)[:, 3:], batch.homography)
+    columns = [list(to_uint8(batch.images[:, 0])), grey_panels(scene.objects[:, 3]),
+               list(to_uint8(scene.background))]
+    flow, gripper = model.still(rows), batch.grippers[:, 0]
+    for t in range(1, config.horizon + 1):
+        flow, gripper, _ = model.advance(scene.features, flow, gripper, batch.actions[:, t - 1])
+        if t in (config.horizon // 3, 2 * config.horizon // 3, config.horizon):
+            predicted, _ = model.picture(scene, flow, arm(t), batch.homography)
+            columns += [list(to_uint8(batch.images[:, t])), list(to_uint8(predicted))]
+    return grid([list(row) for row in zip(*columns)])

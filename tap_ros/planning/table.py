@@ -1,0 +1,186 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Between the picture and the table: homographies, projections and sampling of fields on the table.
+
+Objects slide on a table, so their motion is rigid in metres on the table's plane and only there:
+the forward model keeps its flow on a square grid of the table and looks into the picture through
+a homography. Both are fitted from recordings, see fit_table and fit_arm.
+"""
+
+import numpy as np
+import torch
+from torch.nn import functional as F
+
+from tap_ros.errors import RecordingError
+
+
+def project(matrix, points):
+    """
+    Apply a homography (3, 3) or a camera (3, 4) to points.
+
+    :param matrix: (..., 3, D + 1), broadcast against the points' leading axes but the last.
+    :param points: (..., N, D) metres.
+    :return: (..., N, 2) pixels (u, v).
+    """
+    rays = points @ matrix[..., :-1].transpose(-1, -2) + matrix[..., None, :, -1]
+    return rays[..., :2] / rays[..., 2:]
+
+
+def grid_points(cells, half_size):
+    """Return the centres (cells, cells, 2) in metres of a square table grid: [row y, column x]."""
+    line = torch.linspace(-half_size, half_size, cells)
+    y, x = torch.meshgrid(line, line, indexing='ij')
+    return torch.stack([x, y], dim=-1)
+
+
+def pixel_points(size):
+    """Return the pixel centres (H, W, 2) as (u, v)."""
+    v, u = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing='ij')
+    return torch.stack([u, v], dim=-1).float()
+
+
+def sample_picture(images, pixels, padding='border'):
+    """
+    Read pictures at pixel positions, bilinearly.
+
+    :param images: (B, C, H, W).
+    :param pixels: (B, h, w, 2) as (u, v).
+    :return: (B, C, h, w).
+    """
+    height, width = images.shape[-2:]
+    scale = torch.tensor([2 / (width - 1), 2 / (height - 1)], dtype=pixels.dtype)
+    return F.grid_sample(
+        images, pixels * scale - 1, padding_mode=padding, align_corners=True)
+
+
+def sample_table(fields, points, half_size, padding='border'):
+    """
+    Read fields on the table grid at points in metres, bilinearly.
+
+    :param fields: (B, C, n, n) over [-half_size, half_size]^2, row y, column x.
+    :param points: (B, h, w, 2) metres.
+    :return: (B, C, h, w).
+    """
+    return F.grid_sample(
+        fields, points / half_size, padding_mode=padding, align_corners=True)
+
+
+def splat_on_table(pixels, weights, homography, cells, half_size):
+    """
+    Spread weighted pixel positions bilinearly over the table grid, then blur by one cell.
+
+    :param pixels: (K, N, 2) as (u, v).
+    :param weights: (K, N).
+    :param homography: (3, 3), table metres to pixels.
+    :return: (K, cells, cells), each summing to 1. Weight outside the table counts at its rim.
+    """
+    points = project(torch.linalg.inv(homography), pixels)
+    at = ((points / half_size + 1) * (cells - 1) / 2).clamp(0, cells - 1.001)  # (K, N, 2) x, y
+    low = at.floor()
+    share = at - low
+    low = low.long()
+    maps = torch.zeros(len(pixels), cells * cells)
+    for dx in (0, 1):
+        for dy in (0, 1):
+            part = (share[..., 0] if dx else 1 - share[..., 0])
+            part = part * (share[..., 1] if dy else 1 - share[..., 1])
+            maps.scatter_add_(
+                1, (low[..., 1] + dy) * cells + low[..., 0] + dx, part * weights)
+    line = torch.tensor([1.0, 2.0, 1.0]) / 4
+    maps = F.conv2d(
+        maps.view(-1, 1, cells, cells), torch.outer(line, line)[None, None], padding=1)[:, 0]
+    return maps / maps.sum((-1, -2), keepdim=True).clamp_min(1e-12)
+
+
+def mirror_table(homography, width):
+    """Return the homography of the mirrored picture over the table with x negated."""
+    flip_u = torch.tensor([[-1.0, 0, width - 1], [0, 1, 0], [0, 0, 1]])
+    flip_x = torch.diag(torch.tensor([-1.0, 1, 1]))
+    return flip_u @ homography @ flip_x
+
+
+def fit_projection(points, pixels, iterations=30):
+    """
+    Fit a projection to matching points: linear start, then robust Gauss-Newton (Huber, 1 px).
+
+    :param points: (N, D) metres, D = 2 for a homography, 3 for a camera.
+    :param pixels: (N, 2) as (u, v).
+    :return: (3, D + 1) float64 with its last entry 1.
+    """
+    count, dims = points.shape
+    homogeneous = np.column_stack([points, np.ones(count)])
+    matrix = np.zeros((3, dims + 1))
+    matrix[:2] = np.linalg.lstsq(homogeneous, pixels, rcond=None)[0].T
+    matrix[2, -1] = 1
+    for _ in range(iterations):
+        rays = homogeneous @ matrix.T
+        error = pixels - rays[:, :2] / rays[:, 2:]  # (N, 2)
+        weight = np.minimum(1, 1 / np.maximum(np.linalg.norm(error, axis=1), 1e-9))
+        unit = homogeneous / rays[:, 2:]
+        zero = np.zeros_like(unit)
+        fall = -(rays[:, :2] / rays[:, 2:])[..., None] * unit[:, None, :-1]  # (N, 2, D)
+        jacobian = np.stack([np.hstack([unit, zero]), np.hstack([zero, unit])], axis=1)
+        jacobian = np.concatenate([jacobian, fall], axis=2)  # (N, 2, 3 D + 2)
+        left = (jacobian * np.sqrt(weight)[:, None, None]).reshape(2 * count, -1)
+        right = (error * np.sqrt(weight)[:, None]).reshape(-1)
+        damping = 1e-6 * np.eye(left.shape[1])
+        step = np.linalg.solve(left.T @ left + damping, left.T @ right)
+        matrix.reshape(-1)[:-1] += step
+    return matrix
+
+
+def fit_arm(episodes):
+    """
+    Fit where the arm appears: a camera from gripper positions to the middle of what changes.
+
+    From one frame to the next mostly the arm moves, and what it pushes lies around it: the
+    weighted middle of the picture's change, regressed on the middle of the two gripper positions,
+    needs no calibration and no labels. It lands on the arm's visible body, not its fingertips.
+
+    :param episodes: iterable of recording Episodes.
+    :return: (3, 4) float64, metres to pixels.
+    :raises RecordingError: when grippers are missing or hardly move.
+    """
+    points, pixels = [], []
+    for episode in episodes:
+        frames = episode.frames.astype(np.float32)
+        change = np.abs(np.diff(frames, axis=0)).sum(-1)  # (T-1, H, W)
+        change[change < 30] = 0
+        mass = change.sum((1, 2))
+        u = (change.sum(1) @ np.arange(frames.shape[2])) / np.maximum(mass, 1)
+        v = (change.sum(2) @ np.arange(frames.shape[1])) / np.maximum(mass, 1)
+        middle = (episode.grippers[1:, :3] + episode.grippers[:-1, :3]) / 2
+        good = (mass > 0) & np.isfinite(middle).all(1)
+        points.append(middle[good])
+        pixels.append(np.column_stack([u, v])[good])
+    points = np.concatenate(points) if points else np.zeros((0, 3))
+    if len(points) < 50 or points[:, :2].std(0).min() < 0.01:
+        raise RecordingError(
+            '/joint_states: the forward model needs gripper positions of a moving arm '
+            f'(gripper_x, gripper_y, gripper_z); {len(points)} usable steps found')
+    return fit_projection(points.astype(np.float64), np.concatenate(pixels))
+
+
+def fit_table(episodes, arm):
+    """
+    Fit the homography of the plane in which objects slide, table metres to pixels.
+
+    Where the recordings hold object positions in metres and in pixels, these calibrate the camera
+    (and are used for nothing else); otherwise the plane is that of the gripper at z = 0.
+
+    :param episodes: iterable of recording Episodes.
+    :param arm: (3, 4), see fit_arm.
+    :return: (3, 3) float64.
+    """
+    points, pixels = [], []
+    for episode in episodes:
+        xy = episode.object_poses[..., :2].reshape(-1, 2)
+        uv = episode.object_pixels.reshape(-1, 2)
+        good = np.isfinite(xy).all(1) & np.isfinite(uv).all(1)
+        points.append(xy[good])
+        pixels.append(uv[good])
+    points = np.concatenate(points) if points else np.zeros((0, 2))
+    if len(points) < 50 or points.std(0).min() < 0.01:
+        return arm[:, [0, 1, 3]]
+    return fit_projection(points.astype(np.float64), np.concatenate(pixels).astype(np.float64))

@@ -1,0 +1,120 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The state of a training run, and its way to a file and back.
+
+Batches and augmentation are drawn from (seed, step), so that there are no random numbers in it.
+"""
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from tap_ros.errors import ConfigError
+from tap_ros.prediction.weights import load_tensors, save_tensors
+
+# Settings that change where a run happens and what it shows, not what it learns.
+_FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
+
+
+@dataclass
+class TrainingState:
+    """
+    What changes during training.
+
+    :param network: the network that is trained.
+    :param average: moving average of its weights, in eval mode; what is shipped.
+    :param optimizer: Adam.
+    :param step: number of steps done.
+    :param seconds: time they took, over all sessions.
+    """
+
+    network: torch.nn.Module
+    average: torch.nn.Module
+    optimizer: torch.optim.Optimizer
+    step: int = 0
+    seconds: float = 0.0
+
+    @torch.no_grad()
+    def update_average(self, decay):
+        """
+        Move the average towards the network; faster at the beginning.
+
+        :param decay: share of the average that stays, 0..1.
+        """
+        decay = min(decay, (1 + self.step) / (10 + self.step))
+        averages, weights = list(self.average.parameters()), list(self.network.parameters())
+        torch._foreach_lerp_(averages, weights, 1 - decay)
+        for mine, other in zip(self.average.buffers(), self.network.buffers()):
+            mine.copy_(other)  # batch norm's statistics are averages already
+
+
+def start(network, learning_rate, device):
+    """
+    Begin a training run.
+
+    :param network: with fresh weights.
+    :param learning_rate: of Adam.
+    :param device: torch device.
+    :return: TrainingState.
+    """
+    network = network.to(device, memory_format=torch.channels_last)
+    average = copy.deepcopy(network).eval().requires_grad_(False)
+    optimizer = torch.optim.Adam(network.parameters(), learning_rate, fused=True)
+    return TrainingState(network, average, optimizer)
+
+
+def save_checkpoint(path, state, settings, data_hash):
+    """
+    Write the whole state of a run, in one step.
+
+    :param path: the file.
+    :param state: TrainingState.
+    :param settings: dict of the run's settings.
+    :param data_hash: of the recordings.
+    """
+    tensors = {f'network.{name}': value for name, value in state.network.state_dict().items()}
+    tensors |= {f'average.{name}': value for name, value in state.average.state_dict().items()}
+    for i, values in state.optimizer.state_dict()['state'].items():
+        tensors |= {f'optimizer.{i}.{name}': value for name, value in values.items()}
+    save_tensors(path, tensors, {
+        'kind': 'checkpoint', 'step': state.step, 'seconds': state.seconds,
+        'settings': settings, 'data_hash': data_hash})
+
+
+def load_checkpoint(path, state, settings, data_hash):
+    """
+    Put the state of a run back.
+
+    :param path: the file; if there is none, nothing happens.
+    :param state: TrainingState as start made it; changed in place.
+    :param settings: dict of the run's settings.
+    :param data_hash: of the recordings.
+    :raises ConfigError: if the checkpoint is of other settings or other recordings.
+    :raises WeightsError: if it is damaged.
+    """
+    if not Path(path).exists():
+        return
+    tensors, about = load_tensors(path)
+    for name, value in settings.items():
+        before = about['settings'].get(name)
+        if name not in _FREE and before != value:
+            raise ConfigError(
+                f'{path}: made with {name}={before!r}, not {value!r}; to go on with it give the '
+                'same settings, else choose another --out folder')
+    if about['data_hash'] != data_hash:
+        raise ConfigError(f'{path}: made from other recordings; to go on with it give the same '
+                          'ones in the same order, else choose another --out folder')
+    for prefix, module in (('network.', state.network), ('average.', state.average)):
+        module.load_state_dict({name[len(prefix):]: value for name, value in tensors.items()
+                                if name.startswith(prefix)})
+    for i, weight in enumerate(state.optimizer.param_groups[0]['params']):
+        names = [name for name in tensors if name.startswith(f'optimizer.{i}.')]
+        for name in names:
+            value = tensors[name].to(weight.device)
+            if value.shape == weight.shape:  # the fused Adam wants the weight's own strides
+                value = torch.empty_like(weight).copy_(value)
+            state.optimizer.state[weight][name.rsplit('.', 1)[1]] = value
+    state.step, state.seconds = about['step'], about['seconds']

@@ -1,0 +1,160 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The losses of section 3: fixed time, minimum over time, generalized minimum over time.
+
+Errors are per-pixel means of the absolute difference on [0, 1], half of that on [-1, 1], so that
+losses and reported numbers have the same unit.
+"""
+
+import math
+
+import torch
+
+# A frame that equals a context picture has no distance to it; keep the ratio finite.
+_MIN_COPY_DISTANCE = 1e-4
+
+
+def l1_error(images, targets):
+    """
+    Measure the l1 error of pictures, on [0, 1].
+
+    :param images: (..., 3, H, W) in [-1, 1].
+    :param targets: the same shape and range, or one that broadcasts to it.
+    :return: (...), the per-pixel mean; has a gradient.
+    """
+    return (images - targets).abs().mean((-3, -2, -1)) / 2
+
+
+@torch.no_grad()
+def l1_errors(images, targets):
+    """
+    Measure the l1 error of each picture against each target frame, on [0, 1], without gradient.
+
+    :param images: (B, Q, 3, H, W) in [-1, 1], for example the prediction and the context.
+    :param targets: uint8 (B, T, 3, H, W).
+    :return: (B, Q, T).
+    """
+    # Fastest on a CPU as frames stay in uint8 until they fit the cache, one episode at a time.
+    frames = targets.movedim(2, -1).flatten(2)                             # B, T, D
+    images = images.float().movedim(2, -1).flatten(2).add(1).mul(127.5)    # B, Q, D
+    if frames.is_cuda:
+        distances = torch.stack(
+            [(frames - images[:, q, None]).abs().mean(-1) for q in range(images.shape[1])], 1)
+        return distances / 255
+    distances = images.new_empty(*images.shape[:2], frames.shape[1])
+    for b, (episode, queries) in enumerate(zip(frames, images)):
+        episode = episode.float()
+        for q, query in enumerate(queries):
+            distances[b, q] = (episode - query).abs_().mean(1)
+    return distances / 255
+
+
+def match_step(selection_error, valid=None):
+    """
+    Pick the target with the least selection error, the argmin of Eq. 5.
+
+    :param selection_error: (B, T), E'_t.
+    :param valid: bool (B, T), False where an episode is padded; None: all are valid.
+    :return: int64 (B,), indices into T; never a padded one.
+    """
+    if valid is not None:
+        selection_error = selection_error.masked_fill(~valid, math.inf)
+    return selection_error.argmin(1)
+
+
+def fixed_time_loss(error, step):
+    """
+    Fixed-time loss (Eq. 1): the error at a step chosen in advance.
+
+    :param error: (B, T) errors E_t, or a function from steps (B,) to their errors (B,).
+    :param step: int64 (B,), tau as an index into T.
+    :return: its mean over the batch.
+    """
+    error = error(step) if callable(error) else error.gather(1, step[:, None])
+    return error.mean()
+
+
+def minimum_loss(error, valid=None):
+    """
+    Minimum-over-time loss (Eq. 2): the least error over the targets.
+
+    :param error: (B, T) errors E_t.
+    :param valid: bool (B, T), False where an episode is padded.
+    :return: its mean over the batch.
+    """
+    return generalized_minimum_loss(error, error, valid)
+
+
+def generalized_minimum_loss(error, selection_error, valid=None):
+    """
+    Generalized minimum over time (Eq. 5): E at the argmin of E'.
+
+    The choice has no gradient; the outer error is not weighted by the preference.
+
+    :param error: (B, T) errors E_t, or a function from steps (B,) to their errors (B,), which
+        saves the gradients of the frames that were not chosen.
+    :param selection_error: (B, T) errors E'_t.
+    :param valid: bool (B, T), False where an episode is padded.
+    :return: its mean over the batch.
+    """
+    return fixed_time_loss(error, match_step(selection_error.detach(), valid))
+
+
+def bell_preference(times, first, last, edge=2 / 3):
+    """
+    Prefer the middle: a Gaussian over the target times, 1 in the middle and `edge` at both ends.
+
+    The paper's edge, 2/3, makes the standard deviation 1.110 of half the range (section 4).
+
+    :param times: (B, T) times of the targets.
+    :param first: (B, 1) or number, the earliest target time.
+    :param last: (B, 1) or number, the latest.
+    :param edge: w at the ends, above 0 and at most 1; 1 prefers none.
+    :return: w(t), (B, T).
+    """
+    half_range = ((last - first) / 2)
+    half_range = torch.as_tensor(half_range, dtype=torch.float32).clamp(min=0.5)
+    position = (times - (last + first) / 2) / half_range  # -1..1
+    return torch.exp(math.log(edge) * position ** 2)
+
+
+def linear_preference(times, last, beta):
+    """
+    Prefer later frames, for forward prediction: w(t) = beta + t / last (section 4).
+
+    :param times: (B, T) times of the targets.
+    :param last: (B, 1) or number, the last time.
+    :param beta: the smaller, the later; infinity prefers none.
+    :return: w(t), (B, T).
+    """
+    if math.isinf(beta):
+        return torch.ones_like(times, dtype=torch.float32)
+    return beta + times / last
+
+
+def preferred_error(error, preference):
+    """
+    Divide by the time preference, the selection error E'_t = E_t / w(t) of section 3.2.
+
+    :param error: (B, T).
+    :param preference: (B, T), w(t).
+    :return: (B, T).
+    """
+    return error / preference
+
+
+def relative_to_copying(error, copy_error, preference):
+    """
+    Measure errors by what copying a context picture would have scored.
+
+    E'_t = E_t / (d_t w(t)), with d_t the l1 distance of frame t to the nearest context picture.
+    Not in the paper, though Eq. 5 allows it: with E_t / w(t) alone, the frames beside the context
+    win, because predicting them is copying. Here copying is worth 1 everywhere.
+
+    :param error: (B, T).
+    :param copy_error: (B, C, T), errors of the context pictures against the targets.
+    :param preference: (B, T), w(t).
+    :return: (B, T).
+    """
+    return error / (copy_error.amin(1).clamp(min=_MIN_COPY_DISTANCE) * preference)

@@ -1,0 +1,176 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The predictor G of appendix C.
+
+Pictures go in and out as NCHW float32 in [-1, 1]. Everything works in either memory format; on a
+CPU `channels_last` is the faster one.
+"""
+
+from dataclasses import dataclass
+import math
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+from tap_ros.errors import ConfigError
+from tap_ros.prediction.warp import combine, warp
+
+
+@dataclass(frozen=True)
+class PredictorConfig:
+    """
+    The shape of a predictor; saved in its weights file.
+
+    :param image_size: pixels on each side, a power of two from 16 on; the paper has 64.
+    :param base_width: channels of the first block; they double at each following one. Paper: 32.
+    :param num_context: pictures that the prediction is conditioned on: 2 is start and goal.
+    :param code_size: length of the vector between encoder and decoders.
+    :param latent_size: length of z, appended to that vector; 0 is a deterministic predictor.
+    :param new_pixels: whether there is a decoder for pixels that cannot be copied. Object maps
+        need the variant without (appendix E).
+    :param flow_scale: pixels of flow for an output of 1 of the flow decoder; not in the paper.
+    """
+
+    image_size: int = 64
+    base_width: int = 32
+    num_context: int = 2
+    code_size: int = 128
+    latent_size: int = 0
+    new_pixels: bool = True
+    flow_scale: float = 16.0
+
+    def __post_init__(self):
+        """Refuse shapes that the network cannot have."""
+        levels = math.log2(self.image_size) if self.image_size > 0 else 0.5
+        if self.image_size < 16 or levels != int(levels):
+            raise ConfigError(f'image_size: expected a power of two from 16 on, such as 64, '
+                              f'got {self.image_size}')
+        for name in ('base_width', 'num_context', 'code_size'):
+            if getattr(self, name) < 1:
+                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
+        if self.latent_size < 0:
+            raise ConfigError(f'latent_size: expected 0 or more, got {self.latent_size}')
+
+    @property
+    def widths(self):
+        """Channels from the finest block to the coarsest: (32, 64, 128, 256) in the paper."""
+        return tuple(self.base_width * 2 ** i for i in range(int(math.log2(self.image_size)) - 2))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """
+    What a predictor answers for a batch.
+
+    :param image: (B, 3, H, W) in [-1, 1], the predicted frame.
+    :param flow: (B, C, 2, H, W) in pixels, (du, dv): where, relative to itself, each pixel of
+        the prediction is read from in context picture c.
+    :param masks: (B, C+1, 1, H, W), or (B, C, 1, H, W) without new pixels; sum to 1 over dim 1,
+        in the order of the context, the new pixels last.
+    :param new_pixels: (B, 3, H, W) in [-1, 1], or None.
+    """
+
+    image: torch.Tensor
+    flow: torch.Tensor
+    masks: torch.Tensor
+    new_pixels: torch.Tensor | None
+
+
+def encoder(in_channels, widths):
+    """
+    Build the DCGAN discriminator's trunk: 4x4 convolutions that halve the size (appendix C).
+
+    As in DCGAN, to which the paper says it is identical, the first block has no batch norm.
+    """
+    layers = []
+    for i, width in enumerate(widths):
+        layers.append(nn.Conv2d(in_channels, width, 4, stride=2, padding=1, bias=i == 0))
+        if i > 0:
+            layers.append(nn.BatchNorm2d(width))
+        layers.append(nn.LeakyReLU(0.2))
+        in_channels = width
+    return nn.Sequential(*layers)
+
+
+def decoder(in_features, widths, out_channels):
+    """
+    Build a decoder: transposed convolution to 4x4, then upsampling-5x5 convolutions (appendix C).
+
+    With the misprint of the paper corrected: 256x4x4, 128x8x8, 64x16x16, 32x32x32, out x64x64.
+    The activation of the last block is left to the caller.
+    """
+    width = widths[-1]
+    layers = [nn.ConvTranspose2d(in_features, width, 4, bias=False),
+              nn.BatchNorm2d(width), nn.ReLU()]
+    for narrower in widths[-2::-1]:
+        layers += [nn.Upsample(scale_factor=2, mode='bilinear', align_corners=False),
+                   nn.Conv2d(width, narrower, 5, padding=2, bias=False),
+                   nn.BatchNorm2d(narrower), nn.ReLU()]
+        width = narrower
+    layers += [nn.Upsample(scale_factor=2, mode='bilinear', align_corners=False),
+               nn.Conv2d(width, out_channels, 5, padding=2)]
+    return nn.Sequential(*layers)
+
+
+def initialise(module):
+    """Set DCGAN's initial weights: normal(0, .02), batch norm normal(1, .02), biases 0."""
+    if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
+        nn.init.normal_(module.weight, 0.0, 0.02)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.BatchNorm2d):
+        nn.init.normal_(module.weight, 1.0, 0.02)
+        nn.init.zeros_(module.bias)
+
+
+class Predictor(nn.Module):
+    """
+    Predict one frame between context pictures: warped pictures and new pixels, blended by masks.
+
+    One encoder reads each context picture; their features are concatenated. Three decoders of
+    the same shape give the new pixels, the flow and the masks (appendix C, its last figure).
+    """
+
+    def __init__(self, config):
+        """Build the network with fresh weights."""
+        super().__init__()
+        self.config = config
+        widths, features = config.widths, config.code_size + config.latent_size
+        self.encoder = encoder(3, widths)
+        # Kernel sizes of the head are ours: the paper says convolution-ReLU-convolution.
+        self.head = nn.Sequential(
+            nn.Conv2d(config.num_context * widths[-1], widths[-1], 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(widths[-1], config.code_size, 4))
+        self.flow_decoder = decoder(features, widths, 2 * config.num_context)
+        self.mask_decoder = decoder(features, widths, config.num_context + config.new_pixels)
+        self.pixel_decoder = decoder(features, widths, 3) if config.new_pixels else None
+        self.apply(initialise)
+        # Training starts from copying: flow near 0.
+        nn.init.normal_(self.flow_decoder[-1].weight, 0.0, 0.002)
+
+    def forward(self, context, z=None):
+        """
+        Predict.
+
+        :param context: (B, C, 3, H, W) in [-1, 1].
+        :param z: (B, latent_size), or None for zeros, the mean of the prior.
+        :return: a Prediction.
+        """
+        B, C, _, H, W = context.shape
+        features = self.encoder(context.flatten(0, 1))          # B*C, 256, 4, 4
+        code = self.head(features.unflatten(0, (B, C)).flatten(1, 2))  # B, 128, 1, 1
+        if self.config.latent_size:
+            if z is None:
+                z = code.new_zeros(B, self.config.latent_size)
+            code = torch.cat([code, z[:, :, None, None].to(code.dtype)], 1)
+        # Positions need more digits than half precision has: blend in float32.
+        flow = self.flow_decoder(code).float().unflatten(1, (C, 2)) * self.config.flow_scale
+        masks = functional.softmax(self.mask_decoder(code).float(), 1)[:, :, None]
+        new_pixels = None
+        if self.pixel_decoder is not None:
+            new_pixels = torch.tanh(self.pixel_decoder(code).float())
+        image = combine(warp(context.float(), flow), masks, new_pixels)
+        return Prediction(image, flow, masks, new_pixels)

@@ -1,0 +1,223 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Training the predictor on recordings (sections 3.1 and 3.2, appendix C)."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from functools import partial
+import json
+import math
+import os
+from pathlib import Path
+import platform
+import time
+
+import numpy as np
+import torch
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+from tap_ros.errors import ConfigError
+from tap_ros.prediction.augmentation import Augmentation, reverse
+from tap_ros.prediction.batches import episode_order, make_batch, split_episodes
+from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
+from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.objective import held_out_scores, predictor_loss
+from tap_ros.prediction.pictures import sample_grid
+from tap_ros.prediction.weights import save_weights
+from tap_ros.recording import open_recordings
+
+_SHOWN = 8  # episodes in a sample picture
+
+
+def train(config, stop_at=None, score=None, progress=True):
+    """
+    Train a predictor, or go on with a run that was interrupted.
+
+    Interrupted and resumed runs end with the same weights, bit for bit, on the same machine.
+    Leaves in the run's folder: config.json, run.json, scores.json, checkpoint.safetensors,
+    predictor.safetensors and TensorBoard curves with sample pictures.
+
+    :param config: TrainingConfig.
+    :param stop_at: stop (and save) at this step instead of the last.
+    :param score: function (network, store, episodes) -> dict of numbers, to add to the scores
+        of the held-out episodes.
+    :param progress: whether to show a progress bar.
+    :return: path of the weights file.
+    :raises ConfigError: if the folder holds a run with other settings or recordings.
+    :raises RecordingError: if the recordings cannot be trained on.
+    """
+    device = pick_device(config.device)
+    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    store = open_recordings(list(config.recordings), progress=progress)
+    training, held_out = split_episodes(store, config.test_fraction)
+    torch.manual_seed(config.seed)
+    network = Predictor(network_config(config, store.image_size))
+    state = start(network, config.learning_rate, device)
+    checkpoint = Path(config.out) / 'checkpoint.safetensors'
+    load_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+    autocast = make_autocast(config.precision, device)
+    model = torch.compile(state.network) if config.compile else state.network
+    last = min(config.steps, stop_at or config.steps)
+    report = partial(_report, config=config, store=store, training=training, held_out=held_out,
+                     autocast=autocast, score=score)
+    bar = tqdm(total=config.steps, initial=state.step, desc=config.method, unit='step',
+               disable=not progress)
+    with SummaryWriter(config.out, purge_step=state.step) as curves, bar:
+        began = time.monotonic() - state.seconds
+        for step, batch, augmentation in _batches(store, training, config, state.step, last):
+            for group in state.optimizer.param_groups:
+                group['lr'] = learning_rate(step, config)
+            # One step of Adam towards the matched frames.
+            state.network.train()
+            outcome = predictor_loss(
+                model, batch.to(device), augmentation.to(device), config, autocast)
+            state.optimizer.zero_grad()
+            outcome.loss.backward()
+            norm = torch.nn.utils.clip_grad_norm_(
+                state.network.parameters(), config.gradient_clip or math.inf)
+            state.optimizer.step()
+            state.update_average(config.average_decay)
+            state.step = step + 1
+            # Tell and save.
+            bar.update()
+            if state.step % config.log_every == 0:
+                _log(curves, bar, state.step, outcome, batch, norm, learning_rate(step, config))
+            if state.step % config.save_every == 0 or state.step == last:
+                state.seconds = time.monotonic() - began
+                save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+                report(state, curves)
+    return str(Path(config.out) / 'predictor.safetensors')
+
+
+def network_config(config, image_size):
+    """
+    Say which network a training run needs.
+
+    :param config: TrainingConfig.
+    :param image_size: (height, width) of the recordings.
+    :return: PredictorConfig.
+    :raises ConfigError: if the pictures are not square.
+    """
+    height, width = image_size
+    if height != width:
+        raise ConfigError(f'recordings: pictures are {width}x{height} pixels, the predictor needs '
+                          'square ones such as 64x64; record or crop them so')
+    return PredictorConfig(image_size=height, base_width=config.base_width,
+                           new_pixels=config.new_pixels, flow_scale=config.flow_scale)
+
+
+def learning_rate(step, config):
+    """
+    Compute a step's learning rate: a linear rise, then half a cosine down to 2 %.
+
+    :param step: from 0 on.
+    :param config: TrainingConfig.
+    :return: the rate.
+    """
+    rise = min(1.0, (step + 1) / (config.warmup + 1))
+    fall = 0.5 + 0.5 * math.cos(math.pi * step / config.steps)
+    return config.learning_rate * rise * (0.02 + 0.98 * fall)
+
+
+def pick_device(name):
+    """
+    Choose the device to train on.
+
+    :param name: 'auto', 'cpu', 'cuda' or 'cuda:1'.
+    :return: torch device.
+    :raises ConfigError: if it is not there.
+    """
+    if name == 'auto':
+        return torch.device('cuda' if torch.cuda.is_available() else 'cpu')
+    try:
+        torch.empty(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f'device: {name!r} is not usable here ({error}); '
+                          "choose 'cpu' or 'auto'") from error
+    return torch.device(name)
+
+
+def make_autocast(precision, device):
+    """
+    Choose the precision to run networks in.
+
+    :param precision: 'float32', 'bfloat16', or 'auto': bfloat16 on a GPU and on CPUs that have
+        instructions for it; on others it is ten times slower than float32.
+    :param device: torch device.
+    :return: function that makes a context manager.
+    """
+    fast = device.type == 'cuda' or _cpu_has_bfloat16()
+    half = precision == 'bfloat16' or (precision == 'auto' and fast)
+    return partial(torch.autocast, device.type, torch.bfloat16, enabled=half)
+
+
+def _cpu_has_bfloat16():
+    """Say whether the CPU multiplies bfloat16 itself (AVX512_BF16)."""
+    return getattr(torch.cpu, '_is_avx512_bf16_supported', lambda: False)()
+
+
+def _batches(store, episodes, config, first, last):
+    """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
+    def make(step):
+        rng = np.random.default_rng([config.seed, 2, step])
+        chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
+        batch = make_batch(
+            store, chosen, config.margin, config.num_targets, config.method == 'fix',
+            config.max_frames, config.min_crop, config.goal_picture, rng)
+        if config.reverse:
+            batch = reverse(batch, torch.from_numpy(rng.random(len(chosen)) < 0.5))
+        return step, batch, Augmentation.draw(
+            len(chosen), config.flip, config.colour, config.brightness, rng)
+
+    with ThreadPoolExecutor(1) as pool:
+        ahead = [pool.submit(make, step) for step in range(first, min(first + 2, last))]
+        for step in range(first, last):
+            if step + 2 < last:
+                ahead.append(pool.submit(make, step + 2))
+            yield ahead.pop(0).result()
+
+
+def _log(curves, bar, step, outcome, batch, norm, rate):
+    """Add a point to the curves and to the progress bar."""
+    fraction = batch.times.gather(1, outcome.match.cpu()[:, None]) / batch.end
+    loss = outcome.loss.item()
+    for name, value in (('loss', loss), ('gradient_norm', norm.item()), ('learning_rate', rate),
+                        ('match_fraction', fraction.mean().item()),
+                        ('match_fraction_std', fraction.std(correction=0).item())):
+        curves.add_scalar(f'train/{name}', value, step)
+    bar.set_postfix(loss=f'{loss:.4f}', match=f'{fraction.mean().item():.2f}')
+
+
+def _report(state, curves, config, store, training, held_out, autocast, score):
+    """Score the averaged network on held-out episodes; write weights, scores and pictures."""
+    device = next(state.average.parameters()).device
+
+    def batch(episodes):
+        return make_batch(store, episodes, config.margin, middle=config.method == 'fix',
+                          goal_picture=config.goal_picture).to(device)
+
+    scores = {}
+    if len(held_out):
+        parts = (batch(held_out[i:i + 64]) for i in range(0, len(held_out), 64))
+        scores = held_out_scores(state.average, parts, config, autocast)
+        if score is not None:
+            scores |= score(state.average, store, held_out)
+    for name, value in scores.items():
+        curves.add_scalar(f'held_out/{name}', value, state.step)
+    for name, episodes in (('training', training[:_SHOWN]), ('held_out', held_out[:_SHOWN])):
+        if len(episodes):
+            shown = batch(episodes)
+            with torch.no_grad():
+                outcome = predictor_loss(state.average, shown, None, config, autocast)
+            curves.add_image(name, sample_grid(shown, outcome), state.step, dataformats='HWC')
+    about = {
+        'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
+        'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
+        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device.type}',
+        'torch': torch.__version__, 'python': platform.python_version()}
+    for name, values in (('config', asdict(config)), ('run', about), ('scores', scores)):
+        path = Path(config.out) / f'{name}.json'
+        path.write_text(json.dumps(values, indent=2) + '\n')
+    save_weights(Path(config.out) / 'predictor.safetensors', state.average, 'predictor',
+                 state.network.config, about | {'settings': asdict(config), 'scores': scores})

@@ -1,0 +1,106 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The settings of a training run of the predictor."""
+
+from dataclasses import dataclass
+
+from tap_ros.errors import ConfigError
+
+METHODS = ('fix', 'min', 'genmin')
+SELECTIONS = ('time_preference', 'relative_to_copying')
+GOAL_PICTURES = ('last', 'recorded')
+PRECISIONS = ('auto', 'float32', 'bfloat16')
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """
+    All that a training run is made from.
+
+    :param recordings: .mcap files, bag folders, or folders of these.
+    :param out: the run's folder; if it holds a checkpoint, training goes on from there.
+    :param method: 'fix' (Eq. 1, the middle frame), 'min' (Eq. 2) or 'genmin' (Eq. 5).
+    :param selection: genmin's selection error, 'time_preference' (the paper's E_t / w(t)) or
+        'relative_to_copying' (E_t / (d_t w(t)), losses.relative_to_copying).
+    :param bell_edge: w at both ends of the targets; 2/3 in the paper.
+    :param margin: frames left out of the targets next to each context picture.
+    :param num_targets: at most so many random targets an episode and step; 0: all of them.
+    :param max_frames: longer episodes are cut to a random piece of this length; 0: never.
+    :param min_crop: cut episodes to a random piece of at least this share; 1: never.
+    :param goal_picture: the goal picture is the episode's 'last' frame, or the 'recorded' goal
+        where the episode reached it.
+    :param new_pixels: whether the network may paint; object maps are best without.
+    :param base_width: the network's width; 32 in the paper.
+    :param flow_scale: see PredictorConfig.
+    :param steps: length of the training, and of the cosine schedule of the learning rate.
+    :param batch_size: 64 in the paper.
+    :param learning_rate: at the start; Adam. 1e-4 in the paper, for 200 epochs.
+    :param warmup: steps over which the learning rate rises.
+    :param gradient_clip: largest norm of the gradient; 0: any.
+    :param average_decay: of the exponential moving average that is shipped; 0: none.
+    :param flip: mirror half of the episodes.
+    :param colour: permute the colour channels of each episode.
+    :param brightness: change each channel's brightness by up to this share.
+    :param reverse: play half of the episodes backwards.
+    :param test_fraction: share of episodes held out, by seed.
+    :param seed: of the weights, batches and augmentation.
+    :param device: 'auto', 'cpu', 'cuda'.
+    :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 where it is fast.
+    :param threads: of the CPU; 0: as many as there are.
+    :param compile: use torch.compile; slow to start, results differ in the last digits.
+    :param log_every: steps between curve points.
+    :param save_every: steps between checkpoints, scores and sample pictures.
+    """
+
+    recordings: tuple[str, ...]
+    out: str
+    method: str = 'genmin'
+    selection: str = 'relative_to_copying'
+    bell_edge: float = 2 / 3
+    margin: int = 3
+    num_targets: int = 0
+    max_frames: int = 0
+    min_crop: float = 1.0
+    goal_picture: str = 'last'
+    new_pixels: bool = False
+    base_width: int = 16
+    flow_scale: float = 16.0
+    steps: int = 6000
+    batch_size: int = 64
+    learning_rate: float = 5e-4
+    warmup: int = 100
+    gradient_clip: float = 1.0
+    average_decay: float = 0.999
+    flip: bool = True
+    colour: bool = True
+    brightness: float = 0.2
+    reverse: bool = False
+    test_fraction: float = 0.05
+    seed: int = 0
+    device: str = 'auto'
+    precision: str = 'auto'
+    threads: int = 0
+    compile: bool = False
+    log_every: int = 20
+    save_every: int = 500
+
+    def __post_init__(self):
+        """Refuse settings that cannot be trained with."""
+        for name, choices in (('method', METHODS), ('selection', SELECTIONS),
+                              ('goal_picture', GOAL_PICTURES), ('precision', PRECISIONS)):
+            if getattr(self, name) not in choices:
+                raise ConfigError(f'{name}: expected one of {", ".join(choices)}, '
+                                  f'got {getattr(self, name)!r}')
+        for name in ('steps', 'batch_size', 'base_width', 'log_every', 'save_every'):
+            if getattr(self, name) < 1:
+                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
+        for name in ('margin', 'num_targets', 'max_frames', 'warmup', 'threads'):
+            if getattr(self, name) < 0:
+                raise ConfigError(f'{name}: expected 0 or more, got {getattr(self, name)}')
+        if 0 < self.max_frames < 3:
+            raise ConfigError(f'max_frames: expected 0 or at least 3, got {self.max_frames}')
+        for name, low, high in (('bell_edge', 1e-6, 1), ('min_crop', 1e-6, 1),
+                                ('test_fraction', 0, 0.9), ('brightness', 0, 0.9),
+                                ('average_decay', 0, 0.99999)):
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(f'{name}: expected {low}..{high}, got {getattr(self, name)}')

@@ -1,0 +1,142 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Appearance flow: one backward warp for pictures and for object maps.
+
+A flow (du, dv) in pixels at pixel (u, v) says that the output there is read from
+(u + du, v + dv). Pixel (0, 0) is the centre of the top-left pixel.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch.nn import functional
+
+# Of the mass 1 of an object map, what has to survive the warp for it to be trusted.
+MIN_MASS = 0.05
+
+
+@dataclass(frozen=True)
+class WarpedMaps:
+    """
+    Object maps of a predicted frame.
+
+    :param maps: (B, K, H, W), each sums to 1.
+    :param mass: (B, K), what each map summed to before it was normalised. Backward warping does
+        not conserve mass: near 0 the object got lost, near 2 it is seen twice.
+    """
+
+    maps: torch.Tensor
+    mass: torch.Tensor
+
+
+def warp(images, flow):
+    """
+    Read each pixel of the output where the flow points to, bilinearly.
+
+    :param images: (B, C, channels, H, W), pictures or maps.
+    :param flow: (B, C, 2, H, W) in pixels, (du, dv).
+    :return: (B, C, channels, H, W). Positions outside the picture read its border.
+    """
+    B, C, _, H, W = flow.shape
+    u = torch.arange(W, device=flow.device, dtype=flow.dtype)
+    v = torch.arange(H, device=flow.device, dtype=flow.dtype)
+    # With align_corners -1 and 1 are the centres of the outermost pixels.
+    grid = torch.stack([(flow[:, :, 0] + u) * (2 / (W - 1)) - 1,
+                        (flow[:, :, 1] + v[:, None]) * (2 / (H - 1)) - 1], -1)  # B, C, H, W, 2
+    warped = functional.grid_sample(images.flatten(0, 1), grid.flatten(0, 1), mode='bilinear',
+                                    padding_mode='border', align_corners=True)
+    return warped.unflatten(0, (B, C))
+
+
+def combine(warped, masks, new_pixels=None):
+    """
+    Blend warped pictures, and new pixels if there are any, by masks.
+
+    :param warped: (B, C, channels, H, W).
+    :param masks: (B, C, 1, H, W), or (B, C+1, 1, H, W) with the one of the new pixels last.
+    :param new_pixels: (B, channels, H, W) or None.
+    :return: (B, channels, H, W).
+    """
+    C = warped.shape[1]
+    image = (masks[:, :C] * warped).sum(1)
+    return image if new_pixels is None else image + masks[:, C] * new_pixels
+
+
+def one_hot_maps(pixels, size):
+    """
+    Draw each position as a map that sums to 1 and has its mean there.
+
+    A position between pixels is shared among its four neighbours bilinearly; one outside the
+    picture moves to the nearest pixel inside.
+
+    :param pixels: (..., 2) in (u, v) order, finite.
+    :param size: (height, width).
+    :return: float32 (..., H, W).
+    """
+    H, W = size
+    pixels = pixels.float()
+    u = pixels[..., 0].clamp(0, W - 1)[..., None]
+    v = pixels[..., 1].clamp(0, H - 1)[..., None]
+    along_u = (1 - (u - torch.arange(W, device=pixels.device)).abs()).clamp(min=0)  # ..., W
+    along_v = (1 - (v - torch.arange(H, device=pixels.device)).abs()).clamp(min=0)  # ..., H
+    return along_v[..., :, None] * along_u[..., None, :]
+
+
+def expected_pixels(maps):
+    """
+    Take the mean position under each map.
+
+    :param maps: (..., H, W), each sums to 1.
+    :return: (..., 2) in (u, v) order.
+    """
+    H, W = maps.shape[-2:]
+    u = maps.sum(-2) @ torch.arange(W, device=maps.device, dtype=maps.dtype)
+    v = maps.sum(-1) @ torch.arange(H, device=maps.device, dtype=maps.dtype)
+    return torch.stack([u, v], -1)
+
+
+def warp_object_maps(maps, flow, masks, min_mass=MIN_MASS):
+    """
+    Find where a prediction puts each object, by its own flow and masks (appendix E).
+
+    p = sum over c of mask_c * warp(map_c, flow_c), divided by its sum. A map that loses nearly
+    all its mass (the flow jumps over the object's pixel) is blurred by one pixel before warping;
+    if that does not help, it is the mask-weighted mixture of the maps where they were, and
+    if the masks hide these too, their plain mean.
+
+    :param maps: (B, C, K, H, W), maps in each context picture, each summing to 1.
+    :param flow: (B, C, 2, H, W) in pixels.
+    :param masks: (B, C or C+1, 1, H, W); the new pixels' mask is left out, for new pixels
+        have no origin.
+    :param min_mass: a map with less than this is taken for lost.
+    :return: WarpedMaps.
+    """
+    masks = masks[:, :maps.shape[1]]
+    candidates = [combine(warp(maps, flow), masks)]  # B, K, H, W
+    mass = candidates[0].sum((-2, -1))
+    if bool((mass < min_mass).any()):
+        candidates.append(combine(warp(blur(maps), flow), masks))
+        candidates.append(combine(maps, masks))
+        candidates.append(maps.mean(1))
+    warped = candidates[-1]
+    for candidate in reversed(candidates[:-1]):
+        kept = candidate.sum((-2, -1), keepdim=True) >= min_mass
+        warped = torch.where(kept, candidate, warped)
+    return WarpedMaps(warped / warped.sum((-2, -1), keepdim=True), mass)
+
+
+def blur(maps, sigma=1.0):
+    """
+    Blur maps by a Gaussian; at the border mass stays inside.
+
+    :param maps: (..., H, W).
+    :param sigma: its standard deviation in pixels.
+    :return: (..., H, W).
+    """
+    for dim in (-1, -2):
+        at = torch.arange(maps.shape[dim], device=maps.device, dtype=maps.dtype)
+        kernel = torch.exp(-((at[:, None] - at) ** 2) / (2 * sigma ** 2))
+        kernel = kernel / kernel.sum(0)  # column: how the mass of one pixel is shared out
+        maps = (maps.transpose(dim, -1) @ kernel.T).transpose(dim, -1)
+    return maps

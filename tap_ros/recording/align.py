@@ -1,0 +1,330 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Cut recordings into episodes and align what was done and measured to the frames.
+
+By the marks on /episode, by header stamps where messages have them and by log time where they do
+not: a frame belongs to an episode whose marks enclose its stamp, and that is nearest in the log.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tap_ros.recording.columns import pad_objects
+from tap_ros.recording.episode import Episode
+
+MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
+MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
+_FAR = 2**62
+_EMPTY = {
+    'frame_log': ((0,), np.int64), 'frame_stamp': ((0,), np.int64),
+    'goal_log': ((0,), np.int64), 'goal_stamp': ((0,), np.int64), 'goal_index': ((0,), np.int64),
+    'twist_log': ((0,), np.int64), 'twist_stamp': ((0,), np.int64),
+    'twist': ((0, 3), np.float32),
+    'command_log': ((0,), np.int64), 'command': ((0,), np.float32),
+    'joint_log': ((0,), np.int64), 'joint_stamp': ((0,), np.int64),
+    'joint': ((0, 4), np.float32),
+    'object_log': ((0,), np.int64), 'object_stamp': ((0,), np.int64),
+    'object': ((0, 0, 9), np.float64), 'object_names': ((0,), np.int64),
+    'goal_object_log': ((0,), np.int64), 'goal_object_stamp': ((0,), np.int64),
+    'goal_object': ((0, 0, 9), np.float64), 'goal_object_names': ((0,), np.int64),
+    'mark_log': ((0,), np.int64), 'mark_stamp': ((0,), np.int64), 'mark_event': ((0,), np.int64)}
+
+
+@dataclass
+class _Span:
+    """The part of the log and of the stamps that belongs to one episode."""
+
+    start_log: int = -_FAR
+    end_log: int = _FAR
+    start_stamp: int = -_FAR
+    end_stamp: int = _FAR
+    task: str = ''
+    seed: int = 0
+    outcome: str = ''
+
+
+@dataclass(frozen=True)
+class EpisodeTable:
+    """The episodes of files that follow each other; F frames in E episodes, K objects at most."""
+
+    parts: list  # of Columns, one a file
+    starts: np.ndarray  # (E + 1,) int64: episode i has the rows starts[i] to starts[i + 1]
+    spans: list  # of E spans
+    file: np.ndarray  # (F,) int64, index into parts
+    row: np.ndarray  # (F,) int64, index into the frames of that part
+    stamps: np.ndarray  # (F,) int64
+    actions: np.ndarray  # (F, 4) float32
+    grippers: np.ndarray  # (F, 4) float32
+    objects: np.ndarray  # (F, K, 9) float64: u, v, pose
+    names: list  # of E tuples
+    goals: list  # of E pairs (index into parts, index into goal_frames), or None
+    goal_objects: np.ndarray  # (E, K, 9) float64
+
+    def __len__(self):
+        return len(self.spans)
+
+    def frames(self, i):
+        """Return the frames of episode i, (T, H, W, 3) uint8, a view unless it is in two files."""
+        rows = slice(self.starts[i], self.starts[i + 1])
+        file, row = self.file[rows], self.row[rows]
+        runs = np.flatnonzero((np.diff(row) != 1) | (np.diff(file) != 0)) + 1
+        pieces = [
+            self.parts[f[0]].frames[r[0]:r[-1] + 1]
+            for f, r in zip(np.split(file, runs), np.split(row, runs), strict=True)]
+        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+
+    def episode(self, i):
+        """Return episode i."""
+        rows, K, span = slice(self.starts[i], self.starts[i + 1]), len(self.names[i]), self.spans[i]
+        objects, goal_objects, goal = self.objects[rows, :K], self.goal_objects[i, :K], self.goals[i]
+        return Episode(
+            frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
+            grippers=self.grippers[rows], object_names=self.names[i],
+            object_pixels=objects[..., :2].astype(np.float32), object_poses=objects[..., 2:],
+            goal_frame=None if goal is None else self.parts[goal[0]].goal_frames[goal[1]],
+            goal_pixels=goal_objects[:, :2].astype(np.float32), goal_poses=goal_objects[:, 2:],
+            task=span.task, seed=span.seed, outcome=span.outcome)
+
+
+def follows(before, after):
+    """
+    Tell whether one file goes on where another ends, as the files of a split bag do.
+
+    :param before, after: Columns.
+    """
+    def times(columns):
+        logs = [a for k, a in columns.arrays.items() if k.endswith('_log') and len(a)]
+        return [log[0] for log in logs], [log[-1] for log in logs]
+    (_, ends), (starts, _) = times(before), times(after)
+    return not ends or not starts or min(starts) >= max(ends) - MAX_JITTER_NS
+
+
+def assemble(parts):
+    """
+    Cut files that follow each other into episodes.
+
+    :param parts: list of Columns, frames included, in playing order.
+    :return: EpisodeTable; episodes without any frame are left out.
+    """
+    data, names, marks = _join(parts)
+    if len(data['frame_stamp']) > 1 and not data['frame_stamp'].any():
+        data['frame_stamp'] = data['frame_log']
+    for name in ('twist', 'joint', 'object'):
+        _stamp_unstamped(data, name)
+    spans = _spans(data, marks)
+    owner = _assign(spans, data['frame_log'], data['frame_stamp'])
+    order = np.lexsort((data['frame_stamp'], owner))
+    order = order[owner[order] >= 0]
+    owner, stamps = owner[order], data['frame_stamp'][order]
+    repeated = (np.diff(stamps, prepend=-1) == 0) & (np.diff(owner, prepend=-1) == 0)
+    order, owner, stamps = order[~repeated], owner[~repeated], stamps[~repeated]
+    present, owner, counts = np.unique(owner, return_inverse=True, return_counts=True)
+    spans = [spans[i] for i in present.tolist()]
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    clock = _Clock(spans, starts, stamps)
+    picked, goal_picked = _pick_names(data, clock)
+    goals = [
+        _newest(data['goal_log'], data['goal_stamp'], span) for span in spans]
+    return EpisodeTable(
+        parts=parts, starts=starts, spans=spans,
+        file=data['frame_file'][order], row=data['frame_row'][order], stamps=stamps,
+        actions=_actions(data, clock, data['frame_log'][order]),
+        grippers=clock.nearest(
+            data['joint_log'], data['joint_stamp'], data['joint'], np.float32),
+        objects=_by_name(*clock.nearest_rows(data['object_log'], data['object_stamp']),
+                         data['object'], data['object_names'], names, picked[clock.owner]),
+        names=[names[i] if i >= 0 else () for i in picked.tolist()],
+        goals=[None if g < 0 or data['goal_index'][g] < 0
+               else (int(data['goal_file'][g]), int(data['goal_index'][g])) for g in goals],
+        goal_objects=_by_name(goal_picked, goal_picked >= 0, data['goal_object'],
+                              data['goal_object_names'], names, picked))
+
+
+class _Clock:
+    """One increasing time over all frames: the episodes laid end to end with room between."""
+
+    def __init__(self, spans, starts, stamps):
+        self.spans, self.starts, self.stamps = spans, starts, stamps
+        counts = np.diff(starts)
+        self.owner = np.repeat(np.arange(len(counts)), counts)  # (F,) episode of each frame
+        steps = np.diff(stamps)[np.diff(self.owner) == 0]
+        self.match = max(int(np.median(steps)) // 2 if len(steps) else 0, MIN_MATCH_NS)
+        self.first, last = stamps[starts[:-1]], stamps[starts[1:] - 1]
+        self.length = last - self.first
+        room = self.length + 4 * self.match
+        self.base = np.cumsum(room) - room
+        self.frames = self.base[self.owner] + stamps - self.first[self.owner]  # (F,) increasing
+
+    def rows(self, log, stamps):
+        """Return (times, rows): of the messages that belong to an episode, sorted by time."""
+        if not len(self.spans):
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        owner = _assign(self.spans, log, stamps)
+        since = stamps - self.first[owner]
+        rows = np.flatnonzero(
+            (owner >= 0) & (since >= -self.match) & (since <= self.length[owner] + self.match))
+        times = self.base[owner[rows]] + since[rows]
+        order = np.argsort(times, kind='stable')
+        return times[order], rows[order]
+
+    def nearest_rows(self, log, stamps):
+        """Return (rows, found): for each frame the message nearest in time, the newest of equals."""
+        times, rows = self.rows(log, stamps)
+        if not len(times):
+            return np.zeros(len(self.frames), np.int64), np.zeros(len(self.frames), bool)
+        after = np.searchsorted(times, self.frames, 'right')
+        before = np.maximum(after - 1, 0)
+        after = np.minimum(after, len(times) - 1)
+        nearer = np.abs(times[after] - self.frames) < np.abs(times[before] - self.frames)
+        best = np.where(nearer, after, before)
+        return rows[best], np.abs(times[best] - self.frames) <= self.match
+
+    def nearest(self, log, stamps, values, dtype):
+        """Return the nearest values, NaN where none is near."""
+        rows, found = self.nearest_rows(log, stamps)
+        out = np.full((len(rows), *values.shape[1:]), np.nan, dtype)
+        out[found] = values[rows[found]]
+        return out
+
+
+def _join(parts):
+    """Put the columns of several files one behind the other."""
+    data = {key: [] for key in (*_EMPTY, 'frame_file', 'frame_row', 'goal_file')}
+    numbers, marks = {}, []
+    for index, part in enumerate(parts):
+        arrays = {k: part.arrays.get(k, np.empty(s, d)) for k, (s, d) in _EMPTY.items()}
+        local = np.array(
+            [numbers.setdefault(tuple(n), len(numbers)) for n in part.names], np.int64)
+        for key in ('object_names', 'goal_object_names'):
+            arrays[key] = local[arrays[key]]
+        arrays['frame_file'] = np.full(len(arrays['frame_log']), index)
+        arrays['frame_row'] = np.arange(len(arrays['frame_log']))
+        arrays['goal_file'] = np.full(len(arrays['goal_log']), index)
+        marks += part.marks
+        for key, value in arrays.items():
+            data[key].append(value)
+    objects = pad_objects(data['object'] + data['goal_object'])
+    data['object'], data['goal_object'] = objects[:len(parts)], objects[len(parts):]
+    return {key: np.concatenate(value) for key, value in data.items()}, list(numbers), marks
+
+
+def _stamp_unstamped(data, name):
+    """Give messages without a stamp that of the newest frame logged before."""
+    stamps, frames = data[f'{name}_stamp'], data['frame_stamp']
+    if len(frames) and (stamps == 0).any():
+        newest = np.searchsorted(data['frame_log'], data[f'{name}_log'], 'right') - 1
+        data[f'{name}_stamp'] = np.where(stamps == 0, frames[np.maximum(newest, 0)], stamps)
+
+
+def _spans(data, marks):
+    """Read the marks: a list of spans in the order of the log."""
+    if not marks:
+        return [_Span()]
+    spans, current, last_end = [], None, -_FAR
+    for log, stamp, event, (task, seed, outcome) in zip(
+            data['mark_log'].tolist(), data['mark_stamp'].tolist(),
+            data['mark_event'].tolist(), marks, strict=True):
+        if event == 0:
+            if current is not None:
+                current.end_log = log - 1
+                if stamp > current.start_stamp:
+                    current.end_stamp = stamp - 1
+            current = _Span(log, _FAR, stamp, _FAR, task, seed, 'interrupted')
+            spans.append(current)
+        else:
+            if current is None:  # recording began after the start of the episode
+                current = _Span(last_end, task=task, seed=seed)
+                spans.append(current)
+            current.end_log, current.outcome = log, outcome
+            current.end_stamp = stamp or _FAR
+            current, last_end = None, log + 1
+    return spans
+
+
+def _assign(spans, log, stamps):
+    """Return (N,) int64: the episode of each message, -1 for none."""
+    start_log, end_log, start_stamp, end_stamp = np.array(
+        [(s.start_log, s.end_log, s.start_stamp, s.end_stamp) for s in spans],
+        np.int64).reshape(-1, 4).T
+    best = np.full(len(log), -1)
+    best_distance = np.full(len(log), MAX_JITTER_NS + 1)
+    inside = np.searchsorted(start_log, log, 'right') - 1
+    for shift in (0, 1, -1):
+        candidate = np.clip(inside + shift, 0, len(spans) - 1)
+        distance = np.maximum(
+            np.maximum(start_log[candidate] - log, log - end_log[candidate]), 0)
+        better = (
+            (start_stamp[candidate] <= stamps) & (stamps <= end_stamp[candidate])
+            & (distance < best_distance))
+        best[better], best_distance[better] = candidate[better], distance[better]
+    return best
+
+
+def _actions(data, clock, frame_log):
+    """
+    Return (F, 4) float32: row t is what was sent between frame t and frame t + 1, the last wins.
+
+    A gripper opening holds until another is commanded. The last row of an episode is zeros.
+    """
+    actions = np.zeros((len(clock.frames), 4), np.float32)
+    times, rows = clock.rows(data['twist_log'], data['twist_stamp'])
+    step = np.searchsorted(clock.frames, times, 'right') - 1
+    actions[step[step >= 0], :3] = data['twist'][rows[step >= 0]]
+    by_log = np.argsort(frame_log, kind='stable')
+    if len(data['command_log']) and len(frame_log):
+        step = np.searchsorted(frame_log[by_log], data['command_log'], 'right') - 1
+        newest = np.full(len(frame_log), -1)
+        newest[by_log[step[step >= 0]]] = np.flatnonzero(step >= 0)
+        newest = np.maximum.accumulate(newest)
+        earliest = np.searchsorted(data['command_log'], frame_log[clock.starts[:-1]])
+        known = newest >= earliest[clock.owner]
+        actions[known, 3] = data['command'][newest[known]]
+    actions[clock.starts[1:] - 1] = 0
+    return actions
+
+
+def _newest(log, stamps, span):
+    """Return the row of the last message up to the end of an episode, -1 for none."""
+    row = int(np.searchsorted(log, span.end_log, 'right')) - 1
+    while row >= 0 and stamps[row] > span.end_stamp:
+        row -= 1
+    return row
+
+
+def _pick_names(data, clock):
+    """Return the number of each episode's object names and the row of its goal objects, or -1."""
+    rows, found = clock.nearest_rows(data['object_log'], data['object_stamp'])
+    seen = np.where(found, data['object_names'][rows] if len(data['object_names']) else -1, -1)
+    goal_rows = np.array([
+        _newest(data['goal_object_log'], data['goal_object_stamp'], span)
+        for span in clock.spans], np.int64)
+    picked = np.full(len(goal_rows), -1)
+    for i, goal in enumerate(goal_rows.tolist()):
+        known = seen[clock.starts[i]:clock.starts[i + 1]]
+        known = known[known >= 0]
+        if len(known):
+            picked[i] = known[0]
+        elif goal >= 0:
+            picked[i] = data['goal_object_names'][goal]
+    return picked, goal_rows
+
+
+def _by_name(rows, found, values, numbers, names, wanted):
+    """
+    Return (N, K, 9): the values of picked messages with their objects in the wanted order.
+
+    :param rows, found: (N,) row of the message and whether there is one.
+    :param values, numbers: (M, K, 9) of all messages, and (M,) the number of their names.
+    :param names, wanted: tuples by number, and (N,) the number of the wanted names.
+    """
+    out = np.full((len(rows), *values.shape[1:]), np.nan)
+    out[found] = values[rows[found]]
+    for i in np.flatnonzero(found)[numbers[rows[found]] != wanted[found]].tolist():
+        given = names[numbers[rows[i]]]
+        out[i] = np.nan
+        for k, name in enumerate(names[wanted[i]]):
+            if name in given:
+                out[i, k] = values[rows[i], given.index(name)]
+    return out

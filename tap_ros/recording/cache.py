@@ -1,0 +1,262 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Recordings as memory maps: decoded once, kept in a cache, then read at the speed of memory.
+
+Each MCAP file has a folder in the cache, named after the SHA-256 of its content, with the frames
+as one uint8 array and all else as columns. Any number of processes may build and read it at once.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+import hashlib
+import json
+import os
+from pathlib import Path
+import shutil
+import tempfile
+import warnings
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+from tqdm import tqdm
+
+from tap_ros.errors import RecordingError
+from tap_ros.recording import topics
+from tap_ros.recording.align import assemble, follows
+from tap_ros.recording.columns import Columns, decode_file
+from tap_ros.recording.container import McapFile, THREADS
+from tap_ros.recording.episode import RecordingWarning
+from tap_ros.recording.metadata import bag_files, FILE_NAME
+
+FORMAT = 1  # of a cache folder; another number makes all files be decoded again
+ENVIRONMENT = 'TAP_ROS_CACHE'
+_NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
+
+
+class EpisodeStore:
+    """
+    Episodes of recordings, in their order, as views of memory maps.
+
+    :param tables: list of EpisodeTable.
+    :param file_hashes: hex digests of the files, in order.
+    """
+
+    def __init__(self, tables, file_hashes):
+        self._index = [(table, i) for table in tables for i in range(len(table))]
+        lengths = [np.diff(table.starts) for table in tables]
+        self.lengths = np.concatenate([np.empty(0, np.int64), *lengths])  # (E,) frames
+        self.num_frames = int(self.lengths.sum())
+        self.image_size = next(
+            part.image_size for table in tables for part in table.parts if part.image_size)
+        self.data_hash = hashlib.sha256(''.join(file_hashes).encode()).hexdigest()
+
+    def __len__(self):
+        """Return the number of episodes."""
+        return len(self._index)
+
+    def __getitem__(self, i):
+        """Return Episode i."""
+        table, local = self._index[i]
+        return table.episode(local)
+
+    def frames(self, i):
+        """Return the frames of episode i, (T, H, W, 3) uint8."""
+        table, local = self._index[i]
+        return table.frames(local)
+
+
+def open_recordings(paths, cache_dir=None, progress=True, image_topic=None):
+    """
+    Open recordings, decoding what is not in the cache yet.
+
+    :param paths: one or a list of .mcap files, bag folders, or folders of bag folders.
+    :param cache_dir: by default $TAP_ROS_CACHE or ~/.cache/tap_ros.
+    :param progress: show a progress bar when decoding takes long.
+    :param image_topic: the camera's topic when its name does not end in /camera/image_raw.
+    :return: EpisodeStore.
+    :raises RecordingError: when a recording is missing, empty, damaged or lacks the image topic,
+        or when the images differ in size; the message names the file.
+    """
+    paths = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
+    bags = [bag for path in paths for bag in find_bags(path)]
+    cache_dir = Path(cache_dir or os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
+    total = sum(file.stat().st_size for bag in bags for file in bag)
+    with tqdm(total=total, desc='opening recordings', unit='B', unit_scale=True,
+              disable=not progress, delay=1) as bar, ThreadPoolExecutor(THREADS) as pool:
+        found = [find_topics(bag, image_topic) for bag in bags]
+        jobs = [
+            [pool.submit(_open_file, file, names, cache_dir, bar) for file in bag]
+            for bag, names in zip(bags, found, strict=True)]
+        try:
+            loaded = [[job.result() for job in bag] for bag in jobs]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    columns = [[part for part, _ in bag] for bag in loaded]
+    check_sizes([part for bag in columns for part in bag])
+    for part in (part for bag in columns for part in bag):
+        warn_of_damage(part)
+    tables = [assemble(run) for bag in columns for run in _runs(bag)]
+    store = EpisodeStore(tables, [digest for bag in loaded for _, digest in bag])
+    if not len(store):
+        raise RecordingError(f'{_list(paths)}: no camera image lies within an episode')
+    return store
+
+
+def find_bags(path):
+    """
+    Return the bags at a path: a list of lists of .mcap files, in playing order.
+
+    :param path: .mcap file, bag folder, or folder of bag folders.
+    :raises RecordingError: when there is none.
+    """
+    path = Path(path)
+    if path.is_file():
+        return [[path]]
+    if not path.is_dir():
+        raise RecordingError(f'{path}: there is no such file or folder')
+    folders = [path] if _is_bag(path) else sorted(f for f in path.iterdir() if _is_bag(f))
+    bags = [files for folder in folders if (files := bag_files(folder))]
+    if not bags:
+        raise RecordingError(
+            f'{path}: holds no recording; expected .mcap files, with {FILE_NAME} beside them, '
+            'or folders of such')
+    return bags
+
+
+def find_topics(files, image_topic=None):
+    """
+    Find the topics of a bag.
+
+    :param files: its .mcap files.
+    :param image_topic: as in open_recordings.
+    :return: as topics.resolve.
+    """
+    available = {}
+    for file in files:
+        available |= {t: c.type_name for t, c in McapFile(file).topics().items()}
+    return topics.resolve(available, _list(files), image_topic)
+
+
+def check_sizes(parts):
+    """Refuse recordings whose images differ in size, naming them."""
+    sizes = {}
+    for part in parts:
+        if part.image_size is not None:
+            sizes.setdefault(tuple(part.image_size), part.source)
+    if not sizes:
+        raise RecordingError(
+            f'{_list([part.source for part in parts])}: the image topic holds no image')
+    if len(sizes) > 1:
+        listing = ', '.join(f'{s} ({w}x{h})' for (h, w), s in sizes.items())
+        raise RecordingError(
+            f'images of different sizes (width x height): {listing}; open them separately')
+
+
+def warn_of_damage(part):
+    """Say what could not be read of a file."""
+    if part.damage:
+        warnings.warn(f'{part.source}: {part.damage}', RecordingWarning, stacklevel=3)
+
+
+def _is_bag(path):
+    return path.is_dir() and ((path / FILE_NAME).exists() or any(path.glob('*.mcap')))
+
+
+def _list(paths):
+    """Name the first of several files."""
+    paths = [str(path) for path in paths]
+    return paths[0] + (f' and {len(paths) - 1} more' if len(paths) > 1 else '')
+
+
+def _runs(parts):
+    """Split the files of a bag where one does not go on where the one before ended."""
+    runs = []
+    for part in parts:
+        if runs and follows(runs[-1][-1], part):
+            runs[-1].append(part)
+        else:
+            runs.append([part])
+    return runs
+
+
+def _open_file(path, found, cache_dir, bar):
+    """Return (Columns with mapped frames, digest) of one file, from the cache or decoded."""
+    with open(path, 'rb') as stream:
+        digest = hashlib.file_digest(stream, 'sha256').hexdigest()
+    key = hashlib.sha256(json.dumps([FORMAT, sorted(found.items())]).encode()).hexdigest()[:8]
+    folder = cache_dir / f'{digest}-{key}'
+    columns = _load(folder, path)
+    if columns is None:
+        _build(path, found, folder)
+        columns = _load(folder, path)
+        if columns is None:
+            raise RecordingError(f'{folder}: the cache cannot be read back; is the disk full?')
+    bar.update(path.stat().st_size)
+    return columns, digest
+
+
+def _build(path, found, folder):
+    """Decode a file into a cache folder, which appears complete or not at all."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=folder.name + '.', dir=folder.parent))
+    except OSError as error:
+        raise RecordingError(
+            f'{folder.parent}: the cache cannot be written ({error.strerror}); set {ENVIRONMENT} '
+            'to a folder that can') from error
+    try:
+        with open(part / 'frames.npy', 'wb') as stream:
+            stream.write(bytes(_NPY_HEADER))
+            columns = decode_file(McapFile(path), found, stream.write)
+            _write_header(stream, columns)
+        _sort_frames(part / 'frames.npy', columns.arrays)
+        arrays = {k: np.ascontiguousarray(a) for k, a in columns.arrays.items()}
+        if columns.goal_frames is not None:
+            arrays['goal_frames'] = columns.goal_frames
+        save_file(arrays, part / 'columns.safetensors', {'columns': columns.describe()})
+        shutil.rmtree(folder, ignore_errors=True)  # there only when it could not be read
+        os.rename(part, folder)
+    except OSError as error:
+        if not folder.is_dir():  # else another process was faster
+            raise RecordingError(f'{folder}: the cache cannot be written: {error}') from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _write_header(stream, columns):
+    """Put the header of an .npy file in front of the frames."""
+    shape = (len(columns.arrays.get('frame_log', ())), *(columns.image_size or (0, 0)), 3)
+    text = repr({'descr': '|u1', 'fortran_order': False, 'shape': shape})
+    magic = np.lib.format.magic(1, 0)
+    length = _NPY_HEADER - len(magic) - 2
+    stream.seek(0)
+    stream.write(magic + length.to_bytes(2, 'little') + text.ljust(length - 1).encode() + b'\n')
+
+
+def _sort_frames(path, arrays):
+    """Bring the frames into the order of their log times, which they nearly always have."""
+    order = arrays.pop('frame_order', None)
+    if order is not None and (np.diff(order) != 1).any():
+        frames = np.load(path)
+        np.save(path, frames[order], allow_pickle=False)
+
+
+def _load(folder, source):
+    """Return the Columns of a cache folder, or None when it is not there or not complete."""
+    try:
+        arrays = load_file(folder / 'columns.safetensors')
+        with open(folder / 'columns.safetensors', 'rb') as stream:
+            length = int.from_bytes(stream.read(8), 'little')
+            about = json.loads(json.loads(stream.read(length))['__metadata__']['columns'])
+        count = len(arrays.get('frame_log', ()))
+        frames = np.load(folder / 'frames.npy', mmap_mode='r') if count else None
+        if count and frames.shape != (count, *about['image_size'], 3):
+            return None
+    except (OSError, SafetensorError, ValueError, KeyError):
+        return None
+    return Columns(
+        str(source), tuple(about['image_size']) if count else None, frames,
+        arrays.pop('goal_frames', None), arrays, [tuple(n) for n in about['names']],
+        [tuple(m) for m in about['marks']], about['damage'])

@@ -1,0 +1,77 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+One episode of a recording as arrays: what every part of this package trains on and evaluates.
+
+T frames of H x W pixels, K objects. Actions and states follow the control contract: an action is
+dx, dy, dz in metres per control period and the gripper opening, 0 closed to 1 open.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tap_ros.errors import RecordingError
+
+OUTCOMES = ('success', 'failure', 'interrupted', '')
+
+
+class RecordingWarning(UserWarning):
+    """A recording is damaged, but part of it could be read."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What was seen and done between the start and the end of one episode."""
+
+    frames: np.ndarray  # (T, H, W, 3) uint8, rgb
+    stamps: np.ndarray  # (T,) int64, nanoseconds, increasing
+    actions: np.ndarray  # (T, 4) float32; row t leads from frame t to t + 1; the last row is zeros
+    grippers: np.ndarray  # (T, 4) float32 x, y, z (m, world), opening; NaN where unknown
+    object_names: tuple[str, ...]  # K
+    object_pixels: np.ndarray  # (T, K, 2) float32 (u, v); NaN where unknown
+    object_poses: np.ndarray  # (T, K, 7) float64 x y z (m, world) qx qy qz qw; NaN where unknown
+    goal_frame: np.ndarray | None  # (H, W, 3) uint8: the picture of the goal
+    goal_pixels: np.ndarray  # (K, 2) float32; NaN where unknown
+    goal_poses: np.ndarray  # (K, 7) float64; NaN where unknown
+    task: str = ''  # for example 'push2'; '' when unknown
+    seed: int = 0
+    outcome: str = ''  # one of OUTCOMES
+
+    def __len__(self):
+        """Return the number of frames T."""
+        return len(self.frames)
+
+
+def check_episode(episode):
+    """
+    Accept an episode or say what is wrong with it.
+
+    :param episode: what should be a complete Episode with at least one frame.
+    :raises RecordingError: for another type, shape or order; the message names the field.
+    """
+    T, K = len(episode.stamps), len(episode.object_names)
+    size = tuple(np.shape(episode.frames)[1:3])
+    wanted = {
+        'frames': ((T, *size, 3), np.uint8), 'stamps': ((T,), np.int64),
+        'actions': ((T, 4), np.float32), 'grippers': ((T, 4), np.float32),
+        'object_pixels': ((T, K, 2), np.float32), 'object_poses': ((T, K, 7), np.float64),
+        'goal_pixels': ((K, 2), np.float32), 'goal_poses': ((K, 7), np.float64),
+        'goal_frame': ((*size, 3), np.uint8)}
+    if episode.goal_frame is None:
+        del wanted['goal_frame']
+    for field, (shape, dtype) in wanted.items():
+        array = np.asarray(getattr(episode, field))
+        if array.shape != shape or array.dtype != dtype:
+            raise RecordingError(
+                f'Episode.{field}: expected shape {shape} and type {np.dtype(dtype)}, '
+                f'got {array.shape} and {array.dtype}')
+    if T == 0 or 0 in size:
+        raise RecordingError('Episode.frames: expected at least one frame of at least one pixel')
+    if episode.stamps[0] < 0 or (np.diff(episode.stamps) <= 0).any():
+        raise RecordingError('Episode.stamps: expected nanoseconds >= 0 that increase')
+    if episode.actions[-1].any():
+        raise RecordingError('Episode.actions: expected zeros in the last row')
+    if episode.outcome not in OUTCOMES:
+        raise RecordingError(
+            f'Episode.outcome: expected one of {OUTCOMES}, got {episode.outcome!r}')

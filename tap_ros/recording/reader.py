@@ -1,0 +1,79 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Read recordings once, episode by episode, without a cache."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from tap_ros.recording.align import assemble, follows
+from tap_ros.recording.cache import check_sizes, find_bags, find_topics, warn_of_damage
+from tap_ros.recording.columns import Columns, decode_file
+from tap_ros.recording.container import McapFile
+
+
+def iter_episodes(path, image_topic=None):
+    """
+    Yield the episodes of a recording; at most about one file is in memory at a time.
+
+    :param path: .mcap file, bag folder, or folder of bag folders.
+    :param image_topic: the camera's topic when its name does not end in /camera/image_raw.
+    :return: iterator over Episode.
+    :raises RecordingError: when the recording is missing, empty, damaged or lacks the image topic.
+    """
+    for files in find_bags(path):
+        found = find_topics(files, image_topic)
+        waiting, checked = [], []
+        for file in files:
+            part = _decode(file, found)
+            checked.append(Columns(part.source, part.image_size))
+            if part.image_size is not None:
+                check_sizes(checked)
+            if waiting and not follows(waiting[-1], part):
+                yield from _episodes(waiting)
+                waiting = []
+            waiting.append(part)
+            if _closed(part):
+                yield from _episodes(waiting)
+                waiting = _kept(waiting)
+        yield from _episodes(waiting)
+        check_sizes(checked)
+
+
+def _decode(file, found):
+    """Return the Columns of a file, frames in memory."""
+    pieces = []
+    part = decode_file(McapFile(file), found, pieces.append)
+    order = part.arrays.pop('frame_order', None)
+    if pieces:
+        frames = np.concatenate(pieces)
+        part.frames = frames if (np.diff(order) == 1).all() else frames[order]
+    warn_of_damage(part)
+    return part
+
+
+def _episodes(parts):
+    table = assemble(parts)
+    for i in range(len(table)):
+        yield table.episode(i)
+
+
+def _closed(part):
+    """Tell whether the last mark in a file is the end of an episode."""
+    events = part.arrays.get('mark_event', ())
+    return len(events) > 0 and events[-1] == 1
+
+
+def _kept(parts):
+    """Return what later files need to know of those before: their marks and the goal in force."""
+    kept = parts[-1:]
+    for key in ('goal_log', 'goal_object_log'):
+        last = next((part for part in reversed(parts) if key in part.arrays), None)
+        if last is not None and not any(last is part for part in kept):
+            kept.insert(0, last)
+    kept = [part for part in parts if any(part is other for other in kept)]
+    return [
+        replace(part, frames=None, arrays={
+            key: value for key, value in part.arrays.items()
+            if key.startswith(('goal_', 'mark_'))})
+        for part in kept]

@@ -1,0 +1,96 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The topics of a recording: names, types, quality of service, and how they are found again."""
+
+from dataclasses import dataclass
+
+from tap_ros.errors import RecordingError
+
+IMAGE = '/camera/image_raw'
+CAMERA_INFO = '/camera/camera_info'
+OBJECTS = '/objects'
+JOINT_STATES = '/joint_states'
+TWIST = '/arm/delta_twist_cmds'
+GRIPPER_COMMAND = '/gripper/command'
+GOAL_IMAGE = '/goal/image'
+GOAL_OBJECTS = '/goal/objects'
+EPISODE = '/episode'
+CLOCK = '/clock'
+
+TYPES = {
+    IMAGE: 'sensor_msgs/msg/Image',
+    CAMERA_INFO: 'sensor_msgs/msg/CameraInfo',
+    OBJECTS: 'tap_msgs/msg/ObjectStates',
+    JOINT_STATES: 'sensor_msgs/msg/JointState',
+    TWIST: 'geometry_msgs/msg/TwistStamped',
+    GRIPPER_COMMAND: 'std_msgs/msg/Float64',
+    GOAL_IMAGE: 'sensor_msgs/msg/Image',
+    GOAL_OBJECTS: 'tap_msgs/msg/ObjectStates',
+    EPISODE: 'tap_msgs/msg/Episode',
+    CLOCK: 'rosgraph_msgs/msg/Clock',
+}
+LATCHED = frozenset({GOAL_IMAGE, GOAL_OBJECTS})  # transient_local, depth 1: late joiners get it
+
+
+@dataclass(frozen=True)
+class Qos:
+    """The quality of service that a publisher offers, as far as it differs between our topics."""
+
+    depth: int = 10
+    reliability: str = 'reliable'  # or 'best_effort'
+    durability: str = 'volatile'  # or 'transient_local'
+
+    def profile(self):
+        """Return what rosbag2 writes about it."""
+        infinite = {'sec': 9223372036, 'nsec': 854775807}
+        return {
+            'history': 'keep_last', 'depth': self.depth, 'reliability': self.reliability,
+            'durability': self.durability, 'deadline': infinite, 'lifespan': infinite,
+            'liveliness': 'automatic', 'liveliness_lease_duration': infinite,
+            'avoid_ros_namespace_conventions': False}
+
+
+def default_qos(topic):
+    """Return the Qos of a topic of this package, in any namespace."""
+    if any(topic == name or topic.endswith(name) for name in LATCHED):
+        return Qos(depth=1, durability='transient_local')
+    return Qos()
+
+
+def resolve(available, source, image_topic=None):
+    """
+    Find the topics of a recording, in whatever namespace they are.
+
+    :param available: dict topic -> type of what the recording holds.
+    :param source: what messages call the recording.
+    :param image_topic: the camera's topic when its name does not end in /camera/image_raw.
+    :return: dict from the names above to topics of the recording; what it lacks is left out.
+    :raises RecordingError: without an image topic, or when several would do.
+    """
+    listing = ', '.join(f'{t} ({k})' for t, k in sorted(available.items())) or 'none'
+    if image_topic is not None and available.get(image_topic) != TYPES[IMAGE]:
+        raise RecordingError(
+            f'{source}: no topic {image_topic} of type {TYPES[IMAGE]}; topics found: {listing}')
+    found = {IMAGE: image_topic} if image_topic else {}
+    for name, kind in TYPES.items():
+        if name in found or name in (CAMERA_INFO, CLOCK):
+            continue
+        candidates = [
+            topic for topic in available
+            if topic.endswith(name) and available[topic] == kind
+            and not any(longer.endswith(name) and longer != name and topic.endswith(longer)
+                        for longer in TYPES)]
+        space = found[IMAGE].removesuffix(IMAGE) if found.get(IMAGE, '').endswith(IMAGE) else ''
+        if space + name in candidates:
+            candidates = [space + name]
+        if len(candidates) > 1:
+            raise RecordingError(
+                f'{source}: several topics could be {name}: {", ".join(sorted(candidates))}; '
+                'name the camera topic (image_topic) whose namespace is wanted')
+        if candidates:
+            found[name] = candidates[0]
+    if IMAGE not in found:
+        raise RecordingError(
+            f'{source}: no topic ends in {IMAGE} with type {TYPES[IMAGE]}; name the camera topic '
+            f'(image_topic) if it is called otherwise; topics found: {listing}')
+    return found

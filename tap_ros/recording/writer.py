@@ -1,0 +1,348 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Write recordings: MCAP files and bags as rosbag2 would write them with `ros2 bag record -s mcap`.
+
+`FileWriter` writes messages into one file, `BagWriter` a whole bag of a running system, and
+`EpisodeWriter` finished episodes. Equal input gives equal bytes: no clock is read into a file.
+"""
+
+import os
+from pathlib import Path
+import time
+
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+import numpy as np
+
+from tap_ros.errors import RecordingError
+from tap_ros.recording import metadata, topics
+from tap_ros.recording.codec import encode
+from tap_ros.recording.episode import check_episode
+from tap_ros.recording.schemas import schema_text, type_hash
+
+LIBRARY = 'tap_ros 1'
+CHUNK_BYTES = 786432  # rosbag2's default
+EPISODE_GAP_NS = 10**9  # between episodes whose stamps do not follow each other
+_COMPRESSIONS = {'none': CompressionType.NONE, '': CompressionType.NONE,
+                 'zstd': CompressionType.ZSTD, 'lz4': CompressionType.LZ4}
+
+
+class FileWriter:
+    """
+    Write serialized messages into one MCAP file.
+
+    Complete chunks are readable even when the process is killed. `close` finishes the file.
+
+    :param path: of the file; must not exist.
+    :param name: of the file in its bag; by default the file's own.
+    :param compression: 'zstd', 'lz4' or 'none', of the chunks.
+    :param chunk_bytes: size at which a chunk is finished.
+    :raises RecordingError: for an unknown compression or a file that exists.
+    """
+
+    def __init__(self, path, name=None, compression='zstd', chunk_bytes=CHUNK_BYTES):
+        if compression not in _COMPRESSIONS:
+            raise RecordingError(
+                f'compression: expected zstd, lz4 or none, got {compression!r}')
+        self.path = Path(path)
+        self._name = name or self.path.name
+        try:
+            self._stream = open(self.path, 'xb')
+        except OSError as error:
+            raise RecordingError(f'{self.path}: cannot be created: {error.strerror}') from error
+        self._writer = Writer(
+            self._stream, chunk_size=chunk_bytes, compression=_COMPRESSIONS[compression],
+            index_types=IndexType.ALL)
+        self._writer.start(profile='ros2', library=LIBRARY)
+        self._schemas = {}  # type -> id
+        self._channels = {}  # topic -> id
+        self._info = {
+            'path': self._name, 'start': 0, 'end': 0, 'message_count': 0, 'topics': {}}
+
+    def write_raw(self, topic, type_name, data, log_time_ns, publish_time_ns=None, qos=None):
+        """
+        Append one message.
+
+        :param topic: full name, for example '/camera/image_raw'.
+        :param type_name: for example 'sensor_msgs/msg/Image'.
+        :param data: the serialized message (CDR), bytes.
+        :param log_time_ns: when it was received.
+        :param publish_time_ns: when it was published; by default the same.
+        :param qos: topics.Qos offered by the publisher; used at the topic's first message.
+        :raises RecordingError: for a type without definition, or another one than before.
+        """
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._open_topic(topic, type_name, qos or topics.default_qos(topic))
+        info = self._info['topics'][topic]
+        if info['type'] != type_name:
+            raise RecordingError(
+                f'{self.path}: topic {topic} has the type {info["type"]}, not {type_name}')
+        publish = log_time_ns if publish_time_ns is None else publish_time_ns
+        self._writer.add_message(channel, int(log_time_ns), data, int(publish), info['count'])
+        info['count'] += 1
+        total = self._info
+        total['start'] = min(total['start'], log_time_ns) if total['message_count'] else log_time_ns
+        total['end'] = max(total['end'], log_time_ns)
+        total['message_count'] += 1
+
+    def flush(self):
+        """Finish the chunk in progress, so that what was written so far can be read."""
+        self._writer.flush()
+
+    def close(self):
+        """
+        Finish the file.
+
+        :return: dict that describes it, as metadata.bag_information takes it.
+        """
+        if not self._stream.closed:
+            text = metadata.to_yaml(metadata.bag_information([self._info]))
+            self._writer.add_metadata('rosbag2', {'serialized_metadata': text})
+            self._writer.finish()
+            self._stream.close()
+        return self._info
+
+    def abandon(self):
+        """Close without finishing the file; what was flushed is readable."""
+        self._stream.close()
+
+    def _open_topic(self, topic, type_name, qos):
+        """Register a topic, and its type when it is new."""
+        if type_name not in self._schemas:
+            self._schemas[type_name] = self._writer.register_schema(
+                type_name, 'ros2msg', schema_text(type_name).encode())
+        profiles = [qos.profile()]
+        self._channels[topic] = self._writer.register_channel(
+            topic, 'cdr', self._schemas[type_name],
+            {'offered_qos_profiles': metadata.to_yaml(profiles).strip(),
+             'topic_type_hash': type_hash(type_name)})
+        self._info['topics'][topic] = {
+            'type': type_name, 'qos': profiles, 'type_hash': type_hash(type_name), 'count': 0}
+        return self._channels[topic]
+
+
+class BagWriter:
+    """
+    Write the messages of a running system into a new bag.
+
+    :param folder: of the bag; must not exist, or be empty.
+    :param compression: 'zstd', 'lz4' or 'none'.
+    :param flush_seconds: a killed process loses at most the messages of so many seconds.
+    :param split_bytes: go on in a new file when one has grown to this size; None: never.
+    :raises RecordingError: when the folder holds something, or cannot be made.
+    """
+
+    def __init__(self, folder, compression='zstd', flush_seconds=1.0, split_bytes=None):
+        self.folder = Path(folder)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            occupied = any(self.folder.iterdir())
+        except OSError as error:
+            raise RecordingError(f'{folder}: cannot be made: {error.strerror}') from error
+        if occupied:
+            raise RecordingError(f'{folder}: is not empty; name a new folder for the recording')
+        self._compression = compression
+        self._flush_seconds = flush_seconds
+        self._split_bytes = split_bytes
+        self._finished = []
+        self._file = self._open()
+
+    def write_raw(self, topic, type_name, data, log_time_ns, publish_time_ns=None, qos=None):
+        """Append one message; see FileWriter.write_raw."""
+        if time.monotonic() - self._flushed > self._flush_seconds:
+            self.flush()
+            if self._split_bytes and self._file.path.stat().st_size >= self._split_bytes:
+                self._finished.append(self._file.close())
+                self._file = self._open()
+        self._file.write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
+
+    def flush(self):
+        """Write all that was received so far to the file."""
+        self._file.flush()
+        self._flushed = time.monotonic()
+
+    def close(self):
+        """Finish the bag: its last file and metadata.yaml."""
+        if self._file is not None:
+            self._finished.append(self._file.close())
+            self._file = None
+            metadata.save(self.folder, self._finished)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
+    def _open(self):
+        self._flushed = time.monotonic()
+        name = f'{self.folder.resolve().name}_{len(self._finished)}.mcap'
+        return FileWriter(self.folder / name, compression=self._compression)
+
+
+class EpisodeWriter:
+    """
+    Write finished episodes into one MCAP file, with marks where they start and end.
+
+    Use it as a context manager: the file gets its name when the block ends without an error, and
+    is called path.part until then. The log time of a message is its stamp; where the stamps of an
+    episode do not follow those before it, its log times are moved behind them.
+
+    :param path: of the file; replaced when it exists.
+    :param compression: 'zstd', 'lz4' or 'none'.
+    :param camera_matrix: (3, 3) intrinsics for /camera/camera_info; None: uncalibrated (zeros).
+    """
+
+    def __init__(self, path, compression='zstd', camera_matrix=None):
+        self.path = Path(path)
+        self._part = self.path.with_name(self.path.name + '.part')
+        self._part.unlink(missing_ok=True)
+        self._file = FileWriter(self._part, self.path.name, compression)
+        K = np.zeros((3, 3)) if camera_matrix is None else np.asarray(camera_matrix, float)
+        self._camera = {
+            'distortion_model': 'plumb_bob', 'd': np.zeros(5), 'k': K, 'r': np.eye(3),
+            'p': np.hstack([K, np.zeros((3, 1))])}
+        self._last_log = None
+        self._goal_known = False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, *_):
+        if kind is None:
+            self._file.close()
+            os.replace(self._part, self.path)
+        else:
+            self._file.abandon()
+            self._part.unlink(missing_ok=True)
+
+    def write(self, episode):
+        """
+        Append an episode.
+
+        :param episode: Episode.
+        :raises RecordingError: when a field has the wrong type, shape or order.
+        """
+        check_episode(episode)
+        shift = 0
+        if self._last_log is not None and episode.stamps[0] <= self._last_log:
+            shift = self._last_log + EPISODE_GAP_NS - int(episode.stamps[0])
+        self._shift = shift
+        first, last = int(episode.stamps[0]), int(episode.stamps[-1])
+        self._mark(episode, first, event=0)
+        self._goal(episode, first)
+        for t, stamp in enumerate(episode.stamps.tolist()):
+            self._step(episode, t, stamp)
+        self._mark(episode, last, event=1)
+        self._last_log = last + shift
+
+    def _step(self, episode, t, stamp):
+        """Write all messages of one time step."""
+        frame = episode.frames[t]
+        camera = {
+            'header': _header(stamp, 'camera'), 'height': frame.shape[0], 'width': frame.shape[1]}
+        self._put(topics.CLOCK, stamp, {'clock': _time(stamp)})
+        self._put(topics.CAMERA_INFO, stamp, {**camera, **self._camera})
+        self._put(topics.IMAGE, stamp, _image(frame, stamp))
+        if episode.object_names:
+            self._put(topics.OBJECTS, stamp, _objects(
+                stamp, episode.object_names, episode.object_pixels[t], episode.object_poses[t]))
+        if not np.isnan(episode.grippers[t]).all():
+            self._put(topics.JOINT_STATES, stamp, {
+                'header': _header(stamp, 'world'), 'name': GRIPPER_JOINTS,
+                'position': episode.grippers[t]})
+        if t < len(episode.stamps) - 1:
+            x, y, z, opening = episode.actions[t].tolist()
+            self._put(topics.TWIST, stamp, {
+                'header': _header(stamp, 'world'),
+                'twist': {'linear': {'x': x, 'y': y, 'z': z}}})
+            self._put(topics.GRIPPER_COMMAND, stamp, {'data': opening})
+
+    def _goal(self, episode, stamp):
+        """Write the goal; an empty one takes back that of the episode before."""
+        known = episode.goal_frame is not None
+        if known or self._goal_known:
+            frame = episode.goal_frame if known else np.zeros((0, 0, 3), np.uint8)
+            self._put(topics.GOAL_IMAGE, stamp, _image(frame, stamp))
+        self._goal_known = known
+        if episode.object_names:
+            self._put(topics.GOAL_OBJECTS, stamp, _objects(
+                stamp, episode.object_names, episode.goal_pixels, episode.goal_poses))
+
+    def _mark(self, episode, stamp, event):
+        self._put(topics.EPISODE, stamp, {
+            'header': _header(stamp, ''), 'event': event, 'task': episode.task,
+            'seed': int(episode.seed), 'outcome': episode.outcome if event else ''})
+
+    def _put(self, topic, stamp, message):
+        kind = topics.TYPES[topic]
+        self._file.write_raw(topic, kind, encode(kind, message), stamp + self._shift)
+
+
+GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
+
+
+def write_metadata(folder):
+    """
+    Write metadata.yaml of a bag anew from its finished .mcap files.
+
+    :param folder: of the bag; the files play in the order of the numbers in their names.
+    :raises RecordingError: when there is no .mcap file, or one is not finished.
+    """
+    folder = Path(folder)
+    Path(folder, metadata.FILE_NAME).unlink(missing_ok=True)
+    files = metadata.bag_files(folder)
+    if not files:
+        raise RecordingError(f'{folder}: holds no .mcap file')
+    metadata.save(folder, [_describe(path) for path in files])
+
+
+def _describe(path):
+    """Describe a finished file as FileWriter.close does."""
+    try:
+        with open(path, 'rb') as stream:
+            summary = make_reader(stream).get_summary()
+    except (OSError, McapError) as error:
+        raise RecordingError(f'{path}: not a finished MCAP file: {error}') from error
+    if summary is None or summary.statistics is None:
+        raise RecordingError(f'{path}: not a finished MCAP file: it has no summary')
+    counts = summary.statistics.channel_message_counts
+    found = {}
+    for channel in summary.channels.values():
+        found[channel.topic] = {
+            'type': summary.schemas[channel.schema_id].name,
+            'qos': metadata.qos_from_text(channel.metadata.get('offered_qos_profiles', '')),
+            'type_hash': channel.metadata.get('topic_type_hash', ''),
+            'count': counts.get(channel.id, 0)}
+    return {
+        'path': path.name, 'start': summary.statistics.message_start_time,
+        'end': summary.statistics.message_end_time,
+        'message_count': summary.statistics.message_count, 'topics': found}
+
+
+def _time(stamp):
+    return {'sec': stamp // 10**9, 'nanosec': stamp % 10**9}
+
+
+def _header(stamp, frame_id):
+    return {'stamp': _time(stamp), 'frame_id': frame_id}
+
+
+def _image(frame, stamp):
+    height, width, _ = frame.shape
+    return {
+        'header': _header(stamp, 'camera'), 'height': height, 'width': width,
+        'encoding': 'rgb8', 'step': 3 * width, 'data': frame}
+
+
+def _objects(stamp, names, pixels, poses):
+    states = []
+    for name, (u, v), pose in zip(names, pixels.tolist(), poses.tolist(), strict=True):
+        states.append({
+            'name': name, 'u': u, 'v': v,
+            'pose': {'position': dict(zip('xyz', pose[:3], strict=True)),
+                     'orientation': dict(zip('xyzw', pose[3:], strict=True))}})
+    return {'header': _header(stamp, 'world'), 'source': 'ground_truth', 'objects': states}

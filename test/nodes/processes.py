@@ -1,0 +1,83 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Real nodes as real processes, and a client node of the test's own, all over DDS."""
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from rclpy.context import Context
+from rclpy.node import Node
+
+from tap_ros.nodes.clients import Spinner
+
+ROOT = Path(__file__).parents[2]
+
+
+class NodeProcess:
+    """
+    One node in a process group of its own.
+
+    :param module: Python module with the node's main.
+    :param log: file for what it prints.
+    :param parameters: its ROS parameters.
+    :param remaps: further arguments after --ros-args.
+    """
+
+    def __init__(self, module, log, parameters=None, remaps=()):
+        self.log = Path(log)
+        arguments = [f'-p {name}:={value}' for name, value in (parameters or {}).items()]
+        command = [sys.executable, '-m', module, '--ros-args',
+                   *' '.join([*arguments, *remaps]).split()]
+        with open(self.log, 'wb') as output:
+            self.process = subprocess.Popen(
+                command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT,
+                start_new_session=True)
+
+    @property
+    def text(self):
+        """Everything printed so far."""
+        return self.log.read_text(errors='replace')
+
+    def wait_for(self, words, timeout_s=60):
+        """Wait until the node prints something."""
+        deadline = time.monotonic() + timeout_s
+        while words not in self.text:
+            assert self.process.poll() is None, f'ended before {words!r}:\n{self.text}'
+            assert time.monotonic() < deadline, f'no {words!r} in time:\n{self.text}'
+            time.sleep(0.05)
+        return self
+
+    def end(self, number=signal.SIGTERM, timeout_s=20):
+        """Send a signal and return the exit code."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        return self.process.wait(timeout_s)
+
+    def kill(self):
+        """Leave nothing running."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+
+
+class Client:
+    """A node of the test's own with a thread that spins it; several may live side by side."""
+
+    def __init__(self, name='test_client'):
+        self.context = Context()
+        self.context.init()
+        self.node = Node(name, context=self.context)
+        self.spinner = Spinner(self.node)
+
+    def __enter__(self):
+        self.spinner.__enter__()
+        return self.node
+
+    def __exit__(self, *_):
+        self.spinner.__exit__()
+        self.node.destroy_node()
+        self.context.try_shutdown()

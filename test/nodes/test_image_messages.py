@@ -1,0 +1,173 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the image and object messages: what goes in comes out, what cannot be used is named."""
+
+import array
+
+from builtin_interfaces.msg import Time
+import numpy as np
+import pytest
+from sensor_msgs.msg import Image
+from tap_msgs.msg import ObjectStates
+
+from tap_ros.errors import ImageError, PlanningError
+from tap_ros.nodes import image_messages, object_messages
+from tap_ros.nodes.overlay import draw_overlay, SCALE
+
+pytestmark = pytest.mark.ros
+STAMP = Time(sec=3, nanosec=7)
+
+
+def picture(height=5, width=7, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), np.uint8)
+
+
+def message_of(rows, encoding, width):
+    """Make an Image from uint8 rows (height, step)."""
+    message = Image(height=rows.shape[0], width=width, step=rows.shape[1], encoding=encoding)
+    message.data = array.array('B', rows.tobytes())
+    return message
+
+
+def test_a_picture_survives_the_round_trip():
+    message = image_messages.encode_image(picture(), STAMP, 'camera')
+    assert (message.encoding, message.step, message.header.frame_id) == ('rgb8', 21, 'camera')
+    assert message.header.stamp == STAMP
+    assert np.array_equal(image_messages.decode_image(message, 'start', (5, 7)), picture())
+
+
+@pytest.mark.parametrize('encoding, channels', [
+    ('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 0])])
+@pytest.mark.parametrize('padding', [0, 1, 13])
+def test_every_encoding_and_padding_gives_the_same_picture(encoding, channels, padding):
+    pixels = picture()[..., channels].reshape(5, -1)
+    rows = np.hstack([pixels, np.full((5, padding), 99, np.uint8)])
+    message = message_of(rows, encoding, 7)
+    assert np.array_equal(image_messages.decode_image(message, 'start'), picture())
+    message.is_bigendian = 1  # means nothing for bytes
+    assert np.array_equal(image_messages.decode_image(message, 'start'), picture())
+
+
+def test_grey_becomes_three_equal_channels():
+    grey = picture()[..., 0]
+    decoded = image_messages.decode_image(message_of(grey, 'mono8', 7), 'start')
+    assert all(np.array_equal(decoded[..., channel], grey) for channel in range(3))
+
+
+@pytest.mark.parametrize('change, words', [
+    ({'encoding': 'yuv422'}, ['yuv422', 'rgb8', 'bgr8', 'mono8']),
+    ({'encoding': ''}, ["''", 'rgb8']),
+    ({'step': 20}, ['step', '20', '21']),
+    ({'step': 22}, ['data', '105', '110']),
+    ({'height': 6}, ['data', '105', '126']),
+    ({'width': 8}, ['step', '21', '24']),
+    ({'height': 0}, ['empty', '7x0']),
+    ({'data': array.array('B', bytes(104))}, ['data', '104', '105']),
+])
+def test_a_bad_picture_is_refused_with_the_reason(change, words):
+    message = image_messages.encode_image(picture(), STAMP, 'camera')
+    for field, value in change.items():
+        setattr(message, field, value)
+    with pytest.raises(ImageError) as error:
+        image_messages.decode_image(message, 'goal')
+    for word in ['goal', *words]:
+        assert word in str(error.value)
+
+
+def test_another_size_is_refused_unless_resizing_is_allowed():
+    message = image_messages.encode_image(picture(6, 8), STAMP, 'camera')
+    with pytest.raises(ImageError, match='expected 4x3 .* got 8x6'):
+        image_messages.decode_image(message, 'start', (3, 4))
+    resized = image_messages.decode_image(message, 'start', (3, 4), resize=True)
+    assert resized.shape == (3, 4, 3)
+    assert resized.mean() == pytest.approx(picture(6, 8).mean(), abs=12)
+
+
+def test_pixels_move_with_the_resized_picture():
+    image = np.zeros((32, 64, 3), np.uint8)
+    image[20:24, 40:48] = 255  # centre at u 43.5, v 21.5
+    resized = image_messages.resize_image(image, (16, 16))
+    weight = resized[..., 0] / resized[..., 0].sum()
+    v, u = np.mgrid[:16, :16]
+    centre = [(weight * u).sum(), (weight * v).sum()]
+    moved = image_messages.resize_pixels([[43.5, 21.5]], (32, 64), (16, 16))
+    assert np.allclose(moved, [centre], atol=0.05)
+
+
+def test_a_map_survives_the_round_trip_in_either_byte_order():
+    values = np.random.default_rng(1).random((5, 7), np.float32)
+    message = image_messages.encode_map(values, STAMP, 'camera')
+    assert message.encoding == '32FC1'
+    assert np.array_equal(image_messages.decode_map(message, 'map'), values)
+    message.data = array.array('B', values.astype('>f4').tobytes())
+    message.is_bigendian = 1
+    assert np.array_equal(image_messages.decode_map(message, 'map'), values)
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+def test_a_map_with_nan_is_refused(value):
+    values = np.zeros((5, 7), np.float32)
+    values[2, 3] = value
+    with pytest.raises(ImageError, match='map of red: .*finite'):
+        image_messages.decode_map(
+            image_messages.encode_map(values, STAMP, 'camera'), 'map of red')
+    with pytest.raises(ImageError, match='32FC1'):
+        image_messages.decode_map(image_messages.encode_image(picture(), STAMP, ''), 'map')
+
+
+def objects(pixels, names=('red', 'blue')):
+    poses = np.arange(7 * len(names)).reshape(-1, 7)
+    return object_messages.encode_objects(
+        names, pixels, poses, STAMP, 'world', ObjectStates.SOURCE_TRACKED)
+
+
+def test_objects_survive_the_round_trip_and_are_matched_by_name():
+    pixels = np.array([[1.25, 2.5], [3, -4]], np.float32)
+    message = objects(pixels)
+    assert message.objects[1].pose.orientation.w == 13
+    names, decoded = object_messages.decode_objects(message, 'objects')
+    assert names == ('red', 'blue') and np.array_equal(decoded, pixels)
+    matched = object_messages.match_objects(('blue',), names, decoded, 'start', 'goal')
+    assert np.array_equal(matched, pixels[1:])
+    with pytest.raises(PlanningError, match='goal: lacks green of start; it has red, blue'):
+        object_messages.match_objects(('green', 'red'), names, decoded, 'start', 'goal')
+    assert object_messages.decode_objects(ObjectStates(), 'objects')[1].shape == (0, 2)
+
+
+@pytest.mark.parametrize('pixels, names, words', [
+    ([[1, 2], [np.nan, 3]], ('red', 'blue'), ['blue', 'nan']),
+    ([[np.inf, 2], [1, 3]], ('red', 'blue'), ['red', 'inf']),
+    ([[1, 2], [1, 3]], ('red', 'red'), ['objects[1].name', 'red']),
+    ([[1, 2], [1, 3]], ('', 'red'), ['objects[0].name']),
+])
+def test_unusable_objects_are_refused_with_the_reason(pixels, names, words):
+    with pytest.raises(PlanningError) as error:
+        object_messages.decode_objects(objects(pixels, names), 'goal_objects')
+    for word in ['goal_objects', *words]:
+        assert word in str(error.value)
+
+
+def test_the_gripper_is_found_among_other_joints():
+    message = object_messages.encode_gripper([0.1, -0.2, 0.05, 1], STAMP, 'world')
+    message.name.insert(0, 'elbow')
+    message.position.insert(0, 9.0)
+    assert np.allclose(object_messages.decode_gripper(message), [0.1, -0.2, 0.05, 1])
+    message.position[2] = float('nan')
+    with pytest.raises(PlanningError, match='finite'):
+        object_messages.decode_gripper(message)
+    message.name.pop(2)
+    message.position.pop(2)
+    with pytest.raises(PlanningError, match='lacks gripper_y; it has elbow, gripper_x'):
+        object_messages.decode_gripper(message)
+
+
+def test_the_overlay_shows_each_map_where_it_is():
+    start = np.full((16, 16, 3), 128, np.uint8)
+    maps = np.zeros((2, 16, 16))
+    maps[0, 3, 12] = maps[1, 12, 3] = 1
+    overlay = draw_overlay(start, maps, None, None)
+    assert overlay.shape == (16 * SCALE, 16 * SCALE, 3)
+    changed = (overlay != 128).any(axis=-1).reshape(16, SCALE, 16, SCALE).any(axis=(1, 3))
+    assert set(zip(*np.nonzero(changed))) == {(3, 12), (12, 3)}
+    marked = draw_overlay(start, maps, np.array([[8, 8], [2, 2]]), np.array([[4, 4], [9, 9]]))
+    assert (marked != overlay).any()

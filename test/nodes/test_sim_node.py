@@ -1,0 +1,240 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the simulator's topics and services promise."""
+
+from pathlib import Path
+import sys
+
+from geometry_msgs.msg import TwistStamped
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_srvs.srv import SetBool
+from tap_msgs.msg import Episode, ObjectStates
+from tap_msgs.srv import ResetScene, StepScene
+
+from tap_ros.nodes.clients import call, Newest
+from tap_ros.nodes.image_messages import decode_image
+from tap_ros.nodes.object_messages import decode_gripper
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+
+sys.path.insert(0, str(Path(__file__).parent))
+from processes import Client, NodeProcess  # noqa: E402
+
+pytestmark = pytest.mark.ros
+PERIOD_NS = 250_000_000
+
+
+class Rig:
+    """A simulator process and everything it talks about."""
+
+    def __init__(self, node, process):
+        self.node, self.process = node, process
+        self.image = Newest(node, Image, 'camera/image_raw', STREAM)
+        self.info = Newest(node, CameraInfo, 'camera/camera_info', STREAM)
+        self.objects = Newest(node, ObjectStates, 'objects', STREAM)
+        self.joints = Newest(node, JointState, 'joint_states', STREAM)
+        self.clock = Newest(node, Clock, 'clock', STREAM)
+        self.marks = []
+        node.create_subscription(Episode, 'episode', self.marks.append, STREAM)
+        self.twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
+        self.reset_client = node.create_client(ResetScene, 'sim/reset')
+        self.step_client = node.create_client(StepScene, 'sim/step')
+        self.pause_client = node.create_client(SetBool, 'sim/pause')
+
+    def reset(self, **request):
+        response = call(self.reset_client, ResetScene.Request(**request), 20)
+        if response.success:
+            self.step(0)  # both have answered, so the images before have come
+        return response
+
+    def step(self, periods):
+        if periods == 0:
+            return self.image.wait(10)
+        return call(self.step_client, StepScene.Request(num_periods=periods), 20)
+
+    def send(self, x=0.0, y=0.0, z=0.0, stamp=None):
+        message = TwistStamped()
+        if stamp is not None:
+            message.header.stamp = stamp
+        message.twist.linear.x, message.twist.linear.y, message.twist.linear.z = x, y, z
+        self.twist.publish(message)
+
+    def act(self, **move):
+        """Answer the newest image and wait for the next."""
+        stamp = self.image.wait(10).header.stamp
+        self.send(stamp=stamp, **move)
+        return self.image.wait(
+            10, lambda message: to_nanoseconds(message.header.stamp)
+            == to_nanoseconds(stamp) + PERIOD_NS)
+
+
+@pytest.fixture(scope='module')
+def rig(tmp_path_factory):
+    process = NodeProcess('sim_bridge.sim_node', tmp_path_factory.mktemp('sim') / 'log.txt',
+                          {'lock_step': 'true', 'seed': 3})
+    try:
+        with Client() as node:
+            rig = Rig(node, process.wait_for('ready'))
+            assert rig.reset_client.wait_for_service(20)
+            rig.reset(seed=3)
+            yield rig
+    finally:
+        process.kill()
+
+
+def test_everything_about_one_moment_has_the_same_stamp(rig):
+    before = len(rig.marks)
+    assert rig.reset(task='push2', seed=5).success
+    image = rig.image.wait(10)
+    assert rig.info.wait(10).header.stamp == image.header.stamp
+    assert rig.objects.wait(10).header.stamp == image.header.stamp
+    assert rig.joints.wait(10).header.stamp == image.header.stamp
+    assert rig.clock.wait(10).clock == image.header.stamp
+    assert decode_image(image, 'image', (64, 64)).std() > 5
+    assert rig.objects.wait(1).source == ObjectStates.SOURCE_GROUND_TRUTH
+    end, start = rig.marks[before:]
+    assert (end.event, start.event) == (Episode.END, Episode.START)
+    assert (start.task, start.seed, start.header.stamp) == ('push2', 5, image.header.stamp)
+    assert end.outcome in ('success', 'failure', 'interrupted')
+
+
+def test_the_goal_waits_for_late_joiners(rig):
+    rig.reset(seed=5)
+    image = Newest(rig.node, Image, 'goal/image', LATCHED).wait(10)
+    objects = Newest(rig.node, ObjectStates, 'goal/objects', LATCHED).wait(10)
+    assert image.header.stamp == objects.header.stamp
+    for start, goal in zip(rig.objects.wait(10).objects, objects.objects):
+        move = [start.pose.position.x - goal.pose.position.x,
+                start.pose.position.y - goal.pose.position.y]
+        assert np.hypot(*move) == pytest.approx(0.2, abs=0.01)
+
+
+def test_each_command_lets_exactly_one_period_pass(rig):
+    rig.reset(seed=5)
+    before = decode_gripper(rig.joints.wait(10))
+    towards_middle = -0.05 * np.sign(before[:2])
+    rig.act(x=float(towards_middle[0]), y=float(towards_middle[1]))
+    after = decode_gripper(rig.joints.wait(
+        10, lambda message: message.header.stamp == rig.image.wait(1).header.stamp))
+    assert np.allclose(after[:2] - before[:2], towards_middle, atol=0.01)
+
+
+def test_a_duplicate_a_stale_and_a_future_command_let_no_time_pass(rig):
+    rig.reset(seed=5)
+    first = rig.image.wait(10)
+    second = rig.act(x=0.01)
+    for stamp_ns in (0, -PERIOD_NS, 5 * PERIOD_NS):
+        stamp = type(first.header.stamp)()
+        total = to_nanoseconds(first.header.stamp) + stamp_ns
+        stamp.sec, stamp.nanosec = divmod(total, 10**9)
+        rig.send(x=0.05, stamp=stamp)
+    response = rig.step(1)
+    assert to_nanoseconds(response.stamp) == to_nanoseconds(second.header.stamp) + PERIOD_NS
+    assert 'was answered before' in rig.process.text
+    assert 'newer than the newest image' in rig.process.text
+
+
+def test_nan_is_ignored_by_name_and_a_stop_lets_no_time_pass(rig):
+    rig.reset(seed=5)
+    first = rig.image.wait(10)
+    rig.send(y=float('nan'), stamp=first.header.stamp)
+    rig.send()
+    response = rig.step(1)
+    assert to_nanoseconds(response.stamp) == to_nanoseconds(first.header.stamp) + PERIOD_NS
+    rig.process.wait_for('twist.linear.y is nan')
+
+
+def test_the_same_seed_and_commands_give_the_same_pictures(rig):
+    def run():
+        rig.reset(seed=8)
+        moves = np.random.default_rng(0).uniform(-0.08, 0.08, (6, 3))
+        return [bytes(rig.act(x=x, y=y, z=z).data) for x, y, z in moves.tolist()]
+    first = run()
+    assert run() == first
+    assert len(set(first)) == len(first)
+
+
+def test_bad_requests_are_refused_and_leave_the_scene_as_it_was(rig):
+    rig.reset(seed=5)
+    stamp = rig.image.wait(10).header.stamp
+    response = rig.reset(task='juggle', seed=1)
+    assert not response.success
+    assert 'juggle' in response.message and 'push2' in response.message
+    response = rig.step(101)
+    assert not response.success and '100' in response.message and response.stamp == stamp
+    assert rig.step(2).success
+    assert rig.reset(task='push3', seed=1).success
+    assert len(rig.objects.wait(10, lambda m: len(m.objects) == 3).objects) == 3
+    assert rig.reset(seed=1).success
+    assert len(rig.objects.wait(10, lambda m: len(m.objects) == 2).objects) == 2
+
+
+def test_the_arm_can_be_hidden(rig):
+    rig.reset(seed=5)
+    shown = decode_image(rig.image.wait(10), 'image').astype(int)
+    rig.reset(seed=5, hide_arm=True)
+    hidden = decode_image(rig.image.wait(10), 'image').astype(int)
+    assert (np.abs(shown - hidden).max(axis=-1) > 20).sum() > 10
+    rig.reset(seed=5)
+
+
+def test_a_paused_simulation_takes_no_commands_but_steps(rig):
+    rig.reset(seed=5)
+    first = rig.image.wait(10)
+    call(rig.pause_client, SetBool.Request(data=True), 10)
+    rig.send(x=0.05, stamp=first.header.stamp)
+    response = rig.step(1)
+    assert to_nanoseconds(response.stamp) == to_nanoseconds(first.header.stamp) + PERIOD_NS
+    rig.process.wait_for('the simulation is paused')
+    call(rig.pause_client, SetBool.Request(data=False), 10)
+    rig.act(x=0.01)
+
+
+def test_in_real_time_the_clock_runs_by_itself_unless_paused(tmp_path):
+    process = NodeProcess('sim_bridge.sim_node', tmp_path / 'log.txt', {'real_time_factor': 4.0},
+                          ['-r __ns:=/second'])
+    try:
+        with Client() as node:
+            process.wait_for('ready')
+            images = Newest(node, Image, '/second/camera/image_raw', STREAM)
+            first = images.wait(20)
+            images.wait(20, lambda message: to_nanoseconds(message.header.stamp)
+                        >= to_nanoseconds(first.header.stamp) + 4 * PERIOD_NS)
+            step = node.create_client(StepScene, '/second/sim/step')
+            response = call(step, StepScene.Request(), 10)
+            assert not response.success and 'sim/pause' in response.message
+            pause = node.create_client(SetBool, '/second/sim/pause')
+            assert call(pause, SetBool.Request(data=True), 10).success
+            stamp = call(step, StepScene.Request(num_periods=3), 10).stamp
+            assert to_nanoseconds(call(step, StepScene.Request(), 10).stamp) \
+                == to_nanoseconds(stamp) + PERIOD_NS
+            marks = []
+            node.create_subscription(Episode, '/second/episode', marks.append, STREAM)
+            for _ in range(100):
+                if node.count_publishers('/second/episode'):
+                    break
+                call(step, StepScene.Request(), 10)
+            call(step, StepScene.Request(), 10)
+            assert process.end() == 0, process.text
+            assert 'Traceback' not in process.text
+    finally:
+        process.kill()
+
+
+@pytest.mark.parametrize('parameters, words', [
+    ({'task': 'juggle'}, ['task', 'juggle', 'push2, push3']),
+    ({'seed': '-1'}, ['seed', '-1', 'Min: 0']),
+    ({'image_size': '64.5'}, ['image_size', '64.5', 'INTEGER']),
+])
+def test_a_bad_parameter_ends_the_start_with_one_clear_line(tmp_path, parameters, words):
+    process = NodeProcess('sim_bridge.sim_node', tmp_path / 'log.txt', parameters)
+    try:
+        assert process.process.wait(60) == 1
+        line, = [line for line in process.text.splitlines() if line.strip()]
+        assert '[FATAL]' in line
+        for word in words:
+            assert word in line
+    finally:
+        process.kill()

@@ -1,0 +1,94 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Who may import whom, and who may import ROS."""
+
+import ast
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+# Data flows down this list. A module imports from its own line and from those above it.
+LAYERS = (
+    ('tap_ros', 'tap_ros.errors', 'tap_ros.images', 'tap_ros.weights'),
+    ('sim_bridge',),
+    ('tap_ros.recording',),
+    ('sim_bridge.collect',),  # records what the simulator and the expert do
+    ('tap_ros.prediction',),
+    ('tap_ros.planning',),
+    ('tap_ros.evaluation',),
+    ('tap_ros.nodes', 'sim_bridge.sim_node', 'tap_ros.cli', 'tap_ros.__main__'),
+)
+
+IMPORT_ALL = """
+import importlib, sys
+
+class NoRos:
+    def find_spec(self, name, path=None, target=None):
+        top = name.split('.')[0]
+        if (top.endswith(('_msgs', '_srvs', '_interfaces')) or
+                top.startswith(('rcl', 'rosidl', 'ament', 'launch'))):
+            raise ModuleNotFoundError(f'{name} is blocked: no ROS here', name=name)
+
+sys.meta_path.insert(0, NoRos())
+for name in sys.argv[1:]:
+    importlib.import_module(name)
+"""
+
+
+def modules():
+    """Return {module name: path} of both packages."""
+    paths = [path for package in ('tap_ros', 'sim_bridge')
+             for path in sorted((ROOT / package).rglob('*.py'))]
+    names = ['.'.join(path.relative_to(ROOT).with_suffix('').parts) for path in paths]
+    return {name.removesuffix('.__init__'): path for name, path in zip(names, paths, strict=True)}
+
+
+MODULES = modules()
+
+
+def imported(path):
+    """Return the absolute names that a file imports, of modules and of what is in them."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f'{path}: imports are absolute'
+            names |= {f'{node.module}.{alias.name}' for alias in node.names}
+    return names
+
+
+def layer(name):
+    """Return the number of the layer of a module: that of the longest name that it begins with."""
+    found = [(len(prefix), number) for number, prefixes in enumerate(LAYERS)
+             for prefix in prefixes if f'{name}.'.startswith(f'{prefix}.')]
+    return max(found)[1]
+
+
+def may_import_ros(name):
+    return name.endswith('_node') or name.startswith('tap_ros.nodes')
+
+
+@pytest.mark.parametrize('name', MODULES)
+def test_imports_come_only_from_above(name):
+    own = [target for target in imported(MODULES[name])
+           if target.split('.')[0] in ('tap_ros', 'sim_bridge')]
+    wrong = [target for target in own if layer(target) > layer(name)]
+    assert not wrong, f'{name} imports from below itself: {wrong}'
+
+
+def test_without_ros_all_but_the_nodes_can_be_imported():
+    names = [name for name in MODULES if not may_import_ros(name) and name != 'tap_ros.__main__']
+    run = subprocess.run([sys.executable, '-c', IMPORT_ALL, *names], cwd=ROOT, text=True,
+                         stderr=subprocess.PIPE)
+    assert run.returncode == 0, run.stderr
+
+
+def test_the_block_would_be_noticed():
+    run = subprocess.run([sys.executable, '-c', IMPORT_ALL, 'sensor_msgs.msg'], cwd=ROOT,
+                         text=True, stderr=subprocess.PIPE)
+    assert 'sensor_msgs is blocked' in run.stderr

@@ -1,0 +1,130 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the packages declare is what they have and need, and the build installs it."""
+
+import ast
+import configparser
+from importlib.metadata import packages_distributions
+import os
+from pathlib import Path
+import re
+import sys
+
+from ament_index_python import get_package_prefix, get_package_share_directory
+from catkin_pkg.package import parse_package
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+NODES = {
+    'sim_node': 'sim_bridge/sim_node.py',
+    'predictor_node': 'tap_ros/nodes/predictor_node.py',
+    'visual_mpc_node': 'tap_ros/nodes/visual_mpc_node.py',
+    'recorder_node': 'tap_ros/nodes/recorder_node.py',
+}
+
+
+def imported_packages(*folders):
+    """Return the top-level packages that code imports, without the project's own and Python's."""
+    found = set()
+    for folder in folders:
+        for path in (ROOT / folder).rglob('*.py'):
+            for node in ast.walk(ast.parse(path.read_text(), str(path))):
+                if isinstance(node, ast.Import):
+                    found |= {alias.name.split('.')[0] for alias in node.names}
+                elif isinstance(node, ast.ImportFrom):
+                    found.add(node.module.split('.')[0])
+    return found - set(sys.stdlib_module_names) - {'tap_ros', 'sim_bridge'}
+
+
+def normalized(distribution):
+    """Return the name of a distribution as indexes compare it, without its extras."""
+    return re.sub(r'[-_.]+', '-', distribution.split('[')[0]).lower()
+
+
+def requirements(name='requirements.txt'):
+    """Return {distribution: version} of a file of requirements."""
+    lines = (ROOT / name).read_text().splitlines()
+    pairs = [line.split('==') for line in lines if line and not line.startswith('#')]
+    return {normalized(distribution): version for distribution, version in pairs}
+
+
+def distributions_of(package):
+    """Return the names of the distributions that a top-level package may come from."""
+    return {normalized(owner) for owner in packages_distributions().get(package, [package])}
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_every_executable_is_installed(node):
+    path = Path(get_package_prefix('tap_ros'), 'lib', 'tap_ros', node)
+    assert os.access(path, os.X_OK), f'{path} is missing: make build'
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_every_executable_has_its_main(node):
+    functions = [item.name for item in ast.parse((ROOT / NODES[node]).read_text()).body
+                 if isinstance(item, ast.FunctionDef)]
+    module = NODES[node].removesuffix('.py').replace('/', '.')
+    assert 'main' in functions
+    assert f"'{node} = {module}:main'" in (ROOT / 'setup.py').read_text()
+
+
+def test_launch_files_and_parameters_are_installed():
+    share = Path(get_package_share_directory('tap_ros'))
+    for pattern in ('config/*.yaml', 'launch/*.launch.py'):
+        here = {path.name for path in ROOT.glob(pattern)}
+        assert here and here == {path.name for path in share.glob(pattern)}
+
+
+def test_manifests_are_valid_and_of_one_version():
+    manifests = [parse_package(str(ROOT / folder)) for folder in ('.', 'tap_msgs')]
+    for manifest in manifests:
+        assert manifest.package_format == 3
+        manifest.validate()
+    assert [m.get_build_type() for m in manifests] == ['ament_python', 'ament_cmake']
+    assert manifests[0].version == manifests[1].version
+    assert f"version='{manifests[0].version}'" in (ROOT / 'setup.py').read_text()
+
+
+def test_everything_imported_is_declared_with_ros_or_with_pip():
+    declared = {depend.name for depend in parse_package(str(ROOT)).exec_depends}
+    imported = imported_packages('tap_ros', 'sim_bridge', 'launch')
+    missing = [name for name in sorted(imported - declared)
+               if not distributions_of(name) & set(requirements())]
+    assert not missing, f'neither in package.xml nor in requirements.txt: {missing}'
+
+
+def test_nothing_is_required_that_nobody_imports():
+    used = {'tensorboard'}  # by way of torch.utils.tensorboard
+    for name in imported_packages('tap_ros', 'sim_bridge', 'test'):
+        used |= distributions_of(name)
+    assert set(requirements()) <= used
+
+
+def test_requirements_and_constraints_agree():
+    pinned = requirements('constraints.txt')
+    for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-ros.txt'):
+        for distribution, version in requirements(name).items():
+            assert pinned[distribution] == version, f'{name}: {distribution}'
+
+
+def test_every_interface_is_built():
+    listed = (ROOT / 'tap_msgs' / 'CMakeLists.txt').read_text()
+    for path in sorted((ROOT / 'tap_msgs').glob('*/*.*')):
+        assert f'{path.parent.name}/{path.name}' in listed
+
+
+def test_scripts_go_where_ros2_run_looks():
+    config = configparser.ConfigParser()
+    config.read(ROOT / 'setup.cfg')
+    assert config['develop']['script_dir'] == '$base/lib/tap_ros'
+    assert config['install']['install_scripts'] == '$base/lib/tap_ros'
+
+
+def test_parameter_file_names_only_parameters_that_the_nodes_declare():
+    config = yaml.safe_load((ROOT / 'config' / 'params.yaml').read_text())
+    for key, section in config.items():
+        node = key.split('/')[-1]
+        source = (ROOT / NODES[node]).read_text()
+        for name in section['ros__parameters']:
+            assert f"'{name}'" in source, f'config/params.yaml: {node} has no parameter {name}'

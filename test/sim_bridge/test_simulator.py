@@ -1,0 +1,105 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the simulator: determinism, kinematics, limits."""
+
+import numpy as np
+import pytest
+
+from sim_bridge.scene import WORKSPACE_HIGH
+from sim_bridge.simulator import ACTION_LIMIT, CONTROL_PERIOD, ramp_controls, Simulator, SUBSTEPS
+from tap_ros.errors import SceneError
+
+
+@pytest.fixture(scope='module')
+def simulator():
+    simulator = Simulator('push2')
+    yield simulator
+    simulator.close()
+
+
+def test_the_same_actions_give_the_same_pictures_to_the_bit(simulator):
+    actions = np.random.default_rng(0).uniform(-1, 1, (15, 4)) * [0.08, 0.08, 0.15, 1]
+    runs = []
+    for _ in range(2):
+        first = simulator.reset(3)
+        runs.append([first] + [simulator.step(a) for a in actions])
+    for a, b in zip(*runs):
+        np.testing.assert_array_equal(a.image, b.image)
+        np.testing.assert_array_equal(a.object_poses, b.object_poses)
+        assert a.stamp_ns == b.stamp_ns
+
+
+def test_doing_nothing_leaves_everything_20_cm_from_the_goal(simulator):
+    simulator.reset(1)
+    for _ in range(5):
+        simulator.step(np.zeros(4))
+    np.testing.assert_allclose(simulator.distances(), 0.2, atol=1e-3)
+
+
+def test_the_arm_goes_where_the_action_says(simulator):
+    before = simulator.reset(0)
+    simulator.step([0, 0, 0.15, 0])
+    after = simulator.step([0.05, -0.03, 0, 0])
+    moved = after.gripper[:2] - before.gripper[:2]
+    np.testing.assert_allclose(moved, [0.05, -0.03], atol=0.004)
+    assert after.stamp_ns == round(2 * CONTROL_PERIOD * 1e9)
+
+
+def test_actions_are_limited_and_the_arm_stays_in_the_workspace(simulator):
+    simulator.reset(0)
+    for _ in range(15):
+        seen = simulator.step([1, 0, 1, 0])
+    np.testing.assert_allclose(seen.gripper[[0, 2]], WORKSPACE_HIGH[[0, 2]], atol=0.005)
+    _, targets = ramp_controls(np.zeros(4), np.array([[*ACTION_LIMIT, 0.0]]))
+    np.testing.assert_allclose(targets[0, :3], ACTION_LIMIT)
+
+
+@pytest.mark.parametrize('action', [[0, 0, 0], [0, 0, np.nan, 0], [0, np.inf, 0, 0]])
+def test_an_impossible_action_is_refused_and_nothing_moves(simulator, action):
+    simulator.reset(0)
+    before = simulator.state()
+    with pytest.raises(SceneError, match='action'):
+        simulator.step(action)
+    np.testing.assert_array_equal(simulator.state(), before)
+
+
+def test_ramps_are_the_same_one_by_one_and_at_once():
+    actions = np.random.default_rng(1).uniform(-0.08, 0.08, (3, 6, 4))
+    start = np.array([0.4, 0, 0.01, 0])
+    controls, targets = ramp_controls(start, actions)
+    assert controls.shape == (3, 6 * SUBSTEPS, 5)
+    one_by_one = start
+    for t in range(6):
+        control, target = ramp_controls(one_by_one, actions[1, t:t + 1])
+        one_by_one = target[0]
+        np.testing.assert_allclose(control, controls[1, t * SUBSTEPS:(t + 1) * SUBSTEPS])
+    np.testing.assert_allclose(one_by_one, targets[1, -1])
+
+
+def test_the_arm_can_be_left_out_of_the_picture(simulator):
+    simulator.reset(2)
+    with_arm, without = simulator.observe(), simulator.observe(hide_arm=True)
+    u, v = simulator.camera.project(with_arm.gripper[:3].astype(float)).round().astype(int)
+    assert with_arm.image[v - 2, u].min() > 150, 'white fingers'
+    assert without.image[v - 2, u].max() < 100, 'the table'
+
+
+def test_the_fingers_open_and_close(simulator):
+    simulator.reset(0)
+    assert abs(simulator.step([0, 0, 0.1, 0]).gripper[3]) < 0.05
+    assert simulator.step([0, 0, 0, 1]).gripper[3] > 0.9
+
+
+def test_the_gripper_pushes_an_object(simulator):
+    seen = simulator.reset(0)
+    x, y = seen.object_poses[0, :2]
+
+    def go(position):
+        for _ in range(12):
+            gap = np.array(position) - simulator.target[:3]
+            simulator.step([*gap, 0])
+    go([*simulator.target[:2], 0.14])
+    go([x - 0.14, y, 0.14])
+    go([x - 0.14, y, 0.01])
+    go([x, y, 0.01])
+    assert simulator.object_poses()[0, 0] - x > 0.05
