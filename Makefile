@@ -17,7 +17,7 @@ SOURCES := package.xml setup.py setup.cfg resource/tap_ros $(wildcard config/*.y
   tap_msgs/*/*.action)
 
 # An environment that was copied or moved here from elsewhere names the old place everywhere.
-$(shell [ "$$(head -n 1 .venv/place 2>/dev/null)" = "$$(pwd -P)" ] || rm -f .venv/*.done)
+$(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 
 .PHONY: help demo test build lint bench clean
 

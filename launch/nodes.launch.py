@@ -3,7 +3,7 @@
 """
 Start the simulation, the predictor, the planner and, if a folder is given, the recorder.
 
-Parameters come from config/params.yaml of the package or from params_file; for a real camera and
+Parameters come from config/tap_ros.yaml of the package or from params_file; for a real camera and
 arm start with sim:=false.
 """
 
@@ -24,7 +24,7 @@ def generate_launch_description():
         DeclareLaunchArgument(
             'params_file',
             default_value=PathJoinSubstitution(
-                [FindPackageShare('tap_ros'), 'config', 'params.yaml']),
+                [FindPackageShare('tap_ros'), 'config', 'tap_ros.yaml']),
             description='YAML file with the parameters of the nodes.'),
         DeclareLaunchArgument(
             'namespace', default_value='', description='Namespace of all nodes and topics.'),

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-
 from sim_bridge.scene import ARM_GEOM_GROUP, CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.errors import SceneError  # noqa: E402
 

@@ -17,14 +17,13 @@ from pathlib import Path
 import time
 
 import numpy as np
-from tqdm import tqdm
-
 from sim_bridge.expert import ExpertConfig, run_episode
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task, TASKS
 from tap_ros.errors import ConfigError
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
+from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
@@ -159,14 +158,18 @@ def make_episode(simulator, observations, actions, outcome, start_ns=0):
     """
     Put what was observed and done into an Episode.
 
-    :param simulator: Simulator that made it; its goal is kept with the episode.
+    Its goal is the one that it reached: a picture of where the objects ended, with the arm
+    elsewhere, as a person would photograph a goal. The expert's own goal, from which the outcome
+    follows, is drawn again from the seed by tasks.sample_scene.
+
+    :param simulator: Simulator that made it.
     :param observations: list of T Observations.
     :param actions: (T, 4) float32.
     :param outcome: 'success', 'failure' or 'interrupted'.
     :param start_ns: added to the stamps.
     :return: Episode.
     """
-    goal = simulator.goal()
+    goal = simulator.photograph(observations[-1].object_poses)
     return Episode(
         frames=np.stack([o.image for o in observations]),
         stamps=np.array([o.stamp_ns + start_ns for o in observations], np.int64),

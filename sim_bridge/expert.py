@@ -17,7 +17,6 @@ import time
 import mujoco
 import mujoco.rollout
 import numpy as np
-
 from sim_bridge.scene import WORKSPACE_HIGH
 from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, SUBSTEPS
 

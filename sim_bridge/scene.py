@@ -121,7 +121,7 @@ def _add_gripper(spec, world):
     for i, axis in enumerate('xyz'):
         gripper.add_joint(
             name=f'gripper_{axis}', type=mujoco.mjtJoint.mjJNT_SLIDE, axis=list(np.eye(3)[i]))
-        # Weak downwards: fingers that come down on an object rest on it instead of shooting it away.
+        # Weak downwards: fingers that come down on an object rest on it and do not shoot it away.
         _add_servo(spec, f'gripper_{axis}', kp=1500, kv=60, limit=8 if axis == 'z' else 30)
     for side, sign in (('left', -1), ('right', 1)):
         finger = gripper.add_body(

@@ -8,14 +8,14 @@ import sys
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from std_msgs.msg import Float64
-from std_srvs.srv import SetBool
-
 from sim_bridge.simulator import ACTION_LIMIT, Simulator
 from sim_bridge.tasks import TASKS
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool
 from tap_msgs.msg import Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
 from tap_ros.errors import TapError
@@ -24,7 +24,13 @@ from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, en
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import (
-    CAMERA_FRAME, LATCHED, STREAM, to_nanoseconds, to_stamp, WORLD_FRAME)
+    CAMERA_FRAME,
+    LATCHED,
+    STREAM,
+    to_nanoseconds,
+    to_stamp,
+    WORLD_FRAME,
+)
 
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 MAX_PERIODS = 100  # of one sim/step call: about a second
@@ -76,14 +82,27 @@ class SimNode(Node):
         self._sim.close()
 
     def _create_publishers(self):
-        self._image = self.create_publisher(Image, 'camera/image_raw', STREAM)
-        self._info = self.create_publisher(CameraInfo, 'camera/camera_info', STREAM)
-        self._objects = self.create_publisher(ObjectStates, 'objects', STREAM)
-        self._joints = self.create_publisher(JointState, 'joint_states', STREAM)
-        self._clock_time = self.create_publisher(ClockMessage, 'clock', STREAM)
+        self._newest = {}  # topic -> the message sent last
+        self._streams = {topic: self._create_stream(kind, topic) for topic, kind in {
+            'clock': ClockMessage, 'joint_states': JointState, 'objects': ObjectStates,
+            'camera/camera_info': CameraInfo, 'camera/image_raw': Image}.items()}
         self._episode = self.create_publisher(Episode, 'episode', STREAM)
         self._goal_image = self.create_publisher(Image, 'goal/image', LATCHED)
         self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
+
+    def _create_stream(self, kind, topic):
+        """
+        Create a publisher for what is sent once per control period.
+
+        In lock-step nothing may be sent for long, so a subscriber that comes late gets the newest
+        message at once; the others get it again, with the same stamp.
+        """
+        def on_matched(info):
+            if info.current_count_change > 0 and self.params['lock_step'] and self._newest:
+                self._streams[topic].publish(self._newest[topic])
+
+        return self.create_publisher(
+            kind, topic, STREAM, event_callbacks=PublisherEventCallbacks(matched=on_matched))
 
     # Commands
 
@@ -221,12 +240,15 @@ class SimNode(Node):
             observation = self._sim.observe(hide_arm=True)
         stamp = to_stamp(self._stamp_ns)
         camera = self._sim.camera
-        self._clock_time.publish(ClockMessage(clock=stamp))
-        self._joints.publish(encode_gripper(observation.gripper, stamp, WORLD_FRAME))
-        self._objects.publish(encode_observed(observation, stamp))
-        self._info.publish(
-            encode_camera_info(camera.K, (camera.height, camera.width), stamp, CAMERA_FRAME))
-        self._image.publish(encode_image(observation.image, stamp, CAMERA_FRAME))
+        self._newest = {
+            'clock': ClockMessage(clock=stamp),
+            'joint_states': encode_gripper(observation.gripper, stamp, WORLD_FRAME),
+            'objects': encode_observed(observation, stamp),
+            'camera/camera_info': encode_camera_info(
+                camera.K, (camera.height, camera.width), stamp, CAMERA_FRAME),
+            'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME)}
+        for topic, message in self._newest.items():
+            self._streams[topic].publish(message)
 
     def _publish_goal(self, goal):
         stamp = to_stamp(self._stamp_ns)

@@ -6,10 +6,16 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-
 from sim_bridge.camera import Camera, Renderer
 from sim_bridge.scene import (
-    build_scene, FINGER_TRAVEL, HALF_HEIGHT, object_names, TIMESTEP, WORKSPACE_HIGH, WORKSPACE_LOW)
+    build_scene,
+    FINGER_TRAVEL,
+    HALF_HEIGHT,
+    object_names,
+    TIMESTEP,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+)
 from sim_bridge.tasks import get_task, gripper_away_from, sample_scene, SUCCESS_DISTANCE
 from tap_ros.errors import SceneError
 
@@ -104,16 +110,38 @@ class Simulator:
             self._renderer = Renderer(self.model, self.camera.height)
         else:
             self._renderer.use(self.model)
-        rng = np.random.default_rng([self.scene.seed, 7])
-        gripper = gripper_away_from(rng, self.scene.goal_poses[:, :2])
-        self._place(self.scene.goal_poses, gripper)
-        self._goal = self.observe(), self.observe(hide_arm=True)
         self.target = np.append(self.scene.gripper_start, 0.0)
-        self._place(self.scene.start_poses, self.scene.gripper_start)
+        self._place(_lift(self.scene.start_poses), self.scene.gripper_start)
+        poses = _lift(self.scene.goal_poses)
+        gripper = self._after_last_push()
+        self._goal = [self.photograph(poses, gripper, hide_arm) for hide_arm in (False, True)]
         return self.observe()
 
+    def photograph(self, object_poses, gripper=None, hide_arm=False):
+        """
+        Observe the objects at other places; nothing moves.
+
+        :param object_poses: (K, 7) x, y, z in m, quaternion x, y, z, w.
+        :param gripper: (3,) where the arm is to be seen, m; by default somewhere beside the
+            objects, drawn from the scene's seed.
+        :param hide_arm: leave the arm out of the picture.
+        :return: Observation.
+        """
+        state, controls = self.state(), self.data.ctrl.copy()
+        if gripper is None:
+            rng = np.random.default_rng([self.scene.seed, 7])
+            gripper = gripper_away_from(rng, object_poses[:, :2])
+        self._place(object_poses, gripper)
+        observation = self.observe(hide_arm)
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_setState(
+            self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self.data.ctrl[:] = controls
+        mujoco.mj_forward(self.model, self.data)
+        return observation
+
     def goal(self, hide_arm=False):
-        """Return the Observation of the goal: objects in place, the arm somewhere beside them."""
+        """Return the Observation of the goal: the arm stands as after pushing one object there."""
         return self._goal[1 if hide_arm else 0]
 
     def step(self, action):
@@ -172,15 +200,37 @@ class Simulator:
             self._renderer.close()
             self._renderer = None
 
-    def _place(self, poses, gripper):
-        """Put objects at planar poses (K, 3) and the closed gripper at (3,), all at rest."""
+    def _after_last_push(self):
+        """Return where the gripper touches one object that it has just pushed to its goal."""
+        rng = np.random.default_rng([self.scene.seed, 8])
+        k = rng.integers(self.task.num_objects)
+        starts, goals = self.scene.start_poses[:, :2], self.scene.goal_poses[:, :2]
+        along = (goals[k] - starts[k]) / np.linalg.norm(goals[k] - starts[k])
+        fingers = [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
+        state = self.state()
+        for behind in np.arange(0.04, 0.16, 0.005):
+            gripper = np.append(goals[k] - behind * along, 0.01)
+            self._place(_lift(self.scene.goal_poses), gripper)
+            if not np.isin(self.data.contact.geom, fingers).any():
+                break
+        mujoco.mj_setState(self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        return gripper
+
+    def _place(self, object_poses, gripper):
+        """Put objects at poses (K, 7) and the closed gripper at (3,), all at rest."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:3] = gripper
         self.data.ctrl[:3] = gripper
         objects = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
-        objects[:, :2] = poses[:, :2]
-        objects[:, 2] = HALF_HEIGHT
-        objects[:, 3:] = 0
-        objects[:, 3] = np.cos(poses[:, 2] / 2)
-        objects[:, 6] = np.sin(poses[:, 2] / 2)
+        objects[:] = object_poses[:, [0, 1, 2, 6, 3, 4, 5]]
         mujoco.mj_forward(self.model, self.data)
+
+
+def _lift(planar_poses):
+    """Turn (K, 3) x, y, yaw on the table into (K, 7) poses."""
+    poses = np.zeros((len(planar_poses), 7))
+    poses[:, :2] = planar_poses[:, :2]
+    poses[:, 2] = HALF_HEIGHT
+    poses[:, 5] = np.sin(planar_poses[:, 2] / 2)
+    poses[:, 6] = np.cos(planar_poses[:, 2] / 2)
+    return poses

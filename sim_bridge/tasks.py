@@ -12,7 +12,6 @@ Doing nothing therefore ends 20 cm from the goals.
 from dataclasses import dataclass
 
 import numpy as np
-
 from sim_bridge.scene import random_shape
 from tap_ros.errors import SceneError
 
@@ -78,15 +77,11 @@ def sample_scene(task, seed):
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.num_objects])
     shapes = tuple(random_shape(rng) for _ in range(task.num_objects))
-    # Three separated starts may leave no room for separated goals: then both are drawn anew.
-    while True:
-        starts = _separated(
-            lambda: rng.uniform(-OBJECT_RANGE, OBJECT_RANGE, (task.num_objects, 2)),
-            task.start_separation)
-        goals = None if starts is None else _separated(
-            lambda: _goals_around(rng, starts), GOAL_SEPARATION)
-        if goals is not None:
-            break
+    # Separated starts may leave no room for separated goals: then both are drawn anew.
+    goals = None
+    while goals is None:
+        starts = _draw_starts(rng, task)
+        goals = _draw_goals(rng, starts)
     yaws = rng.uniform(0, 2 * np.pi, task.num_objects)
     goal_yaws = yaws + rng.uniform(-GOAL_YAW_RANGE, GOAL_YAW_RANGE, task.num_objects)
     return Scene(
@@ -110,20 +105,25 @@ def gripper_away_from(rng, positions):
             return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
 
 
-def _separated(draw, separation, attempts=1000):
-    """Draw positions until all pairs are apart; None after too many attempts."""
+def _draw_starts(rng, task):
+    """Draw object origins (K, 2) that are far enough apart."""
+    while True:
+        starts = rng.uniform(-OBJECT_RANGE, OBJECT_RANGE, (task.num_objects, 2))
+        if _apart(starts, task.start_separation):
+            return starts
+
+
+def _draw_goals(rng, starts, attempts=1000):
+    """Draw a goal at the fixed distance from each start; None when there seems to be no room."""
     for _ in range(attempts):
-        positions = draw()
-        if positions is None:
-            continue
-        gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-        if (gaps[np.triu_indices(len(positions), 1)] >= separation).all():
-            return positions
+        angles = rng.uniform(0, 2 * np.pi, len(starts))
+        goals = starts + GOAL_DISTANCE * np.column_stack([np.cos(angles), np.sin(angles)])
+        if (np.abs(goals) <= OBJECT_RANGE).all() and _apart(goals, GOAL_SEPARATION):
+            return goals
     return None
 
 
-def _goals_around(rng, starts):
-    """Draw a goal at the fixed distance from each start; None if one lies out of range."""
-    angles = rng.uniform(0, 2 * np.pi, len(starts))
-    goals = starts + GOAL_DISTANCE * np.column_stack([np.cos(angles), np.sin(angles)])
-    return goals if (np.abs(goals) <= OBJECT_RANGE).all() else None
+def _apart(positions, separation):
+    """Tell whether all pairs of positions (K, 2) are at least so far apart."""
+    gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    return (gaps[np.triu_indices(len(positions), 1)] >= separation).all()

@@ -27,7 +27,8 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
         'collect': 'tap_ros.evaluation.bench_collect',
         'recording': 'tap_ros.evaluation.bench_recording',
         'planning': 'tap_ros.evaluation.bench_planning'}),
-    'inspect': ('show what a recording or a weights file holds', 'tap_ros.evaluation.inspect_files'),
+    'inspect': ('show what a recording or a weights file holds',
+                'tap_ros.evaluation.inspect_files'),
 }
 TRAIN_DEFAULT = 'predictor'
 

@@ -8,9 +8,8 @@ A pixel position is (u, v) = (column, row) with (0, 0) at the centre of the top-
 """
 
 import numpy as np
-import torch
-
 from tap_ros.errors import ImageError
+import torch
 
 
 def to_float(images, dtype=torch.float32):

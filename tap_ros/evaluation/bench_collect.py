@@ -28,7 +28,7 @@ def run(args):
     physics = seconds['search'] + seconds['step'] - render
     busy = seconds['search'] + seconds['step'] + seconds['write']
     workers = args.workers or len(os.sched_getaffinity(0))
-    print(f'''task {args.task}, seed 0, {episodes} episodes of {result['frames'] / episodes:.1f} \
+    print(f"""task {args.task}, seed 0, {episodes} episodes of {result['frames'] / episodes:.1f} \
 frames on average, {workers} workers
 seconds per episode (wall, workers side by side)  {seconds['wall'] / episodes:.2f}
   scaled to 40 frames                             \
@@ -38,7 +38,7 @@ share of the workers' time: physics               {physics / busy:.0%}
                             writing               {seconds['write'] / busy:.0%}
 mean final distance                               {100 * result['mean_final_distance']:.1f} cm
 success rate (all objects within 5 cm)            {result['success_rate']:.0%}
-size of the recording per frame                   {size / result['frames'] / 1024:.1f} KiB''')
+size of the recording per frame                   {size / result['frames'] / 1024:.1f} KiB""")
 
 
 def add_arguments(parser):

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
-
 from tap_ros.evaluation.pictures import enlarge, film_strip, overlay_maps, png_bytes
 
 SCALE = 4
@@ -75,7 +74,7 @@ def write_report(path, scenes, note=''):
     :param note: a sentence on how the numbers were made.
     """
     body = ''.join(_scene_section(scene) for scene in scenes)
-    page = f'''<!doctype html>
+    page = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>tap_ros: pushed by way of a predicted subgoal</title>
 <style>
@@ -95,19 +94,38 @@ of where every object should then be. Doing nothing ends 20 cm from the goals.</
 <pre>{html.escape(results_table(scenes))}</pre>
 <p>{html.escape(note)}</p>
 {body}</html>
-'''
+"""
     Path(path).write_text(page, encoding='utf-8')
+
+
+def write_overview(path, scenes):
+    """
+    Write one picture: a row for each scene with start, goal, subgoal and its object maps.
+
+    :param path: of the PNG file.
+    :param scenes: list of SceneRuns.
+    """
+    white = np.full((SCALE * scenes[0].start.shape[0], SCALE, 3), 255, np.uint8)
+    rows = [np.hstack([part for _, picture in _prediction(scene) for part in (picture, white)])
+            for scene in scenes]
+    line = np.full((SCALE, rows[0].shape[1], 3), 255, np.uint8)
+    Path(path).write_bytes(png_bytes(np.vstack([part for row in rows for part in (row, line)])))
+
+
+def _prediction(scene):
+    """Return (caption, picture) of start, goal, subgoal and object maps."""
+    k = len(scene.object_maps)
+    maps = overlay_maps(
+        scene.start // 3, scene.object_maps, SCALE, scene.start_pixels, scene.goal_pixels)
+    return [
+        ('start', enlarge(scene.start, SCALE)), ('goal', enlarge(scene.goal, SCALE)),
+        ('predicted subgoal', enlarge(scene.subgoal, SCALE)),
+        (f'its object maps: {k} colours; circles mark the starts, crosses the goals', maps)]
 
 
 def _scene_section(scene):
     """Return the HTML of one scene."""
-    k = len(scene.object_maps)
-    flat = np.full_like(scene.subgoal, 24)
-    pictures = [
-        ('start', enlarge(scene.start, SCALE)), ('goal', enlarge(scene.goal, SCALE)),
-        ('predicted subgoal', enlarge(scene.subgoal, SCALE)),
-        (f'its object maps: {k} colours; circles mark the starts, crosses the goals',
-         overlay_maps(flat, scene.object_maps, SCALE, scene.start_pixels, scene.goal_pixels))]
+    pictures = _prediction(scene)
     for mode, run in scene.runs.items():
         final = 100 * run.distances[-1].mean()
         pictures.append((

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
 from tap_ros.evaluation.pictures import film_strip
 from tap_ros.prediction.weights import load_tensors
 from tap_ros.recording.cache import open_recordings

@@ -8,15 +8,19 @@ picture goes through the same measurement: a low error alone proves nothing.
 """
 
 from dataclasses import dataclass
+import json
+from pathlib import Path
 
 import numpy as np
-import torch
-
+from tap_ros.errors import ConfigError
 from tap_ros.images import to_float, to_uint8
-from tap_ros.prediction.batches import make_batch, uses_recorded_goal
+from tap_ros.prediction.batches import make_batch, split_episodes, uses_recorded_goal
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.pictures import grid, overlay
+from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
+from tap_ros.recording.cache import open_recordings
+import torch
 
 METHODS = ('prediction', 'copy_start', 'copy_goal')
 THRESHOLDS = tuple(range(11))  # px
@@ -191,6 +195,56 @@ def write_pictures(path, network, store, episodes, goal_picture='last', scale=2)
             row.append(overlay(images[b], maps[0].cpu().numpy()))
         rows.append(row)
     imsave(path, grid(rows, scale))
+
+
+def add_arguments(parser):
+    """Add the options of `python -m tap_ros evaluate prediction` to a parser."""
+    parser.add_argument('--weights', required=True, metavar='FILE', help='of a predictor')
+    parser.add_argument('--recordings', nargs='+', required=True, metavar='BAG',
+                        help='bag folders, folders of bag folders, or .mcap files')
+    parser.add_argument('--all', action='store_true',
+                        help='take every episode, not only those that training held out')
+    parser.add_argument('--goal-picture', choices=('last', 'recorded'), default='recorded',
+                        help="the episode's last frame, or the goal's own picture where reached, "
+                        'with the arm elsewhere (default: %(default)s)')
+    parser.add_argument('--margin', type=int, default=0,
+                        help='frames beside the context that do not count as matches')
+    parser.add_argument('--out', metavar='FOLDER', help='write scores.json and pictures.png there')
+
+
+def run(args):
+    """
+    Score weights, print a table with copying beside them, and write what --out asks for.
+
+    :raises ConfigError: if there is nothing to score, or the pictures have another size.
+    """
+    network, training = load_network(args.weights)
+    store = open_recordings(args.recordings)
+    if store.image_size != (network.config.image_size,) * 2:
+        raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
+                          f'the recordings have {store.image_size}; use matching ones')
+    fraction = training.get('settings', {}).get('test_fraction', 0.05)
+    kept, held_out = split_episodes(store, fraction)
+    episodes = np.sort(np.concatenate([kept, held_out])) if args.all else held_out
+    if not len(episodes):
+        raise ConfigError('recordings: no episode of them was held out from training; '
+                          'give more of them, or --all')
+    scores = {method: value.summary() for method, value in
+              evaluate(network, store, episodes, args.margin, args.goal_picture).items()}
+    columns = ('min_l1', 'match_fraction', 'match_fraction_std', 'bottleneck_median',
+               'bottleneck_1px', 'bottleneck_2px', 'bottleneck_5px')
+    print(f'{len(episodes)} episodes, goal picture: {args.goal_picture}; l1 on [0, 1]; '
+          'object positions: ground truth')
+    print(f'{"":12s}' + ''.join(f'{name:>20s}' for name in columns))
+    for method, row in scores.items():
+        print(f'{method:12s}' + ''.join(f'{row.get(name, np.nan):20.4f}' for name in columns))
+    if args.out:
+        folder = Path(args.out)
+        folder.mkdir(parents=True, exist_ok=True)
+        about = {'weights': str(args.weights), 'data_hash': store.data_hash,
+                 'goal_picture': args.goal_picture, 'margin': args.margin, 'scores': scores}
+        (folder / 'scores.json').write_text(json.dumps(about, indent=2) + '\n')
+        write_pictures(folder / 'pictures.png', network, store, episodes[:12], args.goal_picture)
 
 
 def _context_pixels(episode, goal_picture):

@@ -7,7 +7,6 @@ import time
 
 from action_msgs.msg import GoalStatus
 from rclpy.executors import MultiThreadedExecutor
-
 from tap_ros.errors import TapError
 
 
@@ -57,7 +56,7 @@ def call(client, request, timeout_s, give_up=lambda: False):
         the wait was given up.
     """
     deadline = time.monotonic() + timeout_s
-    name = client.srv_name
+    name = client.service_name
     while not client.wait_for_service(timeout_sec=min(0.25, timeout_s)):
         if time.monotonic() >= deadline or give_up():
             raise CallError(

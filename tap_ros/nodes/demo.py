@@ -15,18 +15,23 @@ import rclpy
 from rclpy.action import ActionClient
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
-from tqdm import tqdm
-
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.errors import TapError
-from tap_ros.evaluation.demo_report import results_table, Run, SceneRuns, write_report
+from tap_ros.evaluation.demo_report import (
+    results_table,
+    Run,
+    SceneRuns,
+    write_overview,
+    write_report,
+)
 from tap_ros.nodes.clients import call, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.image_messages import decode_image, decode_map
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tqdm import tqdm
 
 FIRST_SCENE = 1_000_000  # far from the seeds of the training recordings
 MODES = ('direct', 'subgoal')
@@ -230,6 +235,7 @@ def run(args):
         rclpy.try_shutdown()
     seconds = time.monotonic() - begin
     print(f'\n{results_table(scenes)}\n')
+    write_overview(folder / 'subgoals.png', scenes)
     write_report(
         folder / 'report.html', scenes,
         f'Task {args.task}, seeds {args.seed} to {args.seed + args.scenes - 1}, at most '

@@ -7,10 +7,9 @@ import sys
 
 import numpy as np
 from sensor_msgs.msg import Image
-import torch
-
 from tap_ros.errors import ImageError
 from tap_ros.images import check_image
+import torch
 
 # Bytes per pixel, and which of them are red, green and blue.
 ENCODINGS = {

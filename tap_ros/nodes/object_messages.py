@@ -5,7 +5,6 @@
 from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
 from sensor_msgs.msg import CameraInfo, JointState
-
 from tap_msgs.msg import ObjectState, ObjectStates
 from tap_ros.errors import PlanningError
 

@@ -5,6 +5,7 @@
 import numpy as np
 
 SCALE = 4  # pixels of the overlay per pixel of the picture
+MARK_REACH = 12  # pixels of the overlay that a mark needs on each side
 COLOURS = np.array([
     [230, 60, 40], [40, 110, 240], [250, 190, 30], [40, 190, 120], [180, 80, 220], [30, 200, 220]])
 
@@ -21,21 +22,29 @@ def draw_overlay(start, object_maps, start_pixels, goal_pixels):
     :param goal_pixels: (K, 2) as (u, v), or None.
     :return: uint8 (SCALE * H, SCALE * W, 3).
     """
-    picture = np.kron(start, np.ones((SCALE, SCALE, 1))).astype(np.float32)
+    picture = start.astype(np.float32)
     for index, object_map in enumerate(object_maps):
         # The root makes a wide, faint map visible beside a sharp one.
-        strength = np.sqrt(object_map / max(object_map.max(), 1e-12))
-        strength = 0.85 * np.kron(strength, np.ones((SCALE, SCALE)))[..., None]
+        strength = 0.85 * np.sqrt(object_map / max(object_map.max(), 1e-12))[..., None]
         picture += strength * (COLOURS[index % len(COLOURS)] - picture)
-    height, width = picture.shape[:2]
-    v, u = np.mgrid[:height, :width]
+    picture = picture.round().clip(0, 255).astype(np.uint8)
+    picture = picture.repeat(SCALE, axis=0).repeat(SCALE, axis=1)
     for pixels, shape in ((start_pixels, ring), (goal_pixels, cross)):
         for index, pixel in enumerate([] if pixels is None else pixels):
-            centre = (np.asarray(pixel) + 0.5) * SCALE - 0.5
-            across, down = u - centre[0], v - centre[1]
-            picture[shape(across, down, 3.5)] = 255  # a white edge
-            picture[shape(across, down, 2.0)] = COLOURS[index % len(COLOURS)]
-    return picture.round().clip(0, 255).astype(np.uint8)
+            draw_mark(picture, pixel, shape, COLOURS[index % len(COLOURS)])
+    return picture
+
+
+def draw_mark(picture, pixel, shape, colour):
+    """Draw a mark with a white edge around a pixel (u, v) of the small picture, in place."""
+    u, v = (np.asarray(pixel, float) + 0.5) * SCALE - 0.5
+    left, top = max(int(u) - MARK_REACH, 0), max(int(v) - MARK_REACH, 0)
+    patch = picture[top:max(int(v) + MARK_REACH, 0), left:max(int(u) + MARK_REACH, 0)]
+    down, across = np.mgrid[:patch.shape[0], :patch.shape[1]].astype(float)
+    down += top - v
+    across += left - u
+    patch[shape(across, down, 3.5)] = 255
+    patch[shape(across, down, 2.0)] = colour
 
 
 def ring(across, down, thickness):

@@ -3,10 +3,14 @@
 """Node parameters with a description and a range, refused with a reason when wrong."""
 
 from rcl_interfaces.msg import (
-    FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult)
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-
 from tap_ros.errors import ConfigError
+import torch
 
 
 class Parameters:
@@ -66,3 +70,14 @@ class Parameters:
                     reason=f'{parameter.name} is {parameter.value!r}; '
                            f'valid choices: {", ".join(choices)}')
         return SetParametersResult(successful=True)
+
+
+def check_device(device):
+    """
+    Accept a device or say that it is not there.
+
+    :param device: 'cpu' or 'cuda'.
+    :raises ConfigError: for cuda without a GPU that torch can use.
+    """
+    if device == 'cuda' and not torch.cuda.is_available():
+        raise ConfigError('parameter device: torch finds no GPU for cuda; valid here: cpu')

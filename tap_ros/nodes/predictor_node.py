@@ -13,16 +13,20 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Image
-
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ConfigError, ImageError, TapError, WeightsError
 from tap_ros.nodes.image_messages import (
-    decode_image, encode_image, encode_map, is_empty, resize_pixels)
+    decode_image,
+    encode_image,
+    encode_map,
+    is_empty,
+    resize_pixels,
+)
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.overlay import draw_overlay
-from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import CAMERA_FRAME, LATCHED, STREAM
 from tap_ros.prediction.predictor import SubgoalPredictor
@@ -117,7 +121,8 @@ class PredictorNode(Node):
                 topic = {'start': 'camera/image_raw', 'goal': 'goal/image'}[name]
                 raise ImageError(
                     f'{name}: the request has none and nothing has come on '
-                    f'{self.resolve_topic_name(topic)}; publish one there or send it along')
+                    f'{self.resolve_topic_name(topic)}; publish one there (the simulator does at '
+                    'sim/reset), or send it along')
             image = found['image']
             objects = objects if objects.objects else found.get('objects', objects)
         size = self._predictor.image_size
@@ -159,17 +164,6 @@ def load_predictor(path, device):
             f'{path}: predicts object maps that do not sum to 1; the weights are damaged or were '
             'not trained, train them again')
     return predictor
-
-
-def check_device(device):
-    """
-    Accept a device or say that it is not there.
-
-    :raises ConfigError: for cuda without a GPU that torch can use.
-    """
-    import torch
-    if device == 'cuda' and not torch.cuda.is_available():
-        raise ConfigError('parameter device: torch finds no GPU for cuda; valid here: cpu')
 
 
 def check_count(value, name, highest):

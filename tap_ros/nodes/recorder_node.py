@@ -15,7 +15,6 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool
-
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node

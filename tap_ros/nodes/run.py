@@ -8,9 +8,11 @@ import threading
 
 import rclpy
 from rclpy.executors import (
-    ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor)
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
 from rclpy.signals import SignalHandlerOptions
-
 from tap_ros.errors import TapError
 
 

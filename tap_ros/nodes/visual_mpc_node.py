@@ -14,7 +14,6 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64
-
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
@@ -23,10 +22,10 @@ from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.image_messages import decode_image, decode_map, is_empty
 from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, WORLD_FRAME
+from tap_ros.planning.visual_mpc import PRESETS, VisualMPC, with_preset
 
 DEFAULT_WEIGHTS = Path(__file__).parents[1] / 'weights' / 'forward_model_push.safetensors'
 MODES = ('subgoal', 'direct')
@@ -42,15 +41,15 @@ class Cancelled(TapError):
 
 class VisualMpcNode(Node):
     """
-    Executes one goal at a time, in a thread of the executor that is not needed for callbacks.
+    Executes one goal at a time, in a thread of the executor that callbacks do not need.
 
-    Whatever the way a goal ends, the last command is zero.
+    A second goal is rejected meanwhile. Whatever the way a goal ends, the last command is zero.
     """
 
     def __init__(self):
         super().__init__('visual_mpc_node')
         self.params = declare_parameters(self)
-        self._mpc = load_planner(self.params['weights'], self.params['device'])
+        self._mpc = load_planner(self.params)
         self._ending = False
         self._busy = threading.Lock()  # held from the acceptance of a goal to its end
         self._sensors = Observations(*SENSORS)
@@ -71,7 +70,7 @@ class VisualMpcNode(Node):
         """End the goal in progress, and see that the command to stop has left."""
         self._ending = True
         self._sensors.wake()
-        self._busy.acquire(timeout=5.0)
+        self._busy.acquire(timeout=10.0)  # longer than a plan takes
         self._stop()
         self._twist.wait_for_all_acked(Duration(seconds=1))
 
@@ -144,7 +143,7 @@ class VisualMpcNode(Node):
                 goal_pixels=None if stage == 'subgoal' else goal_pixels)
             if cancelled():
                 raise Cancelled('cancelled')
-            sent_ns = self._send(plan.action, seen['image'].header)
+            sent_ns = self._send(plan.action, seen['image'].header.stamp)
             result.steps += 1
             handle.publish_feedback(ReachGoal.Feedback(
                 step=result.steps, stage=stage, expected_distance=float(plan.expected_distance),
@@ -201,7 +200,7 @@ class VisualMpcNode(Node):
                 raise Cancelled('cancelled') from error
             raise
         if not response.success:
-            raise PlanningError(f'service {self._predict.srv_name}: {response.message}')
+            raise PlanningError(f'service {self._predict.service_name}: {response.message}')
         subgoal = response.subgoals[0]
         maps = np.stack([decode_map(message, f'object map of {name}') for name, message in zip(
             subgoal.object_names, subgoal.object_maps)])
@@ -209,7 +208,7 @@ class VisualMpcNode(Node):
 
     # Commands
 
-    def _send(self, action, header):
+    def _send(self, action, stamp):
         """
         Send one command within the limits, stamped like the image that it answers.
 
@@ -220,7 +219,9 @@ class VisualMpcNode(Node):
             raise PlanningError(f'the planner chose {action}; expected finite numbers')
         limit = np.array([self.params['max_step_xy']] * 2 + [self.params['max_step_z']])
         move = np.clip(np.asarray(action[:3], np.float64), -limit, limit)
-        message = TwistStamped(header=header)
+        message = TwistStamped()
+        message.header.stamp = stamp
+        message.header.frame_id = self.params['command_frame']
         linear = message.twist.linear
         linear.x, linear.y, linear.z = move.tolist()
         newest = to_nanoseconds(self._sensors.newest('image')['image'].header.stamp)
@@ -240,9 +241,13 @@ def declare_parameters(node):
                        'File of weights (.safetensors) of a forward model.')
     parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
                        choices=['cpu', 'cuda'])
+    parameters.declare('preset', 'default', 'Settings of the planner: what does best, or what the '
+                       'paper says.', choices=list(PRESETS))
+    parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
     parameters.declare('control_period', 0.25,
                        'Seconds (of image stamps) that the arm takes for one command.',
                        low=0.01, high=10.0)
+    parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
     for name, default, high, description in (
             ('max_step_xy', 0.08, 0.08, 'Largest |dx| and |dy| of a command in metres.'),
             ('max_step_z', 0.15, 0.15, 'Largest |dz| of a command in metres.'),
@@ -256,9 +261,16 @@ def declare_parameters(node):
     return parameters
 
 
-def load_planner(path, device):
-    """Load weights, and plan once, so that the first command comes as fast as the others."""
-    mpc = VisualMPC.load(path, device=device)
+def load_planner(parameters):
+    """
+    Load weights, and plan once, so that the first command comes as fast as the others.
+
+    :raises WeightsError: when the file cannot be used.
+    :raises ConfigError: when the device is not there.
+    """
+    check_device(parameters['device'])
+    config = with_preset(parameters['preset'], arm_hidden=parameters['arm_hidden'])
+    mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
     mpc.reset(0)
@@ -271,8 +283,10 @@ def check_request(request):
     """
     Return mode and step budget of a goal, defaults filled in.
 
-    :raises ConfigError: for an unknown mode or a budget out of range.
+    :raises ConfigError: for an unknown mode, or a budget or seed out of range.
     """
+    if request.seed < 0:
+        raise ConfigError(f'seed is {request.seed}; expected 0 or more')
     mode = request.mode or 'subgoal'
     if mode not in MODES:
         raise ConfigError(f'mode is {mode!r}; valid modes: {", ".join(MODES)}')

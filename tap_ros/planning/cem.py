@@ -55,7 +55,8 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None):
     :param rng: numpy Generator; all randomness comes from it, in an order that depends on the
         configuration only.
     :param repair: function that clips samples (N, D) to what is allowed, or None.
-    :param proposals: (P, D) that replace the first iteration's last samples, or None.
+    :param proposals: (P, D) that replace the first iteration's last samples, or None; P at most
+        num_samples, else the last count.
     :return: best sample (D,), its cost, and the last mean (D,).
     """
     mean, std = np.array(mean, np.float64), np.array(std, np.float64)
@@ -65,7 +66,7 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None):
         # draw
         samples = mean + std * rng.standard_normal((config.num_samples, len(mean)))
         if iteration == 0 and proposals is not None and len(proposals):
-            samples[-len(proposals):] = proposals[:config.num_samples]
+            samples[-len(proposals):] = proposals[-config.num_samples:]
         samples[:len(kept)] = kept
         samples = samples if repair is None else repair(samples)
         # judge

@@ -19,15 +19,17 @@ Unlike the authors' ConvLSTM, nothing is decoded per step, and the arm, whose mo
 is not predicted but drawn where its kinematics put it.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.errors import ConfigError
 from tap_ros.planning.table import (
-    grid_points, pixel_points, project, sample_picture, sample_table, splat_on_table)
+    channels_first, channels_last, grid_points, pixel_points, project, sample, sample_picture,
+    splat_on_table)
+from tap_ros.prediction.weights import load_into, load_weights, make_config
 
 MOVE_LIMIT = (0.08, 0.08, 0.15)  # m per control period
 
@@ -43,6 +45,7 @@ class ForwardModelConfig:
     workspace_high: tuple = (0.45, 0.45, 0.15)
     table_half: float = 0.55  # m, half the side of the table grid
     table_cells: int = 44
+    window_cells: int = 26  # of the table grid around the gripper: the crop in any direction
     crop_cells: tuple = (20, 24)  # along the motion, across it
     crop_cell: float = 0.02  # m
     crop_back: float = 0.14  # m that the crop reaches behind the gripper
@@ -168,8 +171,9 @@ class PushNet(nn.Module):
         :return: flow (N, 2, h, w) along and across the motion, and masks (N, 3, h, w) of what is
             pushed, what is pushed in turn, and what stays.
         """
-        x = self.look(crop) + self.place
-        x = F.relu(x + self.action(action_terms)[..., None, None])
+        dtype = self.look.weight.dtype
+        x = self.look(crop.to(dtype, memory_format=torch.channels_last))
+        x = F.relu(x + self.place + self.action(action_terms.to(dtype))[..., None, None])
         x = F.relu(self.blocks[0](x))
         whole = F.relu(self.gather(F.relu(self.squeeze(x)).flatten(1)))
         x = x + self.spread(whole)[..., None, None]
@@ -220,9 +224,10 @@ class ForwardModel(nn.Module):
         constant = self._constant
         constant('homography', torch.tensor(config.table).view(3, 3).float())
         constant('arm_camera', torch.tensor(config.arm).view(3, 4).float())
-        constant('points', grid_points(config.table_cells, config.table_half))
+        constant('grid', grid_points(config.table_cells))
+        constant('ahead', torch.tensor([1.0, 0.0]))
         constant('pixels', pixel_points((config.image_size, config.image_size)))
-        constant('crop', crop)
+        constant('crop', crop.flatten(0, 1) / config.table_half)
         low = torch.tensor([*config.workspace_low, 0.0])
         high = torch.tensor([*config.workspace_high, 1.0])
         constant('limits', torch.stack([low, high]))
@@ -260,13 +265,17 @@ class ForwardModel(nn.Module):
         if homography is None:
             homography = self.homography.expand(len(image), 3, 3)
         features, objects, background = self.encoder(image, arm_mask)
-        at = project(homography, self.points.flatten(0, 1)).unflatten(1, self.points.shape[:2])
+        at = self._points().expand(len(image), -1, -1)
+        at = project(homography, at).unflatten(1, self.grid.shape[:2])
         return Scene(sample_picture(features, at), objects, background)
 
     def still(self, count):
-        """Return the flow (count, 2, n, n) of a scene in which nothing has moved, metres."""
-        cells = self.config.table_cells
-        return self.points.new_zeros(count, 2, cells, cells)
+        """Return the flow (count, n, n, 2) of a scene in which nothing has moved."""
+        return torch.zeros_like(self.grid).expand(count, -1, -1, -1)
+
+    def _points(self):
+        """Return the table's cells (n n, 2) in metres."""
+        return self.grid.flatten(0, 1) * self.config.table_half
 
     def move_gripper(self, gripper, action):
         """Return where the gripper is after an action: clipped to limits and workspace."""
@@ -279,7 +288,7 @@ class ForwardModel(nn.Module):
         Predict one control period.
 
         :param features: (N, C, n, n) of the Scene, expanded to the samples.
-        :param flow: (N, 2, n, n) backward flow from now to the first picture, metres.
+        :param flow: (N, n, n, 2) backward flow from now to the first picture, table units.
         :param gripper: (N, 4) metres; action: (N, 4) metres and opening.
         :return: flow and gripper after the step, and the step's masks (N, 3, h, w), see PushNet.
         """
@@ -287,61 +296,74 @@ class ForwardModel(nn.Module):
         following = self.move_gripper(gripper, action)
         move = following[:, :2] - gripper[:, :2]
         length = move.norm(dim=1, keepdim=True)
-        direction = torch.where(
-            length > 1e-4, move / length.clamp_min(1e-4), move.new_tensor([1.0, 0.0]))
+        direction = torch.where(length > 1e-4, move / length.clamp_min(1e-4), self.ahead)
         cos, sin = direction[:, 0], direction[:, 1]
-        turn = torch.stack([cos, -sin, sin, cos], 1).view(-1, 2, 2)  # local to table
-        h, w = self.crop.shape[:2]
+        turn = torch.stack([cos, sin, -sin, cos], 1).view(-1, 2, 2)  # rows: local axes on table
         # 1. look at what is now around the gripper
-        at = (self.crop.view(1, h * w, 2) @ turn.mT + gripper[:, None, :2]).view(-1, h, w, 2)
-        at = at + sample_table(flow, at, half).permute(0, 2, 3, 1)
-        crop = sample_table(features, at, half)
+        at = torch.baddbmm((gripper[:, None, :2] / half), self.crop.expand(len(turn), -1, -1), turn)
+        at = at.view(-1, *self.config.crop_cells, 2)
+        crop = sample(features, at + channels_last(sample(channels_first(flow), at)))
         # 2. predict the flow of this step, from new places back to old ones
         local, masks = self.push(crop, action_terms(gripper, following, direction, length))
-        # 3. compose
-        flow = self.compose(flow, local, gripper, turn, length)
-        return flow, following, masks
+        step = (turn.mT @ local.flatten(2)) * (length / half)[..., None]  # (N, 2, h w) on table
+        # 3. compose, where the crop reaches: phi'(x) = f(x) + phi(x + f(x))
+        window, points = self._window(gripper)
+        step = sample(step.view_as(local), self._crop_coordinates(points, gripper, turn), 'zeros')
+        back = points + channels_last(step)
+        moved = back - points + channels_last(sample(channels_first(flow), back))
+        return flow.index_put(window, moved), following, masks
 
-    def compose(self, flow, local, gripper, turn, length):
-        """Compose the flow so far with a step's local flow: phi' = f + phi(x + f)."""
-        config, n = self.config, self.config.table_cells
-        h, w = local.shape[2:]
-        # table points in the crop's own coordinates, scaled to [-1, 1] for grid_sample
-        near = (self.points.view(1, n * n, 2) - gripper[:, None, :2]) @ turn  # (N, n n, 2)
-        spans = near.new_tensor([2 * (h - 1), 2 * (w - 1)]) * config.crop_cell
-        middle = near.new_tensor([spans[0] / 2 - config.crop_back, 0.0])
-        near = ((near - middle) * (2 / spans)).flip(-1).view(-1, n, n, 2)
-        turned = (turn @ local.flatten(2)).view_as(local) * length[..., None, None]
-        step = F.grid_sample(turned, near, padding_mode='zeros', align_corners=True)
-        back = self.points + step.permute(0, 2, 3, 1)
-        return step + sample_table(flow, back, config.table_half)
+    def _window(self, gripper):
+        """Return the indices (N, m, m) and points (N, m, m, 2) of the cells near the gripper."""
+        n, m = self.config.table_cells, self.config.window_cells
+        corner = (gripper[:, :2] / self.config.table_half + 1) * ((n - 1) / 2) - (m - 1) / 2
+        corner = corner.round().long().clamp(0, n - m)  # (N, 2) column, row
+        line = torch.arange(m, device=gripper.device)
+        columns, rows = corner[:, :1] + line, corner[:, 1:] + line  # (N, m)
+        which = torch.arange(len(gripper), device=gripper.device)[:, None, None]
+        window = which, rows[:, :, None], columns[:, None]
+        return window, self.grid[window[1:]]
+
+    def _crop_coordinates(self, points, gripper, turn):
+        """Return where points (N, m, m, 2) lie in the crop, in [-1, 1] if inside."""
+        config = self.config
+        h, w = config.crop_cells[0] // 2, config.crop_cells[1] // 2
+        # the push net's cells are two of the crop's wide, the first at the crop's corner
+        spans = gripper.new_tensor([h - 1, w - 1]) * config.crop_cell  # half extents, metres
+        corner = self.crop[0] * config.table_half
+        rows = turn.mT / spans  # (N, 2, 2): table metres to [-1, 1] along, across
+        shift = -(gripper[:, None, :2] @ rows) - corner / spans - 1
+        # grid_sample wants the last axis of the crop, across, first
+        return torch.baddbmm(
+            shift.flip(-1), points.flatten(1, 2), rows.flip(-1) * config.table_half
+        ).view_as(points)
 
     def carry(self, maps, flow):
         """
         Carry object maps by the flow.
 
         :param maps: (N, K, n, n) on the table grid, in the first picture.
-        :param flow: (N, 2, n, n).
+        :param flow: (N, n, n, 2), table units.
         :return: (N, K, n, n), each summing to 1; mass that left the table is gone.
         """
-        back = self.points + flow.permute(0, 2, 3, 1)
-        carried = sample_table(maps, back, self.config.table_half, 'zeros')
+        carried = sample(maps, self.grid + flow, 'zeros')
         return carried / carried.sum((-1, -2), keepdim=True).clamp_min(1e-6)
 
     def picture(self, scene, flow, arm, homography=None):
         """
         Compose the picture that the flow leads to, for training and for people.
 
-        :param scene: Scene of B first pictures; flow (B, 2, n, n); arm (B, 4, H, W) as drawn.
+        :param scene: Scene of B first pictures; flow (B, n, n, 2); arm (B, 4, H, W) as drawn.
         :return: picture (B, 3, H, W) and masks (B, 3, 1, H, W) of arm, objects and background.
         """
         if homography is None:
             homography = self.homography.expand(len(flow), 3, 3)
         pixels = self.pixels
-        table = project(torch.linalg.inv(homography), pixels.flatten(0, 1))
+        half = self.config.table_half
+        table = project(torch.linalg.inv(homography), pixels.flatten(0, 1)) / half
         table = table.unflatten(1, pixels.shape[:2])  # (B, H, W, 2)
-        moved = sample_table(flow, table, self.config.table_half, 'zeros').permute(0, 2, 3, 1)
-        source = project(homography, (table + moved).flatten(1, 2)).view_as(table)
+        source = table + channels_last(sample(channels_first(flow), table, 'zeros'))
+        source = project(homography, source.flatten(1, 2) * half).view_as(table)
         objects = sample_picture(scene.objects, source)
         arm_mask = arm[:, 3:]
         object_mask = (1 - arm_mask) * objects[:, 3:]
@@ -351,8 +373,7 @@ class ForwardModel(nn.Module):
 
     def pixel_table(self):
         """Return the pixel (n, n, 2) of every cell of the table grid."""
-        n = self.config.table_cells
-        return project(self.homography, self.points.view(n * n, 2)).view(n, n, 2)
+        return project(self.homography, self._points()).view_as(self.grid)
 
     def seed_maps(self, pixels):
         """
@@ -393,9 +414,9 @@ class ForwardModel(nn.Module):
         arm_mask = self.draw_arm(gripper)[:, 3:]
         return self.look(image, torch.zeros_like(arm_mask) if arm_hidden else arm_mask).features
 
-    def carried_maps(self, features, gripper, maps, actions):
+    def carried_maps(self, features, gripper, maps, actions, every=1):
         """
-        Yield the maps (N, K, n, n) after each step of N action sequences.
+        Yield the maps (N, K, n, n) after every so many steps of N action sequences.
 
         :param features: (1, C, n, n) from begin; gripper (1, 4); maps (K, n, n) on the table grid.
         :param actions: (N, horizon, 4).
@@ -405,39 +426,36 @@ class ForwardModel(nn.Module):
         maps = maps.expand(count, -1, -1, -1)
         gripper = gripper.expand(count, -1)
         flow = self.still(count)
-        for action in actions.unbind(1):
+        for t, action in enumerate(actions.unbind(1), 1):
             flow, gripper, _ = self.advance(features, flow, gripper, action)
-            yield self.carry(maps, flow)
+            if t % every == 0:
+                yield self.carry(maps, flow)
 
 
-def config_from_dict(values):
-    """Rebuild a ForwardModelConfig from what was saved, lists becoming tuples."""
-    try:
-        return ForwardModelConfig(
-            **{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
-    except TypeError as error:
-        raise WeightsError(f'forward model: its saved configuration does not fit: {error}') from error
-
-
-def config_to_dict(config):
-    """Return the configuration as plain values."""
-    return asdict(config)
-
-
-def load_forward_model(path, device='cpu'):
+def load_forward_model(path, device='cpu', precision='auto'):
     """
     Load a trained forward model, ready to predict.
 
     :param path: safetensors file of kind 'forward_model'.
+    :param precision: of the push net: 'float32', 'bfloat16', or 'auto': bfloat16 where the
+        device has instructions for it.
     :return: ForwardModel in evaluation mode.
     :raises WeightsError: for a missing or damaged file, or one of another kind.
     """
-    from tap_ros.prediction.weights import load_weights
     values, state, _ = load_weights(path, 'forward_model')
-    model = ForwardModel(config_from_dict(values))
-    missing, unexpected = model.load_state_dict(state, strict=False)
-    if missing or unexpected:
-        raise WeightsError(
-            f'{path}: not the weights of this forward model; missing {missing[:3]}, '
-            f'unexpected {unexpected[:3]}')
-    return model.to(device).eval()
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    model = ForwardModel(make_config(ForwardModelConfig, values, path))
+    load_into(model, state, path)
+    model = model.to(device).eval().requires_grad_(False)
+    if precision == 'bfloat16' or (precision == 'auto' and has_bfloat16(device)):
+        fields = model.push.fields  # geometry stays exact
+        model.push.bfloat16()
+        model.push.fields = fields
+    return model.to(memory_format=torch.channels_last)
+
+
+def has_bfloat16(device):
+    """Say whether a device multiplies bfloat16 itself; others emulate it many times slower."""
+    if torch.device(device).type == 'cuda':
+        return True
+    return getattr(torch.cpu, '_is_avx512_bf16_supported', lambda: False)()

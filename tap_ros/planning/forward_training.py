@@ -31,7 +31,7 @@ from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, sta
 from tap_ros.prediction.pictures import grid, grey_panels
 from tap_ros.prediction.training import learning_rate, pick_device
 from tap_ros.prediction.weights import save_weights
-from tap_ros.recording import open_recordings
+from tap_ros.recording.cache import open_recordings
 
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
 
@@ -60,7 +60,7 @@ class ForwardTrainingConfig:
     out: str
     steps: int = 6000
     batch_size: int = 16
-    horizon: int = 15
+    horizon: int = 8
     grow: float = 0.4
     pictures: int = 4
     learning_rate: float = 2e-3
@@ -68,7 +68,7 @@ class ForwardTrainingConfig:
     gradient_clip: float = 1.0
     average_decay: float = 0.995
     motion_factor: float = 8.0
-    still_weight: float = 1e-3
+    still_weight: float = 2e-4
     width: int = 32
     features: int = 8
     augment: bool = True

@@ -27,9 +27,13 @@ def project(matrix, points):
     return rays[..., :2] / rays[..., 2:]
 
 
-def grid_points(cells, half_size):
-    """Return the centres (cells, cells, 2) in metres of a square table grid: [row y, column x]."""
-    line = torch.linspace(-half_size, half_size, cells)
+def grid_points(cells):
+    """
+    Return the centres (cells, cells, 2) of a square grid, row y, column x, from -1 to 1.
+
+    These are table units: metres divided by half the table's side.
+    """
+    line = torch.linspace(-1, 1, cells)
     y, x = torch.meshgrid(line, line, indexing='ij')
     return torch.stack([x, y], dim=-1)
 
@@ -54,16 +58,25 @@ def sample_picture(images, pixels, padding='border'):
         images, pixels * scale - 1, padding_mode=padding, align_corners=True)
 
 
-def sample_table(fields, points, half_size, padding='border'):
+def sample(fields, points, padding='border'):
     """
-    Read fields on the table grid at points in metres, bilinearly.
+    Read fields on the table grid at points, bilinearly.
 
-    :param fields: (B, C, n, n) over [-half_size, half_size]^2, row y, column x.
-    :param points: (B, h, w, 2) metres.
+    :param fields: (B, C, n, n), row y, column x, from -1 to 1.
+    :param points: (B, h, w, 2) table units.
     :return: (B, C, h, w).
     """
-    return F.grid_sample(
-        fields, points / half_size, padding_mode=padding, align_corners=True)
+    return F.grid_sample(fields, points, padding_mode=padding, align_corners=True)
+
+
+def channels_last(x):
+    """View (N, C, h, w) as (N, h, w, C)."""
+    return x.permute(0, 2, 3, 1)
+
+
+def channels_first(x):
+    """View (N, h, w, C) as (N, C, h, w)."""
+    return x.permute(0, 3, 1, 2)
 
 
 def splat_on_table(pixels, weights, homography, cells, half_size):

@@ -10,10 +10,9 @@ import copy
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.weights import load_tensors, save_tensors
+import torch
 
 # Settings that change where a run happens and what it shows, not what it learns.
 _FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')

@@ -10,12 +10,11 @@ CPU `channels_last` is the faster one.
 from dataclasses import dataclass
 import math
 
+from tap_ros.errors import ConfigError
+from tap_ros.prediction.warp import combine, warp
 import torch
 from torch import nn
 from torch.nn import functional
-
-from tap_ros.errors import ConfigError
-from tap_ros.prediction.warp import combine, warp
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,19 @@
 import contextlib
 from dataclasses import dataclass
 
-import torch
-
 from tap_ros.images import to_float
 from tap_ros.prediction.losses import (
-    bell_preference, fixed_time_loss, generalized_minimum_loss, l1_error, l1_errors, match_step,
-    preferred_error, relative_to_copying)
+    bell_preference,
+    fixed_time_loss,
+    generalized_minimum_loss,
+    l1_error,
+    l1_errors,
+    match_step,
+    preferred_error,
+    relative_to_copying,
+)
 from tap_ros.prediction.networks import Prediction
+import torch
 
 
 @dataclass(frozen=True)

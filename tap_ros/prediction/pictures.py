@@ -3,9 +3,8 @@
 """Pictures of predictions for people: rows of panels side by side."""
 
 import numpy as np
-import torch
-
 from tap_ros.images import to_uint8
+import torch
 
 _GAP = 2
 # One colour for each object, bright on the table's grey.

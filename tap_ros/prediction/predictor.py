@@ -5,13 +5,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-
 from tap_ros.errors import ConfigError, ImageError
 from tap_ros.images import check_image, to_float, to_uint8
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
 from tap_ros.prediction.weights import load_into, load_weights, make_config
+import torch
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,7 @@ class SubgoalPredictor:
         :return: SubgoalPredictor.
         :raises WeightsError: if the file is missing, damaged or for something else.
         """
-        values, state, training = load_weights(path, 'predictor')
-        network = Predictor(make_config(PredictorConfig, values, path))
-        load_into(network, state, path)
-        return cls(network.to(device, memory_format=torch.channels_last), training)
+        return cls(*load_network(path, device))
 
     @torch.inference_mode()
     def predict(self, start, goal, start_pixels=None, goal_pixels=None, num_samples=1,
@@ -127,6 +123,22 @@ class SubgoalPredictor:
             images = torch.stack([images[:, 0], prediction.image.clamp(-1, 1)], 1)
             maps = torch.stack([maps[:, 0], warped.maps], 1)
         return [subgoals[r][n] for n in range(N) for r in range(recursion_depth)]
+
+
+def load_network(path, device='cpu'):
+    """
+    Load the network of a weights file, in eval mode.
+
+    :param path: written by training.
+    :param device: where to run it.
+    :return: (Predictor, dict saying how the weights were made).
+    :raises WeightsError: if the file is missing, damaged or for something else.
+    """
+    values, state, training = load_weights(path, 'predictor')
+    network = Predictor(make_config(PredictorConfig, values, path))
+    load_into(network, state, path)
+    network.eval().requires_grad_(False)
+    return network.to(device, memory_format=torch.channels_last), training
 
 
 def check_pixels(pixels, name):

@@ -8,7 +8,12 @@ import re
 
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import (
-    GOAL_PICTURES, METHODS, PRECISIONS, SELECTIONS, TrainingConfig)
+    GOAL_PICTURES,
+    METHODS,
+    PRECISIONS,
+    SELECTIONS,
+    TrainingConfig,
+)
 
 _CHOICES = {'method': METHODS, 'selection': SELECTIONS, 'goal_picture': GOAL_PICTURES,
             'precision': PRECISIONS}

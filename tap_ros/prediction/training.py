@@ -13,10 +13,6 @@ import platform
 import time
 
 import numpy as np
-import torch
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
-
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.augmentation import Augmentation, reverse
 from tap_ros.prediction.batches import episode_order, make_batch, split_episodes
@@ -25,7 +21,10 @@ from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.objective import held_out_scores, predictor_loss
 from tap_ros.prediction.pictures import sample_grid
 from tap_ros.prediction.weights import save_weights
-from tap_ros.recording import open_recordings
+from tap_ros.recording.cache import open_recordings
+import torch
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
 
 _SHOWN = 8  # episodes in a sample picture
 
@@ -194,8 +193,9 @@ def _report(state, curves, config, store, training, held_out, autocast, score):
     device = next(state.average.parameters()).device
 
     def batch(episodes):
+        goal_picture = 'recorded' if config.goal_picture == 'recorded' else 'last'
         return make_batch(store, episodes, config.margin, middle=config.method == 'fix',
-                          goal_picture=config.goal_picture).to(device)
+                          goal_picture=goal_picture).to(device)
 
     scores = {}
     if len(held_out):

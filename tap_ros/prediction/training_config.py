@@ -8,7 +8,7 @@ from tap_ros.errors import ConfigError
 
 METHODS = ('fix', 'min', 'genmin')
 SELECTIONS = ('time_preference', 'relative_to_copying')
-GOAL_PICTURES = ('last', 'recorded')
+GOAL_PICTURES = ('last', 'recorded', 'mixed')
 PRECISIONS = ('auto', 'float32', 'bfloat16')
 
 
@@ -27,8 +27,8 @@ class TrainingConfig:
     :param num_targets: at most so many random targets an episode and step; 0: all of them.
     :param max_frames: longer episodes are cut to a random piece of this length; 0: never.
     :param min_crop: cut episodes to a random piece of at least this share; 1: never.
-    :param goal_picture: the goal picture is the episode's 'last' frame, or the 'recorded' goal
-        where the episode reached it.
+    :param goal_picture: the goal picture is the episode's 'last' frame; the 'recorded' goal
+        where the episode reached it; or 'mixed', one or the other at random.
     :param new_pixels: whether the network may paint; object maps are best without.
     :param base_width: the network's width; 32 in the paper.
     :param flow_scale: see PredictorConfig.
@@ -61,13 +61,13 @@ class TrainingConfig:
     num_targets: int = 0
     max_frames: int = 0
     min_crop: float = 1.0
-    goal_picture: str = 'last'
+    goal_picture: str = 'mixed'
     new_pixels: bool = False
     base_width: int = 16
     flow_scale: float = 16.0
-    steps: int = 6000
-    batch_size: int = 64
-    learning_rate: float = 5e-4
+    steps: int = 5000
+    batch_size: int = 32
+    learning_rate: float = 1e-3
     warmup: int = 100
     gradient_clip: float = 1.0
     average_decay: float = 0.999
@@ -86,6 +86,8 @@ class TrainingConfig:
 
     def __post_init__(self):
         """Refuse settings that cannot be trained with."""
+        if not self.recordings:
+            raise ConfigError('recordings: expected at least one .mcap file or bag folder')
         for name, choices in (('method', METHODS), ('selection', SELECTIONS),
                               ('goal_picture', GOAL_PICTURES), ('precision', PRECISIONS)):
             if getattr(self, name) not in choices:

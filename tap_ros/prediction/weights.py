@@ -14,7 +14,6 @@ import tempfile
 
 from safetensors import safe_open, SafetensorError
 from safetensors.torch import save_file
-
 from tap_ros.errors import WeightsError
 
 _FORMAT = 'tap_ros 1'

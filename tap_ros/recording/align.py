@@ -10,13 +10,11 @@ not: a frame belongs to an episode whose marks enclose its stamp, and that is ne
 from dataclasses import dataclass
 
 import numpy as np
-
 from tap_ros.recording.columns import pad_objects
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.spans import assign, MAX_JITTER_NS, read_spans
 
-MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
-_FAR = 2**62
 _EMPTY = {
     'frame_log': ((0,), np.int64), 'frame_stamp': ((0,), np.int64),
     'goal_log': ((0,), np.int64), 'goal_stamp': ((0,), np.int64), 'goal_index': ((0,), np.int64),
@@ -30,19 +28,6 @@ _EMPTY = {
     'goal_object_log': ((0,), np.int64), 'goal_object_stamp': ((0,), np.int64),
     'goal_object': ((0, 0, 9), np.float64), 'goal_object_names': ((0,), np.int64),
     'mark_log': ((0,), np.int64), 'mark_stamp': ((0,), np.int64), 'mark_event': ((0,), np.int64)}
-
-
-@dataclass
-class _Span:
-    """The part of the log and of the stamps that belongs to one episode."""
-
-    start_log: int = -_FAR
-    end_log: int = _FAR
-    start_stamp: int = -_FAR
-    end_stamp: int = _FAR
-    task: str = ''
-    seed: int = 0
-    outcome: str = ''
 
 
 @dataclass(frozen=True)
@@ -77,8 +62,9 @@ class EpisodeTable:
 
     def episode(self, i):
         """Return episode i."""
-        rows, K, span = slice(self.starts[i], self.starts[i + 1]), len(self.names[i]), self.spans[i]
-        objects, goal_objects, goal = self.objects[rows, :K], self.goal_objects[i, :K], self.goals[i]
+        rows, K = slice(self.starts[i], self.starts[i + 1]), len(self.names[i])
+        objects, goal_objects = self.objects[rows, :K], self.goal_objects[i, :K]
+        goal, span = self.goals[i], self.spans[i]
         return Episode(
             frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
             grippers=self.grippers[rows], object_names=self.names[i],
@@ -113,8 +99,8 @@ def assemble(parts):
         data['frame_stamp'] = data['frame_log']
     for name in ('twist', 'joint', 'object'):
         _stamp_unstamped(data, name)
-    spans = _spans(data, marks)
-    owner = _assign(spans, data['frame_log'], data['frame_stamp'])
+    spans = read_spans(data, marks)
+    owner = assign(spans, data['frame_log'], data['frame_stamp'])
     order = np.lexsort((data['frame_stamp'], owner))
     order = order[owner[order] >= 0]
     owner, stamps = owner[order], data['frame_stamp'][order]
@@ -161,7 +147,7 @@ class _Clock:
         """Return (times, rows): of the messages that belong to an episode, sorted by time."""
         if not len(self.spans):
             return np.empty(0, np.int64), np.empty(0, np.int64)
-        owner = _assign(self.spans, log, stamps)
+        owner = assign(self.spans, log, stamps)
         since = stamps - self.first[owner]
         rows = np.flatnonzero(
             (owner >= 0) & (since >= -self.match) & (since <= self.length[owner] + self.match))
@@ -170,7 +156,7 @@ class _Clock:
         return times[order], rows[order]
 
     def nearest_rows(self, log, stamps):
-        """Return (rows, found): for each frame the message nearest in time, the newest of equals."""
+        """Return (rows, found): for each frame the message nearest in time, or the newest."""
         times, rows = self.rows(log, stamps)
         if not len(times):
             return np.zeros(len(self.frames), np.int64), np.zeros(len(self.frames), bool)
@@ -216,50 +202,6 @@ def _stamp_unstamped(data, name):
     if len(frames) and (stamps == 0).any():
         newest = np.searchsorted(data['frame_log'], data[f'{name}_log'], 'right') - 1
         data[f'{name}_stamp'] = np.where(stamps == 0, frames[np.maximum(newest, 0)], stamps)
-
-
-def _spans(data, marks):
-    """Read the marks: a list of spans in the order of the log."""
-    if not marks:
-        return [_Span()]
-    spans, current, last_end = [], None, -_FAR
-    for log, stamp, event, (task, seed, outcome) in zip(
-            data['mark_log'].tolist(), data['mark_stamp'].tolist(),
-            data['mark_event'].tolist(), marks, strict=True):
-        if event == 0:
-            if current is not None:
-                current.end_log = log - 1
-                if stamp > current.start_stamp:
-                    current.end_stamp = stamp - 1
-            current = _Span(log, _FAR, stamp, _FAR, task, seed, 'interrupted')
-            spans.append(current)
-        else:
-            if current is None:  # recording began after the start of the episode
-                current = _Span(last_end, task=task, seed=seed)
-                spans.append(current)
-            current.end_log, current.outcome = log, outcome
-            current.end_stamp = stamp or _FAR
-            current, last_end = None, log + 1
-    return spans
-
-
-def _assign(spans, log, stamps):
-    """Return (N,) int64: the episode of each message, -1 for none."""
-    start_log, end_log, start_stamp, end_stamp = np.array(
-        [(s.start_log, s.end_log, s.start_stamp, s.end_stamp) for s in spans],
-        np.int64).reshape(-1, 4).T
-    best = np.full(len(log), -1)
-    best_distance = np.full(len(log), MAX_JITTER_NS + 1)
-    inside = np.searchsorted(start_log, log, 'right') - 1
-    for shift in (0, 1, -1):
-        candidate = np.clip(inside + shift, 0, len(spans) - 1)
-        distance = np.maximum(
-            np.maximum(start_log[candidate] - log, log - end_log[candidate]), 0)
-        better = (
-            (start_stamp[candidate] <= stamps) & (stamps <= end_stamp[candidate])
-            & (distance < best_distance))
-        best[better], best_distance[better] = candidate[better], distance[better]
-    return best
 
 
 def _actions(data, clock, frame_log):

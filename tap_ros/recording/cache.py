@@ -14,23 +14,20 @@ import os
 from pathlib import Path
 import shutil
 import tempfile
-import warnings
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
-from tqdm import tqdm
-
 from tap_ros.errors import RecordingError
-from tap_ros.recording import topics
 from tap_ros.recording.align import assemble, follows
+from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_paths, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
-from tap_ros.recording.container import McapFile, THREADS
-from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.metadata import bag_files, FILE_NAME
+from tap_ros.recording.container import McapFile
+from tqdm import tqdm
 
 FORMAT = 1  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
+_MAX_BUFFERS = 1024  # of one writev
 _NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
 
 
@@ -83,7 +80,7 @@ def open_recordings(paths, cache_dir=None, progress=True, image_topic=None):
     cache_dir = Path(cache_dir or os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
     total = sum(file.stat().st_size for bag in bags for file in bag)
     with tqdm(total=total, desc='opening recordings', unit='B', unit_scale=True,
-              disable=not progress, delay=1) as bar, ThreadPoolExecutor(THREADS) as pool:
+              disable=not progress, delay=1) as bar, ThreadPoolExecutor(_workers()) as pool:
         found = [find_topics(bag, image_topic) for bag in bags]
         jobs = [
             [pool.submit(_open_file, file, names, cache_dir, bar) for file in bag]
@@ -100,74 +97,13 @@ def open_recordings(paths, cache_dir=None, progress=True, image_topic=None):
     tables = [assemble(run) for bag in columns for run in _runs(bag)]
     store = EpisodeStore(tables, [digest for bag in loaded for _, digest in bag])
     if not len(store):
-        raise RecordingError(f'{_list(paths)}: no camera image lies within an episode')
+        raise RecordingError(f'{list_paths(paths)}: no camera image lies within an episode')
     return store
 
 
-def find_bags(path):
-    """
-    Return the bags at a path: a list of lists of .mcap files, in playing order.
-
-    :param path: .mcap file, bag folder, or folder of bag folders.
-    :raises RecordingError: when there is none.
-    """
-    path = Path(path)
-    if path.is_file():
-        return [[path]]
-    if not path.is_dir():
-        raise RecordingError(f'{path}: there is no such file or folder')
-    folders = [path] if _is_bag(path) else sorted(f for f in path.iterdir() if _is_bag(f))
-    bags = [files for folder in folders if (files := bag_files(folder))]
-    if not bags:
-        raise RecordingError(
-            f'{path}: holds no recording; expected .mcap files, with {FILE_NAME} beside them, '
-            'or folders of such')
-    return bags
-
-
-def find_topics(files, image_topic=None):
-    """
-    Find the topics of a bag.
-
-    :param files: its .mcap files.
-    :param image_topic: as in open_recordings.
-    :return: as topics.resolve.
-    """
-    available = {}
-    for file in files:
-        available |= {t: c.type_name for t, c in McapFile(file).topics().items()}
-    return topics.resolve(available, _list(files), image_topic)
-
-
-def check_sizes(parts):
-    """Refuse recordings whose images differ in size, naming them."""
-    sizes = {}
-    for part in parts:
-        if part.image_size is not None:
-            sizes.setdefault(tuple(part.image_size), part.source)
-    if not sizes:
-        raise RecordingError(
-            f'{_list([part.source for part in parts])}: the image topic holds no image')
-    if len(sizes) > 1:
-        listing = ', '.join(f'{s} ({w}x{h})' for (h, w), s in sizes.items())
-        raise RecordingError(
-            f'images of different sizes (width x height): {listing}; open them separately')
-
-
-def warn_of_damage(part):
-    """Say what could not be read of a file."""
-    if part.damage:
-        warnings.warn(f'{part.source}: {part.damage}', RecordingWarning, stacklevel=3)
-
-
-def _is_bag(path):
-    return path.is_dir() and ((path / FILE_NAME).exists() or any(path.glob('*.mcap')))
-
-
-def _list(paths):
-    """Name the first of several files."""
-    paths = [str(path) for path in paths]
-    return paths[0] + (f' and {len(paths) - 1} more' if len(paths) > 1 else '')
+def _workers():
+    """Return the number of files decoded at once."""
+    return len(os.sched_getaffinity(0))
 
 
 def _runs(parts):
@@ -183,8 +119,7 @@ def _runs(parts):
 
 def _open_file(path, found, cache_dir, bar):
     """Return (Columns with mapped frames, digest) of one file, from the cache or decoded."""
-    with open(path, 'rb') as stream:
-        digest = hashlib.file_digest(stream, 'sha256').hexdigest()
+    digest = hashlib.sha256(McapFile(path).data).hexdigest()
     key = hashlib.sha256(json.dumps([FORMAT, sorted(found.items())]).encode()).hexdigest()[:8]
     folder = cache_dir / f'{digest}-{key}'
     columns = _load(folder, path)
@@ -207,22 +142,48 @@ def _build(path, found, folder):
             f'{folder.parent}: the cache cannot be written ({error.strerror}); set {ENVIRONMENT} '
             'to a folder that can') from error
     try:
-        with open(part / 'frames.npy', 'wb') as stream:
+        with open(part / 'frames.npy', 'wb', buffering=0) as stream:
             stream.write(bytes(_NPY_HEADER))
-            columns = decode_file(McapFile(path), found, stream.write)
+            columns = decode_file(
+                McapFile(path), found, lambda buffers: _write_all(stream, buffers))
             _write_header(stream, columns)
         _sort_frames(part / 'frames.npy', columns.arrays)
         arrays = {k: np.ascontiguousarray(a) for k, a in columns.arrays.items()}
         if columns.goal_frames is not None:
             arrays['goal_frames'] = columns.goal_frames
         save_file(arrays, part / 'columns.safetensors', {'columns': columns.describe()})
-        shutil.rmtree(folder, ignore_errors=True)  # there only when it could not be read
-        os.rename(part, folder)
+        _put(part, folder, path)
     except OSError as error:
-        if not folder.is_dir():  # else another process was faster
-            raise RecordingError(f'{folder}: the cache cannot be written: {error}') from error
+        raise RecordingError(f'{folder}: the cache cannot be written: {error}') from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _put(part, folder, path):
+    """Give a finished folder its name; one that is there stays, unless it cannot be read."""
+    if folder.exists() and _load(folder, path) is None:
+        broken = Path(tempfile.mkdtemp(prefix=folder.name + '.', dir=folder.parent))
+        try:
+            os.rename(folder, broken / 'broken')
+        except FileNotFoundError:  # another process was faster
+            pass
+        shutil.rmtree(broken, ignore_errors=True)
+    try:
+        os.rename(part, folder)
+    except OSError:
+        if _load(folder, path) is None:  # else another process was faster
+            raise
+
+
+def _write_all(stream, buffers):
+    """Write many buffers with few calls of the system and without copying them together."""
+    waiting = [memoryview(buffer).cast('B') for buffer in buffers]
+    while waiting:
+        written = os.writev(stream.fileno(), waiting[:_MAX_BUFFERS])
+        while waiting and written >= len(waiting[0]):
+            written -= len(waiting.pop(0))
+        if written:
+            waiting[0] = waiting[0][written:]
 
 
 def _write_header(stream, columns):
@@ -254,7 +215,7 @@ def _load(folder, source):
         frames = np.load(folder / 'frames.npy', mmap_mode='r') if count else None
         if count and frames.shape != (count, *about['image_size'], 3):
             return None
-    except (OSError, SafetensorError, ValueError, KeyError):
+    except (OSError, EOFError, SafetensorError, ValueError, KeyError):
         return None
     return Columns(
         str(source), tuple(about['image_size']) if count else None, frames,

@@ -7,10 +7,10 @@ CDR, the bytes of ROS 2 messages, to and from Python without ROS.
 message lie, and then reads those of all messages that look alike with one numpy view.
 """
 
+import math
 import struct
 
 import numpy as np
-
 from tap_ros.errors import RecordingError
 from tap_ros.recording.schemas import fields, PRIMITIVES
 
@@ -52,12 +52,13 @@ class Layout:
     :param type_name: for example 'sensor_msgs/msg/JointState'.
     :param data: bytes of one such message.
     :param skip: name of the last field, when rows are to end where its content begins.
+    :param same: names of number fields that have to be equal as well.
     :raises RecordingError: when the bytes are not such a message.
     """
 
-    def __init__(self, type_name, data, skip=None):
+    def __init__(self, type_name, data, skip=None, same=()):
         data = bytes(data)
-        self.type_name = type_name
+        self.type_name, self.example = type_name, data
         self.size = len(data)
         self.values = {}  # path -> (offset, dtype, shape); numbers
         self.strings = {}  # path -> text
@@ -66,7 +67,6 @@ class Layout:
             raise RecordingError(
                 f'{type_name}: expected plain CDR (first bytes 00 00 or 00 01), '
                 f'got {data[:2].hex(" ") or "nothing"}')
-        self._data = data
         self._order = '<' if data[1] else '>'
         self._static = np.zeros(len(data), bool)
         self._static[:2] = True
@@ -75,10 +75,13 @@ class Layout:
             self._visit_struct(type_name, '')
         except (struct.error, UnicodeDecodeError, ValueError) as error:
             raise RecordingError(f'{type_name}: damaged message: {error}') from error
+        for path in same:
+            offset, dtype, _ = self.values[path]
+            self._static[offset:offset + dtype.itemsize] = True
         self.prefix = self.values[skip][0] if skip else len(data)
         self._where = np.flatnonzero(self._static[:self.prefix])
         self._template = np.frombuffer(data, np.uint8)[self._where]
-        del self._data, self._static
+        del self._static
 
     def matches(self, rows):
         """
@@ -117,7 +120,7 @@ class Layout:
 
     @staticmethod
     def _column(rows, offset, dtype, shape):
-        size = dtype.itemsize * int(np.prod(shape, dtype=np.int64))
+        size = dtype.itemsize * math.prod(shape)
         part = np.ascontiguousarray(rows[:, offset:offset + size])
         return part.view(dtype).reshape(len(rows), *shape) if size else np.empty(
             (len(rows), *shape), dtype)
@@ -149,7 +152,7 @@ class Layout:
             elif n is None:
                 self._visit_one(base, here)
             else:
-                if n > len(self._data):
+                if n > len(self.example):
                     raise ValueError(f'{here} claims {n} elements')
                 for i in range(n):
                     self._visit_one(base, f'{here}[{i}]')
@@ -158,14 +161,14 @@ class Layout:
         if base == 'string':
             start = self._end_of_length(size := self._length(here))
             self._static[start:start + size] = True
-            self.strings[here] = self._data[start:start + max(size - 1, 0)].decode()
+            self.strings[here] = self.example[start:start + max(size - 1, 0)].decode()
         else:
             self._visit_struct(base, f'{here}.')
 
     def _length(self, here):
         """Read the length of a string or sequence; it is part of the structure."""
         start = self._align(4)
-        (n,) = struct.unpack_from(self._order + 'I', self._data, start)
+        (n,) = struct.unpack_from(self._order + 'I', self.example, start)
         self._end = start + 4
         self.counts[here] = n
         self._static[start:start + 4] = True
@@ -174,7 +177,7 @@ class Layout:
     def _end_of_length(self, size):
         start = self._end
         self._end += size
-        if self._end > len(self._data):
+        if self._end > len(self.example):
             raise ValueError(f'a string of {size} bytes ends behind the message')
         return start
 
@@ -185,8 +188,8 @@ class Layout:
             return
         start = self._align(dtype.itemsize)
         self._end = start + dtype.itemsize * (shape[0] if shape else 1)
-        if self._end > len(self._data):
-            raise ValueError(f'{here} ends at byte {self._end} of {len(self._data)}')
+        if self._end > len(self.example):
+            raise ValueError(f'{here} ends at byte {self._end} of {len(self.example)}')
         self.values[here] = (start, dtype, shape)
 
     def _align(self, size):

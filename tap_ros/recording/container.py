@@ -3,33 +3,29 @@
 """
 MCAP files, read front to back, block by block, as fast as they unpack.
 
-A block is an unpacked chunk with a table of its messages; chunks are unpacked and checked ahead
-in threads. Nothing but complete records is used, so what a killed recorder left is read too.
+A block is an unpacked chunk with a table of its messages; their bytes stay where they are. Nothing
+but complete records is used, so what a killed recorder left is read too.
 """
 
-from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 import mmap
 import struct
-import threading
 import zlib
 
 import numpy as np
-import zstandard
-
 from tap_ros.errors import RecordingError
+from tap_ros.recording.chunks import unpack
 
 MAGIC = b'\x89MCAP0\r\n'
-MAX_CHUNK_BYTES = 256 * 2**20  # a chunk that claims to unpack to more is refused
-THREADS = 2
-_AHEAD = 4  # chunks unpacked ahead of their use
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 3, 4, 5, 6, 15
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _DATA_END = 3, 4, 5, 6, 7, 15
 _RECORD = struct.Struct('<BQ')
-_MESSAGE_START = struct.Struct('<BQHIQQ')  # record header, channel, sequence, log and publish time
-_CHUNK_START = struct.Struct('<QQQII')  # start, end, unpacked size, crc, length of compression
+_MESSAGE_HEAD = np.dtype([
+    ('kind', 'u1'), ('length', '<u8'), ('channel', '<u2'), ('sequence', '<u4'), ('log', '<u8'),
+    ('publish', '<u8')])
+_HEAD_BYTES = _MESSAGE_HEAD.itemsize
+_INDEX_START = 6  # bytes before the entries of a message index: channel, size of the entries
+_RUN_BYTES = 2**20  # of messages outside of chunks that are taken together
 _FOOTER = struct.Struct('<BQQQI')  # record header, summary start, summary offsets start, crc
-_local = threading.local()
 
 
 @dataclass(frozen=True)
@@ -39,18 +35,16 @@ class Channel:
     topic: str
     type_name: str
     encoding: str  # of messages; 'cdr' is all we read
-    schema_encoding: str
+    schema_encoding: str  # 'ros2msg' when schema is the text of the definition
+    schema: str
 
 
 @dataclass(frozen=True)
 class Block:
-    """Messages that lie in one buffer, in the order of the file."""
+    """Messages that lie in one buffer."""
 
     buffer: np.ndarray  # uint8
-    channels: np.ndarray  # (N,) int64, keys of McapFile.channels
-    log_times: np.ndarray  # (N,) int64, nanoseconds
-    starts: np.ndarray  # (N,) int64, where the data of the message starts in the buffer
-    sizes: np.ndarray  # (N,) int64
+    messages: dict  # topic -> (N, 3) int64: log time (ns), start and size of the data
 
 
 class McapFile:
@@ -88,30 +82,30 @@ class McapFile:
         :return: dict topic -> Channel.
         """
         if not self._read_summary():
-            for _ in self.blocks():
+            for _ in self.blocks(()):
                 pass
         return {channel.topic: channel for channel in self.channels.values()}
 
-    def blocks(self):
+    def blocks(self, wanted):
         """
-        Yield all messages, block by block.
+        Yield the messages of some topics, block by block, in the order of the file.
+
+        A block is good until the next one is asked for: buffers are used again, because fresh
+        memory costs as much as unpacking into it.
 
         When the file ends too early all complete chunks are yielded, and `damage` says so.
 
-        :raises RecordingError: for a chunk whose checksum is wrong, that does not unpack, or that
-            claims to unpack to more than MAX_CHUNK_BYTES.
+        :param wanted: the topics.
+        :raises RecordingError: for a damaged chunk.
         """
-        waiting = deque()
-        with ThreadPoolExecutor(THREADS) as pool:
-            for kind, start, end in self._records():
-                if kind == _CHUNK:
-                    waiting.append(pool.submit(self._unpack, start, end))
-                elif kind == _MESSAGE:
-                    waiting.append(pool.submit(self._take, start - _RECORD.size, end))
-                if len(waiting) > _AHEAD:
-                    yield self._block(waiting.popleft().result())
-            while waiting:
-                yield self._block(waiting.popleft().result())
+        buffer = np.empty(0, np.uint8)
+        for kind, start, end, index in self._records():
+            if kind == _CHUNK:
+                where = f'{self.path}: chunk at byte {start}'
+                data, buffer = unpack(memoryview(self.data)[start:end], where, buffer)
+            else:
+                data = np.frombuffer(self.data, np.uint8, end - start, start)
+            yield self._block(data, index, wanted)
 
     def _read_summary(self):
         """Note the topics that the summary lists; tell whether there is a sound one."""
@@ -129,19 +123,21 @@ class McapFile:
             if kind in (_SCHEMA, _CHANNEL):
                 self._define(kind, data[start + _RECORD.size:start + _RECORD.size + length])
             start += _RECORD.size + length
-        return bool(self.channels)
+        return bool(self.channels) and all(c.type_name for c in self.channels.values())
 
     def _records(self):
-        """Yield (opcode, start, end) of chunks, and of runs of messages outside of chunks."""
-        position, size, run = len(MAGIC), len(self.data), None
+        """Yield (opcode, start, end, index) of chunks and of runs of messages outside of them."""
+        position, size, run, chunk = len(MAGIC), len(self.data), None, None
         while True:
             complete = position + _RECORD.size <= size
             kind, length = _RECORD.unpack_from(self.data, position) if complete else (None, 0)
             start, end = position + _RECORD.size, position + _RECORD.size + length
-            complete = complete and end <= size
-            if run is not None and (
-                    not complete or kind != _MESSAGE or end - run > 2**20):
-                yield _MESSAGE, run + _RECORD.size, position
+            complete = complete and end <= size and kind != 0  # zeros: what was never written
+            if chunk and (not complete or kind != _MESSAGE_INDEX):
+                yield chunk
+                chunk = None
+            if run is not None and (not complete or kind != _MESSAGE or end - run > _RUN_BYTES):
+                yield _MESSAGE, run, position, []
                 run = None
             if not complete:
                 self.damage = (
@@ -155,57 +151,82 @@ class McapFile:
             elif kind in (_SCHEMA, _CHANNEL):
                 self._define(kind, memoryview(self.data)[start:end])
             elif kind == _CHUNK:
-                yield kind, start, end
+                chunk = (kind, start, end, [])
+            elif kind == _MESSAGE_INDEX and chunk and length >= _INDEX_START + 16:
+                chunk[3].append((start, length))
             position = end
 
-    def _take(self, start, end):
-        return np.frombuffer(self.data, np.uint8, end - start, start)
+    def _block(self, buffer, index, wanted):
+        """Make the tables of the messages in a buffer, and note the topics defined in it."""
+        positions = self._positions(buffer, index)
+        heads = _heads(buffer, positions)
+        sizes = heads['length'].astype(np.int64) - _HEAD_BYTES + _RECORD.size
+        if sizes.min(initial=0) < 0:
+            raise RecordingError(f'{self.path}: damaged record in a chunk: too short')
+        table = np.stack([heads['log'].astype(np.int64), positions + _HEAD_BYTES, sizes], 1)
+        found = {}
+        for number in set(heads['channel'].tolist()):
+            channel = self.channels.get(number)
+            if channel is None or channel.topic not in wanted:
+                continue
+            if channel.encoding != 'cdr':
+                raise RecordingError(
+                    f'{self.path}: topic {channel.topic} is encoded as {channel.encoding!r}; '
+                    'only cdr can be read')
+            found.setdefault(channel.topic, []).append(np.flatnonzero(heads['channel'] == number))
+        return Block(buffer, {
+            topic: table[rows[0] if len(rows) == 1 else np.sort(np.concatenate(rows))]
+            for topic, rows in found.items()})
 
-    def _unpack(self, start, end):
-        """Unpack and check one chunk; runs in a thread."""
-        where = f'{self.path}: chunk at byte {start}'
-        view = memoryview(self.data)[start:end]
-        try:
-            _, _, size, crc, length = _CHUNK_START.unpack_from(view)
-            compression = bytes(view[_CHUNK_START.size:_CHUNK_START.size + length]).decode()
-            (packed,) = struct.unpack_from('<Q', view, _CHUNK_START.size + length)
-        except (struct.error, UnicodeDecodeError) as error:
-            raise RecordingError(f'{where} is damaged: {error}') from error
-        body = view[_CHUNK_START.size + length + 8:]
-        if len(body) != packed:
-            raise RecordingError(f'{where} is damaged: it has {len(body)} of {packed} bytes')
-        if size > MAX_CHUNK_BYTES:
-            raise RecordingError(
-                f'{where} claims to unpack to {size} bytes; at most {MAX_CHUNK_BYTES} are accepted')
-        data = _decompress(compression, body, size, where)
-        if len(data) != size or (crc and zlib.crc32(data) != crc):
-            raise RecordingError(
-                f'{where} is damaged: its checksum or size is wrong; restore the file from a copy')
-        return np.frombuffer(data, np.uint8)
+    def _positions(self, buffer, index):
+        """
+        Return where the message records of a buffer start, (N,) int64.
 
-    def _block(self, buffer):
-        """Make the table of the messages in a buffer, and note the topics defined in it."""
-        rows, position, size = [], 0, len(buffer)
-        data = memoryview(buffer)
-        unpack, header = _MESSAGE_START.unpack_from, _MESSAGE_START.size
+        The index of the chunk says so; only what it does not cover is walked over. An index that
+        does not fit is of no use: then everything is.
+        """
+        if index:
+            try:
+                return self._indexed(buffer, index)
+            except RecordingError:
+                pass  # a wrong index
+        return self._walk(buffer, 0, len(buffer))
+
+    def _indexed(self, buffer, index):
+        """Return the same by an index; raise RecordingError when it is wrong."""
+        size = len(buffer)
+        entries = [
+            np.frombuffer(self.data, '<u8', (length - _INDEX_START) // 8, start + _INDEX_START)
+            for start, length in index]
+        positions = np.sort(np.concatenate([e[1::2] for e in entries]).astype(np.int64))
+        if positions[0] < 0 or positions[-1] > size - _HEAD_BYTES:
+            raise RecordingError(f'{self.path}: an index points out of its chunk')
+        heads = _heads(buffer, positions)
+        lengths = np.minimum(heads['length'], size).astype(np.int64)
+        ends = np.concatenate([[0], positions + _RECORD.size + lengths])
+        starts = np.append(positions, size)
+        if (starts < ends).any() or (heads['kind'] != _MESSAGE).any():
+            raise RecordingError(f'{self.path}: an index does not point to messages')
+        gaps = np.flatnonzero(starts != ends)
+        more = [self._walk(buffer, int(ends[i]), int(starts[i])) for i in gaps]
+        return np.sort(np.concatenate([positions, *more])) if more else positions
+
+    def _walk(self, buffer, position, end):
+        """Go over records one by one; note topics and return where messages start, (N,) int64."""
+        found, data = [], memoryview(buffer)
         try:
-            while position < size:
-                kind, length = data[position], 0
+            while position < end:
+                kind, length = _RECORD.unpack_from(data, position)
                 if kind == _MESSAGE:
-                    _, length, channel, _, log, _ = unpack(data, position)
-                    rows.append((channel, log, position + header, length - 22))
-                else:
-                    kind, length = _RECORD.unpack_from(data, position)
-                    start = position + _RECORD.size
-                    if kind in (_SCHEMA, _CHANNEL):
-                        self._define(kind, data[start:start + length])
+                    found.append(position)
+                elif kind in (_SCHEMA, _CHANNEL):
+                    self._define(kind, data[position + 9:position + 9 + length])
                 position += _RECORD.size + length
-            table = np.array(rows, np.int64).reshape(-1, 4).T
-        except (struct.error, OverflowError) as error:
+        except struct.error as error:
             raise RecordingError(f'{self.path}: damaged record in a chunk: {error}') from error
-        if position != size or (table[3] < 0).any():
+        if position != end or (found and found[-1] + _HEAD_BYTES > end):
             raise RecordingError(f'{self.path}: damaged record in a chunk: wrong length')
-        return Block(buffer, *table)
+        return np.array(found, np.int64)
 
     def _define(self, kind, record):
         """Read a schema or channel record."""
@@ -213,39 +234,39 @@ class McapFile:
             if kind == _SCHEMA:
                 (number,) = struct.unpack_from('<H', record)
                 name, position = _text(record, 2)
-                encoding, _ = _text(record, position)
-                self._schemas[number] = (name, encoding)
+                encoding, position = _text(record, position)
+                schema, _ = _text(record, position)
+                self._schemas[number] = (name, encoding, schema)
                 return
             number, schema = struct.unpack_from('<HH', record)
             topic, position = _text(record, 4)
             encoding, _ = _text(record, position)
         except (struct.error, UnicodeDecodeError) as error:
             raise RecordingError(f'{self.path}: damaged topic record: {error}') from error
-        name, schema_encoding = self._schemas.get(schema, ('', ''))
-        self.channels[number] = Channel(topic, name, encoding, schema_encoding)
+        name, *about = self._schemas.get(schema, ('', '', ''))
+        self.channels[number] = Channel(topic, name, encoding, *about)
+
+
+def gather(buffer, starts, width):
+    """
+    Copy out equally long pieces of a buffer.
+
+    :param buffer: uint8.
+    :param starts: (N,) where the pieces start.
+    :param width: of a piece.
+    :return: (N, width) uint8.
+    """
+    return np.ndarray((len(buffer) - width + 1, width), np.uint8, buffer, 0, (1, 1))[starts]
+
+
+def _heads(buffer, positions):
+    """Return the first bytes of message records, (N,) of _MESSAGE_HEAD."""
+    if not len(positions):
+        return np.empty(0, _MESSAGE_HEAD)
+    return gather(buffer, positions, _HEAD_BYTES).view(_MESSAGE_HEAD)[:, 0]
 
 
 def _text(record, position):
     (length,) = struct.unpack_from('<I', record, position)
     position += 4
     return bytes(record[position:position + length]).decode(), position + length
-
-
-def _decompress(compression, body, size, where):
-    """Return the unpacked bytes of a chunk, never more than it claims."""
-    if compression == '':
-        return body
-    try:
-        if compression == 'zstd':
-            if zstandard.frame_content_size(body) > size:
-                raise RecordingError(f'{where} is damaged: it unpacks to more than it claims')
-            if not hasattr(_local, 'zstd'):
-                _local.zstd = zstandard.ZstdDecompressor()
-            return _local.zstd.decompress(body, max_output_size=size)
-        if compression == 'lz4':
-            import lz4.frame  # comes with mcap; few recordings need it
-            return lz4.frame.LZ4FrameDecompressor().decompress(body, max_length=size)
-    except (zstandard.ZstdError, RuntimeError) as error:
-        raise RecordingError(f'{where} does not unpack: {error}') from error
-    raise RecordingError(
-        f'{where} is compressed as {compression!r}; zstd, lz4 and none can be read')

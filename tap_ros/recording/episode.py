@@ -10,7 +10,6 @@ dx, dy, dz in metres per control period and the gripper opening, 0 closed to 1 o
 from dataclasses import dataclass
 
 import numpy as np
-
 from tap_ros.errors import RecordingError
 
 OUTCOMES = ('success', 'failure', 'interrupted', '')

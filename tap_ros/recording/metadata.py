@@ -1,14 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""metadata.yaml of a bag, as rosbag2 writes it (version 9, Jazzy) and in every version it reads."""
+"""The metadata.yaml of a bag: written as by rosbag2 of Jazzy (version 9), read in any version."""
 
 import os
 from pathlib import Path
 import re
 
-import yaml
-
 from tap_ros.errors import RecordingError
+import yaml
 
 FILE_NAME = 'metadata.yaml'
 _KEY = 'rosbag2_bagfile_information'

@@ -5,9 +5,8 @@
 from dataclasses import replace
 
 import numpy as np
-
 from tap_ros.recording.align import assemble, follows
-from tap_ros.recording.cache import check_sizes, find_bags, find_topics, warn_of_damage
+from tap_ros.recording.bags import check_sizes, find_bags, find_topics, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.container import McapFile
 
@@ -43,10 +42,10 @@ def iter_episodes(path, image_topic=None):
 def _decode(file, found):
     """Return the Columns of a file, frames in memory."""
     pieces = []
-    part = decode_file(McapFile(file), found, pieces.append)
+    part = decode_file(McapFile(file), found, lambda buffers: pieces.append(b''.join(buffers)))
     order = part.arrays.pop('frame_order', None)
     if pieces:
-        frames = np.concatenate(pieces)
+        frames = np.frombuffer(b''.join(pieces), np.uint8).reshape(-1, *part.image_size, 3)
         part.frames = frames if (np.diff(order) == 1).all() else frames[order]
     warn_of_damage(part)
     return part

@@ -182,8 +182,33 @@ def fields(type_name):
         count None for one value, -1 for a sequence, n for an array of n.
     :raises RecordingError: for a type without definition, or with wstring.
     """
+    return _parse(type_name, definition(type_name))
+
+
+def check_schema(type_name, text):
+    """
+    Accept the schema of a recording if its messages can be read with our definitions.
+
+    :param type_name: for example 'tap_msgs/msg/Episode'.
+    :param text: ros2msg, as schema_text gives it; with comments or without.
+    :raises RecordingError: when fields differ; it names the type and both lists of fields.
+    """
+    name = type_name
+    for part in re.split(r'^=+\n', text.replace('\r\n', '\n'), flags=re.MULTILINE):
+        header = re.match(r'MSG: (\S+)\n', part)
+        if header:
+            name, part = _full(header[1], type_name), part[header.end():]
+        if name in DEFINITIONS and _parse(name, part) != fields(name):
+            theirs, ours = (
+                ', '.join(field for field, _, _ in f) for f in (_parse(name, part), fields(name)))
+            raise RecordingError(
+                f'message type {name}: recorded with the fields {theirs}; expected {ours}')
+
+
+def _parse(type_name, text):
+    """Return the fields that stand in a definition, as fields does."""
     found = []
-    for line in definition(type_name).splitlines():
+    for line in text.splitlines():
         match = _FIELD.match(line.split('#')[0].strip())
         if not match:  # a constant, a comment or an empty line
             continue

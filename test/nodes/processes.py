@@ -11,7 +11,6 @@ import time
 
 from rclpy.context import Context
 from rclpy.node import Node
-
 from tap_ros.nodes.clients import Spinner
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
-
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.nodes import image_messages, object_messages
 from tap_ros.nodes.overlay import draw_overlay, SCALE

@@ -6,7 +6,6 @@ import threading
 
 import pytest
 from sensor_msgs.msg import Image, JointState
-
 from tap_ros.nodes.observations import DEPTH, Observations
 from tap_ros.nodes.topics import to_nanoseconds, to_stamp
 

@@ -15,7 +15,6 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
-
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp

@@ -122,9 +122,10 @@ def test_scripts_go_where_ros2_run_looks():
 
 
 def test_parameter_file_names_only_parameters_that_the_nodes_declare():
-    config = yaml.safe_load((ROOT / 'config' / 'params.yaml').read_text())
+    config = yaml.safe_load((ROOT / 'config' / 'tap_ros.yaml').read_text())
+    assert sorted(key.split('/')[-1] for key in config) == sorted(NODES)
     for key, section in config.items():
         node = key.split('/')[-1]
         source = (ROOT / NODES[node]).read_text()
         for name in section['ros__parameters']:
-            assert f"'{name}'" in source, f'config/params.yaml: {node} has no parameter {name}'
+            assert f"'{name}'" in source, f'config/tap_ros.yaml: {node} has no parameter {name}'

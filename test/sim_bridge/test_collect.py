@@ -4,7 +4,6 @@
 
 import numpy as np
 import pytest
-
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.expert import run_episode
 from sim_bridge.simulator import Simulator

@@ -4,12 +4,17 @@
 
 import numpy as np
 import pytest
-
 from sim_bridge.camera import Camera
 from sim_bridge.scene import build_scene, random_shape
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import (
-    GOAL_DISTANCE, GOAL_SEPARATION, GOAL_YAW_RANGE, OBJECT_RANGE, sample_scene, TASKS)
+    GOAL_DISTANCE,
+    GOAL_SEPARATION,
+    GOAL_YAW_RANGE,
+    OBJECT_RANGE,
+    sample_scene,
+    TASKS,
+)
 from tap_ros.errors import SceneError
 
 

@@ -4,7 +4,6 @@
 
 import numpy as np
 import pytest
-
 from sim_bridge.scene import WORKSPACE_HIGH
 from sim_bridge.simulator import ACTION_LIMIT, CONTROL_PERIOD, ramp_controls, Simulator, SUBSTEPS
 from tap_ros.errors import SceneError
@@ -103,3 +102,19 @@ def test_the_gripper_pushes_an_object(simulator):
     go([x - 0.14, y, 0.01])
     go([x, y, 0.01])
     assert simulator.object_poses()[0, 0] - x > 0.05
+
+
+def test_taking_a_photograph_moves_nothing(simulator):
+    actions = np.random.default_rng(2).uniform(-1, 1, (6, 4)) * [0.08, 0.08, 0.15, 1]
+    runs = []
+    for look in (False, True):
+        simulator.reset(4)
+        for action in actions:
+            seen = simulator.step(action)
+            if look:
+                poses = simulator.goal().object_poses
+                photograph = simulator.photograph(poses)
+                np.testing.assert_allclose(photograph.object_poses, poses, atol=1e-9)
+        runs.append(seen)
+    np.testing.assert_array_equal(runs[0].image, runs[1].image)
+    np.testing.assert_allclose(runs[0].object_poses, runs[1].object_poses, atol=1e-9)

@@ -1,0 +1,178 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How fast recordings are decoded, side by side with the usual libraries, in one run.
+
+    python -m tap_ros.evaluation.bench_recording
+
+Every contender reads the same files, which were read once before. Ours does more than the others:
+it also checks checksums, hashes the file, cuts and aligns the episodes, and writes the cache.
+"""
+
+import argparse
+from pathlib import Path
+import tempfile
+import time
+
+from mcap.reader import make_reader
+import numpy as np
+from tap_ros.recording import topics
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.episode import Episode
+from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.schemas import DEFINITIONS
+from tap_ros.recording.writer import EpisodeWriter
+
+DECODED = frozenset(topics.TYPES) - {topics.CAMERA_INFO, topics.CLOCK}
+
+
+def run(recording=None, episodes=400, files=4, repeats=3, image_size=64):
+    """
+    Measure frames per second of all contenders on a raw and on a compressed copy of a recording.
+
+    :param recording: path whose first episodes are used; None: made up ones of 41 frames.
+    :param episodes: how many.
+    :param files: number of files that they are spread over.
+    :param repeats: the best time of so many counts; contenders take turns.
+    :param image_size: of made up frames.
+    :return: dict compression -> dict contender -> frames per second.
+    """
+    contenders = _contenders()
+    results = {}
+    with tempfile.TemporaryDirectory() as folder:
+        folder = Path(folder)
+        for compression in ('none', 'zstd'):
+            paths, frames = _write(folder, compression, recording, episodes, files, image_size)
+            best = dict.fromkeys(contenders, np.inf)
+            for _ in range(repeats):
+                for name, contender in contenders.items():
+                    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+                        start = time.perf_counter()
+                        seen = contender(paths, scratch)
+                        best[name] = min(best[name], time.perf_counter() - start)
+                    if seen != frames:
+                        raise RuntimeError(f'{name} saw {seen} of {frames} frames')
+            results[compression] = {name: frames / seconds for name, seconds in best.items()}
+    return results
+
+
+def _contenders():
+    """Return dict name -> function(paths, scratch folder) -> number of frames."""
+    found = {
+        'mcap + rosbags CDR, images only': lambda p, _: _read_rosbags(p, {topics.IMAGE}),
+        'mcap + rosbags CDR, what we decode': lambda p, _: _read_rosbags(p, DECODED),
+    }
+    try:
+        from mcap_ros2.decoder import DecoderFactory
+    except ImportError:
+        pass
+    else:
+        found['mcap_ros2, images only'] = lambda p, _: _read_mcap_ros2(p, DecoderFactory)
+    found['tap_ros cache, new'] = _build_cache
+    return found
+
+
+def _write(folder, compression, recording, count, files, image_size):
+    """Write the files to be read; return their paths and the number of frames."""
+    if recording is None:
+        source = (_make_episode(seed, image_size) for seed in range(count))
+    else:
+        source = (episode for episode, _ in zip(iter_episodes(recording), range(count)))
+    paths, frames = [], 0
+    per_file = -(-count // files)
+    episode = next(source, None)
+    while episode is not None:
+        paths.append(folder / f'{compression}_{len(paths)}.mcap')
+        with EpisodeWriter(paths[-1], compression) as writer:
+            for _ in range(per_file):
+                if episode is None:
+                    break
+                writer.write(episode)
+                frames += len(episode)
+                episode = next(source, None)
+    return paths, frames
+
+
+def _make_episode(seed, size, T=41, K=2):
+    """Make up an episode: a lit table with a grain, and two patches that move."""
+    random = np.random.default_rng(seed)
+    table = np.linspace(60, 180, size)[:, None, None] + np.linspace(0, 30, size)[:, None]
+    frames = np.repeat((table + random.normal(0, 1.5, (size, size, 3)))[None], T, 0)
+    patch = max(size // 5, 1)
+    pixels = random.uniform(0, size - patch, (T, K, 2)).astype(np.float32)
+    for t in range(T):
+        for u, v in pixels[t].astype(int):
+            frames[t, v:v + patch, u:u + patch] = random.uniform(0, 255, 3)
+    actions = random.uniform(-0.08, 0.08, (T, 4)).astype(np.float32)
+    actions[-1] = 0
+    frames = frames.clip(0, 255).astype(np.uint8)
+    return Episode(
+        frames=frames, stamps=(seed * 60 + 1) * 10**9 + np.arange(T) * 250_000_000,
+        actions=actions, grippers=random.uniform(-0.4, 0.4, (T, 4)).astype(np.float32),
+        object_names=tuple(f'object_{k}' for k in range(K)), object_pixels=pixels,
+        object_poses=random.normal(size=(T, K, 7)), goal_frame=frames[-1],
+        goal_pixels=pixels[-1], goal_poses=random.normal(size=(K, 7)),
+        task='push2', seed=seed, outcome='success')
+
+
+def _read_rosbags(paths, wanted):
+    """Read with mcap's reader, decode with rosbags' type store, copy the pixels out."""
+    from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+    store = get_typestore(Stores.ROS2_JAZZY)
+    known = {}
+    for name, text in DEFINITIONS.items():
+        if name.startswith('tap_msgs/'):
+            known |= get_types_from_msg(text, name)
+    store.register(known)
+    frames = 0
+    for path in paths:
+        images = []
+        with open(path, 'rb') as stream:
+            for schema, channel, message in make_reader(stream).iter_messages(
+                    topics=sorted(wanted), log_time_order=False):
+                value = store.deserialize_cdr(message.data, schema.name)
+                if channel.topic == topics.IMAGE:
+                    images.append(value.data.reshape(value.height, value.width, 3))
+        frames += len(np.stack(images))
+    return frames
+
+
+def _read_mcap_ros2(paths, factory):
+    """Read and decode with mcap_ros2, copy the pixels out."""
+    frames = 0
+    for path in paths:
+        images = []
+        with open(path, 'rb') as stream:
+            reader = make_reader(stream, decoder_factories=[factory()])
+            for _, _, _, value in reader.iter_decoded_messages(
+                    topics=[topics.IMAGE], log_time_order=False):
+                images.append(np.frombuffer(value.data, np.uint8).reshape(
+                    value.height, value.width, 3))
+        frames += len(np.stack(images))
+    return frames
+
+
+def _build_cache(paths, scratch):
+    """Open the files with an empty cache."""
+    return open_recordings(paths, scratch, progress=False).num_frames
+
+
+def main(arguments=None):
+    """Print a table of frames per second and of the ratios to the first contender."""
+    parser = argparse.ArgumentParser(description='How fast recordings are decoded.')
+    parser.add_argument('--recording', help='use these episodes instead of made up ones')
+    parser.add_argument('--episodes', type=int, default=400)
+    parser.add_argument('--files', type=int, default=4)
+    parser.add_argument('--repeats', type=int, default=3)
+    options = parser.parse_args(arguments)
+    results = run(options.recording, options.episodes, options.files, options.repeats)
+    print(f'{"frames per second":36}{"raw":>10}{"zstd":>10}{"ratio raw":>12}{"ratio zstd":>12}')
+    first = next(iter(results['none']))
+    for name in results['none']:
+        raw, packed = results['none'][name], results['zstd'][name]
+        print(f'{name:36}{raw:10,.0f}{packed:10,.0f}'
+              f'{raw / results["none"][first]:12.2f}{packed / results["zstd"][first]:12.2f}')
+
+
+if __name__ == '__main__':
+    main()

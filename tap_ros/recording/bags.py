@@ -1,0 +1,87 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Find the bags at a path, their files and their topics; say what is wrong with them."""
+
+from pathlib import Path
+import warnings
+
+from tap_ros.errors import RecordingError
+from tap_ros.recording import topics
+from tap_ros.recording.container import McapFile
+from tap_ros.recording.episode import RecordingWarning
+from tap_ros.recording.metadata import bag_files, FILE_NAME
+from tap_ros.recording.schemas import check_schema
+
+
+def find_bags(path):
+    """
+    Return the bags at a path: a list of lists of .mcap files, in playing order.
+
+    :param path: .mcap file, bag folder, or folder of bag folders.
+    :raises RecordingError: when there is none.
+    """
+    path = Path(path)
+    if path.is_file():
+        return [[path]]
+    if not path.is_dir():
+        raise RecordingError(f'{path}: there is no such file or folder')
+    folders = [path] if _is_bag(path) else sorted(f for f in path.iterdir() if _is_bag(f))
+    bags = [files for folder in folders if (files := bag_files(folder))]
+    if not bags:
+        raise RecordingError(
+            f'{path}: holds no recording; expected .mcap files, with {FILE_NAME} beside them, '
+            'or folders of such')
+    return bags
+
+
+def find_topics(files, image_topic=None):
+    """
+    Find the topics of a bag.
+
+    :param files: its .mcap files.
+    :param image_topic: as in open_recordings.
+    :return: as topics.resolve.
+    """
+    channels = {}
+    for file in files:
+        channels |= McapFile(file).topics()
+    available = {topic: channel.type_name for topic, channel in channels.items()}
+    found = topics.resolve(available, list_paths(files), image_topic)
+    for topic in found.values():
+        if channels[topic].schema_encoding == 'ros2msg':
+            try:
+                check_schema(available[topic], channels[topic].schema)
+            except RecordingError as error:
+                raise RecordingError(f'{list_paths(files)}: topic {topic}: {error}') from error
+    return found
+
+
+def check_sizes(parts):
+    """Refuse recordings whose images differ in size, naming them."""
+    sizes = {}
+    for part in parts:
+        if part.image_size is not None:
+            sizes.setdefault(tuple(part.image_size), part.source)
+    if not sizes:
+        raise RecordingError(
+            f'{list_paths([part.source for part in parts])}: the image topic holds no image')
+    if len(sizes) > 1:
+        listing = ', '.join(f'{s} ({w}x{h})' for (h, w), s in sizes.items())
+        raise RecordingError(
+            f'images of different sizes (width x height): {listing}; open them separately')
+
+
+def warn_of_damage(part):
+    """Say what could not be read of a file."""
+    if part.damage:
+        warnings.warn(f'{part.source}: {part.damage}', RecordingWarning, stacklevel=3)
+
+
+def _is_bag(path):
+    return path.is_dir() and ((path / FILE_NAME).exists() or any(path.glob('*.mcap')))
+
+
+def list_paths(paths):
+    """Name the first of several files and how many more there are."""
+    paths = [str(path) for path in paths]
+    return paths[0] + (f' and {len(paths) - 1} more' if len(paths) > 1 else '')

@@ -1,0 +1,60 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The pixels of sensor_msgs/Image messages, whatever their encoding and padding."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from tap_ros.errors import RecordingError
+
+_CHANNELS = {'rgb8': 3, 'bgr8': 3, 'rgba8': 4, 'bgra8': 4, 'mono8': 1}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """How the pixels of an image message lie."""
+
+    size: tuple  # (H, W)
+    encoding: str
+    step: int  # bytes from row to row
+
+    @classmethod
+    def of(cls, layout):
+        """Read and check the description of a sensor_msgs/Image."""
+        head = np.frombuffer(layout.example, np.uint8)[None]
+        height, width, step = (
+            layout.column(head, field).item() for field in ('height', 'width', 'step'))
+        encoding, length = layout.strings['encoding'], layout.counts['data']
+        channels = _CHANNELS.get(encoding)
+        if length == height * width == 0:
+            return cls((0, 0), encoding, 0)
+        if channels is None:
+            raise RecordingError(
+                f'encoding {encoding!r} cannot be read; choose one of {", ".join(_CHANNELS)}')
+        if height * width == 0 or step < width * channels or length != height * step:
+            raise RecordingError(
+                f'a {encoding} image of {width}x{height} pixels with step {step} and {length} '
+                f'bytes of data; expected a step of at least {width * channels} and '
+                'step * height bytes')
+        return cls((height, width), encoding, step)
+
+    def rgb(self, buffer, start):
+        """Return a buffer of H * W * 3 bytes from the pixels that start somewhere in another."""
+        height, width = self.size
+        data = buffer[start:start + height * self.step]
+        channels = _CHANNELS.get(self.encoding)
+        if self.encoding == 'rgb8' and self.step == 3 * width:
+            return data
+        pixels = data.reshape(height, self.step)[:, :width * channels].reshape(height, width, -1)
+        if self.encoding == 'mono8':
+            return np.repeat(pixels, 3, 2)
+        return np.ascontiguousarray(
+            pixels[..., :3] if self.encoding.startswith('rgb') else pixels[..., 2::-1])
+
+
+def check_size(size, expected, what):
+    """Refuse a size (H, W, ...) that is not the expected one."""
+    if tuple(size[:2]) != tuple(expected[:2]):
+        raise RecordingError(
+            f'{what} of different sizes: {expected[1]}x{expected[0]} and {size[1]}x{size[0]} '
+            'pixels (width x height); one recording has one size')

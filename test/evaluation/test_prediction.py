@@ -1,0 +1,176 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the prediction metrics."""
+
+import argparse
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+from tap_ros.errors import ConfigError
+from tap_ros.evaluation.prediction import (
+    add_arguments,
+    bottleneck_frequency,
+    bottleneck_scores,
+    evaluate,
+    evaluate_network,
+    expected_distances,
+    MIN_MOTION,
+    run,
+    write_pictures,
+)
+from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
+from tap_ros.prediction.warp import combine, one_hot_maps
+from tap_ros.prediction.weights import save_weights
+from tap_ros.recording.episode import Episode
+from tap_ros.recording.writer import EpisodeWriter
+import torch
+
+SIZE = 32
+
+
+def make_episode(start, goal, length=9):
+    """Object 0 moves in the first half of the time, object 1 in the second."""
+    start, goal = np.array(start, np.float32), np.array(goal, np.float32)
+    share = np.linspace(0, 2, length)[:, None]
+    done = np.concatenate([share.clip(0, 1), (share - 1).clip(0, 1)], 1)  # T, K
+    pixels = start + done[..., None] * (goal - start)
+    frames = np.full((length, SIZE, SIZE, 3), 40, np.uint8)
+    for t, k in np.ndindex(length, 2):
+        u, v = np.rint(pixels[t, k]).astype(int)
+        frames[t, v - 2:v + 3, u - 2:u + 3] = (200, 60 + 90 * k, 20)
+    return Episode(
+        frames=frames, stamps=np.arange(length), actions=np.zeros((length, 4), np.float32),
+        grippers=np.zeros((length, 4), np.float32), object_names=('a', 'b'),
+        object_pixels=pixels.astype(np.float32), object_poses=np.zeros((length, 2, 7)),
+        goal_frame=frames[0], goal_pixels=goal, goal_poses=np.zeros((2, 7)), task='push2',
+        seed=0, outcome='success')
+
+
+class Store(list):
+    """Episodes in memory, read like an EpisodeStore."""
+
+
+class Pasting(torch.nn.Module):
+    """Shows the goal in the left half and the start in the right half of the picture."""
+
+    def __init__(self):
+        super().__init__()
+        self.share = torch.nn.Parameter(torch.zeros(()))
+
+    def forward(self, context):
+        B, C, _, H, W = context.shape
+        masks = torch.zeros(B, C, 1, H, W)
+        masks[:, 0, ..., W // 2:], masks[:, 1, ..., :W // 2] = 1, 1
+        return Prediction(combine(context, masks), torch.zeros(B, C, 2, H, W), masks, None)
+
+
+# Object 0 stays in the left half, object 1 in the right one.
+EPISODES = Store(make_episode([[6, 6], [24, y]], [[12, 10], [27, y - 9]])
+                 for y in (16, 20, 24))
+
+
+def test_distances_to_a_sure_position_are_plain_distances():
+    maps = one_hot_maps(torch.tensor([[3.0, 4.0]]), (SIZE, SIZE))
+    assert expected_distances(maps, torch.tensor([[0.0, 0.0]])) == 5
+    assert expected_distances(maps, torch.tensor([[3.0, 4.0]])) == 0
+
+
+def test_distance_is_expected_over_the_map_not_from_its_mean():
+    maps = one_hot_maps(torch.tensor([[0.0, 5.0], [10.0, 5.0]]), (SIZE, SIZE)).mean(0)
+    assert expected_distances(maps, torch.tensor([5.0, 5.0])) == 5
+
+
+def test_bottleneck_is_either_object_first_and_the_sum_over_objects():
+    start = torch.tensor([[[5.0, 5.0], [20.0, 20.0]]])
+    goal = torch.tensor([[[5.0, 9.0], [26.0, 20.0]]])
+
+    def score(first, second):
+        maps = torch.stack([one_hot_maps(first, (SIZE, SIZE)), one_hot_maps(second, (SIZE, SIZE))])
+        return bottleneck_scores(maps[None], start, goal).item()
+
+    assert score(goal[0, 0], start[0, 1]) == 0
+    assert score(start[0, 0], goal[0, 1]) == 0
+    # Copying costs the shorter way of the two; halfway costs both halves.
+    assert score(start[0, 0], start[0, 1]) == pytest.approx(4)
+    assert score(goal[0, 0], goal[0, 1]) == pytest.approx(4)
+    halfway = (start + goal)[0] / 2
+    assert score(halfway[0], halfway[1]) == pytest.approx(2 + 3)
+
+
+def test_frequency_rises_with_the_threshold():
+    frequency = bottleneck_frequency([0.5, 1.5, 2.0, 9.0], (0, 1, 2, 10))
+    assert frequency.tolist() == [0, 0.25, 0.75, 1]
+
+
+def test_a_perfect_bottleneck_is_found_and_matched():
+    scores = evaluate(Pasting(), EPISODES, range(3))['prediction']
+    assert np.allclose(scores.bottleneck, 0, atol=1e-4)
+    assert np.allclose(scores.min_l1, 0, atol=1e-6)
+    assert scores.match_step.tolist() == [4, 4, 4]
+    assert np.allclose(scores.match_fraction, 0.5)
+    assert scores.summary()['bottleneck_0px'] == 0 or scores.bottleneck.max() == 0
+    assert scores.summary()['bottleneck_1px'] == 1
+
+
+def test_copying_matches_the_frame_beside_it_and_is_no_bottleneck():
+    scores = evaluate(Pasting(), EPISODES, range(3))
+    assert scores['copy_start'].match_step.tolist() == [1, 1, 1]
+    assert scores['copy_goal'].match_step.tolist() == [7, 7, 7]
+    shorter = [min(np.linalg.norm(e.object_pixels[-1] - e.object_pixels[0], axis=1))
+               for e in EPISODES]
+    assert np.allclose(scores['copy_start'].bottleneck, shorter, atol=1e-4)
+    assert np.allclose(scores['copy_goal'].bottleneck, shorter, atol=1e-4)
+
+
+def test_margin_keeps_matches_away_from_the_context():
+    scores = evaluate(Pasting(), EPISODES, range(3), margin=2)
+    assert scores['copy_start'].match_step.tolist() == [3, 3, 3]
+
+
+def test_episodes_in_which_an_object_stays_do_not_count_as_bottlenecks():
+    still = make_episode([[6, 6], [24, 16]], [[12, 10], [24, 16 + MIN_MOTION / 2]])
+    scores = evaluate(Pasting(), Store([*EPISODES, still]), range(4))['prediction']
+    assert np.isnan(scores.bottleneck).tolist() == [False, False, False, True]
+    assert scores.summary()['bottleneck_episodes'] == 3
+    assert scores.summary()['episodes'] == 4
+
+
+def test_numbers_do_not_depend_on_the_batch(monkeypatch):
+    network = Predictor(PredictorConfig(image_size=32, base_width=4, new_pixels=False)).eval()
+    together = evaluate_network(network, EPISODES, range(3))
+    monkeypatch.setattr('tap_ros.evaluation.prediction._BATCH', 1)
+    alone = evaluate_network(network, EPISODES, range(3))
+    assert alone == pytest.approx(together, abs=1e-4)
+    assert {'copy_start_min_l1', 'copy_goal_bottleneck_2px', 'min_l1'} <= set(alone)
+
+
+def test_pictures_are_written(tmp_path):
+    from matplotlib.image import imread
+    write_pictures(tmp_path / 'sheet.png', Pasting(), EPISODES, range(3), scale=1)
+    sheet = imread(tmp_path / 'sheet.png')
+    assert sheet.shape[:2] == (3 * 34 - 2, 5 * 34 - 2)
+
+
+def test_the_command_scores_what_training_held_out(tmp_path, monkeypatch, capsys):
+    with EpisodeWriter(tmp_path / 'bag_0.mcap') as writer:
+        for i, episode in enumerate(EPISODES):
+            stamps = np.arange(9) * 10 ** 8 + (i + 1) * 10 ** 10
+            writer.write(replace(episode, seed=i, stamps=stamps))
+    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
+    config = PredictorConfig(image_size=32, base_width=4, new_pixels=False)
+    weights = tmp_path / 'weights.safetensors'
+    save_weights(weights, Predictor(config), 'predictor', config,
+                 {'settings': {'test_fraction': 0.0}})
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    common = ['--weights', str(weights), '--recordings', str(tmp_path / 'bag_0.mcap')]
+    with pytest.raises(ConfigError, match='--all'):
+        run(parser.parse_args(common))
+    run(parser.parse_args([*common, '--all', '--out', str(tmp_path / 'out')]))
+    assert 'copy_goal' in capsys.readouterr().out
+    scores = json.loads((tmp_path / 'out' / 'scores.json').read_text())['scores']
+    assert set(scores) == {'prediction', 'copy_start', 'copy_goal'}
+    assert scores['prediction']['episodes'] == 3
+    assert (tmp_path / 'out' / 'pictures.png').stat().st_size > 0

@@ -1,0 +1,151 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of training batches and of augmentation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tap_ros.errors import RecordingError
+from tap_ros.prediction.augmentation import Augmentation, reverse
+from tap_ros.prediction.batches import (
+    episode_order,
+    make_batch,
+    split_episodes,
+    target_times,
+    uses_recorded_goal,
+)
+from tap_ros.recording.cache import open_recordings
+import torch
+
+
+@pytest.fixture
+def store(bag):
+    return open_recordings([bag], progress=False)
+
+
+def test_targets_are_the_frames_between_the_context_pictures(store):
+    batch = make_batch(store, [0, 3])
+    for b, i in enumerate([0, 3]):
+        frames = store.frames(i)
+        assert np.array_equal(batch.context[b], frames[[0, -1]])
+        assert batch.times[b][batch.valid[b]].tolist() == list(range(1, len(frames) - 1))
+        assert np.array_equal(batch.targets[b][batch.valid[b]], frames[1:-1])
+        assert batch.end[b].item() == len(frames) - 1
+        assert (batch.first[b].item(), batch.last[b].item()) == (1, len(frames) - 2)
+    assert batch.valid.sum(1).tolist() == [5, 8]
+
+
+@pytest.mark.parametrize('end, margin, expected', [
+    (39, 0, (1, 38)), (39, 3, (4, 35)), (8, 3, (4, 4)), (4, 3, (2, 2)), (2, 3, (1, 1)),
+    (5, 9, (2, 3))])
+def test_margins_leave_at_least_one_target(end, margin, expected):
+    assert target_times(end, margin) == expected
+
+
+def test_few_targets_are_drawn_without_repetition(store):
+    batch = make_batch(store, [4] * 20, num_targets=3, rng=np.random.default_rng(0))
+    assert batch.targets.shape[1] == 3
+    assert (batch.times.diff(dim=1) > 0).all()
+    assert len(batch.times.unique()) == len(store.frames(4)) - 2
+
+
+def test_middle_frame_alone_for_fixed_time(store):
+    batch = make_batch(store, [0, 1], middle=True)
+    assert batch.times.tolist() == [[3], [4]]
+    assert np.array_equal(batch.targets[0, 0], store.frames(0)[3])
+
+
+def test_pieces_of_episodes_are_pieces(store):
+    rng = np.random.default_rng(0)
+    batch = make_batch(store, [4] * 30, min_crop=0.4, max_frames=8, rng=rng)
+    frames = store.frames(4)
+    assert batch.end.min() >= 2 and batch.end.max() <= 7
+    for b in range(30):
+        starts = [t for t in range(len(frames)) if np.array_equal(frames[t], batch.context[b, 0])]
+        assert any(np.array_equal(frames[(t + batch.end[b]).item()], batch.context[b, 1])
+                   for t in starts if t + batch.end[b] < len(frames))
+
+
+def test_recorded_goals_stand_in_for_last_frames_where_they_were_reached(store):
+    reached, unknown = store[0], np.full((2, 2), np.nan, np.float32)
+    episodes = [
+        reached,
+        replace(reached, outcome='failure'),                                    # positions decide
+        replace(reached, goal_pixels=reached.goal_pixels + np.float32([[0, 0], [3, 0]])),
+        replace(reached, goal_pixels=unknown, outcome='success'),
+        replace(reached, goal_pixels=unknown, outcome='failure'),
+        replace(reached, goal_frame=None)]
+    expected = [True, True, False, True, False, False]
+    assert [uses_recorded_goal(episode, 'recorded') for episode in episodes] == expected
+    assert not any(uses_recorded_goal(episode, 'last') for episode in episodes)
+    rng = np.random.default_rng(0)
+    mixed = [uses_recorded_goal(reached, 'mixed', rng) for _ in range(200)]
+    assert 70 < sum(mixed) < 130
+    batch = make_batch(store, [0], goal_picture='recorded')
+    assert np.array_equal(batch.context[0, 1], reached.goal_frame)
+
+
+def test_split_is_complete_and_does_not_depend_on_what_else_there_is(store):
+    training, held_out = split_episodes(store, 0.3)
+    assert sorted([*training, *held_out]) == list(range(len(store)))
+    assert 0 < len(held_out) < len(training)
+
+    class Half:
+        lengths = store.lengths[:12]
+
+        def __len__(self):
+            return 12
+
+        def __getitem__(self, i):
+            return store[i]
+
+    assert split_episodes(Half(), 0.3)[1].tolist() == [i for i in held_out if i < 12]
+
+
+def test_nothing_to_train_on_is_said(store):
+    with pytest.raises(RecordingError, match='no episode has at least 100 frames'):
+        split_episodes(store, 0.1, min_frames=100)
+
+
+def test_each_pass_has_every_episode_once():
+    steps = [episode_order(10, 4, seed=0, step=step) for step in range(5)]
+    seen = np.concatenate(steps)
+    assert sorted(seen[:10]) == list(range(10)) and sorted(seen[10:]) == list(range(10))
+    assert not np.array_equal(seen[:10], seen[10:])
+    assert np.array_equal(episode_order(10, 4, 0, 3), steps[3])
+
+
+def test_augmentation_can_be_undone():
+    augmentation = Augmentation.draw(16, True, True, 0.3, np.random.default_rng(0))
+    images = torch.rand(16, 2, 3, 8, 8) * 2 - 1
+    changed = augmentation.apply(images)
+    assert not changed.allclose(images)
+    assert augmentation.undo(changed).allclose(images, atol=1e-5)
+    assert augmentation.flip.any() and not augmentation.flip.all()
+
+
+def test_augmentation_of_black_stays_black_and_off_means_off():
+    augmentation = Augmentation.draw(4, True, True, 0.3, np.random.default_rng(0))
+    black = -torch.ones(4, 1, 3, 8, 8)
+    assert augmentation.apply(black).allclose(black)
+    images = torch.rand(4, 2, 3, 8, 8)
+    nothing = Augmentation.draw(4, False, False, 0.0, np.random.default_rng(0))
+    assert nothing.apply(images).allclose(images, atol=1e-6)
+
+
+def test_all_pictures_of_an_episode_change_alike():
+    augmentation = Augmentation.draw(4, True, True, 0.3, np.random.default_rng(1))
+    images = torch.rand(4, 1, 3, 8, 8)
+    changed = augmentation.apply(images.expand(-1, 3, -1, -1, -1))
+    assert changed[:, 0].equal(changed[:, 2])
+
+
+def test_reversed_episodes_run_from_goal_to_start(store):
+    batch = make_batch(store, [0, 1])
+    backwards = reverse(batch, torch.tensor([True, False]))
+    assert backwards.context[0].equal(batch.context[0].flip(0))
+    assert backwards.context[1].equal(batch.context[1])
+    times = backwards.times[0][batch.valid[0]]
+    assert times.tolist() == [5, 4, 3, 2, 1]
+    assert backwards.times[1].equal(batch.times[1])

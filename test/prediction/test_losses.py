@@ -1,0 +1,139 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the losses of section 3."""
+
+import math
+
+import pytest
+from tap_ros.prediction.losses import (
+    bell_preference,
+    fixed_time_loss,
+    generalized_minimum_loss,
+    l1_error,
+    l1_errors,
+    linear_preference,
+    match_step,
+    minimum_loss,
+    preferred_error,
+    relative_to_copying,
+)
+import torch
+
+
+@pytest.fixture
+def error():
+    return torch.rand(6, 9, generator=torch.Generator().manual_seed(0))
+
+
+def test_genmin_with_w_1_equals_min(error):
+    loss = generalized_minimum_loss(error, preferred_error(error, torch.ones_like(error)))
+    assert loss == minimum_loss(error)
+
+
+def test_min_equals_the_smallest_fixed_error(error):
+    row = error[:1]
+    fixed = [fixed_time_loss(row, torch.tensor([t])) for t in range(row.shape[1])]
+    assert minimum_loss(row) == min(fixed)
+
+
+def test_min_is_never_above_fix_nor_genmin(error):
+    minimum = minimum_loss(error)
+    preference = bell_preference(torch.arange(9)[None], 0, 8)
+    assert minimum <= generalized_minimum_loss(error, preferred_error(error, preference))
+    assert minimum <= fixed_time_loss(error, torch.full((6,), 4))
+
+
+def test_outer_error_is_not_weighted_by_the_preference():
+    error, preference = torch.tensor([[0.3, 0.4]]), torch.tensor([[0.5, 1.0]])
+    # 0.3 / 0.5 > 0.4 / 1, so that the second frame is chosen and 0.4 is the loss.
+    loss = generalized_minimum_loss(error, preferred_error(error, preference))
+    assert loss == torch.tensor(0.4)
+
+
+def test_padding_is_never_chosen(error):
+    valid = torch.ones_like(error, dtype=torch.bool)
+    valid[:, 3:] = False
+    error[:, 3:] = -1
+    assert match_step(error, valid).max() < 3
+    assert minimum_loss(error, valid) == error[:, :3].min(1).values.mean()
+
+
+def test_only_the_chosen_frame_has_a_gradient(error):
+    error.requires_grad_()
+    minimum_loss(error).backward()
+    assert ((error.grad != 0).sum(1) == 1).all()
+    assert (error.grad.argmax(1) == error.argmin(1)).all()
+
+
+def test_choice_has_no_gradient(error):
+    selection = (error * 2).requires_grad_()
+    outer = error.clone().requires_grad_()
+    generalized_minimum_loss(outer, selection).backward()
+    assert selection.grad is None and outer.grad is not None
+
+
+def test_errors_may_be_computed_for_the_chosen_frames_only(error):
+    def lazily(step):
+        return error[torch.arange(len(error)), step]
+
+    selection = error.flip(1)
+    assert (generalized_minimum_loss(lazily, selection)
+            == generalized_minimum_loss(error, selection))
+
+
+def test_error_of_black_against_white_is_1():
+    black, white = -torch.ones(2, 3, 8, 8), torch.ones(2, 3, 8, 8)
+    assert l1_error(black, white).equal(torch.ones(2))
+
+
+def test_errors_against_recorded_frames_equal_those_of_floats():
+    generator = torch.Generator().manual_seed(0)
+    frames = torch.randint(0, 256, (3, 5, 3, 8, 8), generator=generator, dtype=torch.uint8)
+    images = torch.rand(3, 2, 3, 8, 8, generator=generator) * 2 - 1
+    expected = l1_error(images[:, :, None], (frames.float() / 127.5 - 1)[:, None])
+    assert l1_errors(images, frames).allclose(expected, atol=1e-6)
+
+
+def test_bell_is_the_papers():
+    # Section 4: 2/3 at both ends and 1 in the middle of a truncated Gaussian.
+    times = torch.arange(1, 14)[None]
+    preference = bell_preference(times, 1, 13)
+    assert preference[0, 6] == 1
+    assert preference[0, [0, -1]].allclose(torch.tensor(2 / 3))
+    assert preference.flip(1).allclose(preference)
+    sigma = 1.110 * 6
+    gaussian = torch.exp(-((times - 7.0) ** 2) / (2 * sigma ** 2))
+    assert preference.allclose(gaussian, atol=1e-3)
+
+
+def test_bell_fits_each_episodes_own_length():
+    times = torch.tensor([[1, 3, 5], [1, 6, 11]])
+    preference = bell_preference(times, torch.tensor([[1], [1]]), torch.tensor([[5], [11]]))
+    assert preference[0].equal(preference[1])
+
+
+def test_bell_of_a_single_target_is_1():
+    assert bell_preference(torch.tensor([[4]]), 4, 4) == 1
+
+
+def test_linear_is_the_papers():
+    times = torch.arange(1, 16)[None]
+    preference = linear_preference(times, 15, 0.5)
+    assert preference[0, 0].allclose(torch.tensor(0.5 + 1 / 15))
+    assert preference[0, -1].allclose(torch.tensor(1.5))
+    assert linear_preference(times, 15, math.inf).eq(1).all()
+
+
+def test_copying_is_worth_the_same_everywhere():
+    copy_error = torch.tensor([[[0.1, 0.2, 0.3], [0.3, 0.2, 0.1]]])  # start, goal
+    ones = torch.ones(1, 3)
+    assert relative_to_copying(copy_error.amin(1), copy_error, ones).allclose(ones)
+    # A prediction half as wrong as copying in the middle wins over less error beside the start.
+    error = torch.tensor([[0.08, 0.1, 0.3]])
+    assert match_step(error).item() == 0
+    assert match_step(relative_to_copying(error, copy_error, ones)).item() == 1
+
+
+def test_a_frame_equal_to_the_context_does_not_break_the_choice():
+    copy_error, error = torch.zeros(1, 2, 3), torch.tensor([[0.0, 0.1, 0.2]])
+    assert relative_to_copying(error, copy_error, torch.ones(1, 3)).isfinite().all()

@@ -1,0 +1,146 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of training the predictor."""
+
+import argparse
+from dataclasses import replace
+import json
+from pathlib import Path
+
+import pytest
+from tap_ros.errors import ConfigError
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.train_command import add_arguments, run
+from tap_ros.prediction.training import learning_rate, train
+from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.prediction.weights import load_tensors, load_weights
+import torch
+
+
+@pytest.fixture
+def config(bag, tmp_path):
+    return TrainingConfig(
+        recordings=(str(bag),), out=str(tmp_path / 'run'), base_width=4, batch_size=4, steps=4,
+        warmup=1, margin=1, test_fraction=0.3, threads=1, save_every=2, log_every=1)
+
+
+def weights(config):
+    return load_tensors(f'{config.out}/checkpoint.safetensors')[0]
+
+
+@pytest.mark.parametrize('precision', ['float32', 'bfloat16'])
+def test_two_steps_and_two_more_equal_four(config, tmp_path, precision):
+    config = replace(config, precision=precision, num_targets=3, reverse=True, min_crop=0.6)
+    train(config, progress=False)
+    interrupted = replace(config, out=str(tmp_path / 'interrupted'))
+    train(interrupted, stop_at=2, progress=False)
+    halfway = weights(interrupted)
+    train(interrupted, progress=False)
+    expected, resumed = weights(config), weights(interrupted)
+    assert set(expected) == set(resumed)
+    for name, tensor in expected.items():
+        assert resumed[name].equal(tensor), name
+    assert not halfway['network.head.0.weight'].equal(resumed['network.head.0.weight'])
+
+
+def test_seed_decides(config, tmp_path):
+    train(config, stop_at=1, progress=False)
+    other = replace(config, seed=1, out=str(tmp_path / 'other'))
+    train(other, stop_at=1, progress=False)
+    name = 'network.head.0.weight'
+    assert not weights(config)[name].equal(weights(other)[name])
+
+
+@pytest.mark.parametrize('method, selection', [
+    ('fix', 'time_preference'), ('min', 'time_preference'), ('genmin', 'time_preference'),
+    ('genmin', 'relative_to_copying')])
+def test_every_method_learns(config, method, selection):
+    config = replace(config, method=method, selection=selection, steps=30, learning_rate=2e-3,
+                     new_pixels=True, save_every=1, average_decay=0.0)
+    losses = []
+    for stop in (1, 30):
+        train(replace(config, save_every=stop), stop_at=stop, progress=False)
+        with open(f'{config.out}/scores.json') as file:
+            losses.append(json.load(file)['loss'])
+    assert losses[1] < losses[0]
+
+
+def test_a_run_leaves_what_is_needed_to_repeat_it(config):
+    scored = []
+
+    def score(network, store, episodes):
+        scored.append(len(episodes))
+        assert not network.training
+        return {'anything': 0.5}
+
+    path = train(config, score=score, progress=False)
+    about = {}
+    for name in ('config', 'run', 'scores'):
+        with open(f'{config.out}/{name}.json') as file:
+            about[name] = json.load(file)
+    assert about['config']['learning_rate'] == config.learning_rate
+    assert about['run']['steps'] == 4 and len(about['run']['data_hash']) == 64
+    assert about['run']['episodes'] + about['run']['held_out'] == 24
+    assert about['scores']['anything'] == 0.5 and about['scores']['loss'] > 0
+    assert scored == [about['run']['held_out']] * 2
+    values, _, training = load_weights(path, 'predictor')
+    assert values['image_size'] == 32 and values['base_width'] == 4
+    assert training['scores'] == about['scores']
+    assert SubgoalPredictor.load(path).image_size == (32, 32)
+    assert list(Path(config.out).glob('events.out.tfevents.*'))
+
+
+def test_a_run_of_other_settings_is_not_continued(config):
+    train(config, stop_at=2, progress=False)
+    with pytest.raises(ConfigError, match='learning_rate=0.0005, not 0.1'):
+        train(replace(config, learning_rate=0.1), progress=False)
+
+
+def test_a_finished_run_stays_as_it_is(config):
+    train(config, progress=False)
+    before = weights(config)
+    train(config, progress=False)
+    assert all(before[name].equal(tensor) for name, tensor in weights(config).items())
+
+
+def test_learning_rate_rises_and_falls():
+    config = TrainingConfig(recordings=('bag',), out='', steps=1000, warmup=10, learning_rate=1.0)
+    rates = [learning_rate(step, config) for step in range(1000)]
+    assert rates[0] < 0.1 and max(rates) == pytest.approx(1, abs=0.01)
+    assert rates[-1] == pytest.approx(0.02, abs=0.001)
+    assert all(a >= b for a, b in zip(rates[10:], rates[11:]))
+
+
+@pytest.mark.parametrize('values', [
+    {'recordings': ()}, {'method': 'max'}, {'selection': 'best'},
+    {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
+    {'bell_edge': 0.0}, {'max_frames': 2}])
+def test_settings_that_make_no_sense_are_refused_by_name(values):
+    with pytest.raises(ConfigError, match=next(iter(values))):
+        TrainingConfig(**{'recordings': ('bag',), 'out': 'out', **values})
+
+
+def test_a_device_that_is_not_there_is_refused(config):
+    with pytest.raises(ConfigError, match="device: 'nonsense'"):
+        train(replace(config, device='nonsense'), progress=False)
+
+
+def test_the_command_line_sets_every_field(config, capsys):
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    args = parser.parse_args([
+        '--recordings', *config.recordings, '--out', config.out, '--steps', '1', '--no-flip',
+        '--base-width', '4', '--batch-size', '2', '--method', 'min', '--new-pixels'])
+    assert run(args) == 0
+    assert capsys.readouterr().out.strip() == f'{config.out}/predictor.safetensors'
+    with open(f'{config.out}/config.json') as file:
+        settings = json.load(file)
+    assert settings['method'] == 'min' and settings['new_pixels'] and not settings['flip']
+    assert 'Eq. 5' in parser.format_help()
+
+
+def test_training_on_one_episode_works_without_held_out_ones(config):
+    train(replace(config, test_fraction=0.0, steps=1), progress=False)
+    with open(f'{config.out}/scores.json') as file:
+        assert json.load(file) == {}
+    assert torch.isfinite(weights(config)['network.head.0.weight']).all()

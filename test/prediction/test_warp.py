@@ -1,0 +1,156 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of warping pictures and object maps."""
+
+import pytest
+from tap_ros.prediction.warp import (
+    blur,
+    combine,
+    expected_pixels,
+    one_hot_maps,
+    warp,
+    warp_object_maps,
+)
+import torch
+
+SIZE = (20, 30)
+
+
+def constant_flow(du, dv, batch=1, contexts=2, size=SIZE):
+    flow = torch.zeros(batch, contexts, 2, *size)
+    flow[:, :, 0], flow[:, :, 1] = du, dv
+    return flow
+
+
+def masks_for(weights, batch=1, size=SIZE):
+    return torch.tensor(weights)[None, :, None, None, None].expand(batch, -1, 1, *size)
+
+
+def test_zero_flow_is_the_identity():
+    images = torch.rand(2, 2, 3, *SIZE)
+    assert warp(images, constant_flow(0, 0, 2)).allclose(images, atol=1e-5)
+
+
+def test_output_is_read_from_where_the_flow_points_to():
+    images = torch.rand(1, 2, 3, *SIZE)
+    warped = warp(images, constant_flow(3, -2))
+    assert warped[..., 2:, :-3].allclose(images[..., :-2, 3:], atol=1e-4)
+
+
+def test_half_a_pixel_is_the_mean_of_two():
+    images = torch.rand(1, 2, 3, *SIZE)
+    warped = warp(images, constant_flow(0.5, 0))
+    assert warped[..., :-1].allclose((images[..., :-1] + images[..., 1:]) / 2, atol=1e-4)
+
+
+def test_outside_is_the_border():
+    images = torch.rand(1, 2, 3, *SIZE)
+    far = warp(images, constant_flow(1000, 0))
+    assert far.allclose(images[..., -1:].expand_as(images), atol=1e-5)
+
+
+def test_each_context_has_its_own_flow():
+    images = torch.rand(1, 2, 3, *SIZE)
+    flow = constant_flow(0, 0)
+    flow[:, 1, 0] = 4
+    warped = warp(images, flow)
+    assert warped[:, 0].allclose(images[:, 0], atol=1e-5)
+    assert warped[:, 1, ..., :-4].allclose(images[:, 1, ..., 4:], atol=1e-4)
+
+
+def test_combine_blends_by_masks_with_the_new_pixels_last():
+    warped = torch.stack([torch.full((1, 3, *SIZE), value) for value in (0.0, 1.0)], 1)
+    new = torch.full((1, 3, *SIZE), 10.0)
+    image = combine(warped, masks_for([0.5, 0.3, 0.2]), new)
+    assert image.allclose(torch.full_like(image, 2.3))
+
+
+def test_one_hot_maps_sum_to_1_with_their_mean_at_the_pixel():
+    pixels = torch.tensor([[[0.0, 0.0], [29.0, 19.0], [7.25, 11.6]]])
+    maps = one_hot_maps(pixels, SIZE)
+    assert maps.sum((-2, -1)).allclose(torch.ones(1, 3))
+    assert expected_pixels(maps).allclose(pixels, atol=1e-5)
+    assert maps[0, 0, 0, 0] == 1 and maps[0, 1, 19, 29] == 1
+
+
+def test_positions_outside_move_to_the_border():
+    maps = one_hot_maps(torch.tensor([[-5.0, 50.0]]), SIZE)
+    assert maps[0, 19, 0] == 1 and maps.sum() == 1
+
+
+@pytest.mark.parametrize('du, dv', [(3.0, -2.0), (-4.5, 1.25)])
+def test_a_translation_moves_the_expected_pixel_by_exactly_that(du, dv):
+    pixels = torch.tensor([[10.3, 8.0], [15.0, 9.6]])
+    maps = one_hot_maps(pixels, SIZE).expand(1, 2, 2, *SIZE)
+    warped = warp_object_maps(maps, constant_flow(-du, -dv), masks_for([0.4, 0.6]))
+    assert warped.maps.sum((-2, -1)).allclose(torch.ones(1, 2))
+    assert warped.mass.allclose(torch.ones(1, 2), atol=1e-4)
+    moved = expected_pixels(warped.maps)[0] - pixels
+    assert moved.allclose(torch.tensor([du, dv]).expand(2, 2), atol=1e-3)
+
+
+def test_masks_choose_the_context_an_object_is_taken_from():
+    start, goal = torch.tensor([[5.0, 5.0]]), torch.tensor([[25.0, 15.0]])
+    maps = torch.stack([one_hot_maps(start, SIZE), one_hot_maps(goal, SIZE)])[None]
+    for weights, expected in (([1.0, 0.0], start), ([0.0, 1.0], goal),
+                              ([0.5, 0.5], (start + goal) / 2)):
+        warped = warp_object_maps(maps, constant_flow(0, 0), masks_for(weights))
+        assert expected_pixels(warped.maps)[0].allclose(expected, atol=1e-4)
+
+
+def test_mass_counts_an_object_that_is_seen_twice():
+    start, goal = torch.tensor([[5.0, 5.0]]), torch.tensor([[25.0, 15.0]])
+    maps = torch.stack([one_hot_maps(start, SIZE), one_hot_maps(goal, SIZE)])[None]
+    masks = torch.zeros(1, 2, 1, *SIZE)
+    masks[:, 0, :, :, :15], masks[:, 1, :, :, 15:] = 1, 1
+    warped = warp_object_maps(maps, constant_flow(0, 0), masks)
+    assert warped.mass.allclose(torch.tensor([[2.0]]))
+    assert warped.maps.sum().allclose(torch.tensor(1.0))
+
+
+def test_an_object_that_the_flow_jumps_over_is_still_found_near_by():
+    flow = constant_flow(0, 0)
+    columns = torch.arange(30.0)
+    flow[:, :, 0] = torch.where(columns >= 10, 1.0, -1.0)  # nothing reads columns 9.01..10.99
+    pixels = torch.tensor([[10.0, 8.0]])
+    maps = one_hot_maps(pixels, SIZE).expand(1, 2, 1, *SIZE)
+    warped = warp_object_maps(maps, flow, masks_for([0.5, 0.5]))
+    assert warped.mass < 0.05
+    assert warped.maps.sum().allclose(torch.tensor(1.0))
+    assert (expected_pixels(warped.maps)[0] - pixels).norm() < 1
+
+
+def test_an_object_that_everything_avoids_stays_where_it_was():
+    start, goal = torch.tensor([[5.0, 5.0]]), torch.tensor([[25.0, 15.0]])
+    maps = torch.stack([one_hot_maps(start, SIZE), one_hot_maps(goal, SIZE)])[None]
+    away = constant_flow(1000, 1000)
+    warped = warp_object_maps(maps, away, masks_for([0.75, 0.25]))
+    assert warped.mass == 0
+    assert expected_pixels(warped.maps)[0].allclose(0.75 * start + 0.25 * goal, atol=1e-4)
+    hidden = warp_object_maps(maps, away, masks_for([0.0, 0.0, 1.0]))
+    assert expected_pixels(hidden.maps)[0].allclose((start + goal) / 2, atol=1e-4)
+
+
+def test_a_lost_object_does_not_change_the_others():
+    flow = constant_flow(0, 0)
+    flow[..., 15:] = 1000  # the right half reads the corner
+    pixels = torch.tensor([[5.0, 5.0], [20.0, 5.0]])
+    maps = one_hot_maps(pixels, SIZE).expand(1, 2, 2, *SIZE)
+    both = warp_object_maps(maps, flow, masks_for([0.5, 0.5]))
+    one = warp_object_maps(maps[:, :, :1], flow, masks_for([0.5, 0.5]))
+    assert both.mass[0, 1] < 0.05
+    assert both.maps[:, 0].allclose(one.maps[:, 0])
+
+
+def test_no_objects_give_no_maps():
+    maps = one_hot_maps(torch.zeros(0, 2), SIZE).expand(1, 2, 0, *SIZE)
+    warped = warp_object_maps(maps, constant_flow(1, 1), masks_for([0.5, 0.5]))
+    assert warped.maps.shape == (1, 0, *SIZE) and warped.mass.shape == (1, 0)
+
+
+def test_blur_keeps_the_mass_even_at_the_border():
+    maps = one_hot_maps(torch.tensor([[0.0, 0.0], [12.0, 9.0]]), SIZE)
+    blurred = blur(maps)
+    assert blurred.sum((-2, -1)).allclose(torch.ones(2))
+    assert expected_pixels(blurred)[1].allclose(torch.tensor([12.0, 9.0]), atol=1e-4)
+    assert blurred.max() < 0.8

@@ -1,0 +1,33 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Bags to read."""
+
+from made_episodes import make_episode
+import pytest
+from tap_ros.recording.writer import EpisodeWriter, write_metadata
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """Keep decoded recordings out of the user's cache."""
+    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
+    return tmp_path / 'cache'
+
+
+@pytest.fixture
+def episodes():
+    """Make episodes of several lengths, with stamps that go on from one to the next."""
+    return [make_episode(seed, T=3 + seed % 4, start=(seed + 1) * 10**10) for seed in range(7)]
+
+
+@pytest.fixture
+def bag(tmp_path, episodes):
+    """Write the episodes into a bag of two files."""
+    folder = tmp_path / 'push2'
+    folder.mkdir()
+    for number, part in enumerate((episodes[:4], episodes[4:])):
+        with EpisodeWriter(folder / f'push2_{number}.mcap') as writer:
+            for episode in part:
+                writer.write(episode)
+    write_metadata(folder)
+    return folder

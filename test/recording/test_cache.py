@@ -1,0 +1,130 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The cache holds what the recording holds, whoever builds it and whatever happened to it."""
+
+from concurrent.futures import ThreadPoolExecutor
+import os
+import shutil
+import subprocess
+import sys
+
+from made_episodes import assert_all_equal, make_episode
+import numpy as np
+import pytest
+from tap_ros.errors import RecordingError
+from tap_ros.recording import cache as cache_module
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.writer import EpisodeWriter
+
+
+def test_store_describes_its_episodes(bag, episodes):
+    store = open_recordings([bag])
+    assert len(store) == len(episodes)
+    assert store.lengths.tolist() == [len(e) for e in episodes]
+    assert store.num_frames == sum(len(e) for e in episodes)
+    assert store.image_size == (8, 12)
+    np.testing.assert_array_equal(store.frames(2), episodes[2].frames)
+    with pytest.raises(IndexError):
+        store[len(episodes)]
+
+
+def test_frames_are_views_of_memory_maps(bag):
+    frames = open_recordings(bag)[3].frames
+    while frames.base is not None and not isinstance(frames, np.memmap):
+        frames = frames.base
+    assert isinstance(frames, np.memmap)
+    assert not frames.flags.writeable
+
+
+def test_second_opening_decodes_nothing(bag, episodes, monkeypatch):
+    open_recordings(bag)
+    monkeypatch.setattr(cache_module, 'decode_file', None)
+    assert_all_equal(open_recordings(bag), episodes)
+
+
+def test_the_key_is_the_content_of_the_file(bag, episodes, cache, monkeypatch):
+    first = open_recordings(bag)
+    before = sorted(os.listdir(cache))
+    moved = bag.with_name('moved')
+    shutil.move(bag, moved)
+    monkeypatch.setattr(cache_module, 'decode_file', None)
+    again = open_recordings(moved)
+    assert_all_equal(again, episodes)
+    assert again.data_hash == first.data_hash
+    assert sorted(os.listdir(cache)) == before
+
+
+def test_other_content_is_another_key(tmp_path, episodes):
+    path = tmp_path / 'a.mcap'
+    hashes = set()
+    for part in (episodes[:2], episodes[1:3], episodes[:2]):
+        with EpisodeWriter(path) as writer:
+            for episode in part:
+                writer.write(episode)
+        store = open_recordings(path)
+        assert_all_equal(store, part)
+        hashes.add(store.data_hash)
+    assert len(hashes) == 2
+
+
+@pytest.mark.parametrize('damage', [
+    lambda folder: (folder / 'frames.npy').unlink(),
+    lambda folder: os.truncate(folder / 'frames.npy', 200),
+    lambda folder: os.truncate(folder / 'frames.npy', 0),
+    lambda folder: (folder / 'columns.safetensors').unlink(),
+    lambda folder: os.truncate(folder / 'columns.safetensors', 100),
+    lambda folder: (folder / 'columns.safetensors').write_bytes(b'nonsense' * 9),
+    lambda folder: os.truncate(
+        folder / 'columns.safetensors', (folder / 'columns.safetensors').stat().st_size - 1)])
+def test_damaged_caches_are_built_again(bag, episodes, cache, damage):
+    open_recordings(bag)
+    for folder in cache.iterdir():
+        damage(folder)
+    assert_all_equal(open_recordings(bag), episodes)
+
+
+def test_many_may_build_at_once(bag, episodes, cache):
+    with ThreadPoolExecutor(6) as pool:
+        for store in pool.map(lambda _: open_recordings(bag, progress=False), range(6)):
+            assert_all_equal(store, episodes)
+    assert len(list(cache.iterdir())) == 2  # a folder a file, nothing unfinished
+
+
+def test_many_processes_may_build_at_once(bag, cache):
+    script = 'import sys; from tap_ros.recording.cache import open_recordings; ' \
+        'print(open_recordings(sys.argv[1], progress=False).num_frames)'
+    runs = [subprocess.Popen([sys.executable, '-c', script, str(bag)], stdout=subprocess.PIPE,
+                             text=True) for _ in range(3)]
+    frames = {run.communicate()[0].strip() for run in runs}
+    assert frames == {str(open_recordings(bag).num_frames)}
+    assert len(list(cache.iterdir())) == 2
+
+
+def test_a_failed_build_leaves_nothing(tmp_path, bag, cache):
+    path = bag / 'push2_0.mcap'
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xff
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match='push2_0.mcap'):
+        open_recordings(path)
+    assert list(cache.glob('*')) == []
+
+
+def test_an_unusable_cache_folder_is_named(tmp_path, bag):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(RecordingError, match='TAP_ROS_CACHE'):
+        open_recordings(bag, tmp_path / 'file' / 'cache')
+
+
+def test_images_of_one_store_share_their_size(tmp_path):
+    for name, size in (('small', (8, 8)), ('large', (16, 8))):
+        (tmp_path / name).mkdir()
+        with EpisodeWriter(tmp_path / name / f'{name}.mcap') as writer:
+            writer.write(make_episode(size=size))
+    with pytest.raises(RecordingError, match=r'large.mcap \(8x16\), .*small.mcap \(8x8\)'):
+        open_recordings([tmp_path / 'large', tmp_path / 'small'])
+    with pytest.raises(RecordingError, match='images of different sizes'):
+        with EpisodeWriter(tmp_path / 'both.mcap') as writer:
+            writer.write(make_episode(size=(8, 8)))
+            writer.write(make_episode(size=(4, 16)))  # as many bytes
+        open_recordings(tmp_path / 'both.mcap')

@@ -1,0 +1,188 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What is written is what is read, by us and by others."""
+
+import dataclasses
+
+from made_episodes import assert_all_equal, assert_equal, make_episode
+from mcap.reader import make_reader
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from tap_ros.errors import RecordingError
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.writer import EpisodeWriter, write_metadata
+import yaml
+
+
+def write(path, episodes, **options):
+    with EpisodeWriter(path, **options) as writer:
+        for episode in episodes:
+            writer.write(episode)
+    return path
+
+
+@pytest.mark.parametrize('compression', ['zstd', 'lz4', 'none'])
+def test_round_trip(tmp_path, episodes, compression):
+    path = write(tmp_path / 'a.mcap', episodes, compression=compression)
+    assert_all_equal(iter_episodes(path), episodes)
+    assert_all_equal(open_recordings(path), episodes)
+
+
+@pytest.mark.parametrize('changes', [
+    {'goal_frame': None}, {'task': '', 'seed': 0, 'outcome': ''}, {'outcome': 'interrupted'},
+    {'seed': 2**63 + 5}, {'grippers': np.full((5, 4), np.nan, np.float32)},
+    {'object_pixels': np.full((5, 2, 2), np.nan, np.float32)},
+    {'goal_pixels': np.full((2, 2), np.nan, np.float32)},
+    {'stamps': np.arange(5)}, {'stamps': np.array([0, 1, 10**9, 10**10, 10**12])}],
+    ids=lambda changes: ','.join(changes))
+def test_round_trip_of_what_is_unusual(tmp_path, changes):
+    unusual = dataclasses.replace(make_episode(1, start=10**11), **changes)
+    episodes = [make_episode(0), unusual, make_episode(2, start=10**13)]
+    assert_all_equal(iter_episodes(write(tmp_path / 'a.mcap', episodes)), episodes)
+
+
+@pytest.mark.parametrize('T, K', [(1, 2), (5, 0), (1, 0), (7, 5)])
+def test_round_trip_of_other_sizes(tmp_path, T, K):
+    episodes = [make_episode(i, T=T, K=K, start=(i + 1) * 10**10) for i in range(3)]
+    assert_all_equal(iter_episodes(write(tmp_path / 'a.mcap', episodes)), episodes)
+
+
+def test_round_trip_when_objects_differ_between_episodes(tmp_path):
+    episodes = [make_episode(i, K=i % 4, start=(i + 1) * 10**10) for i in range(8)]
+    path = write(tmp_path / 'a.mcap', episodes)
+    assert_all_equal(iter_episodes(path), episodes)
+    assert_all_equal(open_recordings(path), episodes)
+
+
+def test_round_trip_when_every_episode_starts_at_zero(tmp_path):
+    episodes = [make_episode(i, T=3 + i, start=0) for i in range(4)]
+    path = write(tmp_path / 'a.mcap', episodes)
+    assert_all_equal(iter_episodes(path), episodes)
+    with open(path, 'rb') as stream:
+        times = [m.log_time for _, _, m in make_reader(stream).iter_messages(
+            log_time_order=False)]
+    assert times == sorted(times)
+
+
+def test_round_trip_of_a_bag_whose_files_all_start_at_zero(tmp_path):
+    episodes = [make_episode(i, T=3 + i, start=0) for i in range(6)]
+    for number in range(3):
+        write(tmp_path / f'a_{number}.mcap', episodes[2 * number:2 * number + 2])
+    write_metadata(tmp_path)
+    assert_all_equal(iter_episodes(tmp_path), episodes)
+    assert_all_equal(open_recordings(tmp_path), episodes)
+
+
+def test_same_episodes_give_the_same_bytes(tmp_path, episodes):
+    files = []
+    for name in ('one', 'two'):
+        (tmp_path / name).mkdir()
+        path = write(tmp_path / name / 'a.mcap', episodes)
+        write_metadata(tmp_path / name)
+        files.append((path.read_bytes(), (tmp_path / name / 'metadata.yaml').read_bytes()))
+    assert files[0] == files[1]
+
+
+def test_rosbags_reads_the_bag(bag, episodes):
+    frames, twists, ends = [], [], []
+    with AnyReader([bag]) as reader:
+        assert reader.message_count == sum(c.msgcount for c in reader.connections)
+        for connection, stamp, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            if connection.topic == '/camera/image_raw':
+                frames.append(message.data.reshape(message.height, message.width, 3))
+                assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
+            elif connection.topic == '/arm/delta_twist_cmds':
+                linear = message.twist.linear
+                twists.append((linear.x, linear.y, linear.z))
+            elif connection.topic == '/episode' and message.event == message.END:
+                ends.append((message.task, message.seed, message.outcome))
+        qos = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
+    np.testing.assert_array_equal(frames, np.concatenate([e.frames for e in episodes]))
+    np.testing.assert_array_equal(
+        np.float32(twists), np.concatenate([e.actions[:-1, :3] for e in episodes]))
+    assert ends == [(e.task, e.seed, e.outcome) for e in episodes]
+    assert qos['/goal/image'].durability.name == 'TRANSIENT_LOCAL'
+    assert qos['/camera/image_raw'].durability.name == 'VOLATILE'
+
+
+def test_mcap_reads_the_files_and_finds_all_checksums_right(bag):
+    for path in sorted(bag.glob('*.mcap')):
+        with open(path, 'rb') as stream:
+            reader = make_reader(stream, validate_crcs=True)
+            assert reader.get_header().profile == 'ros2'
+            messages = list(reader.iter_messages())
+            summary = reader.get_summary()
+        assert len(messages) == summary.statistics.message_count
+        assert {s.encoding for s, _, _ in messages} == {'ros2msg'}
+        assert {c.message_encoding for _, c, _ in messages} == {'cdr'}
+
+
+def test_metadata_describes_the_files(bag):
+    about = yaml.safe_load((bag / 'metadata.yaml').read_text())['rosbag2_bagfile_information']
+    assert about['version'] == 9 and about['storage_identifier'] == 'mcap'
+    assert about['relative_file_paths'] == ['push2_0.mcap', 'push2_1.mcap']
+    assert about['message_count'] == sum(f['message_count'] for f in about['files'])
+    assert about['message_count'] == sum(
+        t['message_count'] for t in about['topics_with_message_count'])
+
+
+def test_ten_files_and_more_play_in_the_order_of_their_numbers(tmp_path):
+    episodes = [make_episode(i, T=2, start=(i + 1) * 10**10) for i in range(12)]
+    for number, episode in enumerate(episodes):
+        write(tmp_path / f'a_{number}.mcap', [episode])
+    assert_all_equal(iter_episodes(tmp_path), episodes)  # before there is a metadata.yaml
+    write_metadata(tmp_path)
+    assert_all_equal(iter_episodes(tmp_path), episodes)
+
+
+def test_the_order_of_the_files_is_that_of_the_metadata(bag, episodes):
+    path = bag / 'metadata.yaml'
+    text = path.read_text().replace('push2_0', 'x').replace('push2_1', 'push2_0')
+    path.write_text(text.replace('x.mcap', 'push2_1.mcap'))
+    assert_all_equal(iter_episodes(bag), episodes[4:] + episodes[:4])
+    assert_all_equal(open_recordings(bag), episodes[4:] + episodes[:4])
+
+
+def test_folder_of_bags(tmp_path, bag, episodes):
+    other = tmp_path / 'a_bag_before'
+    other.mkdir()
+    write(other / 'b_0.mcap', episodes[:1])
+    (tmp_path / 'not_a_bag').mkdir()
+    assert_all_equal(iter_episodes(tmp_path), episodes[:1] + episodes)
+
+
+def test_a_failed_write_leaves_no_file(tmp_path, episodes):
+    with pytest.raises(KeyboardInterrupt), EpisodeWriter(tmp_path / 'a.mcap') as writer:
+        writer.write(episodes[0])
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_file_has_its_name_only_when_it_is_complete(tmp_path, episodes):
+    with EpisodeWriter(tmp_path / 'a.mcap') as writer:
+        writer.write(episodes[0])
+        assert not (tmp_path / 'a.mcap').exists()
+    assert [p.name for p in tmp_path.iterdir()] == ['a.mcap']
+    assert_equal(next(iter_episodes(tmp_path / 'a.mcap')), episodes[0])
+
+
+@pytest.mark.parametrize('field, value, words', [
+    ('frames', np.zeros((5, 8, 12, 3), np.float32), 'uint8'),
+    ('actions', np.zeros((4, 4), np.float32), r'expected shape \(5, 4\)'),
+    ('actions', np.ones((5, 4), np.float32), 'zeros in the last row'),
+    ('stamps', np.zeros(5, np.int64), 'increase'),
+    ('goal_frame', np.zeros((8, 8, 3), np.uint8), r'expected shape \(8, 12, 3\)'),
+    ('outcome', 'won', 'success')])
+def test_unusable_episodes_are_refused_by_field(tmp_path, field, value, words):
+    episode = dataclasses.replace(make_episode(), **{field: value})
+    with pytest.raises(RecordingError, match=f'Episode.{field}: .*{words}'), \
+            EpisodeWriter(tmp_path / 'a.mcap') as writer:
+        writer.write(episode)
+
+
+def test_unknown_compression_is_refused(tmp_path):
+    with pytest.raises(RecordingError, match='zstd, lz4 or none'):
+        EpisodeWriter(tmp_path / 'a.mcap', compression='gzip')
