@@ -155,8 +155,11 @@ def _add_object(world, name, shape):
     for i, (size, centre, colour) in enumerate(
             zip(shape.half_sizes, shape.centres, shape.colours)):
         disc = shape.kind == 'disc'
+        # With rolling friction (condim 6), else a disc that is tipped onto its rim rolls away.
+        rolling = {'condim': 6, 'friction': [1, 0.01, 0.005]} if disc else {
+            'friction': [1, 0.01, 0.0002]}
         body.add_geom(
             name=f'{name}_part_{i}', pos=[*centre, 0],
             type=mujoco.mjtGeom.mjGEOM_CYLINDER if disc else mujoco.mjtGeom.mjGEOM_BOX,
             size=[*size, 0] if disc else list(size), rgba=[*colour, 1],
-            density=300, friction=[1, 0.01, 0.0002], contype=1, conaffinity=3)
+            density=300, contype=1, conaffinity=3, **rolling)

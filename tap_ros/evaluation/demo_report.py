@@ -10,7 +10,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
-from tap_ros.evaluation.pictures import enlarge, film_strip, overlay_maps, png_bytes
+from tap_ros.pictures import enlarge, film_strip, grid, overlay, png_bytes
 
 SCALE = 4
 MODE_NAMES = {'direct': 'straight to the goal', 'subgoal': 'by the subgoal'}
@@ -105,17 +105,14 @@ def write_overview(path, scenes):
     :param path: of the PNG file.
     :param scenes: list of SceneRuns.
     """
-    white = np.full((SCALE * scenes[0].start.shape[0], SCALE, 3), 255, np.uint8)
-    rows = [np.hstack([part for _, picture in _prediction(scene) for part in (picture, white)])
-            for scene in scenes]
-    line = np.full((SCALE, rows[0].shape[1], 3), 255, np.uint8)
-    Path(path).write_bytes(png_bytes(np.vstack([part for row in rows for part in (row, line)])))
+    rows = [[picture for _, picture in _prediction(scene)] for scene in scenes]
+    Path(path).write_bytes(png_bytes(grid(rows)))
 
 
 def _prediction(scene):
     """Return (caption, picture) of start, goal, subgoal and object maps."""
     k = len(scene.object_maps)
-    maps = overlay_maps(
+    maps = overlay(
         scene.start // 3, scene.object_maps, SCALE, scene.start_pixels, scene.goal_pixels)
     return [
         ('start', enlarge(scene.start, SCALE)), ('goal', enlarge(scene.goal, SCALE)),
@@ -134,7 +131,7 @@ def _scene_section(scene):
     figures = ''.join(_figure(caption, png_bytes(image)) for caption, image in pictures)
     strips = ''.join(
         _figure(f'{MODE_NAMES[mode]}: frames 0 to {len(run.frames) - 1}, median planning time '
-                f'{run.planning_ms:.0f} ms', png_bytes(film_strip(run.frames)))
+                f'{run.planning_ms:.0f} ms', png_bytes(grid([film_strip(run.frames)])))
         for mode, run in scene.runs.items())
     return (f'<h2>Scene {scene.seed}</h2>{figures}'
             f'{_figure("error over time", _error_plot(scene), "smooth")}{strips}')

@@ -6,9 +6,8 @@ from collections import Counter
 import json
 from pathlib import Path
 
-import cv2
 import numpy as np
-from tap_ros.evaluation.pictures import film_strip
+from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.prediction.weights import load_tensors
 from tap_ros.recording.cache import open_recordings
 
@@ -41,6 +40,6 @@ def run(args):
         print(f'{name:<11} {counts}')
     print(f'data hash   {store.data_hash}')
     if args.picture:
-        strips = np.vstack([film_strip(e.frames) for e in episodes[:args.episodes]])
-        cv2.imwrite(args.picture, strips[..., ::-1])
+        strips = [film_strip(e.frames) for e in episodes[:args.episodes]]
+        Path(args.picture).write_bytes(png_bytes(grid(strips, scale=2)))
         print(f'picture     {args.picture}')

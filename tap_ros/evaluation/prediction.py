@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.images import to_float, to_uint8
+from tap_ros.pictures import grid, overlay
 from tap_ros.prediction.batches import make_batch, split_episodes, uses_recorded_goal
 from tap_ros.prediction.losses import l1_errors, match_step
-from tap_ros.prediction.pictures import grid, overlay
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
 from tap_ros.recording.cache import open_recordings

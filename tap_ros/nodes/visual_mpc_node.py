@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serves reach_goal: asks for a subgoal, plans with VisualMPC, sends one command per image."""
 
-from pathlib import Path
 import sys
 import threading
 
@@ -17,19 +16,15 @@ from std_msgs.msg import Float64
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.errors import ConfigError, PlanningError, TapError
+from tap_ros.errors import PlanningError, TapError
 from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.image_messages import decode_image, decode_map, is_empty
 from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.nodes.planner_setup import check_request, declare_parameters, load_planner
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, WORLD_FRAME
-from tap_ros.planning.visual_mpc import PRESETS, VisualMPC, with_preset
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 
-DEFAULT_WEIGHTS = Path(__file__).parents[1] / 'weights' / 'forward_model_push.safetensors'
-MODES = ('subgoal', 'direct')
-DEFAULT_BUDGET, MAX_BUDGET = 40, 1000
 SENSORS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
            'joints': (JointState, 'joint_states')}
 GOAL = {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}
@@ -123,24 +118,27 @@ class VisualMpcNode(Node):
             raise PlanningError(
                 'objects: none are seen, so there is nothing to push; publish their pixels')
         goal_pixels = match_objects(names, goal_names, goal_pixels, 'objects', 'goal_objects')
-        maps = None
+        maps = centres = None
         if mode == 'subgoal':
-            maps = self._ask_for_subgoal(seen, goal, names, request.seed, cancelled)
+            maps, centres = self._ask_for_subgoal(seen, goal, names, request.seed, cancelled)
         self._mpc.reset(request.seed)
         while True:
             pixels = match_objects(
                 names, *decode_objects(seen['objects'], 'objects'), 'the first objects', 'objects')
-            distance = np.linalg.norm(pixels - goal_pixels, axis=1).mean()
-            result.expected_distance = float(distance)
-            result.success = bool(distance <= self.params['goal_tolerance'])
+            distance = mean_distance(pixels, goal_pixels)
+            result.expected_distance = distance
+            result.success = distance <= self.params['goal_tolerance']
             if result.success or result.steps >= budget:
                 break
-            stage = 'subgoal' if maps is not None and result.steps < budget // 2 else 'goal'
+            if maps is not None and (
+                    result.steps >= budget // 2
+                    or mean_distance(pixels, centres) <= self.params['goal_tolerance']):
+                maps = None  # from now on straight to the goal
+            stage = 'goal' if maps is None else 'subgoal'
             plan = self._mpc.act(
                 decode_image(seen['image'], 'camera/image_raw', self._mpc.image_size),
                 decode_gripper(seen['joints']), pixels,
-                goal_maps=maps if stage == 'subgoal' else None,
-                goal_pixels=None if stage == 'subgoal' else goal_pixels)
+                goal_maps=maps, goal_pixels=goal_pixels if maps is None else None)
             if cancelled():
                 raise Cancelled('cancelled')
             sent_ns = self._send(plan.action, seen['image'].header.stamp)
@@ -189,7 +187,7 @@ class VisualMpcNode(Node):
         return seen
 
     def _ask_for_subgoal(self, seen, goal, names, seed, cancelled):
-        """Return the subgoal's object maps (K, H, W) in the order of `names`."""
+        """Return the subgoal's object maps (K, H, W) and their means (K, 2) in order of `names`."""
         request = PredictSubgoal.Request(
             start=seen['image'], goal=goal['image'], start_objects=seen['objects'],
             goal_objects=goal['objects'], seed=seed)
@@ -204,7 +202,9 @@ class VisualMpcNode(Node):
         subgoal = response.subgoals[0]
         maps = np.stack([decode_map(message, f'object map of {name}') for name, message in zip(
             subgoal.object_names, subgoal.object_maps)])
-        return match_objects(names, tuple(subgoal.object_names), maps, 'objects', 'subgoal')
+        centres = np.array([(point.x, point.y) for point in subgoal.expected_pixels])
+        return [match_objects(names, tuple(subgoal.object_names), values, 'objects', 'subgoal')
+                for values in (maps, centres)]
 
     # Commands
 
@@ -234,67 +234,9 @@ class VisualMpcNode(Node):
         self._twist.publish(TwistStamped())
 
 
-def declare_parameters(node):
-    """Declare the parameters of the node."""
-    parameters = Parameters(node)
-    parameters.declare('weights', str(DEFAULT_WEIGHTS),
-                       'File of weights (.safetensors) of a forward model.')
-    parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
-                       choices=['cpu', 'cuda'])
-    parameters.declare('preset', 'default', 'Settings of the planner: what does best, or what the '
-                       'paper says.', choices=list(PRESETS))
-    parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
-    parameters.declare('control_period', 0.25,
-                       'Seconds (of image stamps) that the arm takes for one command.',
-                       low=0.01, high=10.0)
-    parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
-    for name, default, high, description in (
-            ('max_step_xy', 0.08, 0.08, 'Largest |dx| and |dy| of a command in metres.'),
-            ('max_step_z', 0.15, 0.15, 'Largest |dz| of a command in metres.'),
-            ('goal_tolerance', 1.0, 64.0,
-             'The goal is reached at this mean distance of the objects in pixels.')):
-        parameters.declare(name, default, description, low=0.0, high=high, read_only=False)
-    parameters.declare('image_timeout', 5.0, 'Seconds to wait for an image before giving up.',
-                       low=0.1, high=600.0, read_only=False)
-    parameters.declare('predictor_timeout', 20.0, 'Seconds to wait for a subgoal.',
-                       low=0.1, high=600.0, read_only=False)
-    return parameters
-
-
-def load_planner(parameters):
-    """
-    Load weights, and plan once, so that the first command comes as fast as the others.
-
-    :raises WeightsError: when the file cannot be used.
-    :raises ConfigError: when the device is not there.
-    """
-    check_device(parameters['device'])
-    config = with_preset(parameters['preset'], arm_hidden=parameters['arm_hidden'])
-    mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
-    height, width = mpc.image_size
-    pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
-    mpc.reset(0)
-    mpc.act(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels,
-            goal_maps=None, goal_pixels=pixels)
-    return mpc
-
-
-def check_request(request):
-    """
-    Return mode and step budget of a goal, defaults filled in.
-
-    :raises ConfigError: for an unknown mode, or a budget or seed out of range.
-    """
-    if request.seed < 0:
-        raise ConfigError(f'seed is {request.seed}; expected 0 or more')
-    mode = request.mode or 'subgoal'
-    if mode not in MODES:
-        raise ConfigError(f'mode is {mode!r}; valid modes: {", ".join(MODES)}')
-    budget = request.step_budget or DEFAULT_BUDGET
-    if budget > MAX_BUDGET:
-        raise ConfigError(f'step_budget is {budget}; expected 1 to {MAX_BUDGET}, or 0 for '
-                          f'{DEFAULT_BUDGET}')
-    return mode, budget
+def mean_distance(pixels, goals):
+    """Return the distance between pixels (K, 2) and their goals (K, 2), mean over K."""
+    return float(np.linalg.norm(pixels - goals, axis=1).mean())
 
 
 def main(args=None):

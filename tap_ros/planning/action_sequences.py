@@ -5,15 +5,19 @@ What the search varies: a few displacements, each repeated, and for how long the
 
 A sequence of `horizon` actions is made of segments of `repeat` control periods. Parameters (D,)
 are x, y of every segment in metres per control period, then the number of segments to stay lifted.
-A plan that is carried over to the next control period starts inside a segment: with `phase`
+Like the expert that was recorded, the arm goes up and down on the spot and pushes slowly: what the
+forward model has never seen, it cannot foresee. A plan that is carried over to the next control period starts inside a segment: with `phase`
 periods of the first one already executed, the horizon reaches into one segment more.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-LIFT = 0.15  # m per control period: to the top of the workspace, or down to the table, in one
+LIFTED = 0.13  # m, height of the gripper that clears the objects
+LOW = 0.012  # m, height at which it pushes
+VERTICAL = 0.06  # m, a change of height beyond which the arm does not move sideways meanwhile
+CLIMB_LIMIT = 0.15  # m per control period
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,8 @@ class SequenceShape:
     :param segments: displacements within the horizon; repeat: control periods of each.
     :param phase: periods of the first segment that are past, 0..repeat-1.
     :param move_limit: m per control period, |x| and |y|; max_lift: segments.
+    :param push_limit: m per control period, length of a displacement while the gripper is low.
+    :param upright: go up and down without moving sideways.
     """
 
     segments: int = 5
@@ -31,6 +37,8 @@ class SequenceShape:
     phase: int = 0
     move_limit: float = 0.08
     max_lift: int = 4
+    push_limit: float = 0.05
+    upright: bool = True
 
     @property
     def horizon(self):
@@ -58,24 +66,56 @@ class SequenceShape:
         parameters[:, -1] = np.clip(np.rint(parameters[:, -1]), 0, self.max_lift)
         return parameters
 
-    def actions(self, parameters):
+    def segment(self):
+        """Return the segment (horizon,) of each control period."""
+        return (np.arange(self.horizon) + self.phase) // self.repeat
+
+    def climbs(self, lifted, height):
+        """
+        Plan the heights.
+
+        :param lifted: (N,) segments; height: of the gripper now, m.
+        :return: climb (N, horizon) m per control period, and whether the arm may move sideways.
+        """
+        heights = np.where(self.segment()[None] < lifted[:, None], LIFTED, LOW)
+        before = np.column_stack([np.full(len(lifted), height), heights[:, :-1]])
+        climb = np.clip(heights - before, -CLIMB_LIMIT, CLIMB_LIMIT)
+        return climb, (np.abs(climb) < VERTICAL) | (not self.upright)
+
+    def actions(self, parameters, height):
         """
         Expand parameters.
 
-        :param parameters: (N, D).
+        :param parameters: (N, D); height: of the gripper now, m.
         :return: (N, horizon, 4) float32: metres per control period, gripper closed (0).
         """
         moves, lifted = self.split(parameters)
-        segment = (np.arange(self.horizon) + self.phase) // self.repeat  # (horizon,)
+        climb, sideways = self.climbs(lifted, height)
         actions = np.zeros((len(parameters), self.horizon, 4), np.float32)
-        actions[..., :2] = moves[:, segment]
-        actions[..., 2] = np.where(segment[None] < lifted[:, None], LIFT, -LIFT)
+        actions[..., :2] = moves[:, self.segment()] * sideways[..., None]
+        actions[..., 2] = climb
+        length = np.linalg.norm(actions[..., :2], axis=-1)
+        low = self.segment()[None] >= lifted[:, None]
+        slow = np.minimum(1, self.push_limit / np.maximum(length, 1e-9))
+        actions[..., :2] *= np.where(low, slow, 1)[..., None]
         return actions
+
+    def landings(self, actions, gripper):
+        """
+        Find where the gripper comes down.
+
+        :param actions: (N, horizon, 4); gripper: (4,).
+        :return: (N, 2) metres; NaN for sequences that stay up or low.
+        """
+        path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, horizon, 3)
+        down = actions[..., 2] < -VERTICAL
+        first = down.argmax(1)
+        return np.where(
+            down.any(1)[:, None], path[np.arange(len(path)), first, :2], np.nan)
 
     def following(self):
         """Return the shape one control period later."""
-        return SequenceShape(self.segments, self.repeat, (self.phase + 1) % self.repeat,
-                             self.move_limit, self.max_lift)
+        return replace(self, phase=(self.phase + 1) % self.repeat)
 
     def shift(self, parameters):
         """

@@ -28,7 +28,8 @@ from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.prediction.batches import split_episodes
 from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
-from tap_ros.prediction.pictures import grid, grey_panels
+from tap_ros.pictures import grid
+from tap_ros.prediction.pictures import grey_panels
 from tap_ros.prediction.training import learning_rate, pick_device
 from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings

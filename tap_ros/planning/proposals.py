@@ -9,7 +9,7 @@ object pixels and goal pixels, brought to the table by the model's homography.
 
 import numpy as np
 
-PERIOD_SLACK = 0.9  # of the move limit is used, so that the search can still add to it
+PACE = 0.9  # of the limits is used, so that the search can still add to it
 
 
 def push_proposals(shape, gripper, objects, goals, count, rng, weights=None):
@@ -30,41 +30,49 @@ def push_proposals(shape, gripper, objects, goals, count, rng, weights=None):
     if weights.sum() <= 0:
         return np.zeros((0, shape.size))
     proposals = []
-    chosen = rng.choice(len(objects), count, p=weights / weights.sum())
-    for k in chosen:
-        direction = gaps[k] / distances[k]
-        side = np.array([-direction[1], direction[0]])
-        offset = rng.normal(0, 0.025)
-        standoff = rng.uniform(0.07, 0.14)
-        start = objects[k] - standoff * direction + offset * side
-        # the gripper's own half width is part of the way to the object's far side
-        end = goals[k] - rng.uniform(0.02, 0.08) * direction + 0.5 * offset * side
-        proposals.append(_go_and_push(shape, gripper, start, end, direction, objects[k]))
+    for k in rng.choice(len(objects), count, p=weights / weights.sum()):
+        angle = np.arctan2(*gaps[k][::-1]) + rng.normal(0, 0.2)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        aside = rng.normal(0, 0.025) * np.array([-along[1], along[0]])
+        start = objects[k] - rng.uniform(0.10, 0.14) * along + aside
+        # the gripper stops where the object's near side should end
+        end = start + (distances[k] + rng.normal(0.07, 0.03)) * along
+        proposals.append(_go_and_push(shape, gripper, start, end, objects[k], along))
     return np.stack(proposals)
 
 
-def _go_and_push(shape, gripper, start, end, direction, target):
-    """Return parameters (D,): travel lifted to the start if needed, then push to the end."""
-    periods = np.full(shape.num_moves, shape.repeat)
-    periods[0] -= shape.phase
-    limit = shape.move_limit * PERIOD_SLACK
-    here, low = gripper[:2], gripper[2] < 0.05
-    behind = (target - here) @ direction
-    beside = abs((target - here) @ np.array([-direction[1], direction[0]]))
-    moves, i = np.zeros((shape.num_moves, 2)), 0
-    if not (low and 0.02 < behind < 0.18 and beside < 0.05):
-        # travel: as many segments as the distance needs, at an even pace
-        total = np.abs(start - here).max()
-        while i < min(shape.max_lift, shape.num_moves - 1):
-            i += 1
-            if total <= limit * periods[:i].sum():
+def _go_and_push(shape, gripper, start, end, target, along):
+    """
+    Return parameters (D,): travel lifted to the start unless already behind, push to the end.
+
+    :param start: (2,) metres; end (2,); target (2,), the object; along (2,), of the push.
+    """
+    here = gripper[:2]
+    ahead = (target - here) @ along
+    beside = np.linalg.norm(target - here - ahead * along)
+    lifted = 0
+    if not (gripper[2] < 0.05 and 0.02 < ahead < 0.2 and beside < 0.05):
+        # as many lifted segments as the way needs at nearly full speed
+        while lifted < min(shape.max_lift, shape.num_moves - 1):
+            lifted += 1
+            periods = _moving_periods(shape, gripper, lifted)
+            if np.abs(start - here).max() <= PACE * shape.move_limit * periods[:lifted].sum():
                 break
-        moves[:i] = (start - here) / periods[:i].sum()
-        here = start
-    lifted = i
-    gap = end - here
-    needed = max(1, int(np.ceil(np.abs(gap).max() / (limit * shape.repeat))))
-    last = min(i + needed, shape.num_moves)
-    moves[i:last] = gap / periods[i:last].sum()
+    periods = _moving_periods(shape, gripper, lifted)
+    moves = np.zeros((shape.num_moves, 2))
+    moves[:lifted] = (start - here) / max(1, periods[:lifted].sum())
+    if not lifted:
+        start = here
+    needed = np.linalg.norm(end - start) / (PACE * shape.push_limit)
+    last = lifted + 1
+    while last < shape.num_moves and periods[lifted:last].sum() < needed:
+        last += 1
+    moves[lifted:last] = (end - start) / max(1, periods[lifted:last].sum())
     moves = np.clip(moves, -shape.move_limit, shape.move_limit)
     return np.append(moves.ravel(), lifted)
+
+
+def _moving_periods(shape, gripper, lifted):
+    """Return how many control periods of each segment (num_moves,) move sideways."""
+    _, sideways = shape.climbs(np.array([lifted]), gripper[2])
+    return np.bincount(shape.segment(), sideways[0], minlength=shape.num_moves)

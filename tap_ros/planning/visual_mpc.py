@@ -31,6 +31,9 @@ class VisualMPCConfig:
     :param search: settings of the search; 200 samples, 3 iterations, 10 elites.
     :param segments: displacements of a sequence; repeat: control periods of each.
     :param std_move: m per control period, of x and y in the first Gaussian; move_limit their clip.
+    :param push_limit: m per control period while the gripper is low, so that pushes are like the
+        recorded ones; upright: go up and down without moving sideways, like them.
+    :param clearance: m from any object's pixel to where the gripper may come down.
     :param max_lift: segments, at most, that the gripper travels lifted before it goes down.
     :param last_weight: weight of the horizon's last step in the cost; the others have 1.
     :param warm_start: begin with the last plan, carried on by one control period.
@@ -46,6 +49,9 @@ class VisualMPCConfig:
     repeat: int = 3
     std_move: float = 0.04
     move_limit: float = 0.08
+    push_limit: float = 0.05
+    upright: bool = True
+    clearance: float = 0.08
     max_lift: int = 4
     last_weight: float = 10.0
     warm_start: bool = True
@@ -72,7 +78,9 @@ class VisualMPCConfig:
 
 
 # 0.08 m std and 0.16 m clip in the paper are for actions of 1 s; ours last 0.25 s.
-PAPER = VisualMPCConfig(warm_start=False, proposals=0, cost_every=1)
+PAPER = VisualMPCConfig(
+    warm_start=False, proposals=0, cost_every=1, push_limit=0.08, upright=False,
+    clearance=0.0)
 PRESETS = {'default': VisualMPCConfig(), 'paper': PAPER}
 
 
@@ -126,7 +134,8 @@ class VisualMPC:
         config = self.config
         self._seed, self._count, self._last = seed, 0, None
         self._shape = SequenceShape(
-            config.segments, config.repeat, 0, config.move_limit, config.max_lift)
+            config.segments, config.repeat, 0, config.move_limit, config.max_lift,
+            config.push_limit, config.upright)
 
     @torch.inference_mode()
     def act(self, image, gripper, object_pixels, goal_maps=None, goal_pixels=None):
@@ -152,15 +161,19 @@ class VisualMPC:
         maps = self.model.seed_maps(torch.from_numpy(objects).to(device))
         current = (maps.flatten(1) * distance).sum(1).mean()
 
+        here = maps.flatten(1).cpu().numpy() @ self._table_points()  # (K, 2) metres
+
         def cost(samples):
-            return self._cost(features, state, maps, distance, shape.actions(samples))[0]
+            actions = shape.actions(samples, gripper[2])
+            clash = landing_clash(shape.landings(actions, gripper), here, config.clearance)
+            return self._cost(features, state, maps, distance, actions)[0] + clash
 
         mean, std = self._first_gaussian(shape)
-        proposals = self._propose(shape, gripper, maps, distance, objects, rng)
+        proposals = self._propose(shape, gripper, here, distance, rng)
         if self._last is not None:
             proposals = np.concatenate([proposals, self._last[None]])
         best, _, _ = cem(cost, mean, std, config.search, rng, shape.clip, proposals)
-        actions = shape.actions(best[None])
+        actions = shape.actions(best[None], gripper[2])
         _, last = self._cost(features, state, maps, distance, actions)
         self._count += 1
         if config.warm_start:
@@ -177,14 +190,17 @@ class VisualMPC:
             mean, std = self._last, std * config.warm_std
         return mean, std
 
-    def _propose(self, shape, gripper, maps, distance, objects, rng):
-        """Return proposals (P, D) towards the goals' nearest table cells."""
+    def _propose(self, shape, gripper, here, distance, rng):
+        """Return proposals (P, D) from where objects are (K, 2) to their goals' nearest cells."""
         if not self.config.proposals:
             return np.zeros((0, shape.size))
-        points = (self.model.grid.flatten(0, 1) * self.model.config.table_half).cpu().numpy()
-        here = maps.flatten(1).cpu().numpy() @ points
-        goals = points[distance.argmin(1).cpu().numpy()]
+        goals = self._table_points()[distance.argmin(1).cpu().numpy()]
         return push_proposals(shape, gripper, here, goals, self.config.proposals, rng)
+
+    def _table_points(self):
+        """Return the table's cells (n n, 2) in metres."""
+        model = self.model
+        return (model.grid.flatten(0, 1) * model.config.table_half).cpu().numpy()
 
     def _cost(self, features, gripper, maps, distance, actions):
         """
@@ -268,6 +284,19 @@ class VisualMPC:
             bad = pixels[((pixels < -0.5) | (pixels > size - 0.5)).any(1)].tolist()
             raise PlanningError(f'{name}: {bad} outside the {size[0]}x{size[1]} picture')
         return pixels
+
+
+def landing_clash(landings, objects, clearance):
+    """
+    Cost of coming down upon an object, which recordings of good pushes do not show.
+
+    :param landings: (N, 2) metres, NaN for none; objects: (K, 2); clearance: m.
+    :return: (N,) pixels: 0, or more than any push can gain.
+    """
+    if not clearance:
+        return np.zeros(len(landings))
+    gap = np.linalg.norm(landings[:, None] - objects, axis=-1).min(1)  # (N,)
+    return np.where(gap < clearance, 100 + 1000 * (clearance - gap), 0)
 
 
 def check_maps(maps, count, size):

@@ -6,6 +6,7 @@ Write one MCAP file as rosbag2 would.
 Equal input gives equal bytes: no clock is read into the file.
 """
 
+from functools import cache
 from pathlib import Path
 
 from mcap.writer import CompressionType, IndexType, Writer
@@ -108,8 +109,13 @@ class FileWriter:
         profiles = [qos.profile()]
         self._channels[topic] = self._writer.register_channel(
             topic, 'cdr', self._schemas[type_name],
-            {'offered_qos_profiles': metadata.to_yaml(profiles).strip(),
+            {'offered_qos_profiles': _qos_text(qos),
              'topic_type_hash': type_hash(type_name)})
         self._info['topics'][topic] = {
             'type': type_name, 'qos': profiles, 'type_hash': type_hash(type_name), 'count': 0}
         return self._channels[topic]
+
+
+@cache
+def _qos_text(qos):
+    return metadata.to_yaml([qos.profile()]).strip()

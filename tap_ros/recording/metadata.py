@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The metadata.yaml of a bag: written as by rosbag2 of Jazzy (version 9), read in any version."""
 
+from functools import cache
 import os
 from pathlib import Path
 import re
@@ -62,6 +63,10 @@ def to_yaml(value):
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
 
 
+def _from_yaml(text):
+    return yaml.load(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+
+
 class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):
     """Writes equal values in full; rosbag2 knows no anchors."""
 
@@ -97,7 +102,7 @@ def bag_files(folder):
     if not path.exists():
         return sorted(folder.glob('*.mcap'), key=_natural)
     try:
-        information = yaml.safe_load(path.read_text())[_KEY]
+        information = _from_yaml(path.read_text())[_KEY]
         storage = information['storage_identifier']
         names = information['relative_file_paths']
         compression = information.get('compression_format') or ''
@@ -122,10 +127,11 @@ def bag_files(folder):
     return files
 
 
+@cache
 def qos_from_text(text):
     """Return the offered QoS profiles that stand in a channel's metadata; [] when unknown."""
     try:
-        profiles = yaml.safe_load(text) if text else []
+        profiles = _from_yaml(text) if text else []
     except yaml.YAMLError:
         return []
     return profiles if isinstance(profiles, list) else []

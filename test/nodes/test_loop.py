@@ -23,8 +23,8 @@ from tap_ros.nodes.clients import call, CallError, Newest, send_goal, wait_for_r
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.overlay import SCALE
+from tap_ros.nodes.planner_setup import DEFAULT_WEIGHTS
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
-from tap_ros.nodes.visual_mpc_node import DEFAULT_WEIGHTS
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.recording.reader import iter_episodes
 

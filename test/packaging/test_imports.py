@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 
 # Data flows down this list. A module imports from its own line and from those above it.
 LAYERS = (
-    ('tap_ros', 'tap_ros.errors', 'tap_ros.images', 'tap_ros.weights'),
+    ('tap_ros', 'tap_ros.errors', 'tap_ros.images', 'tap_ros.pictures', 'tap_ros.weights'),
     ('sim_bridge',),
     ('tap_ros.recording',),
     ('sim_bridge.collect',),  # records what the simulator and the expert do

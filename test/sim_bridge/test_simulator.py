@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from sim_bridge.scene import WORKSPACE_HIGH
 from sim_bridge.simulator import ACTION_LIMIT, CONTROL_PERIOD, ramp_controls, Simulator, SUBSTEPS
+from sim_bridge.tasks import sample_scene
 from tap_ros.errors import SceneError
 
 
@@ -118,3 +119,16 @@ def test_taking_a_photograph_moves_nothing(simulator):
         runs.append(seen)
     np.testing.assert_array_equal(runs[0].image, runs[1].image)
     np.testing.assert_allclose(runs[0].object_poses, runs[1].object_poses, atol=1e-9)
+
+
+def test_a_disc_on_its_rim_comes_to_rest(simulator):
+    seed = next(s for s in range(100) if sample_scene(
+        simulator.task, s).shapes[0].kind == 'disc')
+    simulator.reset(seed)
+    disc = simulator.data.joint('object_0')
+    radius = simulator.model.geom('object_0_part_0').size[0]
+    disc.qpos[2:] = [radius, np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+    disc.qvel[:] = [0.3, 0, 0, 0, 0, -0.3 / radius]
+    for _ in range(8):
+        before, after = simulator.object_poses()[0, :2], simulator.step(np.zeros(4))
+    assert np.linalg.norm(after.object_poses[0, :2] - before) < 0.005

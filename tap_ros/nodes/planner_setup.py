@@ -1,0 +1,79 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
+
+from pathlib import Path
+
+import numpy as np
+
+from tap_ros.errors import ConfigError
+from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.nodes.topics import WORLD_FRAME
+from tap_ros.planning.visual_mpc import PRESETS, VisualMPC, with_preset
+
+DEFAULT_WEIGHTS = Path(__file__).parents[1] / 'weights' / 'forward_model_push.safetensors'
+MODES = ('subgoal', 'direct')
+DEFAULT_BUDGET, MAX_BUDGET = 40, 1000
+
+
+def declare_parameters(node):
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('weights', str(DEFAULT_WEIGHTS),
+                       'File of weights (.safetensors) of a forward model.')
+    parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
+                       choices=['cpu', 'cuda'])
+    parameters.declare('preset', 'default', 'Settings of the planner: what does best, or what the '
+                       'paper says.', choices=list(PRESETS))
+    parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
+    parameters.declare('control_period', 0.25,
+                       'Seconds (of image stamps) that the arm takes for one command.',
+                       low=0.01, high=10.0)
+    parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
+    for name, default, high, description in (
+            ('max_step_xy', 0.08, 0.08, 'Largest |dx| and |dy| of a command in metres.'),
+            ('max_step_z', 0.15, 0.15, 'Largest |dz| of a command in metres.'),
+            ('goal_tolerance', 1.0, 64.0,
+             'The goal is reached at this mean distance of the objects in pixels.')):
+        parameters.declare(name, default, description, low=0.0, high=high, read_only=False)
+    parameters.declare('image_timeout', 5.0, 'Seconds to wait for an image before giving up.',
+                       low=0.1, high=600.0, read_only=False)
+    parameters.declare('predictor_timeout', 20.0, 'Seconds to wait for a subgoal.',
+                       low=0.1, high=600.0, read_only=False)
+    return parameters
+
+
+def load_planner(parameters):
+    """
+    Load weights, and plan once, so that the first command comes as fast as the others.
+
+    :raises WeightsError: when the file cannot be used.
+    :raises ConfigError: when the device is not there.
+    """
+    check_device(parameters['device'])
+    config = with_preset(parameters['preset'], arm_hidden=parameters['arm_hidden'])
+    mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
+    height, width = mpc.image_size
+    pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
+    mpc.reset(0)
+    mpc.act(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels,
+            goal_maps=None, goal_pixels=pixels)
+    return mpc
+
+
+def check_request(request):
+    """
+    Return mode and step budget of a goal, defaults filled in.
+
+    :raises ConfigError: for an unknown mode, or a budget or seed out of range.
+    """
+    if request.seed < 0:
+        raise ConfigError(f'seed is {request.seed}; expected 0 or more')
+    mode = request.mode or 'subgoal'
+    if mode not in MODES:
+        raise ConfigError(f'mode is {mode!r}; valid modes: {", ".join(MODES)}')
+    budget = request.step_budget or DEFAULT_BUDGET
+    if budget > MAX_BUDGET:
+        raise ConfigError(f'step_budget is {budget}; expected 1 to {MAX_BUDGET}, or 0 for '
+                          f'{DEFAULT_BUDGET}')
+    return mode, budget

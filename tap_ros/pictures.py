@@ -1,0 +1,96 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures for people: object maps over a frame, panels side by side, film strips."""
+
+import cv2
+import numpy as np
+
+OBJECT_COLOURS = (  # rgb, one per object; colour-blind readers tell them apart too
+    (255, 176, 0), (100, 143, 255), (220, 38, 127), (0, 158, 115))
+GAP = 2  # white pixels between panels
+
+
+def enlarge(image, scale):
+    """
+    Make a picture larger without blurring it.
+
+    :param image: (H, W, ...).
+    :param scale: whole number of times to enlarge each pixel.
+    :return: (H * scale, W * scale, ...).
+    """
+    return image.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def overlay(image, object_maps, scale=1, start_pixels=None, goal_pixels=None):
+    """
+    Tint a picture where objects are expected.
+
+    :param image: uint8 (H, W, 3) rgb.
+    :param object_maps: (K, H, W), each sums to 1.
+    :param scale: whole number of times to enlarge the picture.
+    :param start_pixels: (K, 2) (u, v) marked by a circle, or None.
+    :param goal_pixels: (K, 2) (u, v) marked by a cross, or None.
+    :return: uint8 (H * scale, W * scale, 3).
+    """
+    tinted = image.astype(np.float32)
+    for k, probability in enumerate(object_maps):
+        # The square root makes spread-out maps visible beside sharp ones.
+        strength = np.sqrt(probability / max(probability.max(), 1e-12))[..., None] * 0.85
+        tinted += strength * (np.float32(OBJECT_COLOURS[k % len(OBJECT_COLOURS)]) - tinted)
+    canvas = enlarge(np.rint(tinted).astype(np.uint8), scale)
+    for pixels, draw in ((start_pixels, _circle), (goal_pixels, _cross)):
+        for k, pixel in enumerate(() if pixels is None else pixels):
+            if np.isfinite(pixel).all():
+                centre = tuple(int((x + 0.5) * scale) for x in pixel)
+                draw(canvas, centre, scale, OBJECT_COLOURS[k % len(OBJECT_COLOURS)])
+    return canvas
+
+
+def _circle(canvas, centre, scale, colour):
+    cv2.circle(canvas, centre, 3 * scale, colour, max(scale // 3, 1), cv2.LINE_AA)
+
+
+def _cross(canvas, centre, scale, colour):
+    cv2.drawMarker(
+        canvas, centre, colour, cv2.MARKER_TILTED_CROSS, 4 * scale, max(scale // 3, 1),
+        cv2.LINE_AA)
+
+
+def grid(rows, scale=1):
+    """
+    Put panels of one size side by side, and rows below each other.
+
+    :param rows: list of lists of uint8 (H, W, 3).
+    :param scale: whole number of times to enlarge each pixel.
+    :return: uint8 (height, width, 3), white between the panels.
+    """
+    rows = [[enlarge(np.asarray(panel), scale) for panel in row] for row in rows]
+    H, W, _ = rows[0][0].shape
+    columns = max(len(row) for row in rows)
+    sheet = np.full((len(rows) * (H + GAP) - GAP, columns * (W + GAP) - GAP, 3), 255, np.uint8)
+    for i, row in enumerate(rows):
+        for j, panel in enumerate(row):
+            sheet[i * (H + GAP):i * (H + GAP) + H, j * (W + GAP):j * (W + GAP) + W] = panel
+    return sheet
+
+
+def film_strip(frames, count=10):
+    """
+    Choose evenly spaced frames, the first and the last among them.
+
+    :param frames: (T, H, W, 3) uint8 or a list of (H, W, 3).
+    :param count: how many.
+    :return: list of `count` frames, a row for grid.
+    """
+    chosen = np.linspace(0, len(frames) - 1, count).round().astype(int)
+    return [frames[i] for i in chosen]
+
+
+def png_bytes(image):
+    """
+    Encode a picture.
+
+    :param image: uint8 (H, W, 3) rgb.
+    :return: bytes of a PNG file.
+    """
+    return cv2.imencode('.png', np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
