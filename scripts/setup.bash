@@ -10,6 +10,7 @@
 # PYTHON=python3.12 chooses the interpreter, PIP_ARGS adds options to every pip install.
 
 set -eo pipefail
+unset PYTHONPATH  # of another ROS 2 that the shell has sourced
 cd -P "$(dirname "${BASH_SOURCE[0]}")/.."
 log=.venv/setup.log
 place=.venv/place  # two lines: the folder and the interpreter that .venv was made for

@@ -6,7 +6,9 @@ How fast recordings are decoded, side by side with the usual libraries, in one r
     python -m tap_ros.evaluation.bench_recording
 
 Every contender reads the same files, which were read once before. Ours does more than the others:
-it also checks checksums, hashes the file, cuts and aligns the episodes, and writes the cache.
+it also checks checksums, hashes the file, cuts and aligns the episodes, and writes the cache. On a
+machine that is busy otherwise, the frames per second of processor time say more than those by the
+clock; ours uses all cores, so that the two differ.
 """
 
 import argparse
@@ -35,7 +37,8 @@ def run(recording=None, episodes=400, files=4, repeats=3, image_size=64):
     :param files: number of files that they are spread over.
     :param repeats: the best time of so many counts; contenders take turns.
     :param image_size: of made up frames.
-    :return: dict compression -> dict contender -> frames per second.
+    :return: dict compression -> dict contender -> (frames per second by the clock, and of
+        processor time).
     """
     contenders = _contenders()
     results = {}
@@ -43,17 +46,21 @@ def run(recording=None, episodes=400, files=4, repeats=3, image_size=64):
         folder = Path(folder)
         for compression in ('none', 'zstd'):
             paths, frames = _write(folder, compression, recording, episodes, files, image_size)
-            best = dict.fromkeys(contenders, np.inf)
+            best = {name: np.full(2, np.inf) for name in contenders}
             for _ in range(repeats):
                 for name, contender in contenders.items():
                     with tempfile.TemporaryDirectory(dir=folder) as scratch:
-                        start = time.perf_counter()
+                        start = _clocks()
                         seen = contender(paths, scratch)
-                        best[name] = min(best[name], time.perf_counter() - start)
+                        best[name] = np.minimum(best[name], _clocks() - start)
                     if seen != frames:
                         raise RuntimeError(f'{name} saw {seen} of {frames} frames')
-            results[compression] = {name: frames / seconds for name, seconds in best.items()}
+            results[compression] = {name: tuple(frames / best[name]) for name in contenders}
     return results
+
+
+def _clocks():
+    return np.array([time.perf_counter(), time.process_time()])
 
 
 def _contenders():
@@ -158,7 +165,7 @@ def _build_cache(paths, scratch):
 
 
 def main(arguments=None):
-    """Print a table of frames per second and of the ratios to the first contender."""
+    """Print a table of frames per second, and how much faster ours is."""
     parser = argparse.ArgumentParser(description='How fast recordings are decoded.')
     parser.add_argument('--recording', help='use these episodes instead of made up ones')
     parser.add_argument('--episodes', type=int, default=400)
@@ -166,12 +173,15 @@ def main(arguments=None):
     parser.add_argument('--repeats', type=int, default=3)
     options = parser.parse_args(arguments)
     results = run(options.recording, options.episodes, options.files, options.repeats)
-    print(f'{"frames per second":36}{"raw":>10}{"zstd":>10}{"ratio raw":>12}{"ratio zstd":>12}')
-    first = next(iter(results['none']))
+    print(f'{"frames per second":44}{"by the clock":^24}{"of processor time":^24}')
+    print(f'{"":44}{"raw":>12}{"zstd":>12}{"raw":>12}{"zstd":>12}')
     for name in results['none']:
         raw, packed = results['none'][name], results['zstd'][name]
-        print(f'{name:36}{raw:10,.0f}{packed:10,.0f}'
-              f'{raw / results["none"][first]:12.2f}{packed / results["zstd"][first]:12.2f}')
+        print(f'{name:44}{raw[0]:12,.0f}{packed[0]:12,.0f}{raw[1]:12,.0f}{packed[1]:12,.0f}')
+    ours = list(results['none'])[-1]
+    for name in list(results['none'])[:-1]:
+        ratios = [results[c][ours][i] / results[c][name][i] for i in (0, 1) for c in results]
+        print(f'{"ours / " + name:44}' + ''.join(f'{ratio:12.2f}' for ratio in ratios))
 
 
 if __name__ == '__main__':

@@ -5,7 +5,6 @@
 from pathlib import Path
 
 import numpy as np
-
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.topics import WORLD_FRAME

@@ -187,7 +187,7 @@ class VisualMpcNode(Node):
         return seen
 
     def _ask_for_subgoal(self, seen, goal, names, seed, cancelled):
-        """Return the subgoal's object maps (K, H, W) and their means (K, 2) in order of `names`."""
+        """Return the subgoal's maps (K, H, W) and their means (K, 2), in the order of `names`."""
         request = PredictSubgoal.Request(
             start=seen['image'], goal=goal['image'], start_objects=seen['objects'],
             goal_objects=goal['objects'], seed=seed)

@@ -5,7 +5,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-
 from tap_ros.errors import ConfigError
 
 

@@ -5,11 +5,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-
 from tap_ros.errors import RecordingError
 from tap_ros.images import to_float
 from tap_ros.planning.table import mirror_table
+import torch
 
 COLOUR_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 

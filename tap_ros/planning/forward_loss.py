@@ -2,11 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The forward model's training loss: pictures reconstructed along whole rollouts."""
 
+from tap_ros.planning.forward_data import mirror, recolour
 import torch
 from torch.nn import functional as F
-
-from tap_ros.planning.forward_data import mirror, recolour
-from tap_ros.planning.forward_model import Scene
 
 MOTION_THRESHOLD = 0.08  # of the range 2: mean channel difference that counts as change
 

@@ -21,15 +21,21 @@ is not predicted but drawn where its kinematics put it.
 
 from dataclasses import dataclass
 
+from tap_ros.errors import ConfigError
+from tap_ros.planning.table import (
+    channels_first,
+    channels_last,
+    grid_points,
+    pixel_points,
+    project,
+    sample,
+    sample_picture,
+    splat_on_table,
+)
+from tap_ros.prediction.weights import load_into, load_weights, make_config
 import torch
 from torch import nn
 from torch.nn import functional as F
-
-from tap_ros.errors import ConfigError
-from tap_ros.planning.table import (
-    channels_first, channels_last, grid_points, pixel_points, project, sample, sample_picture,
-    splat_on_table)
-from tap_ros.prediction.weights import load_into, load_weights, make_config
 
 MOVE_LIMIT = (0.08, 0.08, 0.15)  # m per control period
 

@@ -3,9 +3,8 @@
 """How far the forward model's object maps are from where the objects went."""
 
 import numpy as np
-import torch
-
 from tap_ros.images import to_float
+import torch
 
 SCORED_STEPS = (1, 5, 10, 15)
 MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than this by then

@@ -15,12 +15,9 @@ import platform
 import time
 
 import numpy as np
-import torch
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
-
 from tap_ros.errors import ConfigError
 from tap_ros.images import to_uint8
+from tap_ros.pictures import grid
 from tap_ros.planning.forward_data import draw_windows
 from tap_ros.planning.forward_loss import draw_arm_like, forward_loss
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
@@ -28,11 +25,13 @@ from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.prediction.batches import split_episodes
 from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
-from tap_ros.pictures import grid
 from tap_ros.prediction.pictures import grey_panels
 from tap_ros.prediction.training import learning_rate, pick_device
 from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings
+import torch
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
 
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
 

@@ -9,10 +9,9 @@ a homography. Both are fitted from recordings, see fit_table and fit_arm.
 """
 
 import numpy as np
+from tap_ros.errors import RecordingError
 import torch
 from torch.nn import functional as F
-
-from tap_ros.errors import RecordingError
 
 
 def project(matrix, points):

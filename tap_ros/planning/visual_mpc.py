@@ -13,14 +13,13 @@ import os
 import time
 
 import numpy as np
-import torch
-
 from tap_ros.errors import ConfigError, ImageError, PlanningError
 from tap_ros.images import check_image, to_float
 from tap_ros.planning.action_sequences import SequenceShape
 from tap_ros.planning.cem import cem, CEMConfig
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.proposals import push_proposals
+import torch
 
 
 @dataclass(frozen=True)

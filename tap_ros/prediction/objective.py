@@ -3,7 +3,7 @@
 """What the predictor is trained to do: from a batch to its loss."""
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tap_ros.images import to_float
 from tap_ros.prediction.losses import (
@@ -18,6 +18,8 @@ from tap_ros.prediction.losses import (
 )
 from tap_ros.prediction.networks import Prediction
 import torch
+
+_POWER_OFFSET = 1e-4  # keeps the slope of a power finite at an error of 0
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,10 @@ def predictor_loss(network, batch, augmentation, config, autocast=contextlib.nul
     """
     Compute the training loss of a batch (Eq. 1, 2 or 5).
 
+    With an outer power below 1 the outer error is E_t ** power, which is not in the paper. The
+    mean of E_t is as low for a blend of two possible bottlenecks as for either of them; a concave
+    function of it is lowest at one of them, so that the network commits itself.
+
     :param network: Predictor.
     :param batch: batches.Batch.
     :param augmentation: Augmentation, or None.
@@ -73,7 +79,9 @@ def predictor_loss(network, batch, augmentation, config, autocast=contextlib.nul
     def error(step):
         target = to_float(batch.targets[rows, step])[:, None]  # B, 1, 3, H, W
         target = augmentation.apply(target) if augmentation else target
-        return l1_error(prediction.image, target[:, 0])
+        value = l1_error(prediction.image, target[:, 0])
+        power = config.outer_power
+        return value if power == 1 else (value + _POWER_OFFSET) ** power
 
     if config.method == 'fix':
         step = torch.zeros_like(rows)  # the batch holds the middle frame only
@@ -101,7 +109,7 @@ def held_out_scores(network, batches, config, autocast=contextlib.nullcontext):
     """
     losses, fractions = [], []
     for batch in batches:
-        outcome = predictor_loss(network, batch, None, config, autocast)
+        outcome = predictor_loss(network, batch, None, replace(config, outer_power=1.0), autocast)
         losses += [outcome.loss.item()] * len(batch.context)
         matched = batch.times.gather(1, outcome.match[:, None])
         fractions.append((matched / batch.end)[:, 0].cpu())

@@ -24,6 +24,7 @@ class TrainingConfig:
         'relative_to_copying' (E_t / (d_t w(t)), losses.relative_to_copying).
     :param bell_edge: w at both ends of the targets; 2/3 in the paper.
     :param margin: frames left out of the targets next to each context picture.
+    :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
     :param num_targets: at most so many random targets an episode and step; 0: all of them.
     :param max_frames: longer episodes are cut to a random piece of this length; 0: never.
     :param min_crop: cut episodes to a random piece of at least this share; 1: never.
@@ -58,6 +59,7 @@ class TrainingConfig:
     selection: str = 'relative_to_copying'
     bell_edge: float = 2 / 3
     margin: int = 3
+    outer_power: float = 0.5
     num_targets: int = 0
     max_frames: int = 0
     min_crop: float = 1.0
@@ -101,7 +103,8 @@ class TrainingConfig:
                 raise ConfigError(f'{name}: expected 0 or more, got {getattr(self, name)}')
         if 0 < self.max_frames < 3:
             raise ConfigError(f'max_frames: expected 0 or at least 3, got {self.max_frames}')
-        for name, low, high in (('bell_edge', 1e-6, 1), ('min_crop', 1e-6, 1),
+        for name, low, high in (('bell_edge', 1e-6, 1), ('outer_power', 0.1, 1),
+                                ('min_crop', 1e-6, 1),
                                 ('test_fraction', 0, 0.9), ('brightness', 0, 0.9),
                                 ('average_decay', 0, 0.99999)):
             if not low <= getattr(self, name) <= high:

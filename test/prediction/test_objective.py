@@ -15,7 +15,7 @@ from tap_ros.prediction.objective import held_out_scores, predictor_loss
 from tap_ros.prediction.training_config import TrainingConfig
 import torch
 
-CONFIG = TrainingConfig(recordings=('bag',), out='out')
+CONFIG = TrainingConfig(recordings=('bag',), out='out', outer_power=1.0)
 
 
 class Showing(torch.nn.Module):
@@ -74,6 +74,22 @@ def test_augmentation_does_not_change_the_choice():
     assert changed.match.equal(plain.match)
     perfect = Showing(to_float(batch.targets[:, 3]), augmentation)
     assert predictor_loss(perfect, batch, augmentation, CONFIG).loss < 1e-6
+
+
+def test_a_concave_outer_error_prefers_either_bottleneck_to_their_blend():
+    batch = make_batch(B=2, T=1)
+    targets = to_float(batch.targets[:, 0])  # two episodes of one scene, two ways to do it
+    first, second = targets
+    blend = (first + second) / 2
+
+    def loss(image, power):
+        config = replace(CONFIG, method='fix', outer_power=power)
+        return predictor_loss(
+            Showing(image.expand(2, -1, -1, -1)), batch, None, config).loss.item()
+
+    assert loss(first, 1.0) == pytest.approx(loss(blend, 1.0), rel=1e-5)
+    assert loss(first, 0.5) == pytest.approx(loss(second, 0.5), rel=1e-5)
+    assert loss(first, 0.5) < 0.9 * loss(blend, 0.5)
 
 
 def test_held_out_scores_are_means_over_episodes():

@@ -112,7 +112,7 @@ def test_learning_rate_rises_and_falls():
 
 
 @pytest.mark.parametrize('values', [
-    {'recordings': ()}, {'method': 'max'}, {'selection': 'best'},
+    {'recordings': ()}, {'method': 'max'}, {'outer_power': 2.0}, {'selection': 'best'},
     {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
     {'bell_edge': 0.0}, {'max_frames': 2}])
 def test_settings_that_make_no_sense_are_refused_by_name(values):

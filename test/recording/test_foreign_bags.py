@@ -60,7 +60,7 @@ def camera(t, log=None, value=None, topic='/camera/image_raw'):
     """Return the message of a small frame whose pixels are its second."""
     value = t if value is None else value
     data = image(t * SECOND, np.full((2, 3, 3), value, np.uint8))
-    return topic, IMAGE, data, (t if log is None else log) * SECOND
+    return topic, IMAGE, data, round((t if log is None else log) * SECOND)
 
 
 def command(t, x, log=None):
@@ -275,6 +275,15 @@ def test_marks_may_overtake_images(tmp_path):
         episode_mark(5, 1, 'failure', log=15)])
     episodes = list(iter_episodes(tmp_path / 'bag'))
     assert [e.frames[:, 0, 0, 0].tolist() for e in episodes] == [[1, 2, 3], [4, 5]]
+
+
+def test_frames_stamped_beyond_the_end_are_left_out_however_early_they_are_logged(tmp_path):
+    record(tmp_path / 'bag', [
+        episode_mark(1, 0), camera(1), camera(2), camera(3), camera(4, log=3.1), command(4, 9),
+        episode_mark(3, 1, 'success', log=3.2), camera(5, log=3.4)])
+    (episode,) = iter_episodes(tmp_path / 'bag')
+    assert episode.frames[:, 0, 0, 0].tolist() == [1, 2, 3]
+    assert not episode.actions.any()
 
 
 def test_a_clock_that_starts_anew_does_not_mix_episodes(tmp_path):
