@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmark of collecting: seconds per recorded episode, split into its parts."""
 
-import argparse
 import os
 from pathlib import Path
 import tempfile
@@ -47,9 +46,3 @@ def add_arguments(parser):
     parser.add_argument(
         '--episodes', type=int, default=60, help='how many to collect (default: %(default)s)')
     parser.add_argument('--workers', type=int, help='processes (default: one a core)')
-
-
-if __name__ == '__main__':
-    _parser = argparse.ArgumentParser(description=__doc__)
-    add_arguments(_parser)
-    run(_parser.parse_args())

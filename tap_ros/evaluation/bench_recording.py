@@ -3,7 +3,7 @@
 """
 How fast recordings are decoded, side by side with the usual libraries, in one run.
 
-    python -m tap_ros.evaluation.bench_recording
+    python -m tap_ros bench recording
 
 Every contender reads the same files, which were read once before. Ours does more than the others:
 it also checks checksums, hashes the file, cuts and aligns the episodes, and writes the cache. On a
@@ -11,7 +11,6 @@ machine that is busy otherwise, the frames per second of processor time say more
 clock; ours uses all cores, so that the two differ.
 """
 
-import argparse
 from pathlib import Path
 import tempfile
 import time
@@ -28,7 +27,7 @@ from tap_ros.recording.writer import EpisodeWriter
 DECODED = frozenset(topics.TYPES) - {topics.CAMERA_INFO, topics.CLOCK}
 
 
-def run(recording=None, episodes=400, files=4, repeats=3, image_size=64):
+def measure(recording=None, episodes=400, files=4, repeats=3, image_size=64):
     """
     Measure frames per second of all contenders on a raw and on a compressed copy of a recording.
 
@@ -65,18 +64,11 @@ def _clocks():
 
 def _contenders():
     """Return dict name -> function(paths, scratch folder) -> number of frames."""
-    found = {
+    return {
         'mcap + rosbags CDR, images only': lambda p, _: _read_rosbags(p, {topics.IMAGE}),
         'mcap + rosbags CDR, what we decode': lambda p, _: _read_rosbags(p, DECODED),
+        'tap_ros cache, new': lambda p, scratch: _build_cache(p, scratch),
     }
-    try:
-        from mcap_ros2.decoder import DecoderFactory
-    except ImportError:
-        pass
-    else:
-        found['mcap_ros2, images only'] = lambda p, _: _read_mcap_ros2(p, DecoderFactory)
-    found['tap_ros cache, new'] = _build_cache
-    return found
 
 
 def _write(folder, compression, recording, count, files, image_size):
@@ -144,35 +136,27 @@ def _read_rosbags(paths, wanted):
     return frames
 
 
-def _read_mcap_ros2(paths, factory):
-    """Read and decode with mcap_ros2, copy the pixels out."""
-    frames = 0
-    for path in paths:
-        images = []
-        with open(path, 'rb') as stream:
-            reader = make_reader(stream, decoder_factories=[factory()])
-            for _, _, _, value in reader.iter_decoded_messages(
-                    topics=[topics.IMAGE], log_time_order=False):
-                images.append(np.frombuffer(value.data, np.uint8).reshape(
-                    value.height, value.width, 3))
-        frames += len(np.stack(images))
-    return frames
-
-
 def _build_cache(paths, scratch):
     """Open the files with an empty cache."""
     return open_recordings(paths, scratch, progress=False).num_frames
 
 
-def main(arguments=None):
-    """Print a table of frames per second, and how much faster ours is."""
-    parser = argparse.ArgumentParser(description='How fast recordings are decoded.')
+def add_arguments(parser):
+    """Add the options of this benchmark."""
     parser.add_argument('--recording', help='use these episodes instead of made up ones')
-    parser.add_argument('--episodes', type=int, default=400)
-    parser.add_argument('--files', type=int, default=4)
-    parser.add_argument('--repeats', type=int, default=3)
-    options = parser.parse_args(arguments)
-    results = run(options.recording, options.episodes, options.files, options.repeats)
+    parser.add_argument(
+        '--episodes', type=int, default=400, help='how many (default: %(default)s)')
+    parser.add_argument(
+        '--files', type=int, default=4,
+        help='files that they are spread over (default: %(default)s)')
+    parser.add_argument(
+        '--repeats', type=int, default=3,
+        help='the best of so many counts (default: %(default)s)')
+
+
+def run(args):
+    """Print a table of frames per second, and how much faster ours is."""
+    results = measure(args.recording, args.episodes, args.files, args.repeats)
     print(f'{"frames per second":44}{"by the clock":^24}{"of processor time":^24}')
     print(f'{"":44}{"raw":>12}{"zstd":>12}{"raw":>12}{"zstd":>12}')
     for name in results['none']:
@@ -182,7 +166,3 @@ def main(arguments=None):
     for name in list(results['none'])[:-1]:
         ratios = [results[c][ours][i] / results[c][name][i] for i in (0, 1) for c in results]
         print(f'{"ours / " + name:44}' + ''.join(f'{ratio:12.2f}' for ratio in ratios))
-
-
-if __name__ == '__main__':
-    main()

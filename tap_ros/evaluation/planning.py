@@ -59,7 +59,7 @@ def run_episode(simulator, mpc, predictor, mode, step_budget, seed, reached=REAC
     """
     if mode not in MODES:
         raise ConfigError(f'mode {mode!r} is unknown; valid modes: {", ".join(MODES)}')
-    seen, goal = simulator.reset(seed), None
+    seen = simulator.reset(seed)
     goal = simulator.goal()
     episode = PlannedEpisode([simulator.distances()], [seen.image], [], [], goal.image)
     maps = centres = None
@@ -173,8 +173,9 @@ def add_arguments(parser):
                         help="control periods; 0: the paper's for the task")
     parser.add_argument('--preset', choices=list(PRESETS), default='default',
                         help="settings of the planner; 'paper': the paper's")
-    parser.add_argument('--forward-weights', default=str(WEIGHTS / 'forward_model_push.safetensors'))
-    parser.add_argument('--predictor-weights', default=str(WEIGHTS / 'predictor_push.safetensors'))
+    for name in ('forward_model', 'predictor'):
+        parser.add_argument(f'--{name.split("_")[0]}-weights', metavar='FILE',
+                            default=str(WEIGHTS / f'{name}_push.safetensors'))
     parser.add_argument('--device', default='cpu')
     parser.add_argument('--out', default='runs/planning.json',
                         help='results; an interrupted evaluation goes on (default: %(default)s)')

@@ -25,13 +25,14 @@ from tap_ros.nodes.image_messages import (
 )
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.overlay import draw_overlay
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import CAMERA_FRAME, LATCHED, STREAM
+from tap_ros.pictures import overlay
 from tap_ros.prediction.predictor import SubgoalPredictor
 
 DEFAULT_WEIGHTS = Path(__file__).parents[1] / 'weights' / 'predictor_push.safetensors'
+OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
 
@@ -110,8 +111,9 @@ class PredictorNode(Node):
             response.message += '; weights without a latent variable give one sample only'
         self._subgoal.publish(response.subgoals[0])
         self._picture.publish(response.subgoals[0].image)
-        overlay = draw_overlay(start.image, subgoals[0].object_maps, start_pixels, goal_pixels)
-        self._overlay.publish(encode_image(overlay, start.stamp, start.frame_id))
+        picture = overlay(start.image, subgoals[0].object_maps, OVERLAY_SCALE, start_pixels,
+                          goal_pixels)
+        self._overlay.publish(encode_image(picture, start.stamp, start.frame_id))
 
     def _view(self, image, objects, name, newest):
         """Decode a picture and its objects; take the newest ones if it was left empty."""

@@ -6,8 +6,9 @@ What the search varies: a few displacements, each repeated, and for how long the
 A sequence of `horizon` actions is made of segments of `repeat` control periods. Parameters (D,)
 are x, y of every segment in metres per control period, then the number of segments to stay lifted.
 Like the expert that was recorded, the arm goes up and down on the spot and pushes slowly: what the
-forward model has never seen, it cannot foresee. A plan that is carried over to the next control period starts inside a segment: with `phase`
-periods of the first one already executed, the horizon reaches into one segment more.
+forward model has never seen, it cannot foresee. A plan that is carried over to the next control
+period starts inside a segment: with `phase` periods of the first one already executed, the horizon
+reaches into one segment more.
 """
 
 from dataclasses import dataclass, replace

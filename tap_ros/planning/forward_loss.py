@@ -66,7 +66,8 @@ def forward_loss(model, batch, picture_steps, config):
     flow, gripper = model.still(len(first)), batch.grippers[:, 0]
     pictures, moving, count = 0, 0, batch.actions.shape[1]
     for t in range(1, count + 1):
-        flow, gripper, masks = model.advance(scene.features, flow, gripper, batch.actions[:, t - 1])
+        action = batch.actions[:, t - 1]
+        flow, gripper, masks = model.advance(scene.features, flow, gripper, action)
         moving = moving + (1 - masks[:, 2]).mean()
         if t in picture_steps:
             arm = draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)

@@ -22,7 +22,7 @@ def add_arguments(parser):
     parser.add_argument('--recordings', nargs='+', required=True, metavar='BAG',
                         help='bag folders, folders of bag folders, or .mcap files')
     parser.add_argument('--out', default='runs/forward_model',
-                        help='folder of the run; an interrupted one goes on (default: %(default)s)')
+                        help='folder; an interrupted run goes on there (default: %(default)s)')
     parser.add_argument('--stop-at', type=int, metavar='STEP', help='stop and save at this step')
     for field in fields(ForwardTrainingConfig):
         if field.name in _HELP:

@@ -4,7 +4,7 @@
 Visual MPC: choose the next action by searching through the forward model (App. F of the paper).
 
 At every control period: put each object's map at its pixel, predict where many action sequences
-carry the maps, take the sequence that brings them closest to their goals, execute its first action.
+carry the maps, take the one that brings them closest to their goals, execute its first action.
 """
 
 from concurrent.futures import ThreadPoolExecutor

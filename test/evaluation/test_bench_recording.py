@@ -3,6 +3,7 @@
 """The benchmark of decoding measures what it says."""
 
 import pytest
+from tap_ros.cli import main
 from tap_ros.evaluation import bench_recording
 
 
@@ -13,7 +14,7 @@ def own_cache(tmp_path, monkeypatch):
 
 
 def test_all_contenders_see_all_frames():
-    results = bench_recording.run(episodes=5, files=2, repeats=1, image_size=16)
+    results = bench_recording.measure(episodes=5, files=2, repeats=1, image_size=16)
     assert set(results) == {'none', 'zstd'}
     for speeds in results.values():
         assert {'mcap + rosbags CDR, images only', 'tap_ros cache, new'} <= set(speeds)
@@ -21,7 +22,7 @@ def test_all_contenders_see_all_frames():
 
 
 def test_the_table_has_a_line_for_each_contender(capsys):
-    bench_recording.main(['--episodes', '2', '--files', '1', '--repeats', '1'])
+    assert main(['bench', 'recording', '--episodes', '2', '--files', '1', '--repeats', '1']) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split() == ['raw', 'zstd', 'raw', 'zstd']
     names = [line[:44].strip() for line in lines[2:]]
@@ -32,4 +33,4 @@ def test_the_table_has_a_line_for_each_contender(capsys):
 def test_a_contender_that_skips_frames_is_caught(monkeypatch):
     monkeypatch.setattr(bench_recording, '_build_cache', lambda paths, scratch: 1)
     with pytest.raises(RuntimeError, match='saw 1 of'):
-        bench_recording.run(episodes=1, files=1, repeats=1, image_size=8)
+        bench_recording.measure(episodes=1, files=1, repeats=1, image_size=8)

@@ -11,7 +11,6 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.nodes import image_messages, object_messages
-from tap_ros.nodes.overlay import draw_overlay, SCALE
 
 pytestmark = pytest.mark.ros
 STAMP = Time(sec=3, nanosec=7)
@@ -158,15 +157,3 @@ def test_the_gripper_is_found_among_other_joints():
     message.position.pop(2)
     with pytest.raises(PlanningError, match='lacks gripper_y; it has elbow, gripper_x'):
         object_messages.decode_gripper(message)
-
-
-def test_the_overlay_shows_each_map_where_it_is():
-    start = np.full((16, 16, 3), 128, np.uint8)
-    maps = np.zeros((2, 16, 16))
-    maps[0, 3, 12] = maps[1, 12, 3] = 1
-    overlay = draw_overlay(start, maps, None, None)
-    assert overlay.shape == (16 * SCALE, 16 * SCALE, 3)
-    changed = (overlay != 128).any(axis=-1).reshape(16, SCALE, 16, SCALE).any(axis=(1, 3))
-    assert set(zip(*np.nonzero(changed))) == {(3, 12), (12, 3)}
-    marked = draw_overlay(start, maps, np.array([[8, 8], [2, 2]]), np.array([[4, 4], [9, 9]]))
-    assert (marked != overlay).any()

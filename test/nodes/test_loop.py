@@ -22,8 +22,8 @@ from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.nodes.clients import call, CallError, Newest, send_goal, wait_for_result
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
-from tap_ros.nodes.overlay import SCALE
 from tap_ros.nodes.planner_setup import DEFAULT_WEIGHTS
+from tap_ros.nodes.predictor_node import OVERLAY_SCALE
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.recording.reader import iter_episodes
@@ -140,7 +140,7 @@ def test_an_empty_request_predicts_from_what_was_seen_last(loop):
     published = loop.subgoal.wait(10, lambda m: m.header.stamp == subgoal.header.stamp)
     assert published.image.data == subgoal.image.data
     overlay = loop.overlay.wait(10, lambda m: m.header.stamp == subgoal.header.stamp)
-    assert (overlay.width, overlay.height) == (64 * SCALE, 64 * SCALE)
+    assert (overlay.width, overlay.height) == (64 * OVERLAY_SCALE, 64 * OVERLAY_SCALE)
 
 
 def test_recursion_gives_as_many_subgoals_and_a_bad_request_says_why(loop):

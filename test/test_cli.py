@@ -1,0 +1,59 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: help, errors, and what needs no ROS."""
+
+from pathlib import Path
+
+import pytest
+from tap_ros.cli import main
+from tap_ros.recording.reader import iter_episodes
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / 'bags' / 'sample_push2'
+
+
+@pytest.mark.parametrize('command', [
+    ['collect'], ['train'], ['train', '--model', 'forward'], ['evaluate', 'prediction'],
+    ['evaluate', 'planning'], ['bench', 'collect'], ['bench', 'recording'], ['bench', 'planning'],
+    ['inspect'], []], ids=' '.join)
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([*command, '--help'])
+    assert end.value.code == 0
+    assert 'usage: python -m tap_ros' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('arguments, named', [
+    (['inspect', 'nowhere.mcap'], 'nowhere.mcap'),
+    (['inspect', 'nowhere.safetensors'], 'nowhere.safetensors'),
+    (['train', '--recordings', 'nowhere', '--out', 'somewhere'], 'nowhere'),
+])
+def test_an_error_names_the_file_and_is_one_line(arguments, named, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 1
+    error = capsys.readouterr().err.strip()
+    assert error.startswith('error: ') and named in error and '\n' not in error
+
+
+def test_collect_then_inspect(tmp_path, capsys):
+    folder, picture = tmp_path / 'push', tmp_path / 'strips.png'
+    assert main(['collect', '--out', str(folder), '--episodes', '2', '--seed', '3']) == 0
+    assert [episode.seed for episode in iter_episodes(folder)] == [3, 4]
+    assert main(['inspect', str(folder), '--picture', str(picture)]) == 0
+    assert '2 episodes' in capsys.readouterr().out
+    assert picture.read_bytes().startswith(b'\x89PNG')
+
+
+@pytest.mark.parametrize('name', ['predictor_push', 'forward_model_push'])
+def test_shipped_weights_say_what_they_are(name, capsys):
+    path = ROOT / 'tap_ros' / 'weights' / f'{name}.safetensors'
+    assert main(['inspect', str(path)]) == 0
+    assert 'data_hash' in capsys.readouterr().out
+    card = path.with_suffix('.md').read_text()
+    assert 'python -m tap_ros train' in card and 'python -m tap_ros collect' in card
+
+
+def test_the_sample_recording_is_readable():
+    episodes = list(iter_episodes(SAMPLE))
+    assert len(episodes) == 20
+    assert all(episode.task == 'push2' and len(episode.frames) <= 40 for episode in episodes)
