@@ -206,7 +206,7 @@ class VisualMPC:
         Judge action sequences.
 
         Cost: each object's expected distance to its goal, summed over objects and over the
-        horizon, the last step with its own weight (FACTS of the authors' planner: 10).
+        horizon, the last step with its own weight (10, as the authors' planner has).
 
         :param distance: (K, n n) pixels from every table cell to each object's goal.
         :param actions: (N, horizon, 4).
