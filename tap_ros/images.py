@@ -21,7 +21,8 @@ def to_float(images, dtype=torch.float32):
     :return: tensor (..., 3, H, W) in [-1, 1].
     """
     if isinstance(images, np.ndarray):
-        images = torch.from_numpy(np.ascontiguousarray(images))
+        # Recorded frames are read-only memory maps, which torch warns about unless copied.
+        images = torch.from_numpy(np.require(images, requirements=['C', 'W']))
     return images.movedim(-1, -3).to(dtype).div_(127.5).sub_(1.0)
 
 

@@ -92,7 +92,7 @@ def test_a_run_leaves_what_is_needed_to_repeat_it(config):
 
 def test_a_run_of_other_settings_is_not_continued(config):
     train(config, stop_at=2, progress=False)
-    with pytest.raises(ConfigError, match='learning_rate=0.0005, not 0.1'):
+    with pytest.raises(ConfigError, match='learning_rate=0.001, not 0.1'):
         train(replace(config, learning_rate=0.1), progress=False)
 
 
