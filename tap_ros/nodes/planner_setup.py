@@ -28,6 +28,10 @@ def declare_parameters(node):
     parameters.declare('control_period', 0.25,
                        'Seconds (of image stamps) that the arm takes for one command.',
                        low=0.01, high=10.0)
+    parameters.declare('twist_scale', 1.0,
+                       'Factor of what is sent: 1 for metres per control period, '
+                       '1 / control_period for metres per second as MoveIt Servo takes them.',
+                       low=0.001, high=1000.0)
     parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
     for name, default, high, description in (
             ('max_step_xy', 0.08, 0.08, 'Largest |dx| and |dy| of a command in metres.'),

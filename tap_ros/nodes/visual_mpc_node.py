@@ -223,7 +223,7 @@ class VisualMpcNode(Node):
         message.header.stamp = stamp
         message.header.frame_id = self.params['command_frame']
         linear = message.twist.linear
-        linear.x, linear.y, linear.z = move.tolist()
+        linear.x, linear.y, linear.z = (self.params['twist_scale'] * move).tolist()
         newest = to_nanoseconds(self._sensors.newest('image')['image'].header.stamp)
         self._gripper.publish(Float64(data=float(np.clip(action[3], 0, 1))))
         self._twist.publish(message)

@@ -60,12 +60,24 @@ class SequenceShape:
         moves = parameters[:, :-1].reshape(len(parameters), self.num_moves, 2)
         return moves, np.rint(parameters[:, -1]).astype(int)
 
-    def clip(self, parameters):
-        """Limit parameters (N, D) to what the arm may do; the lift becomes a whole number."""
+    def clip(self, parameters, least_lift=0):
+        """
+        Limit parameters (N, D) to what the arm may do; the lift becomes a whole number.
+
+        :param least_lift: segments to stay lifted at least.
+        """
         parameters = parameters.copy()
         parameters[:, :-1] = np.clip(parameters[:, :-1], -self.move_limit, self.move_limit)
-        parameters[:, -1] = np.clip(np.rint(parameters[:, -1]), 0, self.max_lift)
+        parameters[:, -1] = np.clip(np.rint(parameters[:, -1]), least_lift, self.max_lift)
         return parameters
+
+    def least_lift(self, height):
+        """
+        Return how many segments the gripper has to be lifted at least.
+
+        Neither low nor lifted, it stands upon something: then it must go up before it can push.
+        """
+        return int(self.upright and LOW + 0.02 < height < LIFTED - 0.03)
 
     def segment(self):
         """Return the segment (horizon,) of each control period."""

@@ -49,7 +49,7 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None):
     dimensions a full covariance has not full rank, which is why the diagonal is refitted.
 
     :param cost: function of samples (N, D) to costs (N,); NaN counts as worst.
-    :param mean: (D,) of the first Gaussian; std (D,) or (D, ...).
+    :param mean: (D,) of the first Gaussian; std: (D,).
     :param config: CEMConfig.
     :param rng: numpy Generator; all randomness comes from it, in an order that depends on the
         configuration only.

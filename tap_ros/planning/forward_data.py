@@ -24,6 +24,10 @@ class Windows:
     mirrored: torch.Tensor  # (B,) bool
     colours: torch.Tensor  # (B, 3) int64: channel i shows what was channel colours[i]
 
+    def to(self, device):
+        """Copy everything to a device."""
+        return Windows(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+
 
 def split_episodes(store, held_out, min_length):
     """

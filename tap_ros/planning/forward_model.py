@@ -263,7 +263,7 @@ class ForwardModel(nn.Module):
         """
         config = self.config
         return splat_on_table(
-            pixels[:, None], torch.ones(len(pixels), 1), self.homography,
+            pixels[:, None], torch.ones_like(pixels[:, :1]), self.homography,
             config.table_cells, config.table_half)
 
     def maps_on_table(self, maps):

@@ -36,7 +36,7 @@ def map_errors(model, store, episodes, stride=8, max_windows=400):
                 continue
             gripper = torch.from_numpy(np.array(episode.grippers[start:start + 1])).to(device)
             actions = torch.from_numpy(np.array(episode.actions[None, start:start + horizon]))
-            image = to_float(episode.frames[start])[None].to(device)
+            image = to_float(np.array(episode.frames[start]))[None].to(device)
             maps = model.seed_maps(torch.from_numpy(true[0].copy()).to(device))
             carried = model.carried_maps(
                 model.begin(image, gripper), gripper, maps, actions.to(device))

@@ -124,7 +124,7 @@ def train(config, stop_at=None, progress=True):
                 group['lr'] = rate
             # One step of Adam towards the recorded pictures.
             batch, shown = draw_step(config, store, training, step, state.network.homography)
-            loss, parts = forward_loss(state.network, batch, shown, config)
+            loss, parts = forward_loss(state.network, batch.to(device), shown, config)
             state.optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(state.network.parameters(), config.gradient_clip)
@@ -176,7 +176,7 @@ def draw_step(config, store, training, step, homography):
     growth = min(1.0, (step + 1) / max(1, config.grow * config.steps))
     length = max(1, round(min(2, config.horizon) + growth * (config.horizon - 2)))
     batch = draw_windows(
-        store, training, config.batch_size, length, homography, rng, config.augment)
+        store, training, config.batch_size, length, homography.cpu(), rng, config.augment)
     return batch, set((rng.permutation(length)[:config.pictures] + 1).tolist())
 
 
@@ -210,14 +210,14 @@ def sample_grid(model, store, episodes, config, rows=6, seed=0):
     :return: uint8 (height, width, 3).
     """
     batch = draw_windows(
-        store, episodes, rows, config.horizon, model.homography, np.random.default_rng(seed),
-        augment=False)
+        store, episodes, rows, config.horizon, model.homography.cpu(),
+        np.random.default_rng(seed), augment=False).to(model.homography.device)
 
     def arm(t):
         return draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
 
     scene = model.look(batch.images[:, 0], arm(0)[:, 3:], batch.homography)
-    columns = [list(to_uint8(batch.images[:, 0])), grey_panels(scene.objects[:, 3]),
+    columns = [list(to_uint8(batch.images[:, 0])), grey_panels(scene.objects[:, 3].cpu()),
                list(to_uint8(scene.background))]
     flow, gripper = model.still(rows), batch.grippers[:, 0]
     for t in range(1, config.horizon + 1):

@@ -34,7 +34,7 @@ def push_proposals(shape, gripper, objects, goals, count, rng, weights=None):
         angle = np.arctan2(*gaps[k][::-1]) + rng.normal(0, 0.2)
         along = np.array([np.cos(angle), np.sin(angle)])
         aside = rng.normal(0, 0.025) * np.array([-along[1], along[0]])
-        start = objects[k] - rng.uniform(0.10, 0.14) * along + aside
+        start = objects[k] - rng.uniform(0.12, 0.15) * along + aside
         # the gripper stops where the object's near side should end
         end = start + (distances[k] + rng.normal(0.07, 0.03)) * along
         proposals.append(_go_and_push(shape, gripper, start, end, objects[k], along))

@@ -52,7 +52,7 @@ def sample_picture(images, pixels, padding='border'):
     :return: (B, C, h, w).
     """
     height, width = images.shape[-2:]
-    scale = torch.tensor([2 / (width - 1), 2 / (height - 1)], dtype=pixels.dtype)
+    scale = pixels.new_tensor([2 / (width - 1), 2 / (height - 1)])
     return F.grid_sample(
         images, pixels * scale - 1, padding_mode=padding, align_corners=True)
 
@@ -92,14 +92,14 @@ def splat_on_table(pixels, weights, homography, cells, half_size):
     low = at.floor()
     share = at - low
     low = low.long()
-    maps = torch.zeros(len(pixels), cells * cells)
+    maps = pixels.new_zeros(len(pixels), cells * cells)
     for dx in (0, 1):
         for dy in (0, 1):
             part = (share[..., 0] if dx else 1 - share[..., 0])
             part = part * (share[..., 1] if dy else 1 - share[..., 1])
             maps.scatter_add_(
                 1, (low[..., 1] + dy) * cells + low[..., 0] + dx, part * weights)
-    line = torch.tensor([1.0, 2.0, 1.0]) / 4
+    line = pixels.new_tensor([1.0, 2.0, 1.0]) / 4
     maps = F.conv2d(
         maps.view(-1, 1, cells, cells), torch.outer(line, line)[None, None], padding=1)[:, 0]
     return maps / maps.sum((-1, -2), keepdim=True).clamp_min(1e-12)
@@ -107,8 +107,8 @@ def splat_on_table(pixels, weights, homography, cells, half_size):
 
 def mirror_table(homography, width):
     """Return the homography of the mirrored picture over the table with x negated."""
-    flip_u = torch.tensor([[-1.0, 0, width - 1], [0, 1, 0], [0, 0, 1]])
-    flip_x = torch.diag(torch.tensor([-1.0, 1, 1]))
+    flip_u = homography.new_tensor([[-1.0, 0, width - 1], [0, 1, 0], [0, 0, 1]])
+    flip_x = torch.diag(homography.new_tensor([-1.0, 1, 1]))
     return flip_u @ homography @ flip_x
 
 

@@ -6,11 +6,7 @@ import pytest
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 import torch
-from toy_world import make_episode, SCALE, SIZE
-
-MIDDLE = (SIZE - 1) / 2
-TABLE = (SCALE, 0.0, MIDDLE, 0.0, -SCALE, MIDDLE, 0.0, 0.0, 1.0)
-ARM = (SCALE, 0.0, 0.0, MIDDLE, 0.0, -SCALE, 0.0, MIDDLE, 0.0, 0.0, 0.0, 1.0)
+from toy_world import ARM, make_episode, SIZE, TABLE
 
 
 @pytest.fixture(scope='session')

@@ -7,12 +7,17 @@ from tap_ros.recording.episode import Episode
 
 SIZE = 32
 SCALE = 30  # pixels per metre
+MIDDLE = (SIZE - 1) / 2
+ORIGIN_U = MIDDLE - 1.5  # so that the picture is not its own mirror image
+# homography of the table and camera of the arm, row-major
+TABLE = (SCALE, 0.0, ORIGIN_U, 0.0, -SCALE, MIDDLE, 0.0, 0.0, 1.0)
+ARM = (SCALE, 0.0, 0.0, ORIGIN_U, 0.0, -SCALE, 0.0, MIDDLE, 0.0, 0.0, 0.0, 1.0)
 HALF_SQUARE, HALF_DOT = 0.1, 0.05  # m
 
 
 def to_pixels(points):
     """Project (..., 2) metres to (u, v)."""
-    return (SIZE - 1) / 2 + SCALE * np.stack([points[..., 0], -points[..., 1]], -1)
+    return np.stack([ORIGIN_U + SCALE * points[..., 0], MIDDLE - SCALE * points[..., 1]], -1)
 
 
 def draw(squares, dot, colours):
@@ -40,7 +45,7 @@ def push(squares, before, after):
     return squares
 
 
-def make_episode(seed, length=10):
+def make_episode(seed, length=18):
     """Draw an episode: the dot goes through a square, more or less."""
     rng = np.random.default_rng(seed)
     squares = rng.uniform(-0.3, 0.3, (2, 2))

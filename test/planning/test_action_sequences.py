@@ -1,0 +1,101 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of action sequences and of the proposals for them."""
+
+import numpy as np
+import pytest
+from tap_ros.planning.action_sequences import LIFTED, LOW, SequenceShape
+from tap_ros.planning.proposals import push_proposals
+
+SHAPE = SequenceShape()
+LOW_GRIPPER = np.array([0.1, 0.2, 0.01, 0.0], np.float32)
+
+
+def random_parameters(shape, count=20, seed=0):
+    rng = np.random.default_rng(seed)
+    parameters = rng.normal(0, 0.06, (count, shape.size))
+    parameters[:, -1] = rng.integers(0, 5, count)
+    return shape.clip(parameters)
+
+
+def heights(actions, start):
+    return start + actions[..., 2].astype(float).cumsum(1)
+
+
+def test_actions_stay_within_the_limits():
+    for upright in (True, False):
+        shape = SequenceShape(upright=upright)
+        parameters = shape.clip(np.random.default_rng(0).normal(0, 1, (50, shape.size)))
+        actions = shape.actions(parameters, 0.07)
+        assert actions.shape == (50, 15, 4) and actions.dtype == np.float32
+        assert np.abs(actions[..., :2]).max() <= 0.08 + 1e-6
+        assert np.abs(actions[..., 2]).max() <= 0.15 + 1e-6
+        assert (actions[..., 3] == 0).all()
+
+
+@pytest.mark.parametrize('lifted', range(5))
+def test_gripper_is_lifted_for_the_segments_asked_for(lifted):
+    parameters = np.zeros((1, SHAPE.size))
+    parameters[0, -1] = lifted
+    height = heights(SHAPE.actions(parameters, 0.05), 0.05)[0]
+    np.testing.assert_allclose(height[:3 * lifted], LIFTED, atol=1e-6)
+    np.testing.assert_allclose(height[3 * lifted:], LOW, atol=1e-6)
+
+
+def test_upright_arm_does_not_move_sideways_while_it_climbs():
+    actions = SHAPE.actions(random_parameters(SHAPE), 0.01)
+    climbing = np.abs(actions[..., 2]) > 0.06
+    assert climbing.any() and not actions[climbing][:, :2].any()
+
+
+def test_low_pushes_are_slow():
+    shape = SequenceShape(push_limit=0.03)
+    parameters = random_parameters(shape)
+    parameters[:, -1] = 0
+    length = np.linalg.norm(shape.actions(parameters, LOW)[..., :2], axis=-1)
+    assert length.max() <= 0.03 + 1e-6
+
+
+def test_a_shifted_plan_goes_on_as_planned():
+    shape, parameters = SHAPE, random_parameters(SHAPE, 1)
+    height = 0.1
+    for _ in range(7):
+        before = shape.actions(parameters, height)[0]
+        parameters = shape.shift(parameters[0])[None]
+        shape, height = shape.following(), float(height + before[0, 2])
+        after = shape.actions(parameters, height)[0]
+        np.testing.assert_allclose(after[:14], before[1:], atol=1e-6)
+
+
+def test_landings_are_where_the_gripper_comes_down():
+    parameters = np.zeros((2, SHAPE.size))
+    parameters[:, 0] = 0.05
+    parameters[0, -1] = 1
+    gripper = np.array([0.0, 0.1, LOW, 0])
+    landings = SHAPE.landings(SHAPE.actions(parameters, LOW), gripper)
+    np.testing.assert_allclose(landings[0], [0.1, 0.1], atol=1e-6)  # two periods at 0.05 m
+    assert np.isnan(landings[1]).all()
+
+
+def test_proposals_end_beyond_the_object_on_its_way_to_the_goal():
+    objects, goals = np.array([[0.0, 0.0], [0.2, 0.2]]), np.array([[0.2, 0.0], [0.2, 0.2]])
+    rng = np.random.default_rng(0)
+    proposals = push_proposals(SHAPE, LOW_GRIPPER, objects, goals, 40, rng)
+    actions = SHAPE.actions(SHAPE.clip(proposals), LOW_GRIPPER[2])
+    path = LOW_GRIPPER[:2] + actions[..., :2].cumsum(1)
+    landings = SHAPE.landings(actions, LOW_GRIPPER)
+    assert (landings[:, 0] < -0.05).all()  # behind the only object that is not at its goal
+    assert np.median(path[:, -1, 0]) > 0.05 and np.abs(path[:, -1, 1]).mean() < 0.1
+
+
+def test_a_gripper_already_behind_the_object_is_not_lifted():
+    gripper = np.array([-0.12, 0.0, 0.01, 0.0])
+    proposals = push_proposals(
+        SHAPE, gripper, np.zeros((1, 2)), np.array([[0.15, 0.0]]), 20, np.random.default_rng(0))
+    assert (proposals[:, -1] == 0).mean() > 0.7
+
+
+def test_nothing_is_proposed_when_all_is_in_place():
+    places = np.array([[0.1, 0.1]])
+    rng = np.random.default_rng(0)
+    assert len(push_proposals(SHAPE, LOW_GRIPPER, places, places, 10, rng)) == 0

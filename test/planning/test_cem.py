@@ -1,0 +1,71 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the cross-entropy method."""
+
+import numpy as np
+import pytest
+from tap_ros.errors import ConfigError
+from tap_ros.planning.cem import cem, CEMConfig
+
+TARGET = np.array([0.3, -0.7, 0.2])
+
+
+def quadratic(samples):
+    return ((samples - TARGET) ** 2).sum(1)
+
+
+def search(config, seed=0, cost=quadratic, **options):
+    rng = np.random.default_rng(seed)
+    return cem(cost, np.zeros(3), np.ones(3), config, rng, **options)
+
+
+def test_finds_the_optimum_of_a_quadratic():
+    best, cost, mean = search(CEMConfig(num_samples=200, num_iterations=12))
+    np.testing.assert_allclose(best, TARGET, atol=0.01)
+    np.testing.assert_allclose(mean, TARGET, atol=0.02)
+    assert cost == pytest.approx(quadratic(best[None])[0])
+
+
+def test_more_iterations_never_find_worse():
+    costs = [search(CEMConfig(num_iterations=n))[1] for n in (1, 2, 4, 8)]
+    assert costs == sorted(costs, reverse=True)
+
+
+def test_same_seed_same_result_and_another_seed_another():
+    config = CEMConfig(keep_elites=3, smoothing=0.2)
+    np.testing.assert_array_equal(search(config)[0], search(config)[0])
+    assert not np.array_equal(search(config)[0], search(config, seed=1)[0])
+
+
+def test_best_proposal_wins_when_nothing_is_better():
+    proposals = np.stack([TARGET + 1, TARGET])
+    best, cost, _ = search(CEMConfig(num_iterations=2), proposals=proposals)
+    np.testing.assert_array_equal(best, TARGET)
+    assert cost == 0
+
+
+def test_only_repaired_samples_are_judged_and_returned():
+    seen = []
+
+    def cost(samples):
+        seen.append(samples.copy())
+        return quadratic(samples)
+
+    best, _, _ = search(CEMConfig(), cost=cost, repair=lambda s: np.clip(s, -0.1, 0.1))
+    assert np.abs(np.concatenate(seen)).max() <= 0.1
+    np.testing.assert_allclose(best, [0.1, -0.1, 0.1])
+
+
+def test_a_cost_that_is_not_a_number_never_wins():
+    best, cost, _ = search(
+        CEMConfig(), cost=lambda s: np.where(s[:, 0] > 0, np.nan, quadratic(s)))
+    assert best[0] <= 0 and np.isfinite(cost)
+
+
+@pytest.mark.parametrize('wrong, name', [
+    ({'num_elites': 0}, 'num_elites'), ({'num_elites': 300}, 'num_elites'),
+    ({'num_iterations': 0}, 'num_iterations'), ({'smoothing': 2.0}, 'smoothing'),
+    ({'keep_elites': 11}, 'keep_elites')])
+def test_impossible_settings_are_named(wrong, name):
+    with pytest.raises(ConfigError, match=name):
+        CEMConfig(**wrong)

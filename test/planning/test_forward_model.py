@@ -1,0 +1,123 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the forward model that hold whatever its weights are."""
+
+import pytest
+from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig, load_forward_model
+from tap_ros.prediction.warp import one_hot_maps
+from tap_ros.prediction.weights import save_weights
+import torch
+from toy_world import ARM, TABLE
+
+GRIPPER = torch.tensor([[0.05, -0.1, 0.0, 0.0]])
+PIXELS = torch.tensor([[20.0, 17.0], [8.0, 9.0]])
+
+
+@pytest.fixture
+def image():
+    return torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+
+def pushing(model):
+    """Make a model say that all of its crop moves as the gripper does."""
+    with torch.no_grad():
+        for layer in (model.push.twists, model.push.masks):
+            layer.weight.zero_()
+        model.push.twists.bias.copy_(torch.tensor([-1.0, 0, 0, 0, 0, 0]))
+        model.push.masks.bias.copy_(torch.tensor([50.0, 0, 0]))
+    return model
+
+
+def test_maps_sum_to_one_and_stay_in_the_picture(model, image):
+    actions = torch.randn(5, 6, 4) * 0.05
+    features = model.begin(image, GRIPPER)
+    for maps in model.carried_maps(features, GRIPPER, model.seed_maps(PIXELS), actions):
+        assert maps.shape[:2] == (5, 2) and maps.min() >= 0
+        torch.testing.assert_close(maps.sum((-1, -2)), torch.ones(5, 2))
+
+
+def test_no_action_moves_nothing(model, image):
+    expected = model.rollout(
+        image, GRIPPER, one_hot_maps(PIXELS, (32, 32))[None], torch.zeros(2, 4, 4))
+    torch.testing.assert_close(expected, PIXELS.expand(2, 4, 2, 2), atol=0.01, rtol=0)
+
+
+def test_up_and_down_moves_nothing(model, image):
+    actions = torch.zeros(1, 4, 4)
+    actions[..., 2] = torch.tensor([0.15, -0.15, 0.1, -0.1])
+    expected = model.rollout(image, GRIPPER, one_hot_maps(PIXELS, (32, 32))[None], actions)
+    torch.testing.assert_close(expected, PIXELS.expand(1, 4, 2, 2), atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize('step', [(0.06, 0.0), (0.0, -0.06), (-0.03, 0.04)])
+def test_what_is_pushed_moves_as_the_gripper_does(model, image, step):
+    pushing(model)
+    table = torch.tensor(TABLE).view(3, 3)
+    ahead = GRIPPER[0, :2] + 2 * torch.tensor(step)
+    pixels = (table @ torch.cat([ahead, torch.ones(1)]))[:2]
+    actions = torch.tensor([*step, 0.0, 0.0]).expand(1, 3, 4)
+    expected = model.rollout(
+        image, GRIPPER, one_hot_maps(pixels[None], (32, 32))[None], actions)[0, :, 0]
+    moved = table[:2, :2] @ torch.tensor(step)
+    torch.testing.assert_close(
+        expected, pixels + torch.arange(1, 4)[:, None] * moved, atol=0.25, rtol=0)
+
+
+def test_objects_beyond_the_crop_stay(model, image):
+    pushing(model)
+    gripper = torch.tensor([[0.4, -0.4, 0.0, 0.0]])
+    far = torch.tensor([[5.0, 5.0]])
+    actions = torch.full((1, 3, 4), 0.03)
+    expected = model.rollout(image, gripper, one_hot_maps(far, (32, 32))[None], actions)
+    torch.testing.assert_close(expected, far.expand(1, 3, 1, 2), atol=0.01, rtol=0)
+
+
+def test_picture_masks_sum_to_one(model, image):
+    arm = model.draw_arm(GRIPPER)
+    scene = model.look(image, arm[:, 3:])
+    picture, masks = model.picture(scene, model.still(1), arm)
+    torch.testing.assert_close(masks.sum(1), torch.ones(1, 1, 32, 32))
+    assert masks.min() >= 0 and picture.abs().max() <= 1 + 1e-5
+
+
+def test_gripper_moves_by_the_action_within_limits_and_workspace(model):
+    gripper = torch.tensor([[0.42, 0.0, 0.02, 0.0]])
+    moved = model.move_gripper(gripper, torch.tensor([[0.06, 0.3, -0.1, 2.0]]))
+    torch.testing.assert_close(moved, torch.tensor([[0.45, 0.08, 0.0, 1.0]]))
+
+
+def test_samples_do_not_see_each_other(model, image):
+    actions = torch.randn(3, 4, 4) * 0.05
+    maps = one_hot_maps(PIXELS, (32, 32))[None]
+    together = model.rollout(image, GRIPPER, maps, actions)
+    alone = torch.cat([model.rollout(image, GRIPPER, maps, a[None]) for a in actions])
+    torch.testing.assert_close(together, alone, atol=1e-3, rtol=0)
+
+
+def test_weights_round_trip(model, image, tmp_path):
+    path = tmp_path / 'forward.safetensors'
+    save_weights(path, model, 'forward_model', model.config, {})
+    actions, maps = torch.randn(2, 5, 4) * 0.05, one_hot_maps(PIXELS, (32, 32))[None]
+    before = model.rollout(image, GRIPPER, maps, actions)
+    exact = load_forward_model(path, precision='float32')
+    assert exact.config == model.config
+    torch.testing.assert_close(
+        exact.rollout(image, GRIPPER, maps, actions), before, atol=1e-3, rtol=0)
+    half = load_forward_model(path, precision='bfloat16')
+    torch.testing.assert_close(
+        half.rollout(image, GRIPPER, maps, actions), before, atol=0.2, rtol=0)
+
+
+def test_weights_of_another_kind_are_refused(model, tmp_path):
+    path = tmp_path / 'predictor.safetensors'
+    save_weights(path, model, 'predictor', model.config, {})
+    with pytest.raises(WeightsError, match='forward_model'):
+        load_forward_model(path)
+
+
+def test_impossible_settings_are_named():
+    with pytest.raises(ConfigError, match='image_size 30'):
+        ForwardModel(ForwardModelConfig(TABLE, ARM, image_size=30))
+    with pytest.raises(ConfigError, match='9 numbers'):
+        ForwardModelConfig(TABLE[:6], ARM)

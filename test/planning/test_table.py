@@ -1,0 +1,74 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of projections, and their fits from recordings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tap_ros.errors import RecordingError
+from tap_ros.planning.table import (
+    fit_arm,
+    fit_projection,
+    fit_table,
+    grid_points,
+    mirror_table,
+    project,
+    splat_on_table,
+)
+import torch
+from toy_world import ARM, make_episode, MIDDLE, TABLE
+
+TILTED = np.array([[62.0, 12.0, -15.0, 31.5], [0.1, -37.0, -58.0, 27.0], [0.0, 0.37, -0.48, 1.0]])
+
+
+def test_fit_recovers_a_camera_despite_outliers():
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-0.4, -0.4, 0], [0.4, 0.4, 0.15], (400, 3))
+    pixels = project(torch.from_numpy(TILTED), torch.from_numpy(points)).numpy()
+    pixels[::20] += 30
+    fitted = torch.from_numpy(fit_projection(points, pixels))
+    error = (project(fitted, torch.from_numpy(points)).numpy() - pixels)[1::20]
+    assert np.abs(error).max() < 0.3
+
+
+def test_arm_camera_and_table_are_found_in_recordings():
+    episodes = [make_episode(seed) for seed in range(40)]
+    arm = fit_arm(episodes)
+    points = torch.tensor([[-0.3, -0.2, 0], [0.3, 0.1, 0], [0, 0, 0]], dtype=torch.float64)
+    true = project(torch.tensor(ARM, dtype=torch.float64).view(3, 4), points)
+    assert (project(torch.from_numpy(arm), points) - true).abs().max() < 1.5
+    table = fit_table(episodes, arm)
+    np.testing.assert_allclose(table / table[2, 2], np.reshape(TABLE, (3, 3)), atol=0.01)
+
+
+def test_without_object_positions_the_table_is_the_grippers_plane():
+    blind = [replace(make_episode(seed), object_poses=np.full((18, 2, 7), np.nan))
+             for seed in range(3)]
+    arm = np.reshape(ARM, (3, 4))
+    np.testing.assert_array_equal(fit_table(blind, arm), arm[:, [0, 1, 3]])
+
+
+def test_recordings_without_grippers_are_refused_by_topic():
+    blind = [replace(make_episode(0), grippers=np.full((18, 4), np.nan, np.float32))]
+    with pytest.raises(RecordingError, match='/joint_states'):
+        fit_arm(blind)
+
+
+def test_splatted_maps_sum_to_one_and_have_their_mean_at_the_pixel():
+    table = torch.tensor(TABLE).view(3, 3)
+    pixels = torch.tensor([[10.3, 12.9], [20.0, 17.5]])
+    maps = splat_on_table(pixels[:, None], torch.ones(2, 1), table, 40, 0.55)
+    torch.testing.assert_close(maps.sum((1, 2)), torch.ones(2))
+    points = (grid_points(40) * 0.55).flatten(0, 1)
+    mean = project(table, maps.flatten(1) @ points)
+    torch.testing.assert_close(mean, pixels, atol=1e-3, rtol=0)
+
+
+def test_mirrored_table_puts_mirrored_points_at_mirrored_pixels():
+    table = torch.from_numpy(TILTED[:, [0, 1, 3]]).float()
+    points = torch.tensor([[0.2, 0.1], [-0.3, 0.4]])
+    pixels = project(table, points)
+    mirrored = project(mirror_table(table, 32), points * torch.tensor([-1.0, 1.0]))
+    torch.testing.assert_close(mirrored[:, 0], 2 * MIDDLE - pixels[:, 0])
+    torch.testing.assert_close(mirrored[:, 1], pixels[:, 1])
