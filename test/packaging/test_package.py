@@ -33,9 +33,11 @@ ROSDEP_KEYS = {
 
 
 def required(tree):
-    """Walk a syntax tree, but not into what a try with an ImportError makes optional."""
+    """Walk a syntax tree, but not into what tolerates an ImportError and so is optional."""
     if isinstance(tree, ast.Try) and any(
             'ImportError' in ast.unparse(handler.type or tree) for handler in tree.handlers):
+        return
+    if isinstance(tree, ast.With) and 'suppress(ImportError)' in ast.unparse(tree.items[0]):
         return
     yield tree
     for child in ast.iter_child_nodes(tree):
