@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera's geometry and the off-screen renderer of the simulator."""
 
+import contextlib
 from dataclasses import dataclass
 
 import mujoco
@@ -55,6 +56,9 @@ class Renderer:
 
     def __init__(self, model, image_size):
         self._size = image_size
+        # Torch's CUDA build brings triton, whose LLVM has to be loaded before that of Mesa.
+        with contextlib.suppress(ImportError):
+            import triton  # noqa: F401
         try:
             self._gl = mujoco.GLContext(image_size, image_size)
             self._gl.make_current()
