@@ -131,7 +131,7 @@ def _scene_section(scene):
     figures = ''.join(_figure(caption, png_bytes(image)) for caption, image in pictures)
     strips = ''.join(
         _figure(f'{MODE_NAMES[mode]}: frames 0 to {len(run.frames) - 1}, median planning time '
-                f'{run.planning_ms:.0f} ms', png_bytes(grid([film_strip(run.frames)])))
+                f'{run.planning_ms:.0f} ms', png_bytes(grid([film_strip(run.frames)], scale=2)))
         for mode, run in scene.runs.items())
     return (f'<h2>Scene {scene.seed}</h2>{figures}'
             f'{_figure("error over time", _error_plot(scene), "smooth")}{strips}')

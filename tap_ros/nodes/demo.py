@@ -128,10 +128,15 @@ class DemoClient:
 
     def predict(self):
         """Ask for a subgoal as a person would by hand: with an empty request."""
-        answer = call(self._predict, PredictSubgoal.Request(), CALL_TIMEOUT_S)
-        if not answer.success:
-            raise TapError(f'predict_subgoal: {answer.message}')
-        return answer.subgoals[0]
+        deadline = time.monotonic() + CALL_TIMEOUT_S
+        while True:
+            answer = call(self._predict, PredictSubgoal.Request(), CALL_TIMEOUT_S)
+            if answer.success and answer.subgoals[0].object_maps:
+                return answer.subgoals[0]
+            # Right after the start the predictor may not have heard of the simulator yet.
+            if time.monotonic() > deadline:
+                raise TapError(f'predict_subgoal: {answer.message}')
+            time.sleep(0.2)
 
     def push(self, mode, seed, step_budget, goal):
         """
