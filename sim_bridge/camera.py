@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from sim_bridge.scene import ARM_GEOM_GROUP, CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
-from tap_ros.errors import SceneError  # noqa: E402
+from tap_ros.errors import SceneError
 
 MAX_SCENE_GEOMS = 200
 
@@ -100,5 +100,6 @@ class Renderer:
 
     def close(self):
         """Free the context."""
+        self._gl.make_current()  # else another renderer's objects would be freed
         self._context.free()
         self._gl.free()

@@ -54,8 +54,8 @@ def collect(folder, config, workers=None, progress=True):
     :raises ConfigError: when the folder holds a recording made with other settings.
     """
     get_task(config.task)
-    if min(config.episodes, config.episodes_per_file) < 1:
-        raise ConfigError('episodes and episodes_per_file must be at least 1')
+    if min(config.episodes, config.episodes_per_file, workers or 1) < 1:
+        raise ConfigError('episodes, episodes_per_file and workers must be at least 1')
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     _check_settings(folder, config)
@@ -70,10 +70,14 @@ def collect(folder, config, workers=None, progress=True):
     with ProcessPoolExecutor(workers, context, _start_worker, (done,)) as pool, \
             tqdm(total=total, unit='episode', disable=not progress) as bar:
         waiting = {pool.submit(_collect_shard, str(folder), config, i) for i in missing}
-        while waiting:
-            finished, waiting = wait(waiting, timeout=0.5)
-            bar.update(done.value - bar.n)
-            stats += [future.result() for future in finished]
+        try:
+            while waiting:
+                finished, waiting = wait(waiting, timeout=0.5)
+                bar.update(done.value - bar.n)
+                stats += [future.result() for future in finished]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # finish the files in progress, begin no others
+            raise
     write_metadata(folder)
     return _summary(stats, time.perf_counter() - start)
 
@@ -103,7 +107,9 @@ def _check_settings(folder, config):
                 f'{folder} holds a recording made with other settings ({", ".join(changed)}); '
                 f'choose another folder or the settings in {path}')
         if settings['episodes'] < before['episodes']:
-            return
+            raise ConfigError(
+                f"{folder} is a recording of {before['episodes']} episodes; ask for at least as "
+                'many, or choose another folder')
         if before['episodes'] % config.episodes_per_file and settings != before:
             # The last file was not full: it is made anew with its missing episodes.
             _shard_path(folder, before['episodes'] // config.episodes_per_file).unlink(

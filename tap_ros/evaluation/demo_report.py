@@ -87,7 +87,7 @@ img {{ image-rendering: pixelated; display: block; max-width: 100%; }}
 img.smooth {{ image-rendering: auto; }}
 pre {{ background: #f4f4f6; padding: 1rem; overflow-x: auto; }}
 </style>
-<h1>Two objects pushed to where a goal picture shows them, by way of a predicted subgoal</h1>
+<h1>Objects pushed to where a goal picture shows them, by way of a predicted subgoal</h1>
 <p>Each scene was pushed once straight towards its goal and once by the subgoal that
 <code>/predict_subgoal</code> answered: the picture of a moment on the way, with a probability map
 of where every object should then be. Doing nothing ends 20 cm from the goals.</p>

@@ -10,6 +10,7 @@ answers. Everything goes through the topics, services and actions that any clien
 from pathlib import Path
 import time
 
+from action_msgs.msg import GoalStatus
 import numpy as np
 import rclpy
 from rclpy.action import ActionClient
@@ -18,7 +19,7 @@ from sensor_msgs.msg import Image
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal, ResetScene
-from tap_ros.errors import TapError
+from tap_ros.errors import ConfigError, TapError
 from tap_ros.evaluation.demo_report import (
     results_table,
     Run,
@@ -153,7 +154,10 @@ class DemoClient:
                 bar.update(feedback.step - bar.n)
             request = ReachGoal.Goal(mode=mode, step_budget=step_budget, seed=seed)
             handle = send_goal(self._reach, request, CALL_TIMEOUT_S, on_feedback)
-            _, result = wait_for_result(handle, CALL_TIMEOUT_S + STEP_TIMEOUT_S * step_budget)
+            status, result = wait_for_result(
+                handle, CALL_TIMEOUT_S + STEP_TIMEOUT_S * step_budget)
+        if status != GoalStatus.STATUS_SUCCEEDED:
+            raise TapError(f'reach_goal ({mode}): {result.message}')
         self._processes.check()
         images, objects = self._camera.seen()
         goals = positions(goal['objects'])
@@ -215,6 +219,8 @@ def run(args):
     :param args: parsed arguments of add_arguments.
     :return: exit code.
     """
+    if min(args.scenes, args.step_budget) < 1:
+        raise ConfigError('scenes and step-budget must be at least 1')
     folder = new_folder(args.out)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     client = None

@@ -32,6 +32,9 @@ def declare_parameters(node):
                        'Factor of what is sent: 1 for metres per control period, '
                        '1 / control_period for metres per second as MoveIt Servo takes them.',
                        low=0.001, high=1000.0)
+    parameters.declare('stamp_with_now', False,
+                       'Stamp commands with the time of sending, as MoveIt Servo wants them, '
+                       'instead of the stamp of the image that they answer.')
     parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
     for name, default, high, description in (
             ('max_step_xy', 0.08, 0.08, 'Largest |dx| and |dy| of a command in metres.'),

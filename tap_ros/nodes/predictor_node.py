@@ -118,7 +118,7 @@ class PredictorNode(Node):
     def _view(self, image, objects, name, newest):
         """Decode a picture and its objects; take the newest ones if it was left empty."""
         if is_empty(image):
-            found = newest.newest('image', 'objects') or newest.newest('image')
+            found = newest.newest('image')
             if found is None:
                 topic = {'start': 'camera/image_raw', 'goal': 'goal/image'}[name]
                 raise ImageError(

@@ -220,7 +220,8 @@ class VisualMpcNode(Node):
         limit = np.array([self.params['max_step_xy']] * 2 + [self.params['max_step_z']])
         move = np.clip(np.asarray(action[:3], np.float64), -limit, limit)
         message = TwistStamped()
-        message.header.stamp = stamp
+        now = self.params['stamp_with_now']
+        message.header.stamp = self.get_clock().now().to_msg() if now else stamp
         message.header.frame_id = self.params['command_frame']
         linear = message.twist.linear
         linear.x, linear.y, linear.z = (self.params['twist_scale'] * move).tolist()

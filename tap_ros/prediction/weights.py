@@ -135,7 +135,7 @@ def load_tensors(path):
     except SafetensorError as error:
         raise WeightsError(f'{path}: damaged, truncated, or no safetensors file ({error}); '
                            'copy it again, or train again') from error
-    if metadata.get('format') != _FORMAT:
+    if metadata.get('format') != _FORMAT or 'about' not in metadata:
         raise WeightsError(f'{path}: written by format {metadata.get("format")!r}, not by '
                            f'{_FORMAT!r}; train again with this version')
     return tensors, json.loads(metadata['about'])

@@ -132,3 +132,11 @@ def test_a_disc_on_its_rim_comes_to_rest(simulator):
     for _ in range(8):
         before, after = simulator.object_poses()[0, :2], simulator.step(np.zeros(4))
     assert np.linalg.norm(after.object_poses[0, :2] - before) < 0.005
+
+
+def test_closing_one_simulator_leaves_the_pictures_of_another_alone(simulator):
+    other = Simulator('push3')
+    other.reset(1)
+    before = simulator.reset(1).image
+    other.close()
+    np.testing.assert_array_equal(simulator.observe().image, before)
