@@ -19,18 +19,20 @@ class Camera:
 
     width: int
     height: int
+    tilt: float = CAMERA_TILT  # rad from straight down
+    fovy: float = CAMERA_FOVY  # degrees
 
     @property
     def K(self):
         """Intrinsics, 3x3, in pixels."""
-        focal = 0.5 * self.height / np.tan(np.radians(CAMERA_FOVY) / 2)
+        focal = 0.5 * self.height / np.tan(np.radians(self.fovy) / 2)
         return np.array([
             [focal, 0, (self.width - 1) / 2], [0, focal, (self.height - 1) / 2], [0, 0, 1]])
 
     @property
     def extrinsics(self):
         """World to camera, 3x4, metres; the camera looks along +z, x right, y down."""
-        c, s = np.cos(CAMERA_TILT), np.sin(CAMERA_TILT)
+        c, s = np.cos(self.tilt), np.sin(self.tilt)
         rotation = np.array([[1, 0, 0], [0, -c, -s], [0, s, -c]])
         return np.column_stack([rotation, -rotation @ np.array(CAMERA_POSITION)])
 

@@ -9,7 +9,7 @@ collection goes on with the files that are not there yet.
 """
 
 from concurrent.futures import ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 import json
 import multiprocessing
 import os
@@ -18,6 +18,7 @@ import time
 
 import numpy as np
 from sim_bridge.expert import ExpertConfig, run_episode
+from sim_bridge.grasp_expert import GraspConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task, TASKS
 from tap_ros.errors import ConfigError
@@ -38,7 +39,7 @@ class CollectConfig:
     seed: int = 0
     image_size: int = 64
     episodes_per_file: int = 25
-    expert: ExpertConfig = ExpertConfig()
+    expert: ExpertConfig | GraspConfig | None = None  # None: the default one of the task
 
 
 def collect(folder, config, workers=None, progress=True):
@@ -53,7 +54,8 @@ def collect(folder, config, workers=None, progress=True):
         rate and mean final distance in metres, of the episodes collected by this call.
     :raises ConfigError: when the folder holds a recording made with other settings.
     """
-    get_task(config.task)
+    default = GraspConfig() if get_task(config.task).gripping else ExpertConfig()
+    config = replace(config, expert=config.expert or default)
     if min(config.episodes, config.episodes_per_file, workers or 1) < 1:
         raise ConfigError('episodes, episodes_per_file and workers must be at least 1')
     folder = Path(folder)
@@ -165,7 +167,8 @@ def make_episode(simulator, observations, actions, outcome, start_ns=0):
     Put what was observed and done into an Episode.
 
     Its goal is the one that it reached: a picture of where the objects ended, with the arm
-    elsewhere, as a person would photograph a goal. The expert's own goal, from which the outcome
+    elsewhere, as a person would photograph a goal; after a grasp, whose object the arm may still
+    hold, the last frame itself. The expert's own goal, from which the outcome
     follows, is drawn again from the seed by tasks.sample_scene.
 
     :param simulator: Simulator that made it.
@@ -175,7 +178,9 @@ def make_episode(simulator, observations, actions, outcome, start_ns=0):
     :param start_ns: added to the stamps.
     :return: Episode.
     """
-    goal = simulator.photograph(observations[-1].object_poses)
+    goal = observations[-1]
+    if not simulator.task.gripping:
+        goal = simulator.photograph(goal.object_poses)
     return Episode(
         frames=np.stack([o.image for o in observations]),
         stamps=np.array([o.stamp_ns + start_ns for o in observations], np.int64),

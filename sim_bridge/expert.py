@@ -5,10 +5,10 @@ The expert that generates the data: a cross-entropy method with the true simulat
 
 A sample is one push: go behind an object, come down, push. Samples are rolled out in the true
 physics, all at once; the best are refitted; the best push of all is executed and the search begins
-anew from where things then lie. Which object comes first, how fast and how far it is pushed, and
-whether that succeeds, varies from episode to episode, as the paper's non-deterministic planner
-gives. Proposing whole pushes rather than independent displacements is our deviation: a few
-dozen samples then suffice.
+anew from where things then lie. Which object comes first (mostly the one nearest to the gripper),
+how fast and how far it is pushed, and whether that succeeds, varies from episode to episode, as
+the paper's non-deterministic planner gives. Proposing whole pushes rather than independent
+displacements is our deviation: a few dozen samples then suffice.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ import time
 import mujoco
 import mujoco.rollout
 import numpy as np
+from sim_bridge.grasp_expert import run_grasp_episode
 from sim_bridge.scene import WORKSPACE_HIGH
 from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, SUBSTEPS
 
@@ -36,6 +37,7 @@ class ExpertConfig:
     num_elites: int = 5
     explore: float = 0.1  # probability that a random sample is executed instead of the best
     preference: float = 0.04  # m, spread of the whim for pushing one object before another
+    nearest: float = 0.06  # m, worth of pushing the object nearest to the gripper first
     step_cost: float = 0.001  # m per control period
     done_distance: float = 0.02  # m, an object this near its goal is left alone
     travel_speed: tuple = (0.045, 0.08)  # m per control period
@@ -72,12 +74,14 @@ class Expert:
         todo = np.flatnonzero(distances > self._config.done_distance)
         if len(todo) == 0:
             return None
+        here = np.linalg.norm(poses[todo, :2] - self._simulator.target[:2], axis=1)
+        first = todo[here.argmin()]
         best_cost, best = np.inf, None
         mean = spread = None
         for _ in range(self._config.num_iterations):
             pushes = self._sample(todo, poses, mean, spread)
             plans = [self._actions(*push, poses)[:steps_left] for push in pushes]
-            costs = self._costs(plans, distances)
+            costs = self._costs(plans, distances, first)
             if self._rng.random() < self._config.explore:
                 return plans[0]
             order = np.argsort(costs, kind='stable')[:self._config.num_elites]
@@ -134,7 +138,7 @@ class Expert:
         positions = np.concatenate([here[None, :3], *waypoints])[:MAX_PUSH_STEPS + 1]
         return np.column_stack([np.diff(positions, axis=0), np.zeros(len(positions) - 1)])
 
-    def _costs(self, plans, distances):
+    def _costs(self, plans, distances, first):
         """Roll all plans out in the true simulator; return (N,) metres."""
         simulator = self._simulator
         lengths = np.array([len(plan) for plan in plans])
@@ -152,24 +156,29 @@ class Expert:
         costs = ends.sum(1) + TILT_COST * (upright < 0.9).sum(1)
         costs += self._config.step_cost * lengths
         untouched = np.abs(ends - distances) < 0.005
-        return costs + (untouched * self._preference).sum(1)
+        return costs + (untouched * self._preference).sum(1) + self._config.nearest * untouched[
+            :, first]
 
 
-def run_episode(simulator, seed, config=ExpertConfig(), rollout=None):
+def run_episode(simulator, seed, config=None, rollout=None):
     """
     Run one episode of the expert, from the first motion of the arm to the last of an object.
 
+    Tasks with a grasp go to grasp_expert.py; their episodes are all equally long.
+
     :param simulator: Simulator.
     :param seed: of the scene and of the expert.
-    :param config: ExpertConfig.
+    :param config: ExpertConfig, or GraspConfig for a task with a grasp; None: the default.
     :param rollout: mujoco.rollout.Rollout to share between episodes, or None.
     :return: list of T Observations, (T, 4) float32 actions (the last row is zero), outcome, and
         seconds spent in the search and in stepping and rendering.
     """
+    if simulator.task.gripping:
+        return run_grasp_episode(simulator, seed, config, rollout)
     observations = [simulator.reset(seed)]
     rng = np.random.default_rng([seed, simulator.task.num_objects, 1])
     rollout = rollout or mujoco.rollout.Rollout(nthread=0)
-    expert = Expert(simulator, rng, config, rollout)
+    expert = Expert(simulator, rng, config or ExpertConfig(), rollout)
     actions = []
     seconds = {'search': 0.0, 'step': 0.0}
     while (steps_left := simulator.task.num_frames - len(observations)) > 0:

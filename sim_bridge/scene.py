@@ -20,12 +20,16 @@ HALF_THICKNESS = 0.025  # m, of the boxes an object is made of
 WORKSPACE_LOW = np.array([-0.45, -0.45, 0.0])  # m, of the fingertips; z = 0 just clears the table
 WORKSPACE_HIGH = np.array([0.45, 0.45, 0.15])
 FINGER_CLEARANCE = 0.006  # m between fingertips and table at z = 0
+FINGER_GAP = 0.001  # m, half the gap between closed fingers
 FINGER_TRAVEL = 0.04  # m each finger moves from closed (0) to open (1)
 TIMESTEP = 0.0125  # s; a control period is a whole number of these, see simulator.py
+GRIP = {'friction': [2, 0.02, 0.0002], 'condim': 4}  # rubber: what is held does not turn either
 ARM_GEOM_GROUP = 1  # so that the renderer can leave the arm out of a picture
 CAMERA_POSITION = (0.0, -1.1, 1.3)
 CAMERA_TILT = 0.68  # rad from straight down
 CAMERA_FOVY = 34.0  # degrees
+GRIP_TILT = 0.73  # for tasks with a grasp the view is narrower, as the objects are thin,
+GRIP_FOVY = 27.0  # and higher, so that the lifted arm is in it
 
 
 @dataclass(frozen=True)
@@ -49,16 +53,25 @@ def random_shape(rng):
     colours = tuple(tuple(rng.uniform(0.3, 1.0, 3)) for _ in range(2))
     if kind == 'disc':
         return ObjectShape(kind, ((rng.uniform(0.04, 0.06), HALF_HEIGHT),), ((0, 0),), colours[:1])
-    t, a, b = HALF_THICKNESS, rng.uniform(0.05, 0.09), rng.uniform(0.02, 0.05)
-    bar = (t, a, HALF_HEIGHT)
+    return box_shape(
+        kind, HALF_THICKNESS, rng.uniform(0.05, 0.09), rng.uniform(0.02, 0.05), colours)
+
+
+def box_shape(kind, thickness, length, arm_length, colours):
+    """
+    Make a bar along y, and its arm for an L or a T; all lengths are halves, in metres.
+
+    :return: ObjectShape with its centre of area at the origin.
+    """
+    bar = (thickness, length, HALF_HEIGHT)
     if kind == 'bar':
         return ObjectShape(kind, (bar,), ((0, 0),), colours[:1])
-    arm = (b, t, HALF_HEIGHT)  # sticks out from the bar's side: at its end for L, its middle for T
-    arm_centre = np.array([t + b, a - t if kind == 'L' else 0.0])
+    arm = (arm_length, thickness, HALF_HEIGHT)
+    # The arm sticks out from the bar's side: at its end for L, its middle for T.
+    arm_centre = np.array([thickness + arm_length, length - thickness if kind == 'L' else 0.0])
     areas = np.array([bar[0] * bar[1], arm[0] * arm[1]])
     centroid = arm_centre * areas[1] / areas.sum()
-    centres = (tuple(-centroid), tuple(arm_centre - centroid))
-    return ObjectShape(kind, (bar, arm), centres, colours)
+    return ObjectShape(kind, (bar, arm), (tuple(-centroid), tuple(arm_centre - centroid)), colours)
 
 
 def object_names(count):
@@ -66,7 +79,7 @@ def object_names(count):
     return tuple(f'object_{i}' for i in range(count))
 
 
-def build_scene(shapes, image_size=64):
+def build_scene(shapes, image_size=64, gripping=False):
     """
     Compile the MuJoCo model of a table with a gripper and the given objects.
 
@@ -75,6 +88,8 @@ def build_scene(shapes, image_size=64):
 
     :param shapes: sequence of ObjectShape.
     :param image_size: pixels of the square off-screen picture.
+    :param gripping: let friction hold what the fingers grip, and look from nearer; pushing does
+        without, for speed.
     :return: mujoco.MjModel.
     """
     spec = mujoco.MjSpec()
@@ -83,6 +98,10 @@ def build_scene(shapes, image_size=64):
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     spec.option.iterations = 20
     spec.option.ls_iterations = 8
+    if gripping:
+        # Soft friction lets what is held creep down: solve for no slip.
+        spec.option.noslip_iterations = 5
+        spec.option.iterations, spec.option.ls_iterations = 50, 20
     # Shadows and multi-sampling are most of the cost of a small picture on a CPU.
     spec.visual.quality.shadowsize = 0
     spec.visual.quality.offsamples = 0
@@ -95,25 +114,25 @@ def build_scene(shapes, image_size=64):
     world.add_geom(
         name='table', type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1],
         rgba=[0.26, 0.21, 0.18, 1], friction=[1, 0.01, 0.0002])
-    _add_camera(world)
-    _add_gripper(spec, world)
+    _add_camera(world, *(GRIP_TILT, GRIP_FOVY) if gripping else (CAMERA_TILT, CAMERA_FOVY))
+    _add_gripper(spec, world, GRIP if gripping else {'friction': [1, 0.01, 0.0002]})
     for name, shape in zip(object_names(len(shapes)), shapes):
         _add_object(world, name, shape)
     return spec.compile()
 
 
-def _add_camera(world):
+def _add_camera(world, tilt, fovy):
     """Add the one camera, looking from the front down onto the table."""
-    half = CAMERA_TILT / 2
+    half = tilt / 2
     world.add_camera(
         name='camera', pos=list(CAMERA_POSITION), quat=[np.cos(half), np.sin(half), 0, 0],
-        fovy=CAMERA_FOVY)
+        fovy=fovy)
 
 
-def _add_gripper(spec, world):
-    """Add the gripper on its three slide joints, with two fingers that open along x."""
+def _add_gripper(spec, world, surface):
+    """Add the gripper on three slide joints, and two fingers that open along x."""
     gripper = world.add_body(name='gripper', pos=[0, 0, FINGER_CLEARANCE], gravcomp=1)
-    arm = {'group': ARM_GEOM_GROUP, 'friction': [1, 0.01, 0.0002], 'density': 0}
+    arm = {'group': ARM_GEOM_GROUP, 'density': 0, **surface}
     gripper.add_geom(
         name='palm', type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, 0.03, 0.02],
         pos=[0, 0, 0.14], rgba=[0.55, 0.55, 0.58, 1], contype=0, conaffinity=0, **arm)

@@ -7,9 +7,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from sim_bridge.camera import Camera, Renderer
+from sim_bridge.grasping import grasp_place
 from sim_bridge.scene import (
     build_scene,
+    FINGER_GAP,
     FINGER_TRAVEL,
+    GRIP_FOVY,
+    GRIP_TILT,
     HALF_HEIGHT,
     object_names,
     TIMESTEP,
@@ -25,6 +29,8 @@ if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
     raise SceneError(f'the control period {CONTROL_PERIOD} s is no multiple of {TIMESTEP} s')
 RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time to catch up
 ACTION_LIMIT = np.array([0.08, 0.08, 0.15])  # m per control period, x, y, z
+GRASP_HEIGHT = 0.012  # m of the gripper when it holds an object on the table, in the goal picture
+LEAVE_HEIGHT = 0.12  # m of the gripper when it has put the object down, in the goal picture
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers
 
 
@@ -93,6 +99,8 @@ class Simulator:
         if not 16 <= image_size <= 1024:
             raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')
         self.camera = Camera(image_size, image_size)
+        if self.task.gripping:
+            self.camera = Camera(image_size, image_size, GRIP_TILT, GRIP_FOVY)
         self._renderer = None
 
     def reset(self, seed):
@@ -104,7 +112,8 @@ class Simulator:
         :raises SceneError: for a bad seed.
         """
         self.scene = sample_scene(self.task, seed)
-        self.model = build_scene(self.scene.shapes, self.camera.height)
+        self.model = build_scene(
+            self.scene.shapes, self.camera.height, self.task.gripping)
         self.data = mujoco.MjData(self.model)
         if self._renderer is None:
             self._renderer = Renderer(self.model, self.camera.height)
@@ -112,8 +121,10 @@ class Simulator:
             self._renderer.use(self.model)
         self.target = np.append(self.scene.gripper_start, 0.0)
         self._place(_lift(self.scene.start_poses), self.scene.gripper_start)
-        poses = _lift(self.scene.goal_poses)
-        gripper = self._after_last_push()
+        poses = _lift(self.scene.goal_poses, self.task.lift)
+        gripper = {
+            'push': self._after_last_push, 'grasp': self._holding, 'pick_place': self._leaving,
+        }[self.task.kind]()
         self._goal = [self.photograph(poses, gripper, hide_arm) for hide_arm in (False, True)]
         return self.observe()
 
@@ -122,8 +133,8 @@ class Simulator:
         Observe the objects at other places; nothing moves.
 
         :param object_poses: (K, 7) x, y, z in m, quaternion x, y, z, w.
-        :param gripper: (3,) where the arm is to be seen, m; by default somewhere beside the
-            objects, drawn from the scene's seed.
+        :param gripper: (3,) where the arm is to be seen, m, or (4,) with its opening; by default
+            closed and somewhere beside the objects, drawn from the scene's seed.
         :param hide_arm: leave the arm out of the picture.
         :return: Observation.
         """
@@ -141,7 +152,14 @@ class Simulator:
         return observation
 
     def goal(self, hide_arm=False):
-        """Return the Observation of the goal: the arm stands as after pushing one object there."""
+        """
+        Return the Observation of the goal.
+
+        The arm stands as after pushing one object there, holds the object that is to be grasped,
+        or is above the one that it has put down.
+
+        :param hide_arm: leave the arm out of the picture.
+        """
         return self._goal[1 if hide_arm else 0]
 
     def step(self, action):
@@ -184,8 +202,18 @@ class Simulator:
             self.object_poses()[:, :3] - self.goal().object_poses[:, :3], axis=1)
 
     def outcome(self):
-        """Return 'success' when every object is within SUCCESS_DISTANCE, else 'failure'."""
-        return 'success' if (self.distances() < SUCCESS_DISTANCE).all() else 'failure'
+        """
+        Return 'success' or 'failure'.
+
+        An object is in place within SUCCESS_DISTANCE of its goal; to be grasped is to be held by
+        the fingers, that high above the table.
+        """
+        if self.task.lift:
+            high = self.object_poses()[:, 2] - HALF_HEIGHT > SUCCESS_DISTANCE
+            good = high.all() and np.isin(self.data.contact.geom, self._fingers()).any()
+        else:
+            good = (self.distances() < SUCCESS_DISTANCE).all()
+        return 'success' if good else 'failure'
 
     def state(self):
         """Return the full physics state, as mujoco.rollout takes it."""
@@ -200,14 +228,21 @@ class Simulator:
             self._renderer.close()
             self._renderer = None
 
+    def _fingers(self):
+        """Return the numbers of the fingers' geoms."""
+        return [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
+
     def _after_last_push(self):
         """Return where the gripper touches one object that it has just pushed to its goal."""
-        rng = np.random.default_rng([self.scene.seed, 8])
-        k = rng.integers(self.task.num_objects)
         starts, goals = self.scene.start_poses[:, :2], self.scene.goal_poses[:, :2]
+        # The expert mostly takes the nearest object first: follow it to the last one.
+        here, left = self.scene.gripper_start[:2], list(range(self.task.num_objects))
+        while left:
+            k = min(left, key=lambda i: np.linalg.norm(starts[i] - here))
+            left.remove(k)
+            here = goals[k]
         along = (goals[k] - starts[k]) / np.linalg.norm(goals[k] - starts[k])
-        fingers = [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
-        state = self.state()
+        fingers, state = self._fingers(), self.state()
         for behind in np.arange(0.04, 0.16, 0.005):
             gripper = np.append(goals[k] - behind * along, 0.01)
             self._place(_lift(self.scene.goal_poses), gripper)
@@ -216,21 +251,35 @@ class Simulator:
         mujoco.mj_setState(self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         return gripper
 
+    def _holding(self):
+        """Return where the gripper holds the lifted object, and its opening."""
+        place, _, half_gap = grasp_place(self.scene.shapes[0], self.scene.start_poses[0, 2])
+        return np.array([
+            *self.scene.goal_poses[0, :2] + place, self.task.lift + GRASP_HEIGHT,
+            (half_gap - FINGER_GAP) / FINGER_TRAVEL])
+
+    def _leaving(self):
+        """Return where the open gripper is above the object that it has just put down."""
+        place, _, _ = grasp_place(self.scene.shapes[0], self.scene.start_poses[0, 2])
+        return np.array([*self.scene.goal_poses[0, :2] + place, LEAVE_HEIGHT, 1])
+
     def _place(self, object_poses, gripper):
-        """Put objects at poses (K, 7) and the closed gripper at (3,), all at rest."""
+        """Put objects at poses (K, 7) and the gripper at (3,), closed, or (4,), all at rest."""
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:3] = gripper
-        self.data.ctrl[:3] = gripper
+        self.data.qpos[:3] = gripper[:3]
+        self.data.ctrl[:3] = gripper[:3]
+        if len(gripper) == 4:
+            self.data.qpos[3:5] = self.data.ctrl[3:5] = gripper[3] * FINGER_TRAVEL
         objects = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
         objects[:] = object_poses[:, [0, 1, 2, 6, 3, 4, 5]]
         mujoco.mj_forward(self.model, self.data)
 
 
-def _lift(planar_poses):
-    """Turn (K, 3) x, y, yaw on the table into (K, 7) poses."""
+def _lift(planar_poses, height=0.0):
+    """Turn (K, 3) x, y, yaw into (K, 7) poses at a height above the table in metres."""
     poses = np.zeros((len(planar_poses), 7))
     poses[:, :2] = planar_poses[:, :2]
-    poses[:, 2] = HALF_HEIGHT
+    poses[:, 2] = HALF_HEIGHT + height
     poses[:, 5] = np.sin(planar_poses[:, 2] / 2)
     poses[:, 6] = np.cos(planar_poses[:, 2] / 2)
     return poses

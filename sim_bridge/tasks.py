@@ -7,11 +7,16 @@ The rules are those of the paper's authors (their cartgripper environment): obje
 0.35 m of the middle, starts at least 0.35 m apart (0.3 m with three objects), every goal exactly
 0.2 m from its start and at least 0.2 m from the other goals, yaw changed by at most 0.2 rad.
 Doing nothing therefore ends 20 cm from the goals.
+
+The tasks with a grasp have one object of a shape that the gripper can hold. To grasp is to lift it
+from where it stands; to pick and place is to carry it to a place within 0.2 m of the middle, with
+the arm starting about 0.3 m from the object.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from sim_bridge.grasping import grasp_place, graspable_shape, graspable_yaw
 from sim_bridge.scene import random_shape
 from tap_ros.errors import SceneError
 
@@ -23,6 +28,11 @@ GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
 GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
 GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the start
 SUCCESS_DISTANCE = 0.05  # m; an episode succeeds when every object ends nearer to its goal
+GRASP_RANGE = 0.2  # m, |x| and |y| of the start of an object to be grasped
+GRASP_REACH_RANGE = 0.3  # m, |x| and |y| of the gripper's start before a grasp, all in view
+PLACE_RANGE = 0.2  # m, |x| and |y| of the place where a picked object goes
+PLACE_DISTANCE = (0.12, 0.36)  # m, from the start of an object to its place
+LIFT_HEIGHT = 0.11  # m, of the goal of a grasp
 
 
 @dataclass(frozen=True)
@@ -33,11 +43,26 @@ class Task:
     num_objects: int
     num_frames: int  # the longest episode
     start_separation: float  # m between object origins at the start
+    kind: str = 'push'  # or 'grasp', 'pick_place'
+    reach: tuple = ()  # m, nearest and farthest start of the gripper, for grasps
+    lift: float = 0.0  # m, height of the goal above the table
+    stream: int = 0  # of random numbers, besides the seed; no two tasks have the same
+
+    @property
+    def gripping(self):
+        """Whether the gripper has to hold the object."""
+        return self.kind != 'push'
 
 
 TASKS = {
-    'push2': Task('push2', num_objects=2, num_frames=40, start_separation=0.35),
-    'push3': Task('push3', num_objects=3, num_frames=75, start_separation=0.3),
+    'push2': Task('push2', num_objects=2, num_frames=40, start_separation=0.35, stream=2),
+    'push3': Task('push3', num_objects=3, num_frames=75, start_separation=0.3, stream=3),
+    'grasp': Task(
+        'grasp', num_objects=1, num_frames=15, start_separation=0.0, kind='grasp',
+        reach=(0.13, 0.32), lift=LIFT_HEIGHT, stream=4),
+    'pick_place': Task(
+        'pick_place', num_objects=1, num_frames=20, start_separation=0.0, kind='pick_place',
+        reach=(0.27, 0.33), stream=5),
 }
 
 
@@ -75,7 +100,9 @@ def sample_scene(task, seed):
     """
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
-    rng = np.random.default_rng([int(seed), task.num_objects])
+    rng = np.random.default_rng([int(seed), task.stream])
+    if task.gripping:
+        return _sample_grasp(task, seed, rng)
     shapes = tuple(random_shape(rng) for _ in range(task.num_objects))
     # Separated starts may leave no room for separated goals: then both are drawn anew.
     goals = None
@@ -89,6 +116,25 @@ def sample_scene(task, seed):
         start_poses=np.column_stack([starts, yaws]),
         goal_poses=np.column_stack([goals, goal_yaws]),
         gripper_start=gripper_away_from(rng, starts))
+
+
+def _sample_grasp(task, seed, rng):
+    """Draw a scene with one object that can be held; its goal is lifted, or elsewhere."""
+    shape = graspable_shape(rng)
+    yaw = graspable_yaw(shape, rng)
+    start = rng.uniform(-GRASP_RANGE, GRASP_RANGE, 2)
+    goal = start
+    if task.kind == 'pick_place':
+        while not PLACE_DISTANCE[0] <= np.linalg.norm(goal - start) <= PLACE_DISTANCE[1]:
+            goal = rng.uniform(-PLACE_RANGE, PLACE_RANGE, 2)
+    gripper = np.full(2, np.inf)
+    while (np.abs(gripper) > GRASP_REACH_RANGE).any():
+        angle = rng.uniform(0, 2 * np.pi)
+        gripper = start + rng.uniform(*task.reach) * np.array([np.cos(angle), np.sin(angle)])
+    return Scene(
+        task=task, seed=int(seed), shapes=(shape,), start_poses=np.array([[*start, yaw]]),
+        goal_poses=np.array([[*goal, grasp_place(shape, yaw)[1]]]),
+        gripper_start=np.append(gripper, rng.uniform(0, GRIPPER_HEIGHT)))
 
 
 def gripper_away_from(rng, positions):

@@ -5,20 +5,38 @@
 import numpy as np
 import pytest
 from sim_bridge.camera import Camera
-from sim_bridge.scene import build_scene, random_shape
+from sim_bridge.grasping import GRASP_YAW
+from sim_bridge.scene import (
+    build_scene,
+    GRIP_FOVY,
+    GRIP_TILT,
+    random_shape,
+    WORKSPACE_HIGH,
+)
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import (
     GOAL_DISTANCE,
     GOAL_SEPARATION,
     GOAL_YAW_RANGE,
+    GRASP_RANGE,
+    GRASP_REACH_RANGE,
     OBJECT_RANGE,
+    PLACE_DISTANCE,
+    PLACE_RANGE,
     sample_scene,
     TASKS,
 )
 from tap_ros.errors import SceneError
 
+PUSHING = [task for task in TASKS.values() if not task.gripping]
+GRIPPING = [task for task in TASKS.values() if task.gripping]
 
-@pytest.mark.parametrize('task', TASKS.values(), ids=TASKS)
+
+def name(task):
+    return task.name
+
+
+@pytest.mark.parametrize('task', PUSHING, ids=name)
 def test_scenes_obey_the_start_and_goal_rules(task):
     for seed in range(50):
         scene = sample_scene(task, seed)
@@ -31,6 +49,55 @@ def test_scenes_obey_the_start_and_goal_rules(task):
         for positions, least in ((starts, task.start_separation), (goals, GOAL_SEPARATION)):
             gaps = np.linalg.norm(positions[:, None, :2] - positions[None, :, :2], axis=-1)
             assert (gaps[pairs] >= least).all()
+
+
+@pytest.mark.parametrize('task', GRIPPING, ids=name)
+def test_scenes_with_a_grasp_obey_their_rules(task):
+    for seed in range(50):
+        scene = sample_scene(task, seed)
+        start, goal, gripper = scene.start_poses[0], scene.goal_poses[0], scene.gripper_start
+        assert (np.abs(start[:2]) <= GRASP_RANGE).all()
+        assert (np.abs(goal[:2]) <= PLACE_RANGE).all()
+        assert task.reach[0] <= np.linalg.norm(gripper[:2] - start[:2]) <= task.reach[1]
+        moved = np.linalg.norm(goal[:2] - start[:2])
+        if task.kind == 'grasp':
+            assert moved == 0
+        else:
+            assert PLACE_DISTANCE[0] <= moved <= PLACE_DISTANCE[1]
+        assert abs(goal[2] - start[2]) <= GRASP_YAW + 1e-9, 'turned by the fingers at most so much'
+
+
+@pytest.mark.parametrize('task', GRIPPING, ids=name)
+def test_the_gripper_and_its_object_stay_in_the_picture(task):
+    camera = Camera(64, 64, GRIP_TILT, GRIP_FOVY)
+    reach, top = GRASP_REACH_RANGE, WORKSPACE_HIGH[2] + 0.02
+    corners = np.array([
+        [x, y, z] for x in (-reach, reach) for y in (-reach, reach) for z in (0.03, top)])
+    pixels = camera.project(corners)
+    assert (pixels > 0).all() and (pixels < 63).all()
+
+
+def test_no_two_tasks_draw_the_same_numbers():
+    assert len({task.stream for task in TASKS.values()}) == len(TASKS)
+    grasp, pick_place = (sample_scene(TASKS[name], 3) for name in ('grasp', 'pick_place'))
+    assert not np.allclose(grasp.start_poses, pick_place.start_poses)
+
+
+def test_the_scenes_of_published_recordings_stay_the_same():
+    # Recordings are named by seed: a change here makes them impossible to collect again.
+    push2, push3 = (sample_scene(TASKS[name], 500000) for name in ('push2', 'push3'))
+    np.testing.assert_allclose(
+        push2.start_poses,
+        [[-0.2823144, 0.1070191, 1.0756113], [0.1355647, -0.047126, 1.3841829]], atol=1e-6)
+    np.testing.assert_allclose(
+        push3.start_poses[0], [0.1992881, -0.3184266, 5.2459278], atol=1e-6)
+
+
+@pytest.mark.parametrize('gripping', [False, True])
+def test_only_gripping_pays_for_friction_without_slip(gripping):
+    model = build_scene([random_shape(np.random.default_rng(0))], gripping=gripping)
+    assert (model.opt.noslip_iterations > 0) == gripping
+    assert model.geom('left_finger').condim[0] == (4 if gripping else 3)
 
 
 def test_same_seed_same_scene_and_other_seed_another():
