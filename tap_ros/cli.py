@@ -16,12 +16,14 @@ from tap_ros.errors import TapError
 
 COMMANDS = {  # command: (one line of help, module or {what: module})
     'collect': ('simulate the expert and record it', 'sim_bridge.collect'),
+    'import-bair': ('import the BAIR robot pushing data set', 'tap_ros.recording.bair'),
     'train': ('train on recordings', {
         'predictor': 'tap_ros.prediction.train_command',
         'forward': 'tap_ros.planning.train_command'}),
     'evaluate': ('score trained weights', {
         'prediction': 'tap_ros.evaluation.prediction',
-        'planning': 'tap_ros.evaluation.planning'}),
+        'planning': 'tap_ros.evaluation.planning.command'}),
+    'paper': ("make the paper's prediction results again", 'tap_ros.evaluation.paper.command'),
     'demo': ('push objects by way of a subgoal, with real nodes', 'tap_ros.nodes.demo'),
     'bench': ('measure speed; without a name, all of it', {
         'collect': 'tap_ros.evaluation.bench_collect',
@@ -83,7 +85,8 @@ def _use(parser, module):
 
 def _quiet(modules):
     """Return a parser that only finds out what --model is."""
-    parser = argparse.ArgumentParser(add_help=False)
+    # Without abbreviations, else --mode would be one of --model.
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument('--model', choices=list(modules), default=TRAIN_DEFAULT)
     return parser
 

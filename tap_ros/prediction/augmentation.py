@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Changes of appearance that make few episodes into many."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -72,16 +72,3 @@ class Augmentation:
 def _take_channels(images, order):
     order = order[:, None, :, None, None].expand_as(images)
     return images.gather(2, order)
-
-
-def reverse(batch, which):
-    """
-    Play some episodes of a batch backwards.
-
-    :param batch: batches.Batch.
-    :param which: bool (B,).
-    :return: batches.Batch.
-    """
-    context = torch.where(which[:, None, None, None, None], batch.context.flip(1), batch.context)
-    times = torch.where(which[:, None], batch.end - batch.times, batch.times)
-    return replace(batch, context=context, times=times)

@@ -25,14 +25,18 @@ class TrainingState:
 
     :param network: the network that is trained.
     :param average: moving average of its weights, in eval mode; what is shipped.
-    :param optimizer: Adam.
+    :param helpers: ModuleDict of the networks that only training needs: recognition,
+        discriminators; may be empty.
+    :param optimizers: list of Adams: of the network with what is trained along with it, and, if
+        there are discriminators, theirs.
     :param step: number of steps done.
     :param seconds: time they took, over all sessions.
     """
 
     network: torch.nn.Module
     average: torch.nn.Module
-    optimizer: torch.optim.Optimizer
+    helpers: torch.nn.ModuleDict
+    optimizers: list
     step: int = 0
     seconds: float = 0.0
 
@@ -50,19 +54,28 @@ class TrainingState:
             mine.copy_(other)  # batch norm's statistics are averages already
 
 
-def start(network, learning_rate, device):
+def start(network, learning_rate, device, helpers=None):
     """
     Begin a training run.
 
     :param network: with fresh weights.
     :param learning_rate: of Adam.
     :param device: torch device.
+    :param helpers: dict of the networks that only training needs. Those whose name ends in
+        'discriminator' are trained against the others.
     :return: TrainingState.
     """
+    helpers = torch.nn.ModuleDict(helpers or {}).to(device, memory_format=torch.channels_last)
     network = network.to(device, memory_format=torch.channels_last)
     average = copy.deepcopy(network).eval().requires_grad_(False)
-    optimizer = torch.optim.Adam(network.parameters(), learning_rate, fused=True)
-    return TrainingState(network, average, optimizer)
+    groups = [list(network.parameters()), []]
+    for name, helper in helpers.items():
+        groups[name.endswith('discriminator')] += helper.parameters()
+    # DCGAN's beta1 of 0.5 where networks are trained against each other.
+    betas = (0.5 if groups[1] else 0.9, 0.999)
+    optimizers = [torch.optim.Adam(group, learning_rate, betas, fused=True)
+                  for group in groups if group]
+    return TrainingState(network, average, helpers, optimizers)
 
 
 def save_checkpoint(path, state, settings, data_hash):
@@ -76,8 +89,10 @@ def save_checkpoint(path, state, settings, data_hash):
     """
     tensors = {f'network.{name}': value for name, value in state.network.state_dict().items()}
     tensors |= {f'average.{name}': value for name, value in state.average.state_dict().items()}
-    for i, values in state.optimizer.state_dict()['state'].items():
-        tensors |= {f'optimizer.{i}.{name}': value for name, value in values.items()}
+    tensors |= {f'helpers.{name}': value for name, value in state.helpers.state_dict().items()}
+    for k, optimizer in enumerate(state.optimizers):
+        for i, values in optimizer.state_dict()['state'].items():
+            tensors |= {f'optimizer.{k}.{i}.{name}': value for name, value in values.items()}
     save_tensors(path, tensors, {
         'kind': 'checkpoint', 'step': state.step, 'seconds': state.seconds,
         'settings': settings, 'data_hash': data_hash})
@@ -106,14 +121,15 @@ def load_checkpoint(path, state, settings, data_hash):
     if about['data_hash'] != data_hash:
         raise ConfigError(f'{path}: made from other recordings; to go on with it give the same '
                           'ones in the same order, else choose another --out folder')
-    for prefix, module in (('network.', state.network), ('average.', state.average)):
+    for prefix, module in (('network.', state.network), ('average.', state.average),
+                           ('helpers.', state.helpers)):
         module.load_state_dict({name[len(prefix):]: value for name, value in tensors.items()
                                 if name.startswith(prefix)})
-    for i, weight in enumerate(state.optimizer.param_groups[0]['params']):
-        names = [name for name in tensors if name.startswith(f'optimizer.{i}.')]
-        for name in names:
-            value = tensors[name].to(weight.device)
-            if value.shape == weight.shape:  # the fused Adam wants the weight's own strides
-                value = torch.empty_like(weight).copy_(value)
-            state.optimizer.state[weight][name.rsplit('.', 1)[1]] = value
+    for k, optimizer in enumerate(state.optimizers):
+        for i, weight in enumerate(optimizer.param_groups[0]['params']):
+            for name in [name for name in tensors if name.startswith(f'optimizer.{k}.{i}.')]:
+                value = tensors[name].to(weight.device)
+                if value.shape == weight.shape:  # the fused Adam wants the weight's own strides
+                    value = torch.empty_like(weight).copy_(value)
+                optimizer.state[weight][name.rsplit('.', 1)[1]] = value
     state.step, state.seconds = about['step'], about['seconds']

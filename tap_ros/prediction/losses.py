@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The losses of section 3: fixed time, minimum over time, generalized minimum over time.
+The losses of section 3: fixed time, minimum over time, generalized minimum over time, recursive.
 
 Errors are per-pixel means of the absolute difference on [0, 1], half of that on [-1, 1], so that
 losses and reported numbers have the same unit.
@@ -101,6 +101,31 @@ def generalized_minimum_loss(error, selection_error, valid=None):
     return fixed_time_loss(error, match_step(selection_error.detach(), valid))
 
 
+def recursive_loss(losses, counts):
+    """
+    Recursive loss (Eq. 3): the sum over levels r of the loss of the prediction from c(r).
+
+    :param losses: for each level, the mean loss over the episodes that still have targets.
+    :param counts: for each level, how many those are; level 0 has all of them.
+    :return: the sum over levels, as a mean over all episodes.
+    """
+    return sum(loss * (count / counts[0]) for loss, count in zip(losses, counts))
+
+
+def remaining_targets(valid, times, matched, forward):
+    """
+    Say which targets the next level of recursion has, T(r) of Eq. 3.
+
+    :param valid: bool (B, T), the targets of this level.
+    :param times: int64 (B, T).
+    :param matched: int64 (B, 1), the time that this level's prediction was closest to.
+    :param forward: whether predictions go on after it, as Eq. 3 says; else they go back towards
+        the start, as the paper's recursive bidirectional figure has it.
+    :return: bool (B, T).
+    """
+    return valid & (times > matched if forward else times < matched)
+
+
 def bell_preference(times, first, last, edge=2 / 3):
     """
     Prefer the middle: a Gaussian over the target times, 1 in the middle and `edge` at both ends.
@@ -158,3 +183,36 @@ def relative_to_copying(error, copy_error, preference):
     :return: (B, T).
     """
     return error / (copy_error.amin(1).clamp(min=_MIN_COPY_DISTANCE) * preference)
+
+
+@torch.no_grad()
+def path_length(start, targets):
+    """
+    Measure how much changed on the way to each target: a cost of reaching it that pictures show.
+
+    :param start: uint8 (B, H, W, 3), the start picture.
+    :param targets: uint8 (B, T, H, W, 3), in the order of time.
+    :return: (B, T), the l1 length on [0, 1] of the way from the start picture through the
+        targets, as a share of the way to the last one: 0 to 1, never falling.
+    """
+    frames = torch.cat([start[:, None], targets], 1).flatten(2)  # B, T+1, D
+    steps = torch.stack([(before.float() - after.float()).abs().mean(-1)
+                         for before, after in zip(frames[:, :-1].unbind(1),
+                                                  frames[:, 1:].unbind(1))], 1)
+    length = steps.cumsum(1)
+    return length / length[:, -1:].clamp(min=1e-6)
+
+
+def cost_of_reaching(error, cost, preference, weight=1.0):
+    """
+    Prefer states that are cheap to reach, the other preference that section 3.2 names.
+
+    E'_t = E_t (1 + weight * cost_t) / w(t).
+
+    :param error: (B, T).
+    :param cost: (B, T), not negative, for example path_length, the way of the arm, or time.
+    :param preference: (B, T), w(t).
+    :param weight: how much a cost of 1 adds, not negative; 0 leaves preferred_error.
+    :return: (B, T).
+    """
+    return error * (1 + weight * cost) / preference

@@ -18,22 +18,23 @@ def grey_panels(maps):
 
 
 @torch.no_grad()
-def sample_grid(batch, outcome):
+def sample_grid(batch, prediction, match):
     """
-    Show a batch: start, goal, prediction, matched frame, one mask for each source, new pixels.
+    Show a batch: context, prediction, matched frame, one mask for each source, new pixels.
 
     :param batch: batches.Batch.
-    :param outcome: objective.Outcome of it.
+    :param prediction: networks.Prediction of it.
+    :param match: int64 (B,), the matched targets as indices into T.
     :return: uint8 (height, width, 3).
     """
     context = batch.context.cpu().numpy()
-    images = to_uint8(outcome.prediction.image)
-    match = outcome.match.cpu()
+    images = to_uint8(prediction.image)
+    match = match.cpu()
     rows = []
     for b in range(len(context)):
-        row = [context[b, 0], context[b, -1], images[b], batch.targets[b, match[b]].cpu().numpy()]
-        row += grey_panels(outcome.prediction.masks[b, :, 0].float())
-        if outcome.prediction.new_pixels is not None:
-            row.append(to_uint8(outcome.prediction.new_pixels[b]))
+        row = [*context[b], images[b], batch.targets[b, match[b]].cpu().numpy()]
+        row += grey_panels(prediction.masks[b, :, 0].float())
+        if prediction.new_pixels is not None:
+            row.append(to_uint8(prediction.new_pixels[b]))
         rows.append(row)
     return grid(rows)

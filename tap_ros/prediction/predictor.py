@@ -16,28 +16,33 @@ import torch
 @dataclass(frozen=True)
 class Subgoal:
     """
-    A predicted frame on the way to the goal.
+    A predicted frame: on the way to the goal, or going forward from the start.
 
     :param image: uint8 (H, W, 3).
     :param object_maps: float32 (K, H, W), each sums to 1: where each object should then be.
     :param expected_pixels: float32 (K, 2), the mean (u, v) under each map.
     :param mass: float32 (K,), what each map summed to before normalising; far from 1 the map
         is doubtful (warp.WarpedMaps).
+    :param sample: which sample it belongs to, from 0.
+    :param level: level of recursion, from 1, the one that is predicted from the request.
     """
 
     image: np.ndarray
     object_maps: np.ndarray
     expected_pixels: np.ndarray
     mass: np.ndarray
+    sample: int
+    level: int
 
 
 class SubgoalPredictor:
     """
-    Predict the bottleneck between a start and a goal picture.
+    Predict the bottleneck between a start and a goal picture, or one to come after the start.
 
     :ivar config: PredictorConfig.
     :ivar image_size: (height, width) of the pictures it takes.
-    :ivar num_context: pictures it is conditioned on, 2.
+    :ivar num_context: pictures it is conditioned on: 2, start and goal, or 1, the start.
+    :ivar mode: 'bidirectional' for two of them, 'forward' for one.
     :ivar training: dict saying how the weights were made.
     """
 
@@ -47,19 +52,22 @@ class SubgoalPredictor:
 
         :param network: Predictor, on the device it shall run on.
         :param training: dict saying how the weights were made.
-        :raises ConfigError: if it does not take a start and a goal picture.
+        :raises ConfigError: if it takes more than a start and a goal picture.
         """
-        if network.config.num_context != 2:
-            raise ConfigError(f'predictor: needs weights for 2 context pictures, start and goal; '
-                              f'these are for {network.config.num_context}')
+        if network.config.num_context not in (1, 2):
+            raise ConfigError('predictor: needs weights for 2 context pictures, start and goal, '
+                              f'or for 1, the start; these are for {network.config.num_context}')
         self.config = network.config
         self.num_context = network.config.num_context
+        self.mode = 'forward' if self.num_context == 1 else 'bidirectional'
         self.image_size = (network.config.image_size, network.config.image_size)
         self.training = training or {}
         self._network = network.eval().requires_grad_(False)
         self._device = next(network.parameters()).device
         blank = np.zeros((*self.image_size, 3), np.uint8)
-        self.predict(blank, blank, np.zeros((1, 2)), np.zeros((1, 2)))
+        one = np.zeros((1, 2))
+        goal = {} if self.mode == 'forward' else {'goal': blank, 'goal_pixels': one}
+        self.predict(blank, start_pixels=one, **goal)
 
     @classmethod
     def load(cls, path, device='cpu'):
@@ -74,55 +82,72 @@ class SubgoalPredictor:
         return cls(*load_network(path, device))
 
     @torch.inference_mode()
-    def predict(self, start, goal, start_pixels=None, goal_pixels=None, num_samples=1,
+    def predict(self, start, goal=None, start_pixels=None, goal_pixels=None, num_samples=1,
                 recursion_depth=1, seed=0):
         """
         Predict subgoals.
 
-        Recursive prediction (section 3.1) puts each further one between the start and the one
-        predicted before, and follows the objects through the maps.
+        In recursive prediction (section 3.1) each prediction takes the place of the last context
+        picture of the next one: of the goal, so that the next one lies between the start and it;
+        or, forward, of the start, G(G(c)), so that the next one comes after it. The objects are
+        followed through the maps.
 
         :param start: uint8 (H, W, 3).
-        :param goal: uint8 (H, W, 3).
+        :param goal: uint8 (H, W, 3); None with forward weights.
         :param start_pixels: (K, 2) object positions (u, v) in the start picture; None: K = 0.
-        :param goal_pixels: (K, 2), of the same objects in the goal picture.
-        :param num_samples: how many z to draw; weights without z predict one subgoal whatever
-            this says, for all samples would be the same.
+        :param goal_pixels: (K, 2), of the same objects in the goal picture; None with forward
+            weights.
+        :param num_samples: how many to draw, each level of each with a z of its own; weights
+            without z predict one sample whatever this says, for all would be the same.
         :param recursion_depth: how many subgoals in a row, at least 1.
         :param seed: of z.
         :return: list of Subgoal; each sample's subgoals follow each other, earliest first.
         :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
-        :raises ConfigError: if num_samples or recursion_depth is below 1.
+        :raises ConfigError: if num_samples or recursion_depth is below 1, or there is a goal
+            that the weights do not take, or none that they need.
         """
         for name, value in (('num_samples', num_samples), ('recursion_depth', recursion_depth)):
             if value < 1:
                 raise ConfigError(f'{name}: expected at least 1, got {value}')
+        pictures, pixels = self._check_context(start, goal, start_pixels, goal_pixels)
+        N = num_samples if self.config.latent_size else 1
+        generator = torch.Generator().manual_seed(seed)
+        context = to_float(pictures).to(self._device).expand(N, -1, -1, -1, -1)
+        pixels = torch.from_numpy(pixels).to(self._device)
+        maps = one_hot_maps(pixels, self.image_size).expand(N, -1, -1, -1, -1)  # N, C, K, H, W
+        levels = []
+        for level in range(1, recursion_depth + 1):
+            z = None
+            if self.config.latent_size:
+                z = torch.randn(N, self.config.latent_size, generator=generator).to(self._device)
+            prediction = self._network(context, z)
+            warped = warp_object_maps(maps, prediction.flow, prediction.masks)
+            levels.append(_to_subgoals(prediction.image, warped, level))
+            # The prediction takes the place of the last picture.
+            context = torch.cat([context[:, :-1], prediction.image.clamp(-1, 1)[:, None]], 1)
+            maps = torch.cat([maps[:, :-1], warped.maps[:, None]], 1)
+        if self.mode == 'bidirectional':
+            levels.reverse()  # each level lies before the one that it was predicted from
+        return [subgoals[n] for n in range(N) for subgoals in levels]
+
+    def _check_context(self, start, goal, start_pixels, goal_pixels):
+        """Check what a prediction is conditioned on: pictures (C, H, W, 3), pixels (C, K, 2)."""
         check_image(start, 'start', self.image_size)
-        check_image(goal, 'goal', self.image_size)
         start_pixels = check_pixels(start_pixels, 'start_pixels')
+        if self.mode == 'forward':
+            if goal is not None or goal_pixels is not None:
+                raise ConfigError('goal: these weights predict forward, from the start alone; '
+                                  'leave it out, or use weights for 2 context pictures')
+            return start[None], start_pixels[None]
+        if goal is None:
+            raise ConfigError('goal: these weights predict between a start and a goal picture; '
+                              'give one, or use weights for 1 context picture')
+        check_image(goal, 'goal', self.image_size)
         goal_pixels = check_pixels(goal_pixels, 'goal_pixels')
         if len(start_pixels) != len(goal_pixels):
             raise ImageError(f'goal_pixels: expected {len(start_pixels)} objects as in '
                              f'start_pixels, got {len(goal_pixels)}')
-        if not self.config.latent_size:
-            num_samples = 1
-        N = num_samples
-        generator = torch.Generator().manual_seed(seed)
-        images = to_float(np.stack([start, goal])).to(self._device).expand(N, -1, -1, -1, -1)
-        pixels = torch.from_numpy(np.stack([start_pixels, goal_pixels])).to(self._device)
-        maps = one_hot_maps(pixels, self.image_size).expand(N, -1, -1, -1, -1)  # N, 2, K, H, W
-        subgoals = []
-        for _ in range(recursion_depth):
-            z = None
-            if self.config.latent_size:
-                z = torch.randn(N, self.config.latent_size, generator=generator).to(self._device)
-            prediction = self._network(images, z)
-            warped = warp_object_maps(maps, prediction.flow, prediction.masks)
-            subgoals.insert(0, _to_subgoals(prediction.image, warped))
-            # The prediction is the goal of the next level.
-            images = torch.stack([images[:, 0], prediction.image.clamp(-1, 1)], 1)
-            maps = torch.stack([maps[:, 0], warped.maps], 1)
-        return [subgoals[r][n] for n in range(N) for r in range(recursion_depth)]
+        return np.stack([start, goal]), np.stack([start_pixels, goal_pixels])
 
 
 def load_network(path, device='cpu'):
@@ -164,9 +189,10 @@ def check_pixels(pixels, name):
     return pixels
 
 
-def _to_subgoals(images, warped):
-    """Turn N predictions into Subgoals."""
+def _to_subgoals(images, warped, level):
+    """Turn N predictions of one level into Subgoals."""
     images = to_uint8(images)
     maps, mass = warped.maps.cpu().numpy(), warped.mass.cpu().numpy()
     positions = expected_pixels(warped.maps).cpu().numpy()
-    return [Subgoal(*parts) for parts in zip(images, maps, positions, mass)]
+    return [Subgoal(*parts, sample=n, level=level)
+            for n, parts in enumerate(zip(images, maps, positions, mass))]

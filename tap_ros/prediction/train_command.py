@@ -6,16 +6,16 @@ import argparse
 from dataclasses import fields, MISSING
 import re
 
+from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import (
     GOAL_PICTURES,
-    METHODS,
+    POSTERIORS,
     PRECISIONS,
-    SELECTIONS,
     TrainingConfig,
 )
 
-_CHOICES = {'method': METHODS, 'selection': SELECTIONS, 'goal_picture': GOAL_PICTURES,
+_CHOICES = {'mode': MODES, 'posterior': POSTERIORS, 'goal_picture': GOAL_PICTURES,
             'precision': PRECISIONS}
 
 
@@ -40,17 +40,16 @@ def add_arguments(parser):
                                 choices=_CHOICES.get(field.name), help=about)
 
 
-def run(args, score=None):
+def run(args):
     """
     Train as the command line says, and print where the weights are.
 
     :param args: parsed arguments, of a parser that add_arguments was called with.
-    :param score: see training.train.
     :return: exit status.
     """
     values = {field.name: getattr(args, field.name) for field in fields(TrainingConfig)}
     values['recordings'] = tuple(values['recordings'])
-    print(train(TrainingConfig(**values), score=score))
+    print(train(TrainingConfig(**values)))
     return 0
 
 

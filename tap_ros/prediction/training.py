@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Training the predictor on recordings (sections 3.1 and 3.2, appendix C)."""
+"""Training the predictor on recordings (section 3, appendix C)."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -14,12 +14,23 @@ import time
 
 import numpy as np
 from tap_ros.errors import ConfigError
-from tap_ros.prediction.augmentation import Augmentation, reverse
+from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import episode_order, make_batch, split_episodes
 from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
+from tap_ros.prediction.discriminator import Discriminator
+from tap_ros.prediction.frames import MappedFrames, ResidentFrames
 from tap_ros.prediction.networks import Predictor, PredictorConfig
-from tap_ros.prediction.objective import held_out_scores, predictor_loss
+from tap_ros.prediction.objective import (
+    discriminators_loss,
+    Draws,
+    held_out_scores,
+    matched,
+    Networks,
+    predictor_loss,
+)
 from tap_ros.prediction.pictures import sample_grid
+from tap_ros.prediction.pretraining import pretrain_decoders
+from tap_ros.prediction.recognition import Recognition
 from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings
 import torch
@@ -29,7 +40,7 @@ from tqdm import tqdm
 _SHOWN = 8  # episodes in a sample picture
 
 
-def train(config, stop_at=None, score=None, progress=True):
+def train(config, stop_at=None, minutes=None, progress=True):
     """
     Train a predictor, or go on with a run that was interrupted.
 
@@ -39,8 +50,7 @@ def train(config, stop_at=None, score=None, progress=True):
 
     :param config: TrainingConfig.
     :param stop_at: stop (and save) at this step instead of the last.
-    :param score: function (network, store, episodes) -> dict of numbers, to add to the scores
-        of the held-out episodes.
+    :param minutes: stop (and save) after so many minutes; None: never.
     :param progress: whether to show a progress bar.
     :return: path of the weights file.
     :raises ConfigError: if the folder holds a run with other settings or recordings.
@@ -48,44 +58,55 @@ def train(config, stop_at=None, score=None, progress=True):
     """
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    deadline = time.monotonic() + 60 * (minutes or math.inf)
     store = open_recordings(list(config.recordings), progress=progress)
     training, held_out = split_episodes(store, config.test_fraction)
     torch.manual_seed(config.seed)
     network = Predictor(network_config(config, store.image_size))
-    state = start(network, config.learning_rate, device)
+    state = start(network, config.learning_rate, device, _helpers(config, network.config, store))
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
     load_checkpoint(checkpoint, state, asdict(config), store.data_hash)
     autocast = make_autocast(config.precision, device)
+    if config.pretrain_steps and not state.step:
+        pretrain_decoders(state.network, partial(_frames, store, training, config),
+                          config.pretrain_steps, seed=config.seed, autocast=autocast,
+                          progress=progress)
+        state.average.load_state_dict(state.network.state_dict())
+    # Decoding and copying would be most of the time of a step on a GPU.
+    frames = (ResidentFrames(store, device, progress) if device.type == 'cuda'
+              else MappedFrames(store))
     model = torch.compile(state.network) if config.compile else state.network
+    networks = Networks(model, **dict(state.helpers.items()))
     last = min(config.steps, stop_at or config.steps)
     report = partial(_report, config=config, store=store, training=training, held_out=held_out,
-                     autocast=autocast, score=score)
+                     autocast=autocast)
     bar = tqdm(total=config.steps, initial=state.step, desc=config.method, unit='step',
                disable=not progress)
     with SummaryWriter(config.out, purge_step=state.step) as curves, bar:
         began = time.monotonic() - state.seconds
-        for step, batch, augmentation in _batches(store, training, config, state.step, last):
-            for group in state.optimizer.param_groups:
-                group['lr'] = learning_rate(step, config)
-            # One step of Adam towards the matched frames.
-            state.network.train()
-            outcome = predictor_loss(
-                model, batch.to(device), augmentation.to(device), config, autocast)
-            state.optimizer.zero_grad()
-            outcome.loss.backward()
-            norm = torch.nn.utils.clip_grad_norm_(
-                state.network.parameters(), config.gradient_clip or math.inf)
-            state.optimizer.step()
+        for step, batch, augmentation in _batches(
+                store, frames, training, config, state.step, last):
+            for optimizer, highest in zip(
+                    state.optimizers, (config.learning_rate, config.discriminator_rate)):
+                for group in optimizer.param_groups:
+                    group['lr'] = learning_rate(step, config, highest)
+            batch, augmentation = batch.to(device), augmentation.to(device)
+            draws = Draws.make(batch, config.latent_size, config.seed, step)
+            outcome, norm = _step(state, networks, batch, augmentation, draws, config, autocast)
             state.update_average(config.average_decay)
             state.step = step + 1
             # Tell and save.
             bar.update()
             if state.step % config.log_every == 0:
-                _log(curves, bar, state.step, outcome, batch, norm, learning_rate(step, config))
-            if state.step % config.save_every == 0 or state.step == last:
+                _log(curves, bar, state.step, outcome, batch, norm,
+                     learning_rate(step, config, config.learning_rate))
+            late = time.monotonic() > deadline
+            if state.step % config.save_every == 0 or state.step == last or late:
                 state.seconds = time.monotonic() - began
                 save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
                 report(state, curves)
+            if late:
+                break
     return str(Path(config.out) / 'predictor.safetensors')
 
 
@@ -103,20 +124,69 @@ def network_config(config, image_size):
         raise ConfigError(f'recordings: pictures are {width}x{height} pixels, the predictor needs '
                           'square ones such as 64x64; record or crop them so')
     return PredictorConfig(image_size=height, base_width=config.base_width,
+                           num_context=1 if config.forward else 2,
+                           latent_size=config.latent_size if config.chosen.vae else 0,
                            new_pixels=config.new_pixels, flow_scale=config.flow_scale)
 
 
-def learning_rate(step, config):
+def _step(state, networks, batch, augmentation, draws, config, autocast):
+    """Do one step of the predictor, then one of the discriminators; return (Outcome, norm)."""
+    state.network.train()
+    state.helpers.train()
+    judges = [networks.discriminator, networks.posterior_discriminator]
+    for judge in filter(None, judges):
+        judge.requires_grad_(False)
+    outcome = predictor_loss(networks, batch, augmentation, config, draws, autocast)
+    state.optimizers[0].zero_grad()
+    outcome.loss.backward()
+    norm = torch.nn.utils.clip_grad_norm_(
+        state.optimizers[0].param_groups[0]['params'], config.gradient_clip or math.inf)
+    state.optimizers[0].step()
+    if outcome.judged is not None:
+        for judge in filter(None, judges):
+            judge.requires_grad_(True)
+        loss = discriminators_loss(outcome.judged, autocast)
+        state.optimizers[1].zero_grad()
+        loss.backward()
+        state.optimizers[1].step()
+        outcome.parts['discriminators'] = loss.detach()
+    return outcome, norm
+
+
+def _helpers(config, shape, store):
+    """Make the networks that the method needs for its training alone."""
+    helpers, method = {}, config.chosen
+    longest = int(store.lengths.max())
+    if method.vae:
+        images = (config.video_frames if config.posterior == 'video'
+                  else shape.num_context + 1)
+        helpers['recognition'] = Recognition(shape, images)
+    if method.gan:
+        helpers['discriminator'] = Discriminator(shape, longest - 1)
+        if method.vae:
+            helpers['posterior_discriminator'] = Discriminator(shape, longest - 1)
+    return helpers
+
+
+def _frames(store, episodes, config, step):
+    """Draw single frames of the training episodes, for the decoders' pretraining."""
+    rng = np.random.default_rng([config.seed, 3, step])
+    chosen = rng.choice(episodes, config.batch_size)
+    return np.stack([store.frames(i)[rng.integers(store.lengths[i])] for i in chosen])
+
+
+def learning_rate(step, config, highest):
     """
     Compute a step's learning rate: a linear rise, then half a cosine down to 2 %.
 
     :param step: from 0 on.
     :param config: TrainingConfig.
+    :param highest: the rate at the start, after the rise.
     :return: the rate.
     """
     rise = min(1.0, (step + 1) / (config.warmup + 1))
     fall = 0.5 + 0.5 * math.cos(math.pi * step / config.steps)
-    return config.learning_rate * rise * (0.02 + 0.98 * fall)
+    return highest * rise * (0.02 + 0.98 * fall)
 
 
 def pick_device(name):
@@ -156,16 +226,19 @@ def _cpu_has_bfloat16():
     return getattr(torch.cpu, '_is_avx512_bf16_supported', lambda: False)()
 
 
-def _batches(store, episodes, config, first, last):
+def _batches(store, frames, episodes, config, first, last):
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
+    whole = config.chosen.vae and config.posterior == 'video'
+    video_frames = config.video_frames if whole else 0
+
     def make(step):
         rng = np.random.default_rng([config.seed, 2, step])
         chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
         batch = make_batch(
-            store, chosen, config.margin, config.num_targets, config.method == 'fix',
-            config.max_frames, config.min_crop, config.goal_picture, rng)
-        if config.reverse:
-            batch = reverse(batch, torch.from_numpy(rng.random(len(chosen)) < 0.5))
+            store, chosen, config.margin, config.num_targets, config.chosen.fraction,
+            config.max_frames, config.min_crop, config.goal_picture, config.forward,
+            num_others=int(config.chosen.gan), video_frames=video_frames, frames=frames,
+            rng=rng)
         return step, batch, Augmentation.draw(
             len(chosen), config.flip, config.colour, config.brightness, rng)
 
@@ -179,38 +252,37 @@ def _batches(store, episodes, config, first, last):
 
 def _log(curves, bar, step, outcome, batch, norm, rate):
     """Add a point to the curves and to the progress bar."""
-    fraction = batch.times.gather(1, outcome.match.cpu()[:, None]) / batch.end
+    fraction = batch.times.gather(1, outcome.match[:, None]) / batch.end
     loss = outcome.loss.item()
     for name, value in (('loss', loss), ('gradient_norm', norm.item()), ('learning_rate', rate),
                         ('match_fraction', fraction.mean().item()),
                         ('match_fraction_std', fraction.std(correction=0).item())):
         curves.add_scalar(f'train/{name}', value, step)
+    for name, value in outcome.parts.items():
+        curves.add_scalar(f'train/loss_{name}', value.item(), step)
     bar.set_postfix(loss=f'{loss:.4f}', match=f'{fraction.mean().item():.2f}')
 
 
-def _report(state, curves, config, store, training, held_out, autocast, score):
+def _report(state, curves, config, store, training, held_out, autocast):
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
     device = next(state.average.parameters()).device
 
     def batch(episodes):
         goal_picture = 'recorded' if config.goal_picture == 'recorded' else 'last'
-        return make_batch(store, episodes, config.margin, middle=config.method == 'fix',
-                          goal_picture=goal_picture).to(device)
+        return make_batch(store, episodes, config.margin, fraction=config.chosen.fraction,
+                          goal_picture=goal_picture, forward=config.forward).to(device)
 
     scores = {}
     if len(held_out):
         parts = (batch(held_out[i:i + 64]) for i in range(0, len(held_out), 64))
         scores = held_out_scores(state.average, parts, config, autocast)
-        if score is not None:
-            scores |= score(state.average, store, held_out)
     for name, value in scores.items():
         curves.add_scalar(f'held_out/{name}', value, state.step)
     for name, episodes in (('training', training[:_SHOWN]), ('held_out', held_out[:_SHOWN])):
         if len(episodes):
             shown = batch(episodes)
-            with torch.no_grad():
-                outcome = predictor_loss(state.average, shown, None, config, autocast)
-            curves.add_image(name, sample_grid(shown, outcome), state.step, dataformats='HWC')
+            picture = sample_grid(shown, *matched(state.average, shown, config, autocast))
+            curves.add_image(name, picture, state.step, dataformats='HWC')
     about = {
         'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
         'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),

@@ -3,11 +3,12 @@
 """The settings of a training run of the predictor."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from tap_ros.errors import ConfigError
+from tap_ros.prediction.methods import MODES, parse_method
 
-METHODS = ('fix', 'min', 'genmin')
-SELECTIONS = ('time_preference', 'relative_to_copying')
+POSTERIORS = ('video', 'frame')
 GOAL_PICTURES = ('last', 'recorded', 'mixed')
 PRECISIONS = ('auto', 'float32', 'bfloat16')
 
@@ -19,9 +20,11 @@ class TrainingConfig:
 
     :param recordings: .mcap files, bag folders, or folders of these.
     :param out: the run's folder; if it holds a checkpoint, training goes on from there.
-    :param method: 'fix' (Eq. 1, the middle frame), 'min' (Eq. 2) or 'genmin' (Eq. 5).
-    :param selection: genmin's selection error, 'time_preference' (the paper's E_t / w(t)) or
-        'relative_to_copying' (E_t / (d_t w(t)), losses.relative_to_copying).
+    :param mode: 'bidirectional', from start and goal, or 'forward', from the start alone.
+    :param method: 'fix' (Eq. 1), 'min' (Eq. 2) or 'genmin' (Eq. 5), as the paper names them: with
+        l1 and GAN; fix0.25 with its target at a quarter of the episode, genmin2 with beta = 2
+        (forward); -wo-gan is l1 alone, -vae adds z (Eq. 9), -vae-gan both (Eq. 10). +relative
+        selects by the error relative to copying, +reach by the cost of reaching (losses.py).
     :param bell_edge: w at both ends of the targets; 2/3 in the paper.
     :param margin: frames left out of the targets next to each context picture.
     :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
@@ -30,19 +33,29 @@ class TrainingConfig:
     :param min_crop: cut episodes to a random piece of at least this share; 1: never.
     :param goal_picture: the goal picture is the episode's 'last' frame; the 'recorded' goal
         where the episode reached it; or 'mixed', one or the other at random.
+    :param recursion: levels of Eq. 3; 1: none. The GAN's and the VAE's terms stand at the first.
+    :param pretrain_steps: steps of training the decoders as a frame generator first, at a rate of
+        1e-4 (appendix C).
+    :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
+    :param kl_weight: of the KL divergence beside it.
+    :param latent_size: length of z, for the methods that have it.
+    :param video_frames: the recognition network sees the video at so many moments; the paper: all.
+    :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
+        B, slow: choose a small num_targets).
     :param new_pixels: whether the network may paint; object maps are best without.
     :param base_width: the network's width; 32 in the paper.
     :param flow_scale: see PredictorConfig.
     :param steps: length of the training, and of the cosine schedule of the learning rate.
     :param batch_size: 64 in the paper.
-    :param learning_rate: at the start; Adam. 1e-4 in the paper, for 200 epochs.
+    :param learning_rate: at the start; Adam (beta1 is 0.5 with a GAN, else 0.9). 1e-4 in the
+        paper, for 200 epochs.
+    :param discriminator_rate: the discriminators' learning rate at the start.
     :param warmup: steps over which the learning rate rises.
     :param gradient_clip: largest norm of the gradient; 0: any.
     :param average_decay: of the exponential moving average that is shipped; 0: none.
     :param flip: mirror half of the episodes.
     :param colour: permute the colour channels of each episode.
     :param brightness: change each channel's brightness by up to this share.
-    :param reverse: play half of the episodes backwards.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, batches and augmentation.
     :param device: 'auto', 'cpu', 'cuda'.
@@ -55,8 +68,8 @@ class TrainingConfig:
 
     recordings: tuple[str, ...]
     out: str
-    method: str = 'genmin'
-    selection: str = 'relative_to_copying'
+    mode: str = 'bidirectional'
+    method: str = 'genmin-wo-gan+relative'
     bell_edge: float = 2 / 3
     margin: int = 3
     outer_power: float = 0.5
@@ -64,19 +77,26 @@ class TrainingConfig:
     max_frames: int = 0
     min_crop: float = 1.0
     goal_picture: str = 'mixed'
+    recursion: int = 1
+    pretrain_steps: int = 0
+    gan_weight: float = 5e-4
+    kl_weight: float = 1e-4
+    latent_size: int = 32
+    video_frames: int = 16
+    posterior: str = 'video'
     new_pixels: bool = False
     base_width: int = 16
     flow_scale: float = 16.0
     steps: int = 5000
     batch_size: int = 32
     learning_rate: float = 1e-3
+    discriminator_rate: float = 2e-4
     warmup: int = 100
     gradient_clip: float = 1.0
     average_decay: float = 0.999
     flip: bool = True
     colour: bool = True
     brightness: float = 0.2
-    reverse: bool = False
     test_fraction: float = 0.05
     seed: int = 0
     device: str = 'auto'
@@ -90,15 +110,18 @@ class TrainingConfig:
         """Refuse settings that cannot be trained with."""
         if not self.recordings:
             raise ConfigError('recordings: expected at least one .mcap file or bag folder')
-        for name, choices in (('method', METHODS), ('selection', SELECTIONS),
-                              ('goal_picture', GOAL_PICTURES), ('precision', PRECISIONS)):
+        for name, choices in (('mode', MODES), ('goal_picture', GOAL_PICTURES),
+                              ('posterior', POSTERIORS), ('precision', PRECISIONS)):
             if getattr(self, name) not in choices:
                 raise ConfigError(f'{name}: expected one of {", ".join(choices)}, '
                                   f'got {getattr(self, name)!r}')
-        for name in ('steps', 'batch_size', 'base_width', 'log_every', 'save_every'):
+        self._check_method()
+        for name in ('steps', 'batch_size', 'base_width', 'log_every', 'save_every',
+                     'latent_size', 'recursion', 'video_frames'):
             if getattr(self, name) < 1:
                 raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
-        for name in ('margin', 'num_targets', 'max_frames', 'warmup', 'threads'):
+        for name in ('margin', 'num_targets', 'max_frames', 'warmup', 'threads',
+                     'pretrain_steps', 'gan_weight', 'kl_weight'):
             if getattr(self, name) < 0:
                 raise ConfigError(f'{name}: expected 0 or more, got {getattr(self, name)}')
         if 0 < self.max_frames < 3:
@@ -109,3 +132,26 @@ class TrainingConfig:
                                 ('average_decay', 0, 0.99999)):
             if not low <= getattr(self, name) <= high:
                 raise ConfigError(f'{name}: expected {low}..{high}, got {getattr(self, name)}')
+
+    def _check_method(self):
+        """Refuse methods that are unknown or do not go with the other settings."""
+        method = self.chosen
+        if method.beta is not None and not self.forward:
+            raise ConfigError(f'method: {method.name} has the linear preference of forward '
+                              "prediction; give --mode forward, or 'genmin'")
+        if self.recursion > 1 and method.loss == 'fix':
+            raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
+                              f'method {method.name}')
+        if self.posterior == 'frame' and (method.gan or self.recursion > 1):
+            raise ConfigError("posterior: 'frame' goes with a -vae method without GAN and without "
+                              'recursion')
+
+    @cached_property
+    def chosen(self):
+        """The Method that `method` names."""
+        return parse_method(self.method)
+
+    @property
+    def forward(self):
+        """Whether the start picture is all of the context."""
+        return self.mode == 'forward'

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.errors import RecordingError
-from tap_ros.prediction.augmentation import Augmentation, reverse
+from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import (
     episode_order,
     make_batch,
@@ -15,6 +15,7 @@ from tap_ros.prediction.batches import (
     target_times,
     uses_recorded_goal,
 )
+from tap_ros.prediction.frames import ResidentFrames
 from tap_ros.recording.cache import open_recordings
 import torch
 
@@ -43,6 +44,20 @@ def test_margins_leave_at_least_one_target(end, margin, expected):
     assert target_times(end, margin) == expected
 
 
+@pytest.mark.parametrize('end, margin, expected', [
+    (14, 0, (1, 14)), (14, 3, (4, 14)), (2, 5, (2, 2))])
+def test_forward_targets_are_all_later_frames(end, margin, expected):
+    assert target_times(end, margin, forward=True) == expected
+
+
+def test_forward_context_is_the_start_alone(store):
+    batch = make_batch(store, [0, 3], forward=True)
+    for b, i in enumerate([0, 3]):
+        frames = store.frames(i)
+        assert np.array_equal(batch.context[b], frames[:1])
+        assert np.array_equal(batch.targets[b][batch.valid[b]], frames[1:])
+
+
 def test_few_targets_are_drawn_without_repetition(store):
     batch = make_batch(store, [4] * 20, num_targets=3, rng=np.random.default_rng(0))
     assert batch.targets.shape[1] == 3
@@ -51,9 +66,33 @@ def test_few_targets_are_drawn_without_repetition(store):
 
 
 def test_middle_frame_alone_for_fixed_time(store):
-    batch = make_batch(store, [0, 1], middle=True)
+    batch = make_batch(store, [0, 1], fraction=0.5)
     assert batch.times.tolist() == [[3], [4]]
     assert np.array_equal(batch.targets[0, 0], store.frames(0)[3])
+
+
+def test_fixed_time_is_a_share_of_the_episode(store):
+    end = store.lengths[4] - 1
+    for fraction, expected in ((0.01, 1), (0.25, int(0.25 * end + 0.5)), (1.0, end)):
+        batch = make_batch(store, [4], fraction=fraction, forward=True)
+        assert batch.times.tolist() == [[expected]]
+    assert make_batch(store, [4], fraction=1.0).times.tolist() == [[end - 1]]
+
+
+def test_others_beside_the_fixed_frame_are_other_targets(store):
+    batch = make_batch(store, [4] * 30, fraction=0.5, num_others=1, rng=np.random.default_rng(0))
+    assert (batch.times[:, 0] == (store.lengths[4]) // 2).all()
+    assert (batch.times[:, 1] != batch.times[:, 0]).all() and batch.valid.all()
+    assert len(batch.times[:, 1].unique()) > 3
+    for b in range(30):
+        assert np.array_equal(batch.targets[b, 1], store.frames(4)[batch.times[b, 1]])
+
+
+def test_the_video_is_the_whole_episode(store):
+    batch = make_batch(store, [0, 4], margin=2, num_targets=2, video_frames=7)
+    assert np.array_equal(batch.video[0], store.frames(0))  # 7 frames
+    assert len(store.frames(4)) == 11
+    assert np.array_equal(batch.video[1], store.frames(4)[[0, 2, 3, 5, 7, 8, 10]])
 
 
 def test_pieces_of_episodes_are_pieces(store):
@@ -141,11 +180,13 @@ def test_all_pictures_of_an_episode_change_alike():
     assert changed[:, 0].equal(changed[:, 2])
 
 
-def test_reversed_episodes_run_from_goal_to_start(store):
-    batch = make_batch(store, [0, 1])
-    backwards = reverse(batch, torch.tensor([True, False]))
-    assert backwards.context[0].equal(batch.context[0].flip(0))
-    assert backwards.context[1].equal(batch.context[1])
-    times = backwards.times[0][batch.valid[0]]
-    assert times.tolist() == [5, 4, 3, 2, 1]
-    assert backwards.times[1].equal(batch.times[1])
+def test_resident_frames_are_the_mapped_ones(store):
+    resident = ResidentFrames(store, 'cpu')
+    for forward in (False, True):
+        settings = {'goal_picture': 'mixed', 'video_frames': 12, 'min_crop': 0.5,
+                    'forward': forward}
+        mapped, gathered = (
+            make_batch(store, range(12), frames=frames, rng=np.random.default_rng(1), **settings)
+            for frames in (None, resident))
+        for name, values in vars(mapped).items():
+            assert values.equal(getattr(gathered, name)), name

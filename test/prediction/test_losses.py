@@ -7,6 +7,7 @@ import math
 import pytest
 from tap_ros.prediction.losses import (
     bell_preference,
+    cost_of_reaching,
     fixed_time_loss,
     generalized_minimum_loss,
     l1_error,
@@ -14,8 +15,11 @@ from tap_ros.prediction.losses import (
     linear_preference,
     match_step,
     minimum_loss,
+    path_length,
     preferred_error,
+    recursive_loss,
     relative_to_copying,
+    remaining_targets,
 )
 import torch
 
@@ -137,3 +141,36 @@ def test_copying_is_worth_the_same_everywhere():
 def test_a_frame_equal_to_the_context_does_not_break_the_choice():
     copy_error, error = torch.zeros(1, 2, 3), torch.tensor([[0.0, 0.1, 0.2]])
     assert relative_to_copying(error, copy_error, torch.ones(1, 3)).isfinite().all()
+
+
+def test_recursion_sums_levels_over_all_episodes():
+    # 4 episodes with loss 1, of which 1 has targets left, with loss 2: (4 * 1 + 1 * 2) / 4.
+    assert recursive_loss([torch.tensor(1.0), torch.tensor(2.0)], [4, 1]) == 1.5
+    assert recursive_loss([torch.tensor(1.0)], [4]) == 1
+
+
+def test_targets_of_the_next_level_lie_beyond_the_match():
+    times = torch.arange(1, 7).expand(2, 6)
+    valid = torch.tensor([[True] * 6, [True] * 4 + [False] * 2])
+    matched = torch.tensor([[5], [2]])
+    after = remaining_targets(valid, times, matched, forward=True)
+    before = remaining_targets(valid, times, matched, forward=False)
+    assert [row.nonzero().flatten().add(1).tolist() for row in after] == [[6], [3, 4]]
+    assert [row.nonzero().flatten().add(1).tolist() for row in before] == [[1, 2, 3, 4], [1]]
+
+
+def test_the_way_grows_from_0_to_1_and_stands_where_nothing_changes():
+    frames = torch.zeros(1, 6, 4, 4, 3, dtype=torch.uint8)
+    for t, value in enumerate([0, 100, 100, 0, 100, 200]):
+        frames[:, t] = value
+    length = path_length(frames[:, 0], frames[:, 1:])
+    assert torch.allclose(length, torch.tensor([[0.25, 0.25, 0.5, 0.75, 1.0]]))
+    assert path_length(frames[:, 0], frames[:, :1]).tolist() == [[0.0]]
+
+
+def test_cheap_states_are_preferred_and_weight_0_prefers_none(error):
+    cost, preference = torch.linspace(0, 1, 9).expand(6, 9), torch.ones(6, 9)
+    assert cost_of_reaching(error, cost, preference, 0).equal(preferred_error(error, preference))
+    same = torch.full((1, 9), 0.3)
+    assert match_step(cost_of_reaching(same, cost[:1], preference[:1])).item() == 0
+    assert match_step(cost_of_reaching(same, 1 - cost[:1], preference[:1])).item() == 8

@@ -11,7 +11,13 @@ from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import l1_error, minimum_loss
 from tap_ros.prediction.networks import Prediction
-from tap_ros.prediction.objective import held_out_scores, predictor_loss
+from tap_ros.prediction.objective import (
+    discriminators_loss,
+    Draws,
+    held_out_scores,
+    Networks,
+    predictor_loss,
+)
 from tap_ros.prediction.training_config import TrainingConfig
 import torch
 
@@ -27,8 +33,12 @@ class Showing(torch.nn.Module):
         if augmentation:
             self.image = augmentation.apply(self.image)
 
-    def forward(self, context):
+    def forward(self, context, z=None):
         return Prediction(self.image[:, 0], None, None, None)
+
+
+def showing(image, augmentation=None):
+    return Networks(Showing(image, augmentation))
 
 
 def make_batch(B=4, T=6, padded=0, seed=0):
@@ -40,13 +50,12 @@ def make_batch(B=4, T=6, padded=0, seed=0):
                  column * (T + 1), times <= T - padded)
 
 
-@pytest.mark.parametrize('method, selection', [
-    ('min', 'time_preference'), ('genmin', 'time_preference'),
-    ('genmin', 'relative_to_copying')])
-def test_a_perfect_prediction_is_matched_at_no_loss(method, selection):
+@pytest.mark.parametrize('method', [
+    'min-wo-gan', 'genmin-wo-gan', 'genmin-wo-gan+relative', 'genmin-wo-gan+reach'])
+def test_a_perfect_prediction_is_matched_at_no_loss(method):
     batch = make_batch()
-    config = replace(CONFIG, method=method, selection=selection)
-    outcome = predictor_loss(Showing(to_float(batch.targets[:, 2])), batch, None, config)
+    config = replace(CONFIG, method=method)
+    outcome = predictor_loss(showing(to_float(batch.targets[:, 2])), batch, None, config)
     assert outcome.match.tolist() == [2] * 4
     assert outcome.loss.item() == pytest.approx(0, abs=1e-6)
 
@@ -54,14 +63,14 @@ def test_a_perfect_prediction_is_matched_at_no_loss(method, selection):
 def test_min_is_eq_2():
     batch = make_batch()
     image = to_float(batch.context).mean(1)
-    outcome = predictor_loss(Showing(image), batch, None, replace(CONFIG, method='min'))
+    outcome = predictor_loss(showing(image), batch, None, replace(CONFIG, method='min-wo-gan'))
     errors = l1_error(image[:, None], to_float(batch.targets))
     assert outcome.loss.item() == pytest.approx(minimum_loss(errors).item(), abs=1e-6)
 
 
 def test_padding_is_never_matched():
     batch = make_batch(padded=3)
-    outcome = predictor_loss(Showing(to_float(batch.targets[:, 4])), batch, None, CONFIG)
+    outcome = predictor_loss(showing(to_float(batch.targets[:, 4])), batch, None, CONFIG)
     assert outcome.match.max() <= 2 and outcome.loss > 0.1
 
 
@@ -69,10 +78,10 @@ def test_augmentation_does_not_change_the_choice():
     batch = make_batch(B=16)
     image = to_float(batch.targets).mean(1)
     augmentation = Augmentation.draw(16, True, True, 0.2, np.random.default_rng(0))
-    plain = predictor_loss(Showing(image), batch, None, CONFIG)
-    changed = predictor_loss(Showing(image, augmentation), batch, augmentation, CONFIG)
+    plain = predictor_loss(showing(image), batch, None, CONFIG)
+    changed = predictor_loss(showing(image, augmentation), batch, augmentation, CONFIG)
     assert changed.match.equal(plain.match)
-    perfect = Showing(to_float(batch.targets[:, 3]), augmentation)
+    perfect = showing(to_float(batch.targets[:, 3]), augmentation)
     assert predictor_loss(perfect, batch, augmentation, CONFIG).loss < 1e-6
 
 
@@ -83,9 +92,9 @@ def test_a_concave_outer_error_prefers_either_bottleneck_to_their_blend():
     blend = (first + second) / 2
 
     def loss(image, power):
-        config = replace(CONFIG, method='fix', outer_power=power)
+        config = replace(CONFIG, method='fix-wo-gan', outer_power=power)
         return predictor_loss(
-            Showing(image.expand(2, -1, -1, -1)), batch, None, config).loss.item()
+            showing(image.expand(2, -1, -1, -1)), batch, None, config).loss.item()
 
     assert loss(first, 1.0) == pytest.approx(loss(blend, 1.0), rel=1e-5)
     assert loss(first, 0.5) == pytest.approx(loss(second, 0.5), rel=1e-5)
@@ -97,7 +106,7 @@ def test_held_out_scores_are_means_over_episodes():
     shown = torch.cat([to_float(batch.targets[:, 2]) for batch in batches])
 
     class Next(torch.nn.Module):
-        def forward(self, context):
+        def forward(self, context, z=None):
             nonlocal shown
             image, shown = shown[:len(context)], shown[len(context):]
             return Prediction(image, None, None, None)
@@ -106,3 +115,104 @@ def test_held_out_scores_are_means_over_episodes():
     assert scores['loss'] == pytest.approx(0, abs=1e-6)
     assert scores['match_fraction'] == pytest.approx(3 / 7)
     assert scores['match_fraction_std'] == pytest.approx(0, abs=1e-6)
+
+
+def test_any_callable_can_select():
+    batch = make_batch()
+
+    def latest(error, copy_error, batch, config):
+        return -batch.times.float()
+
+    outcome = predictor_loss(
+        showing(to_float(batch.targets[:, 1])), batch, None, CONFIG, selection=latest)
+    assert outcome.match.tolist() == [5] * 4 and outcome.loss > 0.1
+
+
+def test_forward_genmin_prefers_later_frames_the_more_the_smaller_beta():
+    batch = make_batch(B=32)
+    frames = to_float(batch.targets)
+    image = 0.6 * frames[:, 0] + 0.4 * frames[:, 5]
+    steps = []
+    for method in ('genmin0.5-wo-gan', 'genmin30-wo-gan', 'min-wo-gan'):
+        config = replace(CONFIG, method=method, mode='forward')
+        steps.append(predictor_loss(showing(image), batch, None, config).match.unique().tolist())
+    assert steps == [[5], [0], [0]]
+
+
+class Judge(torch.nn.Module):
+    """A discriminator that sees how bright a picture is."""
+
+    def __init__(self, num_times):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(num_times))
+
+    def forward(self, context, image):
+        return image.mean((1, 2, 3))[:, None] * self.weight
+
+
+def test_gan_terms_stand_at_the_matched_time():
+    batch = make_batch()
+    config = replace(CONFIG, method='genmin', gan_weight=1.0)
+    image = to_float(batch.targets[:, 2]).requires_grad_()
+    networks = Networks(Showing(image), discriminator=Judge(7))
+    outcome = predictor_loss(networks, batch, None, config, Draws.make(batch, 3, 0, 0))
+    logits = image.mean((1, 2, 3))
+    expected = torch.nn.functional.softplus(-logits).mean()
+    assert outcome.parts['gan'].item() == pytest.approx(expected.item(), rel=1e-5)
+    assert outcome.judged['step'].tolist() == [2] * 4  # index of time 3
+    assert (outcome.judged['other_step'] != outcome.judged['step']).all()
+    frames = to_float(batch.targets)
+    assert outcome.judged['real'].equal(frames[:, 2])
+    for b, step in enumerate(outcome.judged['other_step'].tolist()):
+        assert outcome.judged['other'][b].equal(frames[b, step])
+    outcome.loss.backward()
+    assert image.grad.abs().sum() > 0
+    before = image.grad.clone()
+    discriminators_loss(outcome.judged).backward()
+    assert image.grad.equal(before)  # the discriminators' loss does not reach the predictor
+    assert networks.discriminator.weight.grad.nonzero().flatten().tolist() == [2]
+
+
+class Moving(torch.nn.Module):
+    """Predicts one target after the other."""
+
+    def __init__(self, *images):
+        super().__init__()
+        self.images, self.contexts = list(images), []
+
+    def forward(self, context, z=None):
+        self.contexts.append(context)
+        return Prediction(self.images[len(self.contexts) - 1], None, None, None)
+
+
+@pytest.mark.parametrize('mode, second, expected', [
+    ('forward', 4, 4), ('bidirectional', 0, 0)])
+def test_recursion_goes_on_from_its_own_prediction(mode, second, expected):
+    batch = make_batch()
+    config = replace(CONFIG, method='min-wo-gan', mode=mode, recursion=2)
+    frames = to_float(batch.targets)
+    network = Moving(frames[:, 2], frames[:, second])
+    assert predictor_loss(Networks(network), batch, None, config).loss < 1e-6
+    assert network.contexts[1][:, -1].equal(frames[:, 2])
+    if mode == 'bidirectional':
+        assert network.contexts[1][:, 0].equal(to_float(batch.context[:, 0]))
+    # A frame on the other side is no target of the second level.
+    wrong = Moving(frames[:, 2], frames[:, 4 - second])
+    assert predictor_loss(Networks(wrong), batch, None, config).loss > 0.1
+
+
+def test_recursion_ends_where_no_target_is_left():
+    batch = make_batch()
+    config = replace(CONFIG, method='min-wo-gan', recursion=3)
+    frames = to_float(batch.targets)
+    network = Moving(frames[:, 0], frames[:, 3], frames[:, 3])
+    assert predictor_loss(Networks(network), batch, None, config).loss < 1e-6
+
+
+def test_draws_are_those_of_the_step():
+    batch = make_batch()
+    first, again = Draws.make(batch, 8, 3, 5), Draws.make(batch, 8, 3, 5)
+    other = Draws.make(batch, 8, 3, 6)
+    assert first.prior.equal(again.prior) and first.other.equal(again.other)
+    assert not first.prior.equal(other.prior)
+    assert not first.prior.equal(first.posterior[:, 0])
