@@ -1,0 +1,318 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Records of the BAIR data set, written here byte by byte, arrive as recordings."""
+
+from argparse import ArgumentParser
+from functools import cache
+import struct
+
+import cv2
+import numpy as np
+import pytest
+from tap_ros.errors import RecordingError
+from tap_ros.evaluation.prediction import evaluate
+from tap_ros.prediction.batches import make_batch, split_episodes
+from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.recording.bair import add_arguments, find_shards, import_bair
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.tfrecord import parse_example, read_records
+
+
+def remainder(byte):
+    """Divide one byte by the polynomial of CRC-32C (RFC 3720), bit by bit."""
+    for _ in range(8):
+        byte = byte >> 1 ^ (0x82f63b78 if byte & 1 else 0)
+    return byte
+
+
+REMAINDERS = [remainder(byte) for byte in range(256)]
+
+
+@cache  # most tests write the same records
+def crc32c(data):
+    crc = 0xffffffff
+    for byte in data:
+        crc = crc >> 8 ^ REMAINDERS[(crc ^ byte) & 0xff]
+    return crc ^ 0xffffffff
+
+
+def masked(data):
+    crc = crc32c(data)
+    return struct.pack('<I', ((crc >> 15 | crc << 17 & 0xffffffff) + 0xa282ead8) % 2**32)
+
+
+def frame_record(data):
+    length = struct.pack('<Q', len(data))
+    return length + masked(length) + data + masked(data)
+
+
+def varint(value):
+    result = b''
+    while value > 127:
+        result += bytes([value & 127 | 128])
+        value >>= 7
+    return result + bytes([value])
+
+
+def field(number, data):
+    return varint(number << 3 | 2) + varint(len(data)) + data
+
+
+def feature(value):
+    """Encode bytes as a BytesList, numbers as a packed FloatList."""
+    if isinstance(value, bytes):
+        return field(1, field(1, value))
+    return field(2, field(1, struct.pack(f'<{len(value)}f', *value)))
+
+
+def example(features):
+    entries = (field(1, field(1, name.encode()) + field(2, feature(value)))
+               for name, value in features.items())
+    return field(1, b''.join(entries))
+
+
+def make_features(seed, camera='image_aux1', frames=30, size=64):
+    """Make up a record: {name: bytes or numbers}, and what it should become."""
+    random = np.random.default_rng(seed)
+    images = random.integers(0, 256, (frames, size, size, 3), np.uint8)
+    positions = random.normal(size=(frames, 3)).astype(np.float32)
+    actions = random.normal(size=(frames, 4)).astype(np.float32)
+    features = {}
+    for t in range(frames):
+        features[f'{t}/action'] = actions[t].tolist()
+        features[f'{t}/{camera}/encoded'] = images[t].tobytes()
+        features[f'{t}/endeffector_pos'] = positions[t].tolist()
+    return features, (images, positions, actions)
+
+
+def write_file(folder, first, records, count=None):
+    """Write a file of the data set from {name: value} of each record."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f'traj_{first}_to_{first + (count or len(records)) - 1}.tfrecords'
+    path.write_bytes(b''.join(frame_record(example(record)) for record in records))
+    return path
+
+
+def refused(path, out):
+    with pytest.raises(RecordingError) as error:
+        import_bair([path], out, progress=False)
+    return str(error.value)
+
+
+@pytest.fixture
+def made():
+    return [make_features(seed) for seed in range(5)]
+
+
+@pytest.fixture
+def data_set(tmp_path, made):
+    """Lay out five records as the data set does: 0 to 1 and 2 to 3 for training, 0 to test."""
+    folder = tmp_path / 'softmotion30_44k'
+    features = [record for record, _ in made]
+    write_file(folder / 'train', 0, features[:2])
+    write_file(folder / 'train', 2, features[2:4])
+    write_file(folder / 'test', 0, features[4:])
+    return folder
+
+
+def assert_is(episode, expected):
+    images, positions, actions = expected
+    np.testing.assert_array_equal(episode.frames, images)
+    np.testing.assert_array_equal(episode.grippers[:, :3], positions)
+    assert np.isnan(episode.grippers[:, 3]).all()
+    np.testing.assert_array_equal(episode.actions[:-1], actions[:-1])
+    assert not episode.actions[-1].any()
+
+
+def test_the_crc_of_this_test_is_the_published_one():
+    assert crc32c(b'123456789') == 0xe3069283
+
+
+def test_every_pixel_action_and_position_arrives(tmp_path, data_set, made):
+    out = tmp_path / 'bair'
+    assert import_bair([data_set], out, progress=False) == 5
+    assert sorted(p.relative_to(out).as_posix() for p in out.rglob('*.mcap')) == [
+        'test/test_0.mcap', 'train/train_0.mcap', 'train/train_2.mcap']
+    train, test = open_recordings(out / 'train'), open_recordings(out / 'test')
+    assert (len(train), len(test)) == (4, 1)
+    for i, episode in enumerate([*(train[i] for i in range(4)), test[0]]):
+        assert_is(episode, made[i][1])
+        assert (episode.task, episode.object_names, episode.goal_frame) == ('bair', (), None)
+        assert (np.diff(episode.stamps) > 0).all()
+
+
+def test_train_and_test_do_not_share_seeds(tmp_path, data_set):
+    import_bair([data_set], tmp_path / 'bair', progress=False)
+    store = open_recordings(tmp_path / 'bair')
+    seeds = [store[i].seed for i in range(len(store))]
+    assert sorted(seeds) == [0, 1, 2, 3, 1_000_000]
+    kept, held_out = split_episodes(store, 0.5)
+    assert sorted([*kept, *held_out]) == list(range(5))
+
+
+def test_the_order_of_keys_does_not_matter(tmp_path):
+    features, expected = make_features(1)
+    path = write_file(tmp_path, 0, [dict(sorted(features.items(), reverse=True))])
+    import_bair([path], tmp_path / 'bair', progress=False)
+    assert_is(open_recordings(tmp_path / 'bair')[0], expected)
+
+
+def test_the_other_camera_is_taken_where_it_is_the_only_one(tmp_path):
+    features, expected = make_features(1, camera='image_view0')
+    path = write_file(tmp_path, 0, [features])
+    import_bair([path], tmp_path / 'bair', progress=False)
+    assert_is(open_recordings(tmp_path / 'bair')[0], expected)
+
+
+def test_aux1_comes_before_the_other_cameras(tmp_path):
+    features, expected = make_features(1)
+    for camera in ('image_view0', 'image_main'):
+        others, _ = make_features(2, camera=camera)
+        features = {**others, **features}
+    path = write_file(tmp_path, 0, [features])
+    import_bair([path], tmp_path / 'bair', progress=False)
+    np.testing.assert_array_equal(open_recordings(tmp_path / 'bair')[0].frames, expected[0])
+
+
+def test_compressed_pictures_are_decoded(tmp_path):
+    features, expected = make_features(1)
+    for t, image in enumerate(expected[0]):
+        png = cv2.imencode('.png', image[..., ::-1])[1].tobytes()
+        features[f'{t}/image_aux1/encoded'] = png
+    import_bair([write_file(tmp_path, 0, [features])], tmp_path / 'bair', progress=False)
+    assert_is(open_recordings(tmp_path / 'bair')[0], expected)
+
+
+def test_numbers_that_are_not_packed_are_read_too():
+    numbers = b''.join(b'\x0d' + struct.pack('<f', x) for x in (1.5, -2))
+    entry = field(1, b'x') + field(2, field(2, numbers))
+    np.testing.assert_array_equal(parse_example(field(1, field(1, entry)))['x'], [1.5, -2])
+
+
+@pytest.mark.parametrize('damage', ['length', 'length crc', 'data', 'data crc'])
+def test_a_damaged_record_is_named_and_what_came_before_stays(tmp_path, data_set, made, damage):
+    path = data_set / 'train' / 'traj_2_to_3.tfrecords'
+    data = bytearray(path.read_bytes())
+    start = len(data) // 2  # of the second record: both are equally long
+    data[{'length': start, 'length crc': start + 9, 'data': start + 5000, 'data crc': -1}[
+        damage]] ^= 16
+    path.write_bytes(data)
+    assert 'traj_2_to_3.tfrecords: record 1 is damaged' in refused(data_set, tmp_path / 'bair')
+    store = open_recordings(tmp_path / 'bair')
+    assert len(store) == 2
+    assert_is(store[1], made[1][1])
+    assert sorted(p.name for p in (tmp_path / 'bair' / 'train').iterdir()) == [
+        'metadata.yaml', 'train_0.mcap']
+
+
+@pytest.mark.parametrize('kept', [3, 11, 12, 100_000, -5, -1])
+def test_a_file_that_is_cut_off_is_named(tmp_path, kept):
+    features, _ = make_features(1)
+    path = write_file(tmp_path, 0, [features, features])
+    data = path.read_bytes()
+    path.write_bytes(data[:len(data) // 2 + kept if kept > 0 else kept])
+    assert f'{path}: record 1 is cut off' in refused(path, tmp_path / 'bair')
+
+
+def test_a_file_with_fewer_or_more_records_than_its_name_says_is_refused(tmp_path):
+    features, _ = make_features(1)
+    fewer = write_file(tmp_path / 'a', 0, [features], count=2)
+    assert 'holds 2 records, but there are 1' in refused(fewer, tmp_path / 'bair')
+    more = write_file(tmp_path / 'b', 0, [features, features], count=1)
+    assert 'holds 1 records, but there are more' in refused(more, tmp_path / 'bair')
+    assert not list((tmp_path / 'bair').rglob('*.mcap*'))
+
+
+@pytest.mark.parametrize('name', ['17/action', '0/endeffector_pos', '29/image_aux1/encoded',
+                                  '0/image_aux1/encoded'])
+def test_a_missing_key_is_named(tmp_path, name):
+    features, _ = make_features(1)
+    del features[name]
+    path = write_file(tmp_path, 0, [make_features(2)[0], features])
+    text = refused(path, tmp_path / 'bair')
+    assert f'{path}: record 1' in text and f'lacks {name}' in text
+
+
+@pytest.mark.parametrize('changes, expected', [
+    ({'size': 32}, '0/image_aux1/encoded has 3072 bytes'),
+    ({'frames': 29}, 'lacks 29/image_aux1/encoded'), ({'frames': 31}, 'more than 30 frames')])
+def test_other_sizes_and_lengths_are_refused(tmp_path, changes, expected):
+    path = write_file(tmp_path, 0, [make_features(1, **changes)[0]])
+    text = refused(path, tmp_path / 'bair')
+    assert f'{path}: record 0' in text and expected in text
+
+
+@pytest.mark.parametrize('value, expected', [
+    (cv2.imencode('.jpg', np.zeros((48, 64, 3), np.uint8))[1].tobytes(), '64x48 pixels'),
+    (b'\x89PNG not really', 'cannot be decoded'), ((1.0, 2.0), 'lacks 3/image_aux1/encoded')])
+def test_a_wrong_picture_is_named(tmp_path, value, expected):
+    features = {**make_features(1)[0], '3/image_aux1/encoded': value}
+    assert expected in refused(write_file(tmp_path, 0, [features]), tmp_path / 'bair')
+
+
+@pytest.mark.parametrize('value', [(1.0, 2.0, 3.0), b'abcd'])
+def test_a_wrong_action_is_named(tmp_path, value):
+    features = {**make_features(1)[0], '3/action': value}
+    assert 'lacks 3/action' in refused(write_file(tmp_path, 0, [features]), tmp_path / 'bair')
+
+
+def test_a_record_that_is_no_example_is_named(tmp_path):
+    path = tmp_path / 'traj_0_to_0.tfrecords'
+    path.write_bytes(frame_record(b'\x0a\xff'))
+    assert 'record 0: holds no tf.train.Example' in refused(path, tmp_path / 'bair')
+
+
+def test_an_import_goes_on_with_the_files_that_are_missing(tmp_path, data_set):
+    out = tmp_path / 'bair'
+    second = data_set / 'train' / 'traj_2_to_3.tfrecords'
+    good = second.read_bytes()
+    second.write_bytes(good[:-1])
+    refused(data_set, out)
+    second.write_bytes(good)
+    before = (out / 'train' / 'train_0.mcap').stat()
+    assert import_bair([data_set], out, progress=False) == 3
+    after = (out / 'train' / 'train_0.mcap').stat()
+    assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    assert len(open_recordings(out)) == 5
+    assert import_bair([data_set], out, progress=False) == 0
+
+
+def test_what_does_not_belong_to_the_data_set_is_refused(tmp_path, data_set):
+    out = tmp_path / 'bair'
+    (tmp_path / 'empty').mkdir()
+    assert 'holds no file' in refused(tmp_path / 'empty', out)
+    assert 'traj_<first>_to_<last>' in refused(tmp_path / 'other.tfrecords', out)
+    assert 'cannot be read' in refused(tmp_path / 'traj_0_to_1.tfrecords', out)
+    (data_set / 'train' / 'traj_1_to_5.tfrecords').touch()
+    assert 'hold the same trajectories' in refused(data_set, out)
+
+
+def test_files_are_taken_in_the_order_of_their_numbers(tmp_path):
+    for split, first in (('test', 0), ('test/train', 256), ('train', 1024), ('train/new', 0)):
+        write_file(tmp_path / split, first, [], count=256)
+    assert [(s.split, s.numbers.start) for s in find_shards([tmp_path])] == [
+        ('train', 0), ('train', 256), ('train', 1024), ('test', 0)]
+
+
+def test_an_empty_file_has_no_records(tmp_path):
+    path = tmp_path / 'empty'
+    path.touch()
+    assert not list(read_records(path))
+
+
+def test_prediction_is_evaluated_without_objects(tmp_path, data_set):
+    import_bair([data_set], tmp_path / 'bair', progress=False)
+    store = open_recordings(tmp_path / 'bair')
+    batch = make_batch(store, range(5))
+    assert batch.context.shape == (5, 2, 64, 64, 3)
+    network = Predictor(PredictorConfig(image_size=64, base_width=4)).eval()
+    for scores in evaluate(network, store, range(5)).values():
+        assert np.isfinite(scores.min_l1).all() and np.isnan(scores.bottleneck).all()
+        assert scores.summary()['bottleneck_episodes'] == 0
+
+
+def test_the_command_takes_files_and_a_folder():
+    parser = ArgumentParser()
+    add_arguments(parser)
+    args = parser.parse_args(['a', 'b', '--out', 'c'])
+    assert (args.paths, args.out) == (['a', 'b'], 'c')
