@@ -19,12 +19,17 @@ SOURCES := package.xml setup.py setup.cfg resource/tap_ros $(wildcard config/*.y
 # An environment that was copied or moved here from elsewhere names the old place everywhere.
 $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 
-.PHONY: help demo test build lint bench clean
+# Two processes share two cores best when each takes one.
+paper: export OMP_NUM_THREADS ?= 1
+
+.PHONY: help demo test paper build lint bench clean
 
 help:
 	@echo 'make demo    push two objects to where a goal picture shows them, three scenes'
 	@echo '             SCENES=20: that many scenes; ARGS=...: more options of the demo'
 	@echo 'make test    all tests; ARGS="-k warp" chooses'
+	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
+	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
 	@echo 'make bench   measure the speed of each part; ARGS=...'
 	@echo 'make lint    check the style of the code'
 	@echo 'make build   only the set-up: .venv, install/; then, to work in it:'
@@ -38,6 +43,9 @@ demo: build
 
 test: build
 	@$(ENTER); $(DOMAIN); python -m pytest $(ARGS)
+
+paper: build
+	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(if $(SCALE),--scale $(SCALE)) $(ARGS)
 
 bench: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros bench $(ARGS)

@@ -15,7 +15,7 @@ from tap_ros.prediction.weights import load_tensors, save_tensors
 import torch
 
 # Settings that change where a run happens and what it shows, not what it learns.
-_FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
+FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
 
 
 @dataclass
@@ -114,7 +114,7 @@ def load_checkpoint(path, state, settings, data_hash):
     tensors, about = load_tensors(path)
     for name, value in settings.items():
         before = about['settings'].get(name)
-        if name not in _FREE and before != value:
+        if name not in FREE and before != value:
             raise ConfigError(
                 f'{path}: made with {name}={before!r}, not {value!r}; to go on with it give the '
                 'same settings, else choose another --out folder')

@@ -9,17 +9,15 @@ import json
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
-from tap_ros.evaluation.prediction import (
-    add_arguments,
+from tap_ros.evaluation.bottleneck import (
     bottleneck_frequency,
     bottleneck_scores,
-    evaluate,
-    evaluate_network,
     expected_distances,
     MIN_MOTION,
-    run,
-    write_pictures,
 )
+from tap_ros.evaluation.prediction import add_arguments, evaluate, run, write_pictures
+from tap_ros.evaluation.samples import draw_latents, score_samples
+from tap_ros.images import to_float
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
 from tap_ros.prediction.warp import combine, one_hot_maps
 from tap_ros.prediction.weights import save_weights
@@ -51,6 +49,15 @@ def make_episode(start, goal, length=9):
 class Store(list):
     """Episodes in memory, read like an EpisodeStore."""
 
+    image_size = (SIZE, SIZE)
+
+    @property
+    def lengths(self):
+        return np.array([len(episode.frames) for episode in self])
+
+    def frames(self, i):
+        return self[i].frames
+
 
 class Pasting(torch.nn.Module):
     """Shows the goal in the left half and the start in the right half of the picture."""
@@ -58,8 +65,9 @@ class Pasting(torch.nn.Module):
     def __init__(self):
         super().__init__()
         self.share = torch.nn.Parameter(torch.zeros(()))
+        self.config = PredictorConfig(image_size=SIZE)
 
-    def forward(self, context):
+    def forward(self, context, z=None):
         B, C, _, H, W = context.shape
         masks = torch.zeros(B, C, 1, H, W)
         masks[:, 0, ..., W // 2:], masks[:, 1, ..., :W // 2] = 1, 1
@@ -100,8 +108,8 @@ def test_bottleneck_is_either_object_first_and_the_sum_over_objects():
 
 
 def test_frequency_rises_with_the_threshold():
-    frequency = bottleneck_frequency([0.5, 1.5, 2.0, 9.0], (0, 1, 2, 10))
-    assert frequency.tolist() == [0, 0.25, 0.75, 1]
+    frequency = [bottleneck_frequency([0.5, 1.5, 2.0, 9.0], pixels) for pixels in (0, 1, 2, 10)]
+    assert frequency == [0, 0.25, 0.75, 1]
 
 
 def test_a_perfect_bottleneck_is_found_and_matched():
@@ -116,17 +124,17 @@ def test_a_perfect_bottleneck_is_found_and_matched():
 
 def test_copying_matches_the_frame_beside_it_and_is_no_bottleneck():
     scores = evaluate(Pasting(), EPISODES, range(3))
-    assert scores['copy_start'].match_step.tolist() == [1, 1, 1]
-    assert scores['copy_goal'].match_step.tolist() == [7, 7, 7]
+    assert scores['copy-start'].match_step.tolist() == [1, 1, 1]
+    assert scores['copy-goal'].match_step.tolist() == [7, 7, 7]
     shorter = [min(np.linalg.norm(e.object_pixels[-1] - e.object_pixels[0], axis=1))
                for e in EPISODES]
-    assert np.allclose(scores['copy_start'].bottleneck, shorter, atol=1e-4)
-    assert np.allclose(scores['copy_goal'].bottleneck, shorter, atol=1e-4)
+    assert np.allclose(scores['copy-start'].bottleneck, shorter, atol=1e-4)
+    assert np.allclose(scores['copy-goal'].bottleneck, shorter, atol=1e-4)
 
 
 def test_margin_keeps_matches_away_from_the_context():
     scores = evaluate(Pasting(), EPISODES, range(3), margin=2)
-    assert scores['copy_start'].match_step.tolist() == [3, 3, 3]
+    assert scores['copy-start'].match_step.tolist() == [3, 3, 3]
 
 
 def test_episodes_in_which_an_object_stays_do_not_count_as_bottlenecks():
@@ -137,13 +145,77 @@ def test_episodes_in_which_an_object_stays_do_not_count_as_bottlenecks():
     assert scores.summary()['episodes'] == 4
 
 
-def test_numbers_do_not_depend_on_the_batch(monkeypatch):
-    network = Predictor(PredictorConfig(image_size=32, base_width=4, new_pixels=False)).eval()
-    together = evaluate_network(network, EPISODES, range(3))
+def network(**options):
+    torch.manual_seed(0)
+    made = Predictor(PredictorConfig(**{
+        'image_size': SIZE, 'base_width': 4, 'new_pixels': False, **options})).eval()
+    for name, weight in made.named_parameters():
+        # With fresh weights z would hardly matter.
+        weight.data.mul_(10 if 'decoder.0.' in name else 1)
+    return made
+
+
+@pytest.mark.parametrize('latent_size', [0, 8])
+def test_numbers_do_not_depend_on_the_batch(monkeypatch, latent_size):
+    made = network(latent_size=latent_size)
+    together = evaluate(made, EPISODES, range(3))
     monkeypatch.setattr('tap_ros.evaluation.prediction._BATCH', 1)
-    alone = evaluate_network(network, EPISODES, range(3))
-    assert alone == pytest.approx(together, abs=1e-4)
-    assert {'copy_start_min_l1', 'copy_goal_bottleneck_2px', 'min_l1'} <= set(alone)
+    alone = evaluate(made, EPISODES, range(3))
+    backwards = evaluate(made, EPISODES, range(2, -1, -1))
+    for method, scores in together.items():
+        assert alone[method].min_l1 == pytest.approx(scores.min_l1, abs=1e-4)
+        assert alone[method].bottleneck == pytest.approx(scores.bottleneck, abs=1e-3)
+        assert backwards[method].min_l1[::-1] == pytest.approx(scores.min_l1, abs=1e-4)
+
+
+def test_forward_scores_count_the_last_frame_and_have_no_goal_to_copy():
+    class CopiesTheEnd(torch.nn.Module):
+        """Knows the last frame of the first episode."""
+
+        def __init__(self):
+            super().__init__()
+            self.share = torch.nn.Parameter(torch.zeros(()))
+            self.config = PredictorConfig(image_size=SIZE, num_context=1)
+
+        def forward(self, context, z=None):
+            assert context.shape[1] == 1
+            image = to_float(EPISODES[0].frames[-1:])
+            flow = torch.zeros(1, 1, 2, SIZE, SIZE)
+            return Prediction(image, flow, torch.ones(1, 1, 1, SIZE, SIZE), None)
+
+    scores = evaluate(CopiesTheEnd(), EPISODES, [0])
+    assert list(scores) == ['prediction', 'copy-start']
+    assert scores['prediction'].match_fraction.tolist() == [1]
+    assert scores['prediction'].min_l1 == pytest.approx([0], abs=1e-6)
+    assert scores['copy-start'].match_step.tolist() == [1]
+
+
+def test_the_best_of_more_samples_is_never_worse_and_of_one_is_what_evaluate_measures():
+    made = network(latent_size=8, new_pixels=True)
+    scores = evaluate(made, EPISODES, range(3))['prediction']
+    one, few, more = (score_samples(made, EPISODES, range(3), count=count) for count in (1, 3, 12))
+    assert one.min_l1 == pytest.approx(scores.min_l1, abs=1e-6)
+    assert one.match_step.tolist() == scores.match_step.tolist()
+    assert (few.min_l1 <= one.min_l1 + 1e-7).all() and (more.min_l1 <= few.min_l1 + 1e-7).all()
+    assert (more.min_l1 < one.min_l1).all()
+    assert (one.spread == 0).all() and (more.spread > 0).all()
+    assert np.isnan(more.spread_px).all()
+
+
+def test_samples_without_new_pixels_spread_where_they_place_objects():
+    made = network(latent_size=8)
+    assert (score_samples(made, EPISODES, range(3), count=6).spread_px > 0).all()
+    # Nothing but the decoders' first layer reads z.
+    for part in (made.flow_decoder, made.mask_decoder):
+        part[0].weight.data[made.config.code_size:] = 0
+    still = score_samples(made, EPISODES, range(3), count=6)
+    assert np.allclose(still.spread, 0, atol=1e-6) and np.allclose(still.spread_px, 0, atol=1e-3)
+
+
+def test_each_episode_has_samples_of_its_own():
+    assert draw_latents([7, 3], 4, 5)[1].equal(draw_latents([3], 9, 5)[0, :4])
+    assert not draw_latents([3], 1, 5).equal(draw_latents([7], 1, 5))
+    assert not draw_latents([3], 1, 5).equal(draw_latents([3], 1, 5, seed=1))
 
 
 def test_pictures_are_written(tmp_path):
@@ -153,24 +225,31 @@ def test_pictures_are_written(tmp_path):
     assert sheet.shape[:2] == (3 * 34 - 2, 5 * 34 - 2)
 
 
-def test_the_command_scores_what_training_held_out(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize('options', [
+    {}, {'latent_size': 8}, {'num_context': 1, 'new_pixels': True}])
+def test_the_command_scores_what_training_held_out(tmp_path, monkeypatch, capsys, options):
     with EpisodeWriter(tmp_path / 'bag_0.mcap') as writer:
         for i, episode in enumerate(EPISODES):
             stamps = np.arange(9) * 10 ** 8 + (i + 1) * 10 ** 10
             writer.write(replace(episode, seed=i, stamps=stamps))
     monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
-    config = PredictorConfig(image_size=32, base_width=4, new_pixels=False)
+    made = network(**options)
     weights = tmp_path / 'weights.safetensors'
-    save_weights(weights, Predictor(config), 'predictor', config,
-                 {'settings': {'test_fraction': 0.0}})
+    save_weights(weights, made, 'predictor', made.config, {'settings': {'test_fraction': 0.0}})
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     common = ['--weights', str(weights), '--recordings', str(tmp_path / 'bag_0.mcap')]
     with pytest.raises(ConfigError, match='--all'):
         run(parser.parse_args(common))
-    run(parser.parse_args([*common, '--all', '--out', str(tmp_path / 'out')]))
-    assert 'copy_goal' in capsys.readouterr().out
+    run(parser.parse_args([*common, '--all', '--samples', '3', '--out', str(tmp_path / 'out')]))
+    shown = capsys.readouterr().out
+    assert ('best of 3' in shown) == ('latent_size' in options)
     scores = json.loads((tmp_path / 'out' / 'scores.json').read_text())['scores']
-    assert set(scores) == {'prediction', 'copy_start', 'copy_goal'}
+    methods = {'prediction', 'copy-start', 'copy-goal'} - (
+        {'copy-goal'} if 'num_context' in options else set())
+    assert set(scores) - {'samples'} == methods and all(method in shown for method in methods - {
+        'prediction'})
     assert scores['prediction']['episodes'] == 3
+    low, high = scores['prediction']['intervals']['min_l1']
+    assert low <= scores['prediction']['min_l1'] <= high
     assert (tmp_path / 'out' / 'pictures.png').stat().st_size > 0

@@ -1,0 +1,112 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Whether a prediction is a bottleneck: one object at its goal, the other still in place (app. E).
+
+Object positions are the recordings', that is, the simulator's ground truth; they score only.
+"""
+
+import numpy as np
+from tap_ros.prediction.batches import uses_recorded_goal
+from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
+import torch
+
+THRESHOLDS = tuple(range(11))  # px
+# An object that hardly moves is at its start and its goal at once: a bottleneck for free.
+MIN_MOTION = 4.0  # px
+
+
+def expected_distances(maps, pixels):
+    """
+    Compute the expected distance between an object under a map and a position.
+
+    :param maps: (..., H, W), each sums to 1.
+    :param pixels: (..., 2), (u, v).
+    :return: (...), in pixels.
+    """
+    H, W = maps.shape[-2:]
+    u = torch.arange(W, device=maps.device) - pixels[..., 0, None, None]
+    v = torch.arange(H, device=maps.device)[:, None] - pixels[..., 1, None, None]
+    return (maps * torch.sqrt(u ** 2 + v ** 2)).sum((-2, -1))
+
+
+def bottleneck_scores(maps, start_pixels, goal_pixels):
+    """
+    Score how near a prediction is to one object at its goal and the other at its start.
+
+    Appendix E: the smaller one of two hypotheses, which object moves first; each is the sum over
+    both objects of the expected distance.
+
+    :param maps: (B, 2, H, W), object maps of the predictions.
+    :param start_pixels: (B, 2, 2), (u, v) of both objects in the start picture.
+    :param goal_pixels: (B, 2, 2), in the goal picture.
+    :return: (B,), in pixels.
+    """
+    to_start = expected_distances(maps, start_pixels)  # B, 2
+    to_goal = expected_distances(maps, goal_pixels)
+    first = to_goal[:, 0] + to_start[:, 1]
+    second = to_start[:, 0] + to_goal[:, 1]
+    return torch.minimum(first, second)
+
+
+def bottleneck_frequency(scores, threshold):
+    """
+    Compute which share of predictions is a bottleneck.
+
+    :param scores: (..., N), in pixels.
+    :param threshold: in pixels; a score of at most that counts.
+    :return: (...), from 0 to 1.
+    """
+    return (np.asarray(scores) <= threshold).mean(-1)
+
+
+def context_pixels(episode, goal_picture):
+    """
+    Find the objects of an episode at its start and its goal.
+
+    :param episode: the Episode.
+    :param goal_picture: see batches.uses_recorded_goal.
+    :return: float32 (2, K, 2), (u, v); NaN where unknown.
+    """
+    goal = episode.object_pixels[-1]
+    if uses_recorded_goal(episode, goal_picture):
+        goal = episode.goal_pixels
+    return np.stack([episode.object_pixels[0], goal]).astype(np.float32)
+
+
+def predicted_maps(pixels, prediction, b):
+    """
+    Warp one-hot maps of the objects as a prediction warps its context pictures.
+
+    :param pixels: float32 (2, K, 2), of context_pixels; a forward prediction uses the start only.
+    :param prediction: networks.Prediction of a batch.
+    :param b: which one of the batch.
+    :return: (K, H, W), each sums to 1.
+    """
+    flow, masks = prediction.flow[b:b + 1], prediction.masks[b:b + 1]
+    pixels = torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device)
+    return warp_object_maps(one_hot_maps(pixels, flow.shape[-2:])[None], flow, masks).maps[0]
+
+
+def score_bottlenecks(episodes, prediction, goal_picture):
+    """
+    Score the predictions of a batch, and copying the start or the goal instead.
+
+    :param episodes: list of B Episodes.
+    :param prediction: networks.Prediction of them.
+    :param goal_picture: see batches.uses_recorded_goal.
+    :return: float32 (B, 3), prediction, copy-start, copy-goal, in pixels. NaN where it is
+        undefined: for other than two objects, unknown positions, or an object that stays.
+    """
+    result = np.full((len(episodes), 3), np.nan, np.float32)
+    for b, episode in enumerate(episodes):
+        pixels = context_pixels(episode, goal_picture)
+        if pixels.shape[1] != 2 or not np.isfinite(pixels).all():
+            continue
+        if np.linalg.norm(pixels[1] - pixels[0], axis=-1).min() < MIN_MOTION:
+            continue
+        maps = predicted_maps(pixels, prediction, b)[None]
+        pixels = torch.from_numpy(pixels).to(maps.device)
+        maps = torch.cat([maps, one_hot_maps(pixels, maps.shape[-2:])])  # prediction, start, goal
+        result[b] = bottleneck_scores(maps, pixels[:1], pixels[1:]).cpu().numpy()
+    return result

@@ -1,0 +1,311 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The plots: forward scatter (Fig. 4), gains over fix, bottleneck curve, match-steps."""
+
+import io
+
+from matplotlib.figure import Figure
+import numpy as np
+from tap_ros.evaluation.bottleneck import THRESHOLDS
+from tap_ros.evaluation.paper.published import (
+    BOTTLENECK_2PX,
+    FORWARD_GRASP,
+    FRAMES,
+    GAINS,
+    TITLES,
+)
+from tap_ros.evaluation.paper.rows import COPIES, find, lower_hull, method_order
+
+# Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
+COLOURS = {'copy': '#8c8c8c', 'fix': '#0072b2', 'min': '#e69f00', 'genmin': '#d55e00',
+           'ours': '#009e73', 'vae': '#cc79a7'}
+_INK = '#333333'
+_WIDTH = 9.0  # inches
+
+
+def file_name(name, scale):
+    """
+    Name a picture of the results.
+
+    :param name: what it shows.
+    :param scale: the small one's pictures carry no mark.
+    """
+    return f'{name}.png' if scale == 'small' else f'{name}-{scale}.png'
+
+
+def family(method):
+    """
+    Say which family a method belongs to, a key of COLOURS.
+
+    :param method: its name; a form that is not in the paper ('+...') is of 'ours'.
+    """
+    if method in COPIES:
+        return 'copy'
+    if '+' in method:
+        return 'ours'
+    if '-vae' in method:
+        return 'vae'
+    return next(name for name in ('fix', 'min', 'genmin') if method.startswith(name))
+
+
+def _new_figure(height, columns, rows=1, **options):
+    figure = Figure(figsize=(_WIDTH, height), layout='constrained')
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    for axis in axes.flat:
+        for side in ('top', 'right'):
+            axis.spines[side].set_visible(False)
+        for side in ('left', 'bottom'):
+            axis.spines[side].set_color('#a0a0a0')
+        axis.tick_params(colors=_INK, labelsize=8, length=3)
+        axis.set_axisbelow(True)
+    return figure, axes
+
+
+def _png(figure):
+    """Return a figure as bytes that depend on nothing but what it shows."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format='png', dpi=110, metadata={'Software': None})
+    return stream.getvalue()
+
+
+def _spread(positions, gap):
+    """Move positions apart along a line until neighbours are `gap` apart; keeps the order."""
+    order = np.argsort(positions, kind='stable')
+    moved = np.array(positions, float)[order]
+    for _ in range(200):
+        short = gap - np.diff(moved)
+        if (short <= 1e-9).all():
+            break
+        push = np.where(short > 0, short / 2, 0)
+        moved[:-1] -= push
+        moved[1:] += push
+    result = np.empty_like(moved)
+    result[order] = moved
+    return result
+
+
+def forward_scatter(rows, task='grasp'):
+    """
+    Draw error against match-step in forward prediction, ours beside the authors' (Fig. 4).
+
+    :param rows: of one scale.
+    :param task: whose.
+    :return: bytes of a PNG, or None without such rows.
+    """
+    ours = {}
+    for row in rows:
+        if (row['metric'], row['task'], row['mode']) == ('min_l1', task, 'forward'):
+            if row['method'] in COPIES or not row['new_pixels']:
+                continue
+            step = find(rows, **{name: row[name] for name in (
+                'task', 'mode', 'method', 'new_pixels')}, metric='match_step')
+            if step:
+                ours[row['method']] = (step['value'], row['value'], step, row)
+    if not ours:
+        return None
+    authors = {name: (*point, None, None) for name, point in FORWARD_GRASP.items()}
+    panels = [('ours', ours)] + ([("the authors'", authors)] if task == 'grasp' else [])
+    figure, axes = _new_figure(3.9, len(panels))
+    for axis, (title, points) in zip(axes[0], panels):
+        _scatter(axis, points, FRAMES[task])
+        axis.set_title(f'{TITLES[task]}, forward: {title}', fontsize=10, loc='left', color=_INK)
+        axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
+        axis.set_ylabel('min l1', fontsize=9, color=_INK)
+    return _png(figure)
+
+
+def _scatter(axis, points, frames):
+    """Draw one panel: a point for each method, and the lower hull of the fixed-time ones."""
+    methods = sorted(points, key=method_order)
+    high = 1.18 * max(points[m][1] for m in methods)
+    fixed = [points[m][:2] for m in methods if family(m) == 'fix']
+    if fixed:
+        at = np.linspace(min(fixed)[0], max(fixed)[0], 200)
+        axis.plot(at, lower_hull(at, fixed), color=COLOURS['fix'], alpha=0.25, zorder=1)
+    for m in methods:
+        x, y, step, error = points[m]
+        colour = COLOURS[family(m)]
+        if step is not None:
+            axis.errorbar(
+                x, y, [[y - error['ci_low']], [error['ci_high'] - y]],
+                [[x - step['ci_low']], [step['ci_high'] - x]],
+                color=colour, elinewidth=0.8, alpha=0.5, zorder=2)
+        axis.plot(x, y, 's' if family(m) == 'fix' else 'o', color=colour, markersize=6,
+                  markeredgecolor='white', markeredgewidth=0.6, zorder=3)
+    at = np.array([points[m][:2] for m in methods]) / (frames, high)
+    for m, (x, y, align) in zip(methods, _place_labels(at, methods)):
+        axis.text(x * frames, y * high, m, fontsize=8, color=COLOURS[family(m)], va='center',
+                  ha=align)
+    axis.set_xlim(0, frames)
+    axis.set_ylim(0, high)
+    axis.grid(color='#f0f0f0')
+
+
+def _place_labels(at, texts):
+    """
+    Put each label on that side of its point where it covers the least.
+
+    :param at: (N, 2), points in shares of the panel.
+    :param texts: N labels.
+    :return: list of (x, y, horizontal alignment).
+    """
+    taken = [(x - 0.018, y - 0.022, x + 0.018, y + 0.022) for x, y in at]
+    placed = []
+    for (x, y), text in zip(at, texts):
+        width, best, tried = 0.0165 * len(text), None, []
+        for dx, dy, align in ((0.028, 0, 'left'), (-0.028, 0, 'right'), (0.02, 0.04, 'left'),
+                              (0.02, -0.04, 'left'), (-0.02, 0.04, 'right'),
+                              (-0.02, -0.04, 'right'), (0, 0.055, 'center'),
+                              (0, -0.055, 'center'), (0.05, 0.085, 'left'),
+                              (0.05, -0.085, 'left')):
+            left = x + dx - width * {'left': 0, 'right': 1, 'center': 0.5}[align]
+            box = (left, y + dy - 0.02, left + width, y + dy + 0.02)
+            covered = sum(max(0, min(box[2], other[2]) - max(box[0], other[0]))
+                          * max(0, min(box[3], other[3]) - max(box[1], other[1]))
+                          for other in taken) + 10 * (box[0] < 0 or box[2] > 1.05)
+            covered += 2e-4 * len(tried)  # the earlier ones look better
+            tried.append(box)
+            if best is None or covered < best[0] - 1e-9:
+                best = covered, (x + dx, y + dy, align), box
+        placed.append(best[1])
+        taken.append(best[2])
+    return placed
+
+
+def bottleneck_curve(rows, task='push2', new_pixels=False):
+    """
+    Draw the bottleneck frequency over the threshold, copying beside it (appendix E).
+
+    :param rows: of one scale.
+    :param task: whose.
+    :param new_pixels: which variant; the paper's curve is of the one without.
+    :return: bytes of a PNG, or None without such rows.
+    """
+    curves = {}
+    for row in rows:
+        if (row['metric'], row['task'], row['mode']) == (
+                'bottleneck_frequency_0px', task, 'bidirectional'):
+            if row.get('new_pixels', new_pixels) == new_pixels:
+                curves[row['method']] = [find(
+                    rows, task=task, mode='bidirectional', method=row['method'],
+                    new_pixels=new_pixels, metric=f'bottleneck_frequency_{threshold}px')
+                    for threshold in THRESHOLDS]
+    if not set(curves) - set(COPIES):
+        return None
+    figure, axes = _new_figure(4.2, 1)
+    axis = axes[0, 0]
+    styles, ends = _line_styles(curves), {}
+    for method in sorted(curves, key=method_order):
+        points = curves[method]
+        value, low, high = (np.array([100 * p[name] for p in points])
+                            for name in ('value', 'ci_low', 'ci_high'))
+        colour = COLOURS[family(method)]
+        axis.fill_between(THRESHOLDS, low, high, color=colour, alpha=0.10, linewidth=0)
+        axis.plot(THRESHOLDS, value, styles[method], color=colour, linewidth=1.8)
+        ends[method] = value[-1]
+    if task == 'push2':
+        for method, share in BOTTLENECK_2PX.items():
+            axis.plot(2, 100 * share, 'D', color=COLOURS[method], markersize=6,
+                      markerfacecolor='white', markeredgewidth=1.4, clip_on=False, zorder=4)
+            axis.annotate(f"the paper's {method}", (2, 100 * share), (-8, 2),
+                          textcoords='offset points', ha='right', va='bottom', fontsize=8,
+                          color=COLOURS[method], zorder=5,
+                          bbox={'color': 'white', 'alpha': 0.75, 'pad': 0.5})
+    for method, y in zip(ends, _spread(list(ends.values()), 4.5)):
+        colour = COLOURS[family(method)]
+        axis.plot([10.12, 10.5], [y, y], styles[method], color=colour, linewidth=1.8,
+                  clip_on=False)
+        axis.annotate(method, (10.6, y), fontsize=8.5, color=colour, va='center',
+                      annotation_clip=False)
+    axis.set(xlim=(0, 10), ylim=(0, 100), xticks=THRESHOLDS)
+    axis.grid(axis='y', color='#f0f0f0')
+    axis.set_xlabel('threshold: sum over both objects of the expected distance, px', fontsize=9,
+                    color=_INK)
+    axis.set_ylabel('predictions that are a bottleneck, %', fontsize=9, color=_INK)
+    axis.set_title(f'{TITLES[task]}: bottleneck frequency'
+                   + ('' if new_pixels else ', models without new pixels'),
+                   fontsize=10, loc='left', color=_INK)
+    return _png(figure)
+
+
+def _line_styles(methods):
+    """Tell methods of one family apart by the line: method -> style."""
+    styles, used = {}, {}
+    for method in sorted(methods, key=method_order):
+        number = used[family(method)] = used.get(family(method), -1) + 1
+        order = ('--', ':') if family(method) == 'copy' else ('-', '--', '-.', ':')
+        styles[method] = order[number % len(order)]
+    return styles
+
+
+def gains(rows):
+    """
+    Draw how far each method's error is below fix's, with the paper's gains of genmin.
+
+    :param rows: of one scale.
+    :return: bytes of a PNG, or None without such rows.
+    """
+    chosen = [row for row in rows if row['metric'] == 'gain_over_fix'
+              and row['mode'] == 'bidirectional' and row.get('new_pixels', True)]
+    if not chosen:
+        return None
+    tasks = [task for task in TITLES if any(row['task'] == task for row in chosen)]
+    methods = sorted({row['method'] for row in chosen}, key=method_order)
+    figure, axes = _new_figure(1.3 + 0.27 * len(methods), len(tasks), sharey=True)
+    for axis, task in zip(axes[0], tasks):
+        axis.axvline(0, color='#a0a0a0', linewidth=1)
+        for y, method in enumerate(methods):
+            row = find(chosen, task=task, method=method)
+            if row is None:
+                continue
+            value, low, high = (100 * row[name] for name in ('value', 'ci_low', 'ci_high'))
+            colour = COLOURS[family(method)]
+            axis.plot([low, high], [y, y], color=colour, linewidth=2.2, alpha=0.45)
+            axis.plot(value, y, 'o', color=colour, markersize=6, markeredgecolor='white')
+        if task in GAINS and 'genmin' in methods:
+            axis.plot(100 * GAINS[task], methods.index('genmin'), 'D', color=COLOURS['genmin'],
+                      markerfacecolor='none', markersize=7, markeredgewidth=1.3)
+        axis.set_title(TITLES[task], fontsize=10, loc='left', color=_INK)
+        axis.set_yticks(range(len(methods)), methods)
+        axis.set_ylim(len(methods) - 0.4, -0.6)
+        axis.set_xlabel('error below fix, %', fontsize=9, color=_INK)
+        axis.grid(color='#f0f0f0')
+    for label, method in zip(axes[0, 0].get_yticklabels(), methods):
+        label.set_color(COLOURS[family(method)])
+    return _png(figure)
+
+
+def match_histograms(groups):
+    """
+    Draw at which share of the episode the matches of each method lie, a row for each task.
+
+    A predictor that copies an input matches a frame beside it.
+
+    :param groups: rows.Group of one scale.
+    :return: bytes of a PNG, or None without such groups.
+    """
+    shown = [group for group in groups if group.key['mode'] == 'bidirectional'
+             and group.key.get('new_pixels') and 'match_fraction' in group.scores]
+    if not shown:
+        return None
+    tasks = [task for task in TITLES if any(group.key['task'] == task for group in shown)]
+    methods = sorted({group.key['method'] for group in shown}, key=method_order)
+    figure, axes = _new_figure(0.75 + 1.0 * len(tasks), len(methods), len(tasks), sharex=True,
+                               sharey='row')
+    bins = np.linspace(0, 1, 16)
+    for row, task in zip(axes, tasks):
+        for axis, method in zip(row, methods):
+            axis.spines['left'].set_visible(False)
+            axis.set_yticks([])
+            axis.set_xticks([0, 0.5, 1], ['start', '', 'goal'])
+            axis.tick_params(labelsize=7)
+            for group in shown:
+                if (group.key['task'], group.key['method']) == (task, method):
+                    values = group.scores['match_fraction'].ravel()
+                    axis.hist(values, bins, weights=np.full(len(values), 1 / len(values)),
+                              color=COLOURS[family(method)])
+        row[0].set_ylabel(TITLES[task].replace(' ', '\n', 1), fontsize=8, color=_INK)
+    for axis, method in zip(axes[0], methods):
+        axis.set_title(method.replace('-', '\n', 1).replace('+', '\n+'),
+                       fontsize=8, color=COLOURS[family(method)])
+    return _png(figure)

@@ -1,0 +1,120 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where recordings, runs and results are, and who may write to them."""
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+import fcntl
+import hashlib
+import json
+import os
+from pathlib import Path
+import shlex
+
+from tap_ros.errors import RecordingError
+from tap_ros.recording.bags import find_bags
+
+_SETTINGS = 'collection.json'  # as sim_bridge.collect leaves it
+
+
+@dataclass(frozen=True)
+class Places:
+    """
+    The folders of a sweep.
+
+    :param recordings: holds a recording for each task, under the task's name.
+    :param runs: <scale>/<run>/ holds what a training leaves.
+    :param results: runs/<scale>/<run>.json is the result of a run; beside it stand the pages.
+    """
+
+    recordings: str = 'bags'
+    runs: str = 'runs/paper'
+    results: str = 'docs/results'
+
+    def recording(self, task):
+        """Return the Path of a task's recording."""
+        return Path(self.recordings) / task
+
+    def result(self, run):
+        """Return the Path of the result of a PaperRun."""
+        return Path(self.results) / 'runs' / run.scale / f'{run.name}.json'
+
+
+@contextmanager
+def locked(path, wait=False):
+    """
+    Hold a lock as long as the context lasts; it ends with the process, however that ends.
+
+    :param path: of a file to lock, made if it is not there.
+    :param wait: whether to wait until it is free.
+    :return: context manager of a bool: whether this process has it.
+    """
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with open(path, 'a') as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            yield False
+            return
+        yield True
+
+
+def write_json(path, value):
+    """Write a JSON file that appears complete or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f'{path.name}.{os.getpid()}.part')
+    part.write_text(json.dumps(value) + '\n')
+    os.replace(part, path)
+
+
+def read_json(path):
+    """Read a JSON file; None where there is none that can be read."""
+    try:
+        return json.loads(Path(path).read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def is_collected(folder, episodes):
+    """
+    Say whether a recording is there, complete.
+
+    :param folder: of the recording.
+    :param episodes: how many it has to hold at least; a recording that `collect` did not make is
+        taken as it is.
+    :return: bool.
+    """
+    settings = read_json(Path(folder) / _SETTINGS)
+    if settings is None:
+        try:
+            return bool(find_bags(folder))
+        except RecordingError:
+            return False
+    files = -(-settings['episodes'] // settings['episodes_per_file'])
+    return (settings['episodes'] >= episodes and (Path(folder) / 'metadata.yaml').exists()
+            and len(list(Path(folder).glob('*.mcap'))) >= files)
+
+
+def collected_episodes(folder):
+    """Say how many episodes a folder was asked to hold, 0 if `collect` never wrote to it."""
+    return (read_json(Path(folder) / _SETTINGS) or {'episodes': 0})['episodes']
+
+
+def collect_command(folder):
+    """Say which command makes a recording again; '' if `collect` did not make it."""
+    settings = read_json(Path(folder) / _SETTINGS)
+    if settings is None:
+        return ''
+    words = ['python', '-m', 'tap_ros', 'collect', '--task', settings['task'], '--out',
+             str(folder), '--episodes', str(settings['episodes'])]
+    return shlex.join(words + (['--seed', str(settings['seed'])] if settings['seed'] else []))
+
+
+def recording_hash(folder):
+    """Compute EpisodeStore.data_hash without decoding anything."""
+    digests = []
+    for file in (file for bag in find_bags(folder) for file in bag):
+        with open(file, 'rb') as stream:
+            digests.append(hashlib.file_digest(stream, 'sha256').hexdigest())
+    return hashlib.sha256(''.join(digests).encode()).hexdigest()

@@ -1,0 +1,95 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the samples of a predictor with z are worth: the best of many, and how they differ."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from tap_ros.evaluation.bottleneck import context_pixels
+from tap_ros.images import to_float
+from tap_ros.prediction.batches import make_batch
+from tap_ros.prediction.losses import l1_errors, match_step
+from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
+import torch
+
+SAMPLES = 100  # of the paper's last row of Table 1
+
+
+@dataclass(frozen=True)
+class SampleScores:
+    """
+    Measurements of the samples of N episodes.
+
+    :param min_l1: (N,), the least error of any sample against any target.
+    :param match_step: (N,), the time of that target.
+    :param match_fraction: (N,), that time as a share of the episode.
+    :param spread: (N,), standard deviation over the samples, on [0, 1], mean over the pixels.
+    :param spread_px: (N,), how far from their mean the samples place an object: root mean square
+        in pixels, mean over the objects; NaN with new pixels, which have no origin, or where
+        positions are unknown.
+    """
+
+    min_l1: np.ndarray
+    match_step: np.ndarray
+    match_fraction: np.ndarray
+    spread: np.ndarray
+    spread_px: np.ndarray
+
+
+def draw_latents(episodes, count, size, seed=0):
+    """
+    Draw z from the prior, for each episode its own, whichever others are asked for.
+
+    :param episodes: (B,) indices of episodes.
+    :param count: samples of each; fewer are the first ones of more.
+    :param size: length of z.
+    :param seed: of the draws.
+    :return: float32 (B, count, size).
+    """
+    return torch.from_numpy(np.stack([
+        np.random.default_rng([seed, int(i)]).standard_normal((count, size), np.float32)
+        for i in episodes]))
+
+
+def score_samples(network, store, episodes, margin=0, goal_picture='last', count=SAMPLES, seed=0):
+    """
+    Measure many samples of each episode.
+
+    The first sample is the one that prediction.evaluate measures.
+
+    :param network: Predictor with z, in eval mode.
+    :param store: the EpisodeStore.
+    :param episodes: indices of at least one episode.
+    :param margin: frames beside the context pictures that do not count as matches.
+    :param goal_picture: see batches.make_batch.
+    :param count: samples of each episode.
+    :param seed: of the draws.
+    :return: SampleScores.
+    """
+    device = next(network.parameters()).device
+    rows = []
+    for i in episodes:
+        batch = make_batch(store, [i], margin, goal_picture=goal_picture,
+                           forward=network.config.num_context == 1).to(device)
+        z = draw_latents([i], count, network.config.latent_size, seed)[0].to(device)
+        with torch.inference_mode():
+            prediction = network(to_float(batch.context).expand(count, -1, -1, -1, -1), z)
+            errors = l1_errors(prediction.image[None], batch.targets.movedim(-1, 2))[0]
+            spread = (prediction.image.std(0, correction=0) / 2).mean().item()
+            placed = _spread_px(prediction, context_pixels(store[i], goal_picture))
+        errors = errors.amin(0, keepdim=True)  # the best sample for each target
+        match = match_step(errors, batch.valid)
+        step = batch.times[0, match].item()
+        rows.append((errors[0, match].item(), step, step / batch.end.item(), spread, placed))
+    return SampleScores(*(np.array(column) for column in zip(*rows)))
+
+
+def _spread_px(prediction, pixels):
+    """Measure how differently the samples of one episode place its objects."""
+    if prediction.new_pixels is not None or not pixels.size or not np.isfinite(pixels).all():
+        return np.nan
+    flow, masks = prediction.flow, prediction.masks
+    pixels = torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device)
+    maps = one_hot_maps(pixels, flow.shape[-2:]).expand(len(flow), -1, -1, -1, -1)
+    at = expected_pixels(warp_object_maps(maps, flow, masks).maps)  # samples, K, 2
+    return ((at - at.mean(0)) ** 2).sum(-1).mean(0).sqrt().mean().item()
