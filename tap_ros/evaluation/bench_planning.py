@@ -1,52 +1,168 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Benchmark of planning: the time of one plan, and how it compares with one sample at a time."""
+"""
+Benchmark of planning: the time of one plan, beside the naive way and beside arithmetic alone.
 
-from pathlib import Path
+The naive way asks the model for one sample at a time and decodes every predicted frame at the
+picture's full size. Arithmetic alone is what the plan's floating-point operations would take at
+the rate of a large matrix product, measured in the same run.
+"""
+
+from dataclasses import replace
+import os
 import time
 
 import numpy as np
 from sim_bridge.simulator import Simulator
-from tap_ros.evaluation.planning import FIRST_SCENE
-from tap_ros.planning.visual_mpc import PRESETS, VisualMPC, with_preset
+from tap_ros.evaluation.planning.scenes import FIRST_SCENE
+from tap_ros.images import to_float
+from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.weights import FORWARD_MODEL
+import torch
+from torch.utils.flop_counter import FlopCounterMode
 
-WEIGHTS = Path(__file__).parents[1] / 'weights' / 'forward_model_push.safetensors'
+MATRIX = 2048  # side of the matrices whose product sets the rate
+BILINEAR = 8  # operations to read one number between four
 
 
 def add_arguments(parser):
     """Add the options of this benchmark."""
     parser.add_argument(
         '--plans', type=int, default=15, help='how many to time (default: %(default)s)')
-    parser.add_argument('--weights', default=str(WEIGHTS), help='(default: the shipped ones)')
+    parser.add_argument(
+        '--naive-samples', type=int, default=20,
+        help='how many of a plan to time one at a time; scaled up to a whole plan '
+        '(default: %(default)s)')
+    parser.add_argument('--weights', default=str(FORWARD_MODEL), metavar='FILE',
+                        help='of the forward model (default: the shipped ones)')
     parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
 
 
 def run(args):
-    """Print the times of plans, and of the naive way: a batch of one for every sample."""
+    """Print the times of plans, of the naive way, and of the operations alone."""
     simulator = Simulator('push2')
     seen = simulator.reset(FIRST_SCENE)
     goal = simulator.goal().object_pixels
-
-    def times(config, count):
-        mpc = VisualMPC.load(args.weights, config, args.device)
-        measured = []
-        for seed in range(count + 1):
-            mpc.reset(seed)
-            begin = time.perf_counter()
-            mpc.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal)
-            measured.append(1000 * (time.perf_counter() - begin))
-        return np.array(measured[1:])  # the first one warms up
+    cores = len(os.sched_getaffinity(0))
     default = with_preset('default')
-    search = default.search
+    search, horizon = default.search, default.segments * default.repeat
     print(f'one plan: {search.num_samples} samples x {search.num_iterations} iterations x '
-          f'horizon {default.segments * default.repeat}, two objects')
+          f'horizon {horizon}, two objects, {args.device}'
+          + (f', {cores} cores' if args.device == 'cpu' else ''))
     print(f'{"":<34}{"p50, ms":>10}{"p90, ms":>10}')
-    medians = {}
     for name in PRESETS:
-        plans = times(with_preset(name), args.plans)
-        medians[name] = np.median(plans)
-        print(f'preset {name:<27}{medians[name]:>10.0f}{np.percentile(plans, 90):>10.0f}')
-    naive = times(with_preset('default', batch_size=1), 1)
-    print(f'{"default, one sample at a time":<34}{naive[0]:>10.0f}')
-    print(f'ratio to one sample at a time: {naive[0] / medians["default"]:.1f}x faster')
+        mpc = VisualMPC.load(args.weights, planner_for(args.device, with_preset(name)),
+                             args.device)
+        times = time_plans(mpc, seen, goal, args.plans)
+        if name == 'default':
+            planner, median = mpc, np.median(times)
+        size = f'{mpc.config.search.num_samples} x {mpc.config.search.num_iterations}'
+        print(f'{f"preset {name}, {size}":<34}{np.median(times):>10.1f}'
+              f'{np.percentile(times, 90):>10.1f}')
+    samples = search.num_samples * search.num_iterations
+    naive = time_naively(planner, seen, args.naive_samples) * samples
+    operations = samples * count_operations(planner, seen)
+    rates = {'float32': matrix_rate(args.device, torch.float32)}
+    dtype = next(planner.model.push.parameters()).dtype
+    if dtype == torch.bfloat16:
+        rates['bfloat16'] = matrix_rate(args.device, dtype)
+    print(f'{"default, one sample, every frame":<34}{naive:>10.0f}'
+          f'   ({args.naive_samples} of {samples} samples timed)')
+    print(f'naive / planned: {naive / median:.1f}x')
+    print(f'operations of a plan: {operations / 1e9:.2f} G (network {dtype})')
+    for name, rate in rates.items():
+        alone = 1000 * operations / rate
+        print(f'  alone, at {rate / 1e9:.0f} G/s of a {name} product of {MATRIX}: {alone:.1f} ms; '
+              f'planned / alone: {median / alone:.1f}x')
     simulator.close()
+
+
+def planner_for(device, config):
+    """Return the configuration that suits a device: a GPU predicts all samples at once."""
+    return config if device == 'cpu' else replace(config, batch_size=config.search.num_samples)
+
+
+def time_plans(mpc, seen, goal, count):
+    """Return the times (count,) of plans in ms, after one to warm up."""
+    times = []
+    for seed in range(count + 1):
+        mpc.reset(seed)
+        times.append(mpc.act(
+            seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal).planning_ms)
+    return np.array(times[1:])
+
+
+@torch.inference_mode()
+def time_naively(mpc, seen, count):
+    """Return the ms of one sample that is predicted alone, every frame decoded."""
+    model, config = mpc.model, mpc.config
+    image, gripper = _inputs(mpc, seen)
+    actions = random_actions(mpc, count + 1)
+    times = []
+    for sample in actions[:, None]:  # (1, horizon, 4)
+        begin = time.perf_counter()
+        maps = model.seed_maps(torch.from_numpy(seen.object_pixels).to(image.device))[None]
+        arm = model.draw_arm(gripper)
+        scene = model.look(image, arm[:, 3:])
+        flow, hand = model.still(1), gripper
+        for t in range(config.segments * config.repeat):
+            flow, hand, _ = model.advance(scene.features, flow, hand, sample[:, t])
+            picture, _ = model.picture(scene, flow, model.draw_arm(hand))
+            carried = model.carry(maps, flow)
+        float(picture.sum() + carried.sum())  # waits for a GPU
+        times.append(1000 * (time.perf_counter() - begin))
+    return float(np.median(times[1:]))
+
+
+@torch.no_grad()
+def count_operations(mpc, seen):
+    """
+    Count the floating-point operations of one sample among many.
+
+    :return: of convolutions, matrix products and bilinear reading; a product and a sum are two.
+    """
+    image, gripper = _inputs(mpc, seen)
+    maps = mpc.model.seed_maps(torch.from_numpy(seen.object_pixels).to(image.device))
+    actions = random_actions(mpc, mpc.config.batch_size)
+
+    def bilinear(*_, out_shape=None, **__):
+        return BILINEAR * int(np.prod(out_shape))
+
+    features = mpc.model.begin(image, gripper)
+    counter = FlopCounterMode(
+        display=False, custom_mapping={torch.ops.aten.grid_sampler_2d: bilinear})
+    # looked at once before, like in a plan
+    with counter:
+        for _ in mpc.model.carried_maps(
+                features.clone(), gripper, maps.clone(), actions, mpc.config.cost_every):
+            pass
+    return counter.get_total_flops() / len(actions)
+
+
+def matrix_rate(device, dtype, repeat=5):
+    """Return the operations a second of a large matrix product, the best of some."""
+    torch.manual_seed(0)
+    a, b = (torch.randn(MATRIX, MATRIX, device=device).to(dtype) for _ in range(2))
+    best = np.inf
+    for _ in range(repeat + 1):
+        begin = time.perf_counter()
+        float((a @ b)[0, 0])  # waits for a GPU
+        best = min(best, time.perf_counter() - begin)
+    return 2 * MATRIX ** 3 / best
+
+
+def random_actions(mpc, count):
+    """Return sequences (count, horizon, 4) that push all the time, the dearest to predict."""
+    config = mpc.config
+    rng = np.random.default_rng(0)
+    actions = np.zeros((count, config.segments * config.repeat, 4), np.float32)
+    actions[..., :2] = rng.normal(0, config.std_move / 2, (*actions.shape[:2], 2))
+    return torch.from_numpy(actions).to(mpc.model.grid.device)
+
+
+def _inputs(mpc, seen):
+    """Return the picture (1, 3, H, W), and the gripper (1, 4) brought down to push."""
+    device = mpc.model.grid.device
+    gripper = torch.from_numpy(np.append(seen.gripper[:2], [0.012, 0]).astype(np.float32))
+    return to_float(seen.image)[None].to(device), gripper[None].to(device)

@@ -27,6 +27,7 @@ from tap_ros.evaluation.demo_report import (
     write_overview,
     write_report,
 )
+from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS, step_budget
 from tap_ros.nodes.clients import call, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.image_messages import decode_image, decode_map
 from tap_ros.nodes.node_processes import NodeProcesses
@@ -34,7 +35,6 @@ from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 from tqdm import tqdm
 
-FIRST_SCENE = 1_000_000  # far from the seeds of the training recordings
 MODES = ('direct', 'subgoal')
 START_TIMEOUT_S = 90.0
 CALL_TIMEOUT_S = 20.0
@@ -219,8 +219,9 @@ def run(args):
     :param args: parsed arguments of add_arguments.
     :return: exit code.
     """
-    if min(args.scenes, args.step_budget) < 1:
-        raise ConfigError('scenes and step-budget must be at least 1')
+    if args.scenes < 1 or args.step_budget < 0:
+        raise ConfigError('scenes must be at least 1, and step-budget 0 or more')
+    budget = args.step_budget or step_budget(args.task)
     folder = new_folder(args.out)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     client = None
@@ -239,7 +240,7 @@ def run(args):
                 for i in range(args.scenes):
                     print(f'  scene {args.seed + i} ({i + 1} of {args.scenes}): {args.task}',
                           flush=True)
-                    scenes.append(run_scene(client, args.task, args.seed + i, args.step_budget))
+                    scenes.append(run_scene(client, args.task, args.seed + i, budget))
     finally:
         if client is not None:
             client.node.destroy_node()
@@ -250,7 +251,7 @@ def run(args):
     write_report(
         folder / 'report.html', scenes,
         f'Task {args.task}, seeds {args.seed} to {args.seed + args.scenes - 1}, at most '
-        f'{args.step_budget} steps, {seconds:.0f} s in all. Object pixels at every step, and the '
+        f'{budget} steps, {seconds:.0f} s in all. Object pixels at every step, and the '
         'distances, are ground truth of the simulator.')
     if not args.attach:
         print(f'recording  {folder / "recording"}')
@@ -278,10 +279,10 @@ def add_arguments(parser):
         '--seed', type=int, default=FIRST_SCENE,
         help='seed of the first scene (default: %(default)s)')
     parser.add_argument(
-        '--task', default='push2', choices=('push2', 'push3'), help='task (default: %(default)s)')
+        '--task', default='push2', choices=PLANNING_TASKS, help='task (default: %(default)s)')
     parser.add_argument(
-        '--step-budget', type=int, default=40,
-        help='most steps of one run (default: %(default)s)')
+        '--step-budget', type=int, default=0,
+        help="most steps of one run; 0: the task's, 40 and 75 (default: %(default)s)")
     parser.add_argument(
         '--out', default='runs/demo', help='folder for the page, the recording and the logs '
         '(default: %(default)s; a number is added when it exists)')

@@ -2,15 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
 
-from pathlib import Path
-
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.topics import WORLD_FRAME
-from tap_ros.planning.visual_mpc import PRESETS, VisualMPC, with_preset
+from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.weights import FORWARD_MODEL
 
-DEFAULT_WEIGHTS = Path(__file__).parents[1] / 'weights' / 'forward_model_push.safetensors'
 MODES = ('subgoal', 'direct')
 DEFAULT_BUDGET, MAX_BUDGET = 40, 1000
 
@@ -18,7 +17,7 @@ DEFAULT_BUDGET, MAX_BUDGET = 40, 1000
 def declare_parameters(node):
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('weights', str(DEFAULT_WEIGHTS),
+    parameters.declare('weights', str(FORWARD_MODEL),
                        'File of weights (.safetensors) of a forward model.')
     parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
                        choices=['cpu', 'cuda'])

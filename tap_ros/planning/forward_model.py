@@ -38,6 +38,7 @@ import torch
 from torch import nn
 
 MOVE_LIMIT = (0.08, 0.08, 0.15)  # m per control period
+CLEAR = 0.1  # m, gripper height above which no object is touched
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,18 @@ class ForwardModel(nn.Module):
         step = torch.maximum(torch.minimum(action[:, :3], self.move_limit), -self.move_limit)
         moved = torch.cat([gripper[:, :3] + step, action[:, 3:]], 1)
         return torch.maximum(torch.minimum(moved, self.limits[1]), self.limits[0])
+
+    def gripper_after(self, gripper, actions):
+        """
+        Return where a sequence of actions leaves the gripper.
+
+        :param gripper: (4,) float32; actions (T, 4) float32.
+        :return: (4,) float32.
+        """
+        hand = torch.as_tensor(gripper, device=self.grid.device)[None]
+        for action in torch.as_tensor(actions, device=hand.device)[:, None]:
+            hand = self.move_gripper(hand, action)
+        return hand[0].cpu().numpy()
 
     def advance(self, features, flow, gripper, action):
         """
@@ -306,7 +319,13 @@ class ForwardModel(nn.Module):
         gripper = gripper.expand(count, -1)
         flow = self.still(count)
         for t, action in enumerate(actions.unbind(1), 1):
-            flow, gripper, _ = self.advance(features, flow, gripper, action)
+            # above all objects the gripper moves none, whatever the network says
+            following = self.move_gripper(gripper, action)
+            low = torch.minimum(gripper[:, 2], following[:, 2]) < CLEAR
+            if low.any():
+                moved = self.advance(features, flow, gripper, action)[0]
+                flow = moved if low.all() else torch.where(low[:, None, None, None], moved, flow)
+            gripper = following
             if t % every == 0:
                 yield self.carry(maps, flow)
 

@@ -106,7 +106,8 @@ class PushNet(nn.Module):
             pushed, what is pushed in turn, and what stays.
         """
         dtype = self.look.weight.dtype
-        x = self.look(crop.to(dtype, memory_format=torch.channels_last))
+        # in two steps: both at once takes three times as long
+        x = self.look(crop.to(dtype).contiguous(memory_format=torch.channels_last))
         x = F.relu(x + self.place + self.action(action_terms.to(dtype))[..., None, None])
         x = F.relu(self.blocks[0](x))
         whole = F.relu(self.gather(F.relu(self.squeeze(x)).flatten(1)))

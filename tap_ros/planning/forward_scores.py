@@ -22,10 +22,12 @@ def map_errors(model, store, episodes, stride=8, max_windows=400):
     :param store: EpisodeStore; episodes: indices to score.
     :param stride: frames from one window's start to the next.
     :return: dict of `map_error_px_{t}` (expected pixel against true pixel, per step t),
-        `nothing_moves_px_{t}` and `moved_{t}` (how many objects); empty without object pixels.
+        `nothing_moves_px_{t}`, `true_simulator_px_{t}` (maps put where the objects truly are by
+        then: what projection and the table's cells alone cost) and `moved_{t}` (how many
+        objects); empty without object pixels.
     """
     horizon = SCORED_STEPS[-1]
-    errors, moves, table = [], [], model.pixel_table().flatten(0, 1)
+    errors, moves, exact, table = [], [], [], model.pixel_table().flatten(0, 1)
     device = table.device
     for i in episodes:
         episode = store[int(i)]
@@ -42,6 +44,9 @@ def map_errors(model, store, episodes, stride=8, max_windows=400):
                 model.begin(image, gripper), gripper, maps, actions.to(device))
             expected = torch.stack([m[0].flatten(1) @ table for m in carried]).cpu().numpy()
             errors.append(np.linalg.norm(expected - true[1:], axis=-1))  # (T, K)
+            ideal = model.seed_maps(torch.from_numpy(true[1:].reshape(-1, 2).copy()).to(device))
+            ideal = (ideal.flatten(1) @ table).cpu().numpy().reshape(true[1:].shape)
+            exact.append(np.linalg.norm(ideal - true[1:], axis=-1))
             moves.append(np.linalg.norm(true[1:] - true[:1], axis=-1))
     scores = {}
     for t in SCORED_STEPS:
@@ -50,6 +55,8 @@ def map_errors(model, store, episodes, stride=8, max_windows=400):
         if chosen.any():
             error = np.concatenate([e[t - 1] for e in errors])
             scores[f'map_error_px_{t}'] = float(error[chosen].mean())
+            floor = np.concatenate([e[t - 1] for e in exact])
+            scores[f'true_simulator_px_{t}'] = float(floor[chosen].mean())
             scores[f'nothing_moves_px_{t}'] = float(moved[chosen].mean())
             scores[f'moved_{t}'] = int(chosen.sum())
     return scores

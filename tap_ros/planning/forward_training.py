@@ -119,16 +119,16 @@ def train(config, stop_at=None, progress=True):
     with SummaryWriter(config.out, purge_step=state.step) as curves, bar:
         began = time.monotonic() - state.seconds
         for step in range(state.step, last):
-            rate = learning_rate(step, config)
-            for group in state.optimizer.param_groups:
+            rate = learning_rate(step, config, config.learning_rate)
+            for group in state.optimizers[0].param_groups:
                 group['lr'] = rate
             # One step of Adam towards the recorded pictures.
             batch, shown = draw_step(config, store, training, step, state.network.homography)
             loss, parts = forward_loss(state.network, batch.to(device), shown, config)
-            state.optimizer.zero_grad()
+            state.optimizers[0].zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(state.network.parameters(), config.gradient_clip)
-            state.optimizer.step()
+            state.optimizers[0].step()
             state.update_average(config.average_decay)
             state.step = step + 1
             # Tell and save.
@@ -189,10 +189,11 @@ def _report(state, curves, config, store, training, held_out):
         if len(episodes):
             picture = sample_grid(state.average, store, episodes, config)
             curves.add_image(name, picture, state.step, dataformats='HWC')
+    device = next(state.network.parameters()).device.type
     about = {
         'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
         'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
-        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {config.device}',
+        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device}',
         'torch': torch.__version__, 'python': platform.python_version()}
     for name, values in (('config', asdict(config)), ('run', about), ('scores', scores)):
         path = Path(config.out) / f'{name}.json'

@@ -8,85 +8,23 @@ carry the maps, take the one that brings them closest to their goals, execute it
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 import os
 import time
 
 import numpy as np
-from tap_ros.errors import ConfigError, ImageError, PlanningError
-from tap_ros.images import check_image, to_float
-from tap_ros.planning.action_sequences import SequenceShape
-from tap_ros.planning.cem import cem, CEMConfig
+from tap_ros.errors import PlanningError
+from tap_ros.images import to_float
+from tap_ros.planning.action_sequences import LOW, SequenceShape
+from tap_ros.planning.cem import cem
 from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_inputs import check_maps, check_pixels, check_scene
 from tap_ros.planning.proposals import push_proposals
 import torch
 
-
-@dataclass(frozen=True)
-class VisualMPCConfig:
-    """
-    Settings of the planner. The default is what does best; PAPER is the paper's.
-
-    :param search: settings of the search; 200 samples, 3 iterations, 10 elites.
-    :param segments: displacements of a sequence; repeat: control periods of each.
-    :param std_move: m per control period, of x and y in the first Gaussian; move_limit their clip.
-    :param push_limit: m per control period while the gripper is low, so that pushes are like the
-        recorded ones; upright: go up and down without moving sideways, like them.
-    :param clearance: m from any object's pixel to where the gripper may come down.
-    :param max_lift: segments, at most, that the gripper travels lifted before it goes down.
-    :param last_weight: weight of the horizon's last step in the cost; the others have 1.
-    :param unfinished: px, extra cost of an object that is not yet within 3 px of its goal, so
-        that one is brought home before the next is begun: each change costs a long way.
-    :param warm_start: begin with the last plan, carried on by one control period.
-    :param warm_std: share of std_move that the warm-started search begins with.
-    :param proposals: how many first samples are pushes aimed at the objects, see proposals.py.
-    :param arm_hidden: the arm is not in the pictures.
-    :param cost_every: the cost looks at every so many steps; 1: at all of them.
-    :param batch_size: samples predicted at once; threads: on the CPU. Both change the speed only.
-    """
-
-    search: CEMConfig = CEMConfig()
-    segments: int = 5
-    repeat: int = 3
-    std_move: float = 0.04
-    move_limit: float = 0.08
-    push_limit: float = 0.05
-    upright: bool = True
-    clearance: float = 0.1
-    max_lift: int = 4
-    last_weight: float = 10.0
-    unfinished: float = 4.0
-    warm_start: bool = True
-    warm_std: float = 0.5
-    proposals: int = 80
-    arm_hidden: bool = False
-    cost_every: int = 3
-    batch_size: int = 50
-    threads: int = 0  # 0: as many as there are cores
-
-    def __post_init__(self):
-        for name in ('segments', 'repeat', 'batch_size'):
-            if getattr(self, name) < 1:
-                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
-        if self.cost_every < 1 or self.segments * self.repeat % self.cost_every:
-            raise ConfigError(f'cost_every: expected a divisor of the horizon '
-                              f'{self.segments * self.repeat}, got {self.cost_every}')
-        if not 0 <= self.max_lift < self.segments:
-            raise ConfigError(
-                f'max_lift: expected 0..{self.segments - 1} (segments - 1), got {self.max_lift}')
-        if not 0 <= self.proposals <= self.search.num_samples:
-            raise ConfigError(f'proposals: expected 0..{self.search.num_samples} '
-                              f'(num_samples), got {self.proposals}')
-
-
 NEAR = 3.0  # px
-
-# 0.08 m std and 0.16 m clip in the paper are for actions of 1 s; ours last 0.25 s.
-PAPER = VisualMPCConfig(
-    warm_start=False, proposals=0, cost_every=1, push_limit=0.08, upright=False,
-    clearance=0.0, unfinished=0.0)
-PRESETS = {'default': VisualMPCConfig(), 'paper': PAPER}
 
 
 @dataclass(frozen=True)
@@ -98,13 +36,14 @@ class Plan:
     current_distance: float  # px, mean over objects, before it
     planning_ms: float
     actions: np.ndarray  # (horizon, 4) the whole sequence
+    cost: float  # what the search minimised: px, summed over objects and time
 
 
 class VisualMPC:
     """
     The planner. Deterministic: the same seed and inputs give the same actions.
 
-    :param model: ForwardModel.
+    :param model: ForwardModel, or what carries object maps as it does.
     :param config: VisualMPCConfig.
     """
 
@@ -115,7 +54,7 @@ class VisualMPC:
         # other at every one of some thousand small steps, and for anything else that runs.
         threads = self.config.threads or len(os.sched_getaffinity(0))
         self._pool = ThreadPoolExecutor(
-            threads if next(model.parameters()).device.type == 'cpu' else 1,
+            threads if model.grid.device.type == 'cpu' else 1,
             initializer=torch.set_num_threads, initargs=(1,))
         self.reset(0)
 
@@ -137,10 +76,11 @@ class VisualMPC:
     def reset(self, seed=0):
         """Forget the last plan and start the random numbers anew."""
         config = self.config
-        self._seed, self._count, self._last = seed, 0, None
-        self._shape = SequenceShape(
+        self._seed, self._count, self._age = seed, 0, 0
+        self._first_shape = self._shape = SequenceShape(
             config.segments, config.repeat, 0, config.move_limit, config.max_lift,
             config.push_limit, config.upright)
+        self._last = self._plan = self._goal = None  # _last: parameters of what is left of _plan
 
     @torch.inference_mode()
     def act(self, image, gripper, object_pixels, goal_maps=None, goal_pixels=None):
@@ -156,17 +96,38 @@ class VisualMPC:
         :raises PlanningError: for inputs that cannot be planned with.
         """
         begin = time.perf_counter()
-        gripper, objects = self._check(image, gripper, object_pixels)
+        gripper, objects = check_scene(image, gripper, object_pixels, self.image_size)
         distance = self._goal_distance(goal_maps, goal_pixels, len(objects))  # (K, n n)
-        shape = self._shape
-        rng = np.random.default_rng([self._seed, self._count])
+        maps = self.model.seed_maps(torch.from_numpy(objects).to(distance.device))
+        current = float((maps.flatten(1) * distance).sum(1).mean())
+        unchanged = self._goal is not None and torch.equal(self._goal, distance)
+        if unchanged and self._age < self.config.replan_every:
+            shape, best = self._shape, self._last
+            actions = shape.actions(best[None], gripper[2])[0]
+            expected, cost = self._plan.expected_distance, self._plan.cost
+        else:
+            shape = self._shape if self.config.warm_start else self._first_shape
+            best, actions, expected, cost = self._search(shape, image, gripper, maps, distance)
+            self._age = 0
+        self._count, self._age = self._count + 1, self._age + 1
+        self._last, self._shape, self._goal = shape.shift(best), shape.following(), distance
+        self._plan = Plan(
+            actions[0], expected, current, 1000 * (time.perf_counter() - begin), actions, cost)
+        return self._plan
+
+    def _search(self, shape, image, gripper, maps, distance):
+        """
+        Search the best sequence of actions.
+
+        :param shape: SequenceShape; maps (K, n, n) of the objects on the table grid.
+        :param distance: (K, n n) px from each table cell to the goals.
+        :return: its parameters (D,), actions (horizon, 4), expected distance at its end, cost.
+        """
         device, config = distance.device, self.config
+        rng = np.random.default_rng([self._seed, self._count])
         price = distance + config.unfinished * (distance / NEAR).clamp(max=1)
         state = torch.from_numpy(gripper)[None].to(device)
         features = self.model.begin(to_float(image)[None].to(device), state, config.arm_hidden)
-        maps = self.model.seed_maps(torch.from_numpy(objects).to(device))
-        current = (maps.flatten(1) * distance).sum(1).mean()
-
         here = maps.flatten(1).cpu().numpy() @ self._table_points()  # (K, 2) metres
 
         def cost(samples):
@@ -176,24 +137,20 @@ class VisualMPC:
 
         mean, std = self._first_gaussian(shape)
         proposals = self._propose(shape, gripper, here, distance, rng)
-        if self._last is not None:
+        if config.warm_start and self._last is not None:
             proposals = np.concatenate([proposals, self._last[None]])
         clip = partial(shape.clip, least_lift=shape.least_lift(gripper[2]))
-        best, _, _ = cem(cost, mean, std, config.search, rng, clip, proposals)
+        best, best_cost, _ = cem(cost, mean, std, config.search, rng, clip, proposals)
         actions = shape.actions(best[None], gripper[2])
-        _, last = self._cost(features, state, maps, distance, actions)
-        self._count += 1
-        if config.warm_start:
-            self._last, self._shape = shape.shift(best), shape.following()
-        return Plan(actions[0, 0], float(last[0]), float(current),
-                    1000 * (time.perf_counter() - begin), actions[0])
+        _, ends = self._cost(features, state, maps, distance, actions)
+        return best, actions[0], float(ends[0]), best_cost
 
     def _first_gaussian(self, shape):
         """Return mean and deviation (D,): fresh, or around the last plan."""
         config = self.config
         mean, std = np.zeros(shape.size), np.full(shape.size, config.std_move)
         mean[-1], std[-1] = config.max_lift / 2, config.max_lift / 2
-        if self._last is not None:
+        if config.warm_start and self._last is not None:
             mean, std = self._last, std * config.warm_std
         return mean, std
 
@@ -235,10 +192,15 @@ class VisualMPC:
             total = (total - last.sum(1)) * (steps - 1) / max(1, seen - 1)
             return (total + config.last_weight * last.sum(1))[:count], last.mean(1)[:count]
 
-        parts = torch.from_numpy(actions).to(distance.device).split(config.batch_size)
-        costs, ends = zip(*self._pool.map(judge, parts))
+        # together with others that come down as late: up there, nothing needs to be predicted
+        order = np.argsort((actions[..., 2].cumsum(1) + gripper[0, 2].item() > LOW + 0.01).sum(1),
+                           kind='stable')
+        parts = torch.from_numpy(actions[order]).to(distance.device).split(config.batch_size)
+        costs, ends = map(torch.cat, zip(*self._pool.map(judge, parts)))
+        back = np.argsort(order)
+        costs, ends = costs.cpu().double().numpy()[back], ends.cpu().numpy()[back]
         # rounded so that the batch size, which moves the last bits, cannot change the ranking
-        return torch.cat(costs).cpu().double().numpy().round(3), torch.cat(ends).cpu().numpy()
+        return costs.round(2), ends
 
     def _goal_distance(self, goal_maps, goal_pixels, count):
         """
@@ -253,44 +215,13 @@ class VisualMPC:
             raise PlanningError('goal: give exactly one of goal_maps and goal_pixels')
         cells = self.model.pixel_table().flatten(0, 1)  # (n n, 2)
         if goal_pixels is not None:
-            goals = self._check_pixels(goal_pixels, 'goal_pixels', count)
+            goals = check_pixels(goal_pixels, 'goal_pixels', count, self.image_size)
             return torch.cdist(torch.from_numpy(goals).to(cells.device), cells)
         maps = check_maps(goal_maps, count, self.image_size)
         grid = self.model.pixels.flatten(0, 1)
         weights = torch.from_numpy(maps).flatten(1).to(cells.device)
         weights = weights / weights.sum(1, keepdim=True)
         return weights @ torch.cdist(grid, cells)
-
-    def _check(self, image, gripper, object_pixels):
-        """Check what the robot sees; return gripper (4,) and object pixels (K, 2) as float32."""
-        try:
-            check_image(image, 'image', self.image_size)
-        except ImageError as error:
-            raise PlanningError(str(error)) from error
-        gripper = np.asarray(gripper, np.float32)
-        if gripper.shape != (4,) or not np.isfinite(gripper).all():
-            raise PlanningError(
-                f'gripper: expected 4 finite numbers (x, y, z in m, opening), got {gripper}')
-        return gripper, self._check_pixels(object_pixels, 'object_pixels', None)
-
-    def _check_pixels(self, pixels, name, count):
-        """Check pixels (K, 2); return them as float32."""
-        pixels = np.asarray(pixels, np.float32)
-        if pixels.ndim != 2 or pixels.shape[1] != 2 or not len(pixels):
-            raise PlanningError(f'{name}: expected shape (K, 2) with K at least 1, '
-                                f'got {pixels.shape}')
-        if count is not None and len(pixels) != count:
-            raise PlanningError(f'{name}: {len(pixels)} goals for {count} objects; '
-                                'give one for each object, in the same order')
-        if not np.isfinite(pixels).all():
-            bad = np.flatnonzero(~np.isfinite(pixels).all(1)).tolist()
-            raise PlanningError(f'{name}: unknown (not finite) for objects {bad}; '
-                                'plan for known objects only')
-        size = np.array(self.image_size[::-1])
-        if name == 'goal_pixels' and ((pixels < -0.5) | (pixels > size - 0.5)).any():
-            bad = pixels[((pixels < -0.5) | (pixels > size - 0.5)).any(1)].tolist()
-            raise PlanningError(f'{name}: {bad} outside the {size[0]}x{size[1]} picture')
-        return pixels
 
 
 def landing_clash(landings, objects, clearance):
@@ -304,31 +235,3 @@ def landing_clash(landings, objects, clearance):
         return np.zeros(len(landings))
     gap = np.linalg.norm(landings[:, None] - objects, axis=-1).min(1)  # (N,)
     return np.where(gap < clearance, 100 + 1000 * (clearance - gap), 0)
-
-
-def check_maps(maps, count, size):
-    """
-    Check goal maps (K, H, W); return them as float32.
-
-    :raises PlanningError: for a wrong shape, negative or not finite values, or an empty map.
-    """
-    maps = np.asarray(maps, np.float32)
-    if maps.shape != (count, *size):
-        raise PlanningError(f'goal_maps: expected shape {(count, *size)} (one map for each '
-                            f'object), got {maps.shape}')
-    mass = maps.sum((1, 2))
-    if not np.isfinite(maps).all() or (maps < 0).any() or (mass <= 0).any():
-        raise PlanningError('goal_maps: expected finite values of at least 0 and a positive sum '
-                            f'for each object, got sums {mass.tolist()}')
-    return maps
-
-
-def with_preset(name, **changes):
-    """
-    Return a preset with changes.
-
-    :raises ConfigError: for an unknown preset.
-    """
-    if name not in PRESETS:
-        raise ConfigError(f'preset {name!r} is unknown; valid presets: {", ".join(PRESETS)}')
-    return replace(PRESETS[name], **changes)

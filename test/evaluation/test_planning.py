@@ -1,22 +1,34 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of the planning evaluation, in the real simulator with the shipped forward model."""
+"""Laws of planned episodes, in the real simulator with the shipped weights."""
 
-import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
 from tap_ros.errors import ConfigError
-from tap_ros.evaluation.planning import evaluate_planning, run_episode, summarise, WEIGHTS
+from tap_ros.evaluation.planning.episode import (
+    as_recording,
+    make_targets,
+    run_episode,
+    true_configuration,
+)
+from tap_ros.evaluation.planning.methods import BASES, parse_method
+from tap_ros.evaluation.planning.scenes import nearest_first, step_budget
+from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.images import to_float
 from tap_ros.planning.cem import CEMConfig
-from tap_ros.planning.visual_mpc import VisualMPC, VisualMPCConfig
+from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.warp import one_hot_maps
+from tap_ros.recording.episode import check_episode
+from tap_ros.weights import FORWARD_MODEL, PREDICTOR
 import torch
 
 QUICK = VisualMPCConfig(search=CEMConfig(16, 1, 4), proposals=8, batch_size=16, threads=1)
+DIRECT, SHIPPED = parse_method('direct'), parse_method('shipped')
 
 
 @pytest.fixture(scope='module')
@@ -28,86 +40,182 @@ def simulator():
 
 @pytest.fixture(scope='module')
 def mpc():
-    return VisualMPC.load(WEIGHTS / 'forward_model_push.safetensors', QUICK)
+    return VisualMPC.load(FORWARD_MODEL, QUICK)
 
 
 @pytest.fixture(scope='module')
 def predictor():
-    return SubgoalPredictor.load(WEIGHTS / 'predictor_push.safetensors')
+    return SubgoalPredictor.load(PREDICTOR)
 
 
 def test_doing_nothing_ends_20_cm_away(simulator, mpc):
-    run = run_episode(simulator, mpc, None, 'nothing', 10, seed=5)
+    run = run_episode(simulator, mpc, parse_method('nothing'), 10, seed=5)
     np.testing.assert_allclose(run.distances, 0.2, atol=1e-3)
     assert len(run.frames) == 1 and not len(run.actions)
 
 
 def test_the_same_seed_repeats_an_episode(simulator, mpc):
-    first, second = (run_episode(simulator, mpc, None, 'direct', 3, seed=5) for _ in range(2))
+    first, second = (run_episode(simulator, mpc, DIRECT, 3, seed=5) for _ in range(2))
     np.testing.assert_array_equal(first.actions, second.actions)
     np.testing.assert_array_equal(first.distances, second.distances)
     assert first.distances.shape == (4, 2) and len(first.frames) == 4
+    check_episode(as_recording(first, 'push2', 5, 'failure'))
 
 
 def test_the_goal_follows_the_subgoal_at_half_the_budget(simulator, mpc, predictor):
-    run = run_episode(simulator, mpc, predictor, 'subgoal', 4, seed=5)
-    assert run.switched_at == 2 and len(run.actions) == 4
-    at_once = run_episode(simulator, mpc, predictor, 'subgoal', 4, seed=5, reached=30.0)
+    run = run_episode(simulator, mpc, SHIPPED, 4, 5, predictor)
+    assert run.switches == [2] and len(run.actions) == 4
+    at_once = run_episode(simulator, mpc, SHIPPED, 4, 5, predictor, reached=30.0)
     assert not len(at_once.actions)  # 20 cm are less than 30 px: already there
 
 
-def test_unknown_modes_and_missing_predictors_are_named(simulator, mpc):
-    with pytest.raises(ConfigError, match='nothing, direct, subgoal'):
-        run_episode(simulator, mpc, None, 'both', 4, seed=5)
+def test_recursion_gives_one_subgoal_more_and_all_share_the_budget(simulator, mpc, predictor):
+    run = run_episode(simulator, mpc, parse_method('shipped:recursion2:half'), 3, 5, predictor)
+    assert run.switches == [1, 2] and len(run.subgoals) == 2 and len(run.targets) == 3
+
+
+def test_a_missing_predictor_is_named(simulator, mpc):
     with pytest.raises(ConfigError, match='predictor'):
-        run_episode(simulator, mpc, None, 'subgoal', 4, seed=5)
+        run_episode(simulator, mpc, SHIPPED, 4, seed=5)
 
 
-def test_an_evaluation_goes_on_where_it_stopped(simulator, mpc, tmp_path):
-    out = tmp_path / 'planning.json'
-    settings, modes = {'step_budget': 2}, ['nothing', 'direct']
-
-    def evaluate(seeds):
-        return evaluate_planning(
-            simulator, mpc, None, modes, seeds, 2, out, settings, progress=False)
-
-    first = evaluate([7])
-    stored = json.loads(out.read_text())
-    stored['episodes'][0]['final_cm'] = 99.0  # to see that it is not run again
-    out.write_text(json.dumps(stored))
-    both = evaluate([7, 8])
-    assert len(first) == 2 and len(both) == 4 and both[0]['final_cm'] == 99.0
-    with pytest.raises(ConfigError, match='other settings'):
-        evaluate_planning(
-            simulator, mpc, None, modes, [7], 3, out, {'step_budget': 3}, progress=False)
+def test_the_true_subgoal_has_the_nearest_object_at_its_goal(simulator, mpc):
+    seen = simulator.reset(5)
+    goal = simulator.goal()
+    targets, _ = make_targets(simulator, mpc, parse_method('true_subgoal'), seen, goal, None, 5)
+    moved = np.linalg.norm(targets[0].pixels - seen.object_pixels, axis=1) > 1
+    gaps = np.linalg.norm(seen.object_poses[:, :2] - seen.gripper[:2], axis=1)
+    assert moved.tolist() == (gaps == gaps.min()).tolist()
+    np.testing.assert_array_equal(targets[0].pixels[moved], goal.object_pixels[moved])
+    np.testing.assert_array_equal(targets[1].pixels, goal.object_pixels)
+    oracle, _ = make_targets(simulator, mpc, parse_method('oracle_order'), seen, goal, None, 5)
+    assert oracle[0].free.tolist() == (~moved).tolist() and oracle[1].free is None
 
 
-def test_summary_averages_and_pairs_scenes():
-    episodes = [
-        {'seed': seed, 'mode': mode, 'final_cm': cm, 'objects_cm': [cm, cm], 'planning_ms': 5.0}
-        for mode, finals in (('direct', (10.0, 14.0)), ('subgoal', (4.0, 10.0)))
-        for seed, cm in enumerate(finals)]
-    table = summarise(episodes)
-    assert table['direct']['mean_cm'] == 12 and table['subgoal']['mean_cm'] == 7
-    assert table['subgoal']['success_5cm'] == 0.5
-    assert table['subgoal']['gain_cm'] == 5
-    assert table['subgoal']['gain_standard_error_cm'] == pytest.approx(1.0)
-    assert 'nothing' not in table
+def test_objects_are_taken_from_the_nearest_on():
+    starts = np.array([[3.0, 0], [1, 0], [0.5, 3]])
+    goals = np.array([[3.0, 1], [0.5, 2], [0, 3]])
+    assert nearest_first(np.zeros(2), starts, goals) == [1, 2, 0]
+
+
+def test_a_true_picture_is_recognised(simulator):
+    seen = simulator.reset(5)
+    goal = simulator.goal()
+    for k in (0, 1):
+        poses = seen.object_poses.copy()
+        poses[k] = goal.object_poses[k]
+        shown = simulator.photograph(poses)
+        found = true_configuration(simulator, shown.image, seen, goal)
+        np.testing.assert_allclose(found, shown.object_pixels, atol=0.01)
+
+
+def test_one_object_alone_is_planned_for_alone(simulator, mpc):
+    run = run_episode(simulator, mpc, parse_method('one_object'), 2, 5, objects=[1])
+    assert len(run.targets) == 1 and len(run.targets[0].pixels) == 1
+    assert run.distances.shape == (3, 2)
+
+
+def test_carried_pixels_are_not_the_simulators(simulator, mpc):
+    run = run_episode(simulator, mpc, parse_method('direct:carried'), 2, 5)
+    assert 0 < run.tracking_error() < 1
+
+
+def go_behind(simulator, seed):
+    """Bring the gripper down behind object 0; return what is seen and where to push (2,)."""
+    seen = simulator.reset(seed)
+    target = seen.object_poses[0, :2]
+    along = -target / np.linalg.norm(target)  # towards the middle of the table
+    behind = target - 0.13 * along
+    for _ in range(14):
+        gap = behind - seen.gripper[:2]
+        seen = simulator.step([*gap, 0.13 - seen.gripper[2], 0])
+        if np.abs(gap).max() < 0.005:
+            break
+    return simulator.step([0, 0, 0.012 - seen.gripper[2], 0]), along
+
+
+def test_the_true_model_foresees_what_then_happens(simulator, mpc):
+    seen, along = go_behind(simulator, 30)
+    model = TrueModel(mpc.model, simulator)
+    actions = np.zeros((2, 6, 4), np.float32)
+    actions[0, :, :2] = 0.035 * along
+    actions = torch.from_numpy(actions)
+    start = model.begin(seen.image, seen.gripper)
+    maps = model.seed_maps(torch.from_numpy(seen.object_pixels))
+    *_, pushed = model.carried_maps(start, None, maps, actions, 3)
+    table = model.pixel_table().flatten(0, 1)
+    foreseen = (pushed.flatten(2) @ table).numpy()
+    for action in actions[0].numpy():
+        after = simulator.step(action)
+    assert np.linalg.norm(after.object_pixels - seen.object_pixels, axis=1).max() > 2
+    assert np.abs(foreseen[0] - after.object_pixels).max() < 0.3
+    assert np.abs(foreseen[1] - seen.object_pixels).max() < 0.3
+
+
+def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):
+    method = parse_method('true_model')
+    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(QUICK))
+    runs = [run_episode(simulator, planner, method, 2, 5) for _ in range(2)]
+    np.testing.assert_array_equal(runs[0].actions, runs[1].actions)
+
+
+@pytest.mark.parametrize('text', [
+    *BASES, 'genmin', 'true_model', 'genmin:half', 'fix0.25:recursion2:samples8:carried',
+    'genmin+relative:true_maps', 'genmin:true_model:more_search', 'direct:every3',
+    'true_subgoal:half:recursion2'])
+def test_the_name_of_a_method_reads_as_that_method(text):
+    method = parse_method(text)
+    assert parse_method(method.name) == method
+    assert ':' not in method.file_name
+
+
+def test_options_that_a_method_has_no_use_for_change_nothing():
+    assert parse_method('direct', switch='half', recursion=3) == DIRECT
+    assert parse_method('nothing', tracking='carried') == parse_method('nothing')
+    assert parse_method('genmin', switch='half').name == 'genmin:half'
+    assert parse_method('genmin:reached', switch='half') == parse_method('genmin')
+
+
+@pytest.mark.parametrize('text', [
+    'genmin:often', 'genmin:half2', 'genmin:recursion', 'genmin:recursion0', 'a b',
+    'genmin:samples4:true_model'])
+def test_impossible_methods_are_named(text):
+    with pytest.raises(ConfigError, match=text):
+        parse_method(text)
+
+
+def test_options_change_the_planner():
+    assert parse_method('direct:more_search').planner(QUICK).search.num_samples == 64
+    assert parse_method('direct:every3').planner(QUICK).replan_every == 3
+    assert parse_method('direct').planner(QUICK) == QUICK
+
+
+def test_budgets_are_the_papers():
+    assert (step_budget('push2'), step_budget('push3')) == (40, 75)
+
+
+def test_replanning_less_often_carries_the_plan_out(simulator, mpc):
+    seen = simulator.reset(5)
+    goal = simulator.goal().object_pixels
+    planner = VisualMPC(mpc.model, replace(QUICK, replan_every=3))
+    planner.reset(5)
+    plans = []
+    for _ in range(4):
+        plans.append(planner.act(
+            seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal))
+        seen = simulator.step(plans[-1].action)
+    for i in (1, 2):
+        np.testing.assert_allclose(plans[i].action[:2], plans[0].actions[i, :2], atol=1e-6)
+    assert plans[1].cost == plans[0].cost != plans[3].cost
+    planner.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal)
+    moved = planner.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal + 2)
+    assert moved.cost != plans[3].cost  # another goal needs another plan at once
 
 
 def test_shipped_model_foresees_a_push(simulator, mpc):
     errors, moves = [], []
     for seed in range(30, 34):
-        seen = simulator.reset(seed)
-        target = seen.object_poses[0, :2]
-        along = -target / np.linalg.norm(target)  # towards the middle of the table
-        behind = target - 0.13 * along
-        for _ in range(14):
-            gap = behind - seen.gripper[:2]
-            seen = simulator.step([*gap, 0.13 - seen.gripper[2], 0])
-            if np.abs(gap).max() < 0.005:
-                break
-        seen = simulator.step([0, 0, 0.012 - seen.gripper[2], 0])
+        seen, along = go_behind(simulator, seed)
         actions = np.tile(np.append(0.035 * along, [0, 0]), (1, 7, 1)).astype(np.float32)
         maps = one_hot_maps(torch.from_numpy(seen.object_pixels), (64, 64))[None]
         predicted = mpc.model.rollout(

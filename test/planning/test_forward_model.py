@@ -50,6 +50,16 @@ def test_up_and_down_moves_nothing(model, image):
     torch.testing.assert_close(expected, PIXELS.expand(1, 4, 2, 2), atol=0.01, rtol=0)
 
 
+def test_high_above_the_table_nothing_is_pushed(model, image):
+    pushing(model)
+    actions = torch.zeros(2, 6, 4)
+    actions[:, 1:, 0] = 0.05
+    actions[0, 0, 2] = 0.13  # up first
+    high, low = model.rollout(image, GRIPPER, one_hot_maps(PIXELS, (32, 32))[None], actions)
+    torch.testing.assert_close(high, PIXELS.expand(6, 2, 2), atol=0.01, rtol=0)
+    assert (low[-1] - PIXELS).abs().max() > 1
+
+
 @pytest.mark.parametrize('step', [(0.06, 0.0), (0.0, -0.06), (-0.03, 0.04)])
 def test_what_is_pushed_moves_as_the_gripper_does(model, image, step):
     pushing(model)

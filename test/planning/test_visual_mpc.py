@@ -7,14 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, PlanningError
+from tap_ros.images import to_float
 from tap_ros.planning.cem import CEMConfig
-from tap_ros.planning.visual_mpc import (
-    landing_clash,
-    PRESETS,
-    VisualMPC,
-    VisualMPCConfig,
-    with_preset,
-)
+from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig, with_preset
+from tap_ros.planning.visual_mpc import landing_clash, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
 import torch
 
@@ -22,6 +18,7 @@ SMALL = VisualMPCConfig(search=CEMConfig(24, 2, 5), proposals=8, batch_size=24, 
 IMAGE = np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8)
 GRIPPER = np.array([0.05, -0.1, 0.01, 0.0], np.float32)
 PIXELS = np.array([[20.0, 17.0], [9.0, 9.0]])
+DISTANCE = np.random.default_rng(1).uniform(0, 30, (2, 44 * 44))  # px, of each table cell
 GOALS = np.array([[24.0, 15.0], [9.0, 14.0]])
 
 
@@ -63,6 +60,20 @@ def test_reset_forgets_the_last_plan(model):
 @pytest.mark.parametrize('changes', [{'batch_size': 5}, {'batch_size': 50}, {'threads': 2}])
 def test_batch_size_and_threads_change_nothing(model, changes):
     assert same(plans(model), plans(model, replace(SMALL, **changes)))
+
+
+def test_equal_sequences_cost_the_same_in_any_batch(model):
+    costs, actions = {}, np.zeros((40, 15, 4), np.float32)
+    actions[..., :2] = np.random.default_rng(0).normal(0, 0.05, (5, 15, 2)).repeat(8, 0)
+    features = model.begin(to_float(IMAGE)[None], torch.zeros(1, 4))
+    maps = model.seed_maps(torch.tensor(PIXELS).float())
+    for size in (1, 3, 7, 40):
+        mpc = VisualMPC(model, replace(SMALL, batch_size=size))
+        costs[size], _ = mpc._cost(features, torch.zeros(1, 4), maps,
+                                   torch.from_numpy(DISTANCE).float(), actions)
+        assert (costs[size].reshape(5, 8) == costs[size][::8, None]).all()
+    assert len({values.tobytes() for values in costs.values()}) == 1
+    assert len(set(costs[40])) == 5
 
 
 def test_current_distance_is_that_of_the_pixels(model):
@@ -120,7 +131,8 @@ def test_bad_input_is_named(model, wrong, name):
 
 @pytest.mark.parametrize('wrong, name', [
     ({'cost_every': 4}, 'cost_every'), ({'max_lift': 5}, 'max_lift'),
-    ({'proposals': 500}, 'proposals'), ({'batch_size': 0}, 'batch_size')])
+    ({'proposals': 500}, 'proposals'), ({'replan_every': 0}, 'replan_every'),
+    ({'replan_every': 16}, 'replan_every'), ({'batch_size': 0}, 'batch_size')])
 def test_impossible_settings_are_named(wrong, name):
     with pytest.raises(ConfigError, match=name):
         VisualMPCConfig(**wrong)

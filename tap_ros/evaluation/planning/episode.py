@@ -1,0 +1,173 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+One scene, planned and pushed in one process.
+
+The loop, its seeds and its classes are those of visual_mpc_node, so that both act the same.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from tap_ros.errors import ConfigError
+from tap_ros.evaluation.planning.scenes import nearest_first
+from tap_ros.planning.hierarchy import choose_subgoals, Itinerary, Target
+from tap_ros.planning.tracking import ObjectTracker
+from tap_ros.recording.episode import Episode
+
+REACHED = 1.0  # px, mean over the objects, at which a goal or subgoal is reached
+
+
+@dataclass
+class PlannedEpisode:
+    """What happened in one run."""
+
+    distances: np.ndarray  # (steps + 1, K) metres from each object to its goal, ground truth
+    observations: list  # steps + 1 Observations
+    actions: np.ndarray  # (steps, 4)
+    planning_ms: np.ndarray  # (steps,)
+    goal: object  # Observation
+    targets: list  # Target, the goal last
+    switches: list  # steps at which the second, third ... target began
+    tracked: np.ndarray  # (steps + 1, K, 2) pixels that the planner was given
+    subgoals: list  # prediction.predictor.Subgoal
+
+    @property
+    def frames(self):
+        """Return the steps + 1 pictures uint8 (H, W, 3)."""
+        return [seen.image for seen in self.observations]
+
+    def tracking_error(self):
+        """Return the mean distance in pixels from what the planner was given to the truth."""
+        true = np.array([seen.object_pixels for seen in self.observations])
+        return float(np.linalg.norm(self.tracked - true, axis=-1).mean())
+
+
+def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reached=REACHED,
+                objects=None):
+    """
+    Push the objects of one scene.
+
+    :param simulator: Simulator; reset here.
+    :param mpc: VisualMPC; reset here.
+    :param method: methods.Method.
+    :param step_budget: control periods at most.
+    :param seed: of the scene, the planner and the predictor.
+    :param predictor: SubgoalPredictor, for methods that predict.
+    :param reached: px, mean over objects; nearer than this is there. 0: never.
+    :param objects: indices of the objects that are planned for; None: all.
+    :return: PlannedEpisode.
+    :raises ConfigError: when the predictor is missing.
+    """
+    if method.predicted and predictor is None:
+        raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
+    seen = simulator.reset(seed)
+    goal = simulator.goal()
+    K = len(goal.object_pixels)
+    chosen = np.arange(K) if objects is None else np.asarray(objects)
+    targets, subgoals = make_targets(simulator, mpc, method, seen, goal, predictor, seed)
+    if objects is not None:
+        targets = [Target(goal.object_pixels[chosen])]
+    tracker = None
+    if method.tracking == 'carried':
+        tracker = ObjectTracker(mpc.model, seen.image, seen.gripper, seen.object_pixels)
+    itinerary = Itinerary(targets, step_budget, method.switch, reached)
+    observations, distances, actions, times = [seen], [simulator.distances()], [], []
+    pixels = seen.object_pixels
+    tracked, limit = [pixels], np.array(seen.image.shape[1::-1]) - 1
+    mpc.reset(seed)
+    for step in range(step_budget if method.base != 'nothing' else 0):
+        if targets[-1].distance(pixels[chosen]) <= reached:
+            break
+        target = itinerary.target(step, pixels[chosen])
+        plan = mpc.act(seen.image, seen.gripper, pixels[chosen],
+                       **target.goal(np.clip(pixels[chosen], 0, limit)))
+        before, seen = seen, simulator.step(plan.action)
+        pixels = seen.object_pixels
+        if tracker is not None:
+            pixels = tracker.update(
+                before.image, before.gripper, plan.action, seen.image, seen.gripper)
+        observations.append(seen)
+        distances.append(simulator.distances())
+        tracked.append(pixels)
+        actions.append(plan.action)
+        times.append(plan.planning_ms)
+    return PlannedEpisode(
+        np.array(distances), observations, np.array(actions).reshape(-1, 4), np.array(times),
+        goal, targets, itinerary.switches, np.array(tracked), subgoals)
+
+
+def make_targets(simulator, mpc, method, seen, goal, predictor, seed):
+    """
+    Decide what is planned to, at the start of an episode.
+
+    :return: list of Target, the goal last, and the list of the Subgoals that were predicted.
+    """
+    start, end = seen.object_pixels, goal.object_pixels
+    last = Target(end)
+    if method.predicted:
+        subgoals = predict_chain(mpc, method, seen, goal, predictor, seed)
+        if method.maps == 'true':
+            return [*(Target(true_configuration(simulator, s.image, seen, goal))
+                      for s in subgoals), last], subgoals
+        return [*(Target(s.expected_pixels, s.object_maps) for s in subgoals), last], subgoals
+    if method.base not in ('oracle_order', 'true_subgoal'):
+        return [last], []
+    order = nearest_first(
+        seen.gripper[:2], seen.object_poses[:, :2], goal.object_poses[:, :2])
+    K, n = len(order), method.recursion
+    if method.base == 'oracle_order':
+        later = [np.isin(np.arange(K), order[i + 1:]) for i in range(K - 1)]
+        return [*(Target(end, free=free) for free in later), last], []
+    moved = [order[:max(1, i * K // (n + 1))] for i in range(1, n + 1)]
+    return [*(Target(np.where(np.isin(np.arange(K), done)[:, None], end, start))
+              for done in moved), last], []
+
+
+def predict_chain(mpc, method, seen, goal, predictor, seed):
+    """Return the predicted Subgoals, earliest first; of several samples the cheapest to plan."""
+    found = predictor.predict(
+        seen.image, goal.image, seen.object_pixels, goal.object_pixels,
+        num_samples=method.samples, recursion_depth=method.recursion, seed=seed)
+    chains = [found[i:i + method.recursion] for i in range(0, len(found), method.recursion)]
+    if len(chains) == 1:
+        return chains[0]
+    best, _ = choose_subgoals(
+        mpc, seen.image, seen.gripper, seen.object_pixels, goal.object_pixels, chains, seed)
+    return chains[best]
+
+
+def true_configuration(simulator, picture, seen, goal):
+    """
+    Find where objects are in the true configuration that looks most like a predicted picture.
+
+    :param picture: uint8 (H, W, 3), predicted.
+    :param seen: Observation of the start; goal: of the goal.
+    :return: (K, 2) pixels: some objects at their goals, but not all, the others at their starts.
+    """
+    errors = []
+    for moved in list(product((False, True), repeat=len(seen.object_pixels)))[1:-1]:
+        poses = np.where(np.array(moved)[:, None], goal.object_poses, seen.object_poses)
+        shown = simulator.photograph(poses, hide_arm=True)
+        error = np.abs(shown.image.astype(float) - picture).mean()
+        errors.append((error, shown.object_pixels))
+    return min(errors, key=lambda found: found[0])[1]
+
+
+def as_recording(run, task, seed, outcome):
+    """Return a PlannedEpisode as the Episode of a recording."""
+    seen, goal = run.observations, run.goal
+
+    def stack(name, dtype):
+        return np.array([getattr(o, name) for o in seen], dtype)
+
+    return Episode(
+        frames=stack('image', np.uint8), stamps=stack('stamp_ns', np.int64),
+        actions=np.concatenate([run.actions, np.zeros((1, 4))]).astype(np.float32),
+        grippers=stack('gripper', np.float32), object_names=tuple(seen[0].object_names),
+        object_pixels=stack('object_pixels', np.float32),
+        object_poses=stack('object_poses', np.float64), goal_frame=goal.image,
+        goal_pixels=np.asarray(goal.object_pixels, np.float32),
+        goal_poses=np.asarray(goal.object_poses, np.float64), task=task, seed=seed,
+        outcome=outcome)

@@ -1,0 +1,100 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The page about planning, in Markdown, from the rows of planning.json."""
+
+from tap_ros.evaluation.planning.methods import BOUNDS
+
+PAPER = {  # Table 2: mean final distance in cm and its standard error
+    ('push2', 'direct'): (12.9, 0.6), ('push2', 'fix'): (12.5, 0.5),
+    ('push2', 'genmin'): (11.9, 0.6), ('push3', 'direct'): (15.8, 0.6),
+    ('push3', 'fix'): (17.6, 0.6), ('push3', 'genmin'): (12.9, 0.7)}
+PAPER_NOTHING, PAPER_ONE_OBJECT = '20', 'about 5'
+TITLES = {'push2': 'Two objects', 'push3': 'Three objects'}
+FIRST = ('nothing', 'direct', 'fix', 'genmin')
+
+HOW_TO_READ = """\
+Final distances are in three dimensions from each object's origin to its goal, mean over the
+objects, in centimetres; a success has every object within 5 cm. In brackets are 95% bootstrap
+intervals over scenes. All methods push the same scenes, so that differences are paired: less than
+0 is better. The time of a plan is that of one thread beside others that plan at the same time;
+`python -m tap_ros bench planning` measures the speed. The paper's numbers (with their standard
+error) are from its own world, objects and planner: the order of methods can be compared, the
+centimetres only roughly.
+
+`one_object`, `oracle_order`, `true_subgoal` and `true_model` are bounds, which know more than a
+robot would: each object alone with the whole budget; one object after another, the nearest first;
+the subgoal's true positions, the nearest object moved; the simulator as forward model.
+
+What stands behind a colon replaces one part of the chain: `half` switches at half the budget as
+the paper does, otherwise a subgoal is left when it is reached or half the budget is spent;
+`recursion2` takes two subgoals in a row; `samples8` chooses among 8 by the planner's own cost;
+`true_maps` takes the objects' positions from the true configuration that looks most like the
+predicted picture; `true_model` plans with the simulator; `more_search` searches with four times
+the samples and five iterations; `every2` plans anew at every second action. Object pixels come
+from the simulator's ground truth at every step, except with `carried`: there only in the first
+picture, then the forward model carries them and the camera's pictures correct them.
+"""
+
+
+def make_page(rows, strips):
+    """
+    Write the page.
+
+    :param rows: of results.make_rows.
+    :param strips: dict (task, method) -> (file name of the film strip, caption).
+    :return: Markdown.
+    """
+    parts = [
+        '# Planning results\n',
+        'Made by `python -m tap_ros evaluate planning` from the files in [planning](planning), '
+        'never typed; as data: [planning.json](planning.json).\n', HOW_TO_READ]
+    for task in dict.fromkeys(row['task'] for row in rows):
+        own = [row for row in rows if row['task'] == task]
+        budget = own[0]['step_budget']
+        parts += [f'## {TITLES.get(task, task)}, at most {budget} steps\n', _table(task, own)]
+        for (of, method), (name, caption) in strips.items():
+            if of == task:
+                parts.append(f'**{method}**, {caption}:\n\n![{method}]({name})\n')
+    parts.append('## Commands\n')
+    parts += [f'    {command}' for command in dict.fromkeys(row['command'] for row in rows)]
+    return '\n'.join(parts) + '\n'
+
+
+def _table(task, rows):
+    """Return the table of one task."""
+    lines = ['| method | paper | final distance, cm | minus direct, cm | minus fix, cm '
+             '| all within 5 cm | steps | ms a plan | samples | scenes |', '|---' * 10 + '|']
+    methods = list(dict.fromkeys(row['method'] for row in rows))
+    for method in sorted(methods, key=_rank):
+        own = {(r['metric'], r.get('against')): r for r in rows if r['method'] == method}
+        final = own['final_distance_cm', None]
+        search = f'{final["planner_samples"]} x {final["planner_iterations"]}'
+        lines.append('| ' + ' | '.join([
+            f'`{method}`', _paper(task, method), _value(final),
+            _value(own.get(('final_distance_difference_cm', 'direct')), '+.1f'),
+            _value(own.get(('final_distance_difference_cm', 'fix')), '+.1f'),
+            f'{100 * own["success_5cm", None]["value"]:.0f}%',
+            f'{own["steps", None]["value"]:.0f}',
+            f'{own["plan_ms", None]["value"]:.0f}' if ('plan_ms', None) in own else '',
+            search if method != 'nothing' else '', str(final['n'])]) + ' |')
+    return '\n'.join(lines) + '\n'
+
+
+def _rank(method):
+    """Sort the paper's methods first, then their variants, then bounds."""
+    base = method.split(':')[0]
+    first = FIRST.index(base) if base in FIRST else len(FIRST)
+    return base in BOUNDS, first, method
+
+
+def _paper(task, method):
+    if method in ('nothing', 'one_object'):
+        return PAPER_NOTHING if method == 'nothing' else PAPER_ONE_OBJECT
+    value = PAPER.get((task, method))
+    return f'{value[0]} ± {value[1]}' if value else ''
+
+
+def _value(row, form='.1f'):
+    if row is None:
+        return ''
+    return f'{row["value"]:{form}} [{row["ci_low"]:{form}}, {row["ci_high"]:{form}}]'

@@ -1,0 +1,55 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulator in place of the forward model: what planning loses by predicting."""
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from sim_bridge.simulator import ACTION_LIMIT, OBJECT_QPOS_START, ramp_controls, SUBSTEPS
+import torch
+
+
+class TrueModel:
+    """
+    Carries object maps by the true physics, from the state that the simulator is in.
+
+    The planner sees no difference: a map is put on the table grid where the object truly gets to.
+
+    :param model: ForwardModel; its geometry is used, none of its networks.
+    :param simulator: Simulator.
+    :param objects: indices of the objects that are planned for; None: all.
+    """
+
+    def __init__(self, model, simulator, objects=None):
+        self.config, self.grid, self.pixels = model.config, model.grid, model.pixels
+        self.pixel_table, self.seed_maps = model.pixel_table, model.seed_maps
+        self.objects = objects
+        self._simulator = simulator
+        self._rollout = mujoco.rollout.Rollout(nthread=0)
+
+    def begin(self, image, gripper, arm_hidden=False):
+        """Return the simulator's model and state, in place of features; nothing is looked at."""
+        simulator = self._simulator
+        return simulator.model, simulator.state(), simulator.target.copy()
+
+    def carried_maps(self, start, gripper, maps, actions, every=1):
+        """
+        Yield the maps (N, K, n, n) after every so many steps, as ForwardModel does.
+
+        :param start: from begin; actions (N, horizon, 4).
+        """
+        model, state, target = start
+        actions, same = torch.unique(actions, dim=0, return_inverse=True)
+        steps = actions.cpu().double().numpy()
+        steps[..., :3] = np.clip(steps[..., :3], -ACTION_LIMIT, ACTION_LIMIT)
+        controls, _ = ramp_controls(target, steps)
+        states, _ = self._rollout.rollout(
+            model, mujoco.MjData(model), np.tile(state, (len(steps), 1)), controls)
+        for t in range(every, steps.shape[1] + 1, every):
+            poses = states[:, t * SUBSTEPS - 1, 1 + OBJECT_QPOS_START:1 + model.nq]
+            places = poses.reshape(len(steps), -1, 7)[..., :3]
+            if self.objects is not None:
+                places = places[:, self.objects]
+            pixels = self._simulator.camera.project(places).astype(np.float32)  # (N, K, 2)
+            reached = self.seed_maps(torch.from_numpy(pixels).to(self.grid.device).view(-1, 2))
+            yield reached.view(*pixels.shape[:2], *maps.shape[-2:])[same]

@@ -1,0 +1,113 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Hierarchical planning: one target after another, the goal last (App. F of the paper).
+
+The paper has one subgoal and switches at half the budget ('half'). Switching as soon as the
+subgoal is reached ('reached') wastes no steps; several subgoals share the budget equally.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from tap_ros.errors import ConfigError
+
+SWITCHES = ('reached', 'half')
+
+
+@dataclass(frozen=True)
+class Target:
+    """
+    Where objects should be.
+
+    :param pixels: (K, 2) (u, v), for a map its mean.
+    :param maps: (K, H, W) object maps that the planner takes instead of the pixels, or None.
+    :param free: (K,) bool, objects that should stay wherever they are; None: no object.
+    """
+
+    pixels: np.ndarray
+    maps: np.ndarray | None = None
+    free: np.ndarray | None = None
+
+    def distance(self, pixels):
+        """Return the mean distance in pixels of the objects (K, 2) that are not free."""
+        gaps = np.linalg.norm(np.asarray(pixels) - self.pixels, axis=1)
+        return float(gaps.mean() if self.free is None else gaps[~self.free].mean())
+
+    def goal(self, pixels):
+        """Return the keyword arguments of VisualMPC.act, for objects that are at pixels (K, 2)."""
+        if self.maps is not None:
+            return {'goal_maps': self.maps}
+        if self.free is None:
+            return {'goal_pixels': self.pixels}
+        return {'goal_pixels': np.where(self.free[:, None], pixels, self.pixels)}
+
+
+class Itinerary:
+    """
+    Say at every step what to plan to.
+
+    Target i of n lasts until step (i + 1) B / n at most.
+
+    :param targets: list of Target, the last one is the goal.
+    :param step_budget: B.
+    :param switch: 'half': a target gets its whole share of the budget; 'reached': goes on to the
+        next one as soon as it is reached.
+    :param reached: px, mean over objects; nearer than this is there. 0: never.
+    :ivar switches: steps at which the second, third ... target began.
+    """
+
+    def __init__(self, targets, step_budget, switch='reached', reached=1.0):
+        if switch not in SWITCHES:
+            raise ConfigError(f'switch {switch!r} is unknown; expected one of {SWITCHES}')
+        self._targets, self._budget = list(targets), step_budget
+        self._switch, self._reached = switch, reached
+        self.switches = []
+
+    def target(self, step, pixels):
+        """
+        Return the Target of this step.
+
+        :param step: control periods that have passed.
+        :param pixels: (K, 2), where the objects are.
+        """
+        while len(self.switches) < len(self._targets) - 1:
+            stage = len(self.switches)
+            late = step >= (stage + 1) * self._budget // len(self._targets)
+            there = (self._switch == 'reached'
+                     and self._targets[stage].distance(pixels) <= self._reached)
+            if not late and not there:
+                break
+            self.switches.append(step)
+        return self._targets[len(self.switches)]
+
+
+def choose_subgoals(mpc, image, gripper, pixels, goal_pixels, candidates, seed=0):
+    """
+    Choose among sampled subgoals by what the planner itself expects them to cost.
+
+    The cost of a chain of subgoals is what the planner minimises, summed over its legs: to the
+    first subgoal from what is seen, then from each predicted picture to the next target, the arm
+    standing where the plan before left it.
+
+    :param mpc: VisualMPC; reset here before every plan.
+    :param image: (H, W, 3) uint8; gripper (4,); pixels (K, 2), what is seen now.
+    :param goal_pixels: (K, 2).
+    :param candidates: list of lists of prediction.predictor.Subgoal, earliest first.
+    :param seed: of the planner.
+    :return: index of the candidate of least cost, the first of equals; costs (N,).
+    """
+    costs = []
+    for chain in candidates:
+        seen, hand, places, total = image, np.asarray(gripper, np.float32), pixels, 0.0
+        legs = [{'goal_maps': subgoal.object_maps} for subgoal in chain]
+        for leg, subgoal in zip([*legs, {'goal_pixels': goal_pixels}], [*chain, None]):
+            mpc.reset(seed)
+            plan = mpc.act(seen, hand, places, **leg)
+            total += plan.cost
+            if subgoal is not None:
+                seen, places = subgoal.image, subgoal.expected_pixels
+                hand = mpc.model.gripper_after(hand, plan.actions)
+        costs.append(total)
+    mpc.reset(seed)
+    return int(np.argmin(costs)), np.array(costs)

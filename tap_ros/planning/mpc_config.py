@@ -1,0 +1,91 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of the planner, and presets of them."""
+
+from dataclasses import dataclass, replace
+
+from tap_ros.errors import ConfigError
+from tap_ros.planning.cem import CEMConfig
+
+
+@dataclass(frozen=True)
+class VisualMPCConfig:
+    """
+    Settings of the planner. The default is what does best; PAPER is the paper's.
+
+    :param search: settings of the search; 200 samples, 3 iterations, 10 elites.
+    :param segments: displacements of a sequence; repeat: control periods of each.
+    :param std_move: m per control period, of x and y in the first Gaussian; move_limit their clip.
+    :param push_limit: m per control period while the gripper is low, so that pushes are like the
+        recorded ones; upright: go up and down without moving sideways, like them.
+    :param clearance: m from any object's pixel to where the gripper may come down.
+    :param max_lift: segments, at most, that the gripper travels lifted before it goes down.
+    :param last_weight: weight of the horizon's last step in the cost; the others have 1.
+    :param unfinished: px, extra cost of an object that is not yet within 3 px of its goal, so
+        that one is brought home before the next is begun: each change costs a long way.
+    :param warm_start: begin with the last plan, carried on by one control period.
+    :param warm_std: share of std_move that the warm-started search begins with.
+    :param proposals: how many first samples are pushes aimed at the objects, see proposals.py.
+    :param arm_hidden: the arm is not in the pictures.
+    :param cost_every: the cost looks at every so many steps; 1: at all of them.
+    :param replan_every: search anew at every so many actions, or when the goal changes; between
+        these the last plan is carried out.
+    :param batch_size: samples predicted at once; threads: on the CPU. Both change the speed only.
+    """
+
+    search: CEMConfig = CEMConfig()
+    segments: int = 5
+    repeat: int = 3
+    std_move: float = 0.04
+    move_limit: float = 0.08
+    push_limit: float = 0.05
+    upright: bool = True
+    clearance: float = 0.1
+    max_lift: int = 4
+    last_weight: float = 10.0
+    unfinished: float = 4.0
+    warm_start: bool = True
+    warm_std: float = 0.5
+    proposals: int = 80
+    arm_hidden: bool = False
+    cost_every: int = 3
+    replan_every: int = 1
+    batch_size: int = 50
+    threads: int = 0  # 0: as many as there are cores
+
+    def __post_init__(self):
+        for name in ('segments', 'repeat', 'batch_size', 'replan_every'):
+            if getattr(self, name) < 1:
+                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
+        if self.cost_every < 1 or self.segments * self.repeat % self.cost_every:
+            raise ConfigError(f'cost_every: expected a divisor of the horizon '
+                              f'{self.segments * self.repeat}, got {self.cost_every}')
+        if self.replan_every > self.segments * self.repeat:
+            raise ConfigError(f'replan_every: expected at most the horizon '
+                              f'{self.segments * self.repeat}, got {self.replan_every}')
+        if not 0 <= self.max_lift < self.segments:
+            raise ConfigError(
+                f'max_lift: expected 0..{self.segments - 1} (segments - 1), got {self.max_lift}')
+        if not 0 <= self.proposals <= self.search.num_samples:
+            raise ConfigError(f'proposals: expected 0..{self.search.num_samples} '
+                              f'(num_samples), got {self.proposals}')
+
+
+# 0.08 m std and 0.16 m clip in the paper are for actions of 1 s; ours last 0.25 s.
+PAPER = VisualMPCConfig(
+    warm_start=False, proposals=0, cost_every=1, push_limit=0.08, upright=False,
+    clearance=0.0, unfinished=0.0)
+# A fifth of the samples: for long evaluations and weak machines.
+QUICK = VisualMPCConfig(search=CEMConfig(64, 2, 8), proposals=32, batch_size=32)
+PRESETS = {'default': VisualMPCConfig(), 'paper': PAPER, 'quick': QUICK}
+
+
+def with_preset(name, **changes):
+    """
+    Return a preset with changes.
+
+    :raises ConfigError: for an unknown preset.
+    """
+    if name not in PRESETS:
+        raise ConfigError(f'preset {name!r} is unknown; valid presets: {", ".join(PRESETS)}')
+    return replace(PRESETS[name], **changes)

@@ -1,0 +1,86 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of hierarchical planning: which target comes when, and how subgoals are chosen."""
+
+import numpy as np
+import pytest
+from tap_ros.errors import ConfigError
+from tap_ros.planning.cem import CEMConfig
+from tap_ros.planning.hierarchy import choose_subgoals, Itinerary, Target
+from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.prediction.predictor import Subgoal
+from tap_ros.prediction.warp import one_hot_maps
+import torch
+
+PLACES = np.array([[8.0, 8.0], [20.0, 20.0]])
+
+
+def targets(count):
+    return [Target(PLACES + 4 * i) for i in range(count)]
+
+
+def stages(itinerary, path):
+    """Return the number of the target at each step, the objects being at path (T, K, 2)."""
+    found = []
+    for step, pixels in enumerate(path):
+        itinerary.target(step, pixels)
+        found.append(len(itinerary.switches))
+    return found
+
+
+def test_half_gives_every_target_its_share_of_the_budget():
+    far = np.full((12, 2, 2), 60.0)
+    assert stages(Itinerary(targets(2), 12, 'half'), far) == [0] * 6 + [1] * 6
+    assert stages(Itinerary(targets(3), 12, 'half'), far) == [0] * 4 + [1] * 4 + [2] * 4
+    on_the_spot = np.repeat(PLACES[None], 12, 0)
+    assert stages(Itinerary(targets(2), 12, 'half'), on_the_spot) == [0] * 6 + [1] * 6
+
+
+def test_reached_goes_on_at_once_but_not_later_than_half():
+    on_the_spot = np.repeat(PLACES[None], 12, 0)
+    assert stages(Itinerary(targets(3), 12), on_the_spot) == [1] * 8 + [2] * 4
+    far = np.full((12, 2, 2), 60.0)
+    assert stages(Itinerary(targets(2), 12), far) == [0] * 6 + [1] * 6
+    assert stages(Itinerary(targets(2), 12, reached=0.0), on_the_spot + 1e-3)[5] == 0
+
+
+def test_several_targets_that_are_reached_are_passed_at_once():
+    same = [Target(PLACES)] * 3
+    assert Itinerary(same, 12).target(0, PLACES) is same[2]
+
+
+def test_free_objects_count_for_nothing_and_shall_stay_where_they_are():
+    target = Target(PLACES, free=np.array([False, True]))
+    now = np.array([[8.0, 11.0], [50.0, 50.0]])
+    assert target.distance(now) == 3
+    np.testing.assert_array_equal(target.goal(now)['goal_pixels'], [PLACES[0], now[1]])
+
+
+def test_maps_go_before_their_means():
+    maps = np.ones((2, 32, 32))
+    assert Target(PLACES, maps).goal(PLACES) == {'goal_maps': maps}
+
+
+def test_unknown_switches_are_named():
+    with pytest.raises(ConfigError, match='half'):
+        Itinerary(targets(2), 12, 'sometimes')
+
+
+def subgoal(pixels):
+    maps = one_hot_maps(torch.tensor(pixels), (32, 32)).numpy()
+    picture = np.full((32, 32, 3), 90, np.uint8)
+    return Subgoal(picture, maps, np.asarray(pixels, np.float32), np.ones(2, np.float32), 0, 0)
+
+
+def test_the_subgoal_on_the_way_is_chosen_and_the_first_of_equals(model):
+    mpc = VisualMPC(model, VisualMPCConfig(
+        search=CEMConfig(16, 1, 4), proposals=4, batch_size=16, threads=1))
+    image, gripper = np.full((32, 32, 3), 90, np.uint8), np.zeros(4, np.float32)
+    start, goal = PLACES, PLACES + [4.0, 0.0]
+    between, astray = start + [2.0, 0.0], np.array([[28.0, 28.0], [3.0, 3.0]])
+    chains = [[subgoal(astray)], [subgoal(between)], [subgoal(between)]]
+    best, costs = choose_subgoals(mpc, image, gripper, start, goal, chains)
+    assert best == 1 and costs[1] == costs[2] < costs[0]
+    again, _ = choose_subgoals(mpc, image, gripper, start, goal, chains[::-1])
+    assert again == 0
