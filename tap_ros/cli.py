@@ -28,6 +28,7 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
     'bench': ('measure speed; without a name, all of it', {
         'collect': 'tap_ros.evaluation.bench_collect',
         'recording': 'tap_ros.evaluation.bench_recording',
+        'training': 'tap_ros.evaluation.bench_training',
         'planning': 'tap_ros.evaluation.bench_planning'}),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),

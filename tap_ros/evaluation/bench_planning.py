@@ -15,6 +15,7 @@ import time
 import numpy as np
 from sim_bridge.simulator import Simulator
 from tap_ros.evaluation.planning.scenes import FIRST_SCENE
+from tap_ros.evaluation.speed import MATRIX, matrix_rate
 from tap_ros.images import to_float
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
@@ -22,7 +23,6 @@ from tap_ros.weights import FORWARD_MODEL
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-MATRIX = 2048  # side of the matrices whose product sets the rate
 BILINEAR = 8  # operations to read one number between four
 
 
@@ -138,18 +138,6 @@ def count_operations(mpc, seen):
                 features.clone(), gripper, maps.clone(), actions, mpc.config.cost_every):
             pass
     return counter.get_total_flops() / len(actions)
-
-
-def matrix_rate(device, dtype, repeat=5):
-    """Return the operations a second of a large matrix product, the best of some."""
-    torch.manual_seed(0)
-    a, b = (torch.randn(MATRIX, MATRIX, device=device).to(dtype) for _ in range(2))
-    best = np.inf
-    for _ in range(repeat + 1):
-        begin = time.perf_counter()
-        float((a @ b)[0, 0])  # waits for a GPU
-        best = min(best, time.perf_counter() - begin)
-    return 2 * MATRIX ** 3 / best
 
 
 def random_actions(mpc, count):
