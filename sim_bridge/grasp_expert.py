@@ -36,7 +36,7 @@ class GraspConfig:
     spread: tuple = (0.03, 0.04)  # m along x and y around the object's origin, at first
     hover: tuple = (0.1, 0.13)  # m, heights of the gripper before it drops,
     low: tuple = (0.004, 0.018)  # when it grasps
-    lift: tuple = (0.1, 0.135)  # and how far it lifts
+    lift: tuple = (0.12, 0.14)  # and how far it lifts
     travel_speed: tuple = (0.035, 0.08)  # m per control period
     walk: tuple = (1, 6)  # control periods of the random walk at the end, if there is time
     wiggle: float = 0.035  # m per control period, of the random walk
@@ -80,22 +80,24 @@ class GraspExpert:
         travel, fastest = self._travel_steps(place - here[:2])
         fixed = rise + self._drop_steps + 1 + self._lift_steps
         travel = min(travel, max(steps_left - fixed, fastest))
-        # Idle time is spent before the grasp as often as after it.
         idle = self._rng.integers(0, 1 + max(min(steps_left - fixed - travel, 4), 0))
-        before = self._rng.integers(0, 1 + idle)
-        path = [here[:3]] * (1 + before)
+        lift_steps = self._lift_steps
+        if self._simulator.task.lift:
+            # Up to the last frame: idle frames beside the goal picture would make copying perfect.
+            lift_steps = max(steps_left - (fixed - lift_steps) - travel - idle, lift_steps)
+        path = [here[:3]]
         if rise:
             path.append(np.append(here[:2], self._hover))
         above, below = np.append(place, self._hover), np.append(place, self._low)
         path += _line(path[-1], above, travel)
         if far:
             path[-travel:] = [np.append(point[:2], self._hover) for point in path[-travel:]]
-        path += [above] * (idle - before)
+        path += [above] * idle  # it waits above the object
         path += _line(above, below, self._drop_steps)
         opened = len(path) - 1
-        path += [below] + _line(below, np.append(place, self._top), self._lift_steps)
+        path += [below] + _line(below, np.append(place, self._top), lift_steps)
         opening = np.zeros(len(path) - 1)
-        opening[before:opened] = 1
+        opening[:opened] = 1
         return np.column_stack([np.diff(path, axis=0), opening])
 
     def _reserve(self, steps_left):
