@@ -35,7 +35,8 @@ def test_every_run_can_be_trained_as_its_name_says():
     for run in EVERY:
         config = run.config('bags', 'runs/paper')
         assert config.chosen.name == run.method and config.mode == run.mode
-        assert config.goal_picture == 'last' and config.seed == run.seed
+        assert config.seed == run.seed
+        assert (config.goal_picture == 'last') == (run.variant != '+mixed')
         assert run.task in TASKS and config.recordings == (f'bags/{run.task}',)
         assert config.out == f'runs/paper/{run.scale}/{run.name}'
         if 'relative' not in run.method and not run.variant:
@@ -51,7 +52,7 @@ def test_names_are_unique_and_the_first_seed_comes_first():
 
 
 def test_rows_of_a_task_and_mode_differ_in_the_method_only():
-    free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'outer_power'}
+    free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'outer_power', 'goal_picture'}
     for scale in SCALES:
         settings = {}
         for run in paper_runs(scale):

@@ -24,6 +24,9 @@ def add_arguments(parser):
     parser.add_argument('--collect', action='store_true', help='make the recordings only')
     parser.add_argument('--results-only', action='store_true',
                         help='only write the page and its data from the runs that are done')
+    parser.add_argument('--ship', nargs=2, metavar=('RUN', 'FILE'),
+                        help='write the weights of a run that is done at half their size, with a '
+                        'model card beside them')
     parser.add_argument('--jobs', type=int, default=1, metavar='N',
                         help='processes at a time (default: %(default)s)')
     parser.add_argument('--limit', '--slice-minutes', type=float, metavar='MINUTES',
@@ -58,6 +61,8 @@ def run(args):
     if args.results_only:
         _write_results(places, pictures=True)
         return 0
+    if args.ship:
+        return _ship(*args.ship, args, places)
     runs = choose_runs(args)
     if args.list:
         show(runs, places)
@@ -78,6 +83,17 @@ def run(args):
     if failed and any(state.kind == 'other' for state in states):
         print('--fresh begins runs anew that were begun with other settings or recordings')
     return 1 if failed else 0
+
+
+def _ship(name, file, args, places):
+    """Write weights and card of the run of this name."""
+    from tap_ros.evaluation.paper.shipping import ship
+    runs = {run.name: run for run in paper_runs(
+        args.scale, args.seeds, args.episodes, args.steps)}
+    if name not in runs:
+        raise ConfigError(f'--ship {name}: there is no such run; --list shows all')
+    print(ship(runs[name], file, places))
+    return 0
 
 
 def choose_runs(args):

@@ -50,11 +50,13 @@ SCALES = {
 _PAPER = {'margin': 0, 'outer_power': 1.0, 'goal_picture': 'last'}
 # Choosing by the error relative to copying needs both, see docs/paper_map.md.
 _RELATIVE = {**_PAPER, 'margin': 3, 'outer_power': 0.5}
-# What each part of that does: everything but the selection error, and everything but the root.
 VARIANTS = {
     '': {},
+    # What each part of that does: all but the selection error, and all but the root.
     '+root': {'margin': 3, 'outer_power': 0.5},
     '+mean': {'outer_power': 1.0},
+    # For use: goal pictures with the arm elsewhere too, as people photograph goals.
+    '+mixed': {'goal_picture': 'mixed'},
 }
 
 
@@ -193,6 +195,8 @@ def paper_runs(scale, seeds=(0,), episodes=0, steps=0):
     # What planning with three objects and recursion use.
     add(['push3'], ['genmin+relative', 'genmin', 'fix'], new_pixels=False)
     add(['pick_place'], ['genmin'], recursion=2)
+    # For use in planning.
+    add(['push2', 'push3'], ['genmin+relative'], new_pixels=False, variant='+mixed')
     # What the parts of genmin+relative are worth.
     add(['push2'], ['genmin'], new_pixels=False, variant='+root')
     add(['push2'], ['genmin+relative'], new_pixels=False, variant='+mean')
