@@ -3,7 +3,6 @@
 """Serves predict_subgoal: decode, call SubgoalPredictor, encode."""
 
 from dataclasses import dataclass
-from pathlib import Path
 import sys
 import time
 
@@ -15,7 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.errors import ConfigError, ImageError, TapError, WeightsError
+from tap_ros.errors import ImageError, TapError
 from tap_ros.nodes.image_messages import (
     decode_image,
     encode_image,
@@ -25,16 +24,23 @@ from tap_ros.nodes.image_messages import (
 )
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.nodes.predictor_setup import (
+    check_count,
+    choose_mode,
+    declare_parameters,
+    load_predictors,
+    MAX_DEPTH,
+    MAX_SAMPLES,
+)
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.topics import CAMERA_FRAME, LATCHED, STREAM
+from tap_ros.nodes.topics import CAMERA_FRAME, LATCHED, STREAM, to_nanoseconds
 from tap_ros.pictures import overlay
-from tap_ros.prediction.predictor import SubgoalPredictor
 
-DEFAULT_WEIGHTS = Path(__file__).parents[1] / 'weights' / 'predictor_push.safetensors'
+TOPICS = {  # what stands in for the fields that a request leaves empty
+    'start': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
+    'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
-MAX_SAMPLES = 100
-MAX_DEPTH = 8
+OBJECTS_TIMEOUT = 0.1  # s that the objects of the newest picture may come after it
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,7 @@ class View:
     image: np.ndarray  # (H, W, 3) uint8
     names: tuple  # K object names
     pixels: np.ndarray  # (K, 2) float32 (u, v)
+    lacking: str  # why there are no objects; empty if there are
     stamp: Time
     frame_id: str
 
@@ -54,24 +61,22 @@ class PredictorNode(Node):
     def __init__(self):
         super().__init__('predictor_node')
         self.params = declare_parameters(self)
-        self._predictor = load_predictor(self.params['weights'], self.params['device'])
-        self._camera = Observations('image', 'objects')
-        self._camera.subscribe(
-            self, {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
-            STREAM)
-        self._goal = Observations('image', 'objects')
-        self._goal.subscribe(
-            self, {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')},
-            LATCHED)
+        self._predictors = load_predictors(
+            self.params['weights'], self.params['forward_weights'], self.params['device'])
+        self._newest = {name: Observations(*topics) for name, topics in TOPICS.items()}
+        self._newest['start'].subscribe(self, TOPICS['start'], STREAM)
+        self._newest['goal'].subscribe(self, TOPICS['goal'], LATCHED)
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
         # Its own group: images keep coming in while the network works.
         self.create_service(PredictSubgoal, 'predict_subgoal', self._on_request,
                             callback_group=MutuallyExclusiveCallbackGroup())
-        height, width = self._predictor.image_size
+        sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
+                 for mode, predictor in self._predictors.items()]
+        files = [path for path in (self.params['weights'], self.params['forward_weights']) if path]
         self.get_logger().info(
-            f'ready: {width}x{height} pixels, {self.params["device"]}, {self.params["weights"]}')
+            f'ready: {", ".join(sizes)}, {self.params["device"]}, {", ".join(files)}')
 
     def close(self):
         """Do nothing: there is nothing to end."""
@@ -87,92 +92,90 @@ class PredictorNode(Node):
     def _predict(self, request, response):
         num_samples = check_count(request.num_samples, 'num_samples', MAX_SAMPLES)
         depth = check_count(request.recursion_depth, 'recursion_depth', MAX_DEPTH)
-        start = self._view(request.start, request.start_objects, 'start', self._camera)
-        goal = self._view(request.goal, request.goal_objects, 'goal', self._goal)
-        names, start_pixels, goal_pixels = start.names, None, None
-        if start.names and goal.names:
-            start_pixels = start.pixels
-            goal_pixels = match_objects(
-                names, goal.names, goal.pixels, 'start_objects', 'goal_objects')
-        else:
-            names = ()
+        mode = choose_mode(request, self._predictors)
+        predictor = self._predictors[mode]
+        start = self._view('start', request.start, request.start_objects, predictor.image_size)
+        goal = None
+        if mode == 'bidirectional':
+            goal = self._view('goal', request.goal, request.goal_objects, predictor.image_size)
+        views = [view for view in (start, goal) if view]
+        lacking = '; '.join(view.lacking for view in views if view.lacking)
+        names = () if lacking else start.names
+        start_pixels = start.pixels if names else None
+        goal_pixels = match_objects(
+            names, goal.names, goal.pixels, 'start_objects', 'goal_objects'
+        ) if names and goal else None
         begin = time.perf_counter()
-        subgoals = self._predictor.predict(
-            start.image, goal.image, start_pixels, goal_pixels, num_samples=num_samples,
+        subgoals = predictor.predict(
+            start.image, goal and goal.image, start_pixels, goal_pixels, num_samples=num_samples,
             recursion_depth=depth, seed=request.seed)
         response.model_time_ms = (time.perf_counter() - begin) * 1e3
         response.subgoals = [
             encode_subgoal(subgoal, names, start.stamp, start.frame_id) for subgoal in subgoals]
+        response.sample = [subgoal.sample for subgoal in subgoals]
+        response.level = [subgoal.level for subgoal in subgoals]
         response.success = True
-        response.message = f'{len(subgoals)} subgoals, ' + (
-            f'maps of {", ".join(names)}' if names
-            else 'no object maps, as the objects of start or goal are unknown')
+        response.message = (
+            f'{mode}, {len(subgoals)} subgoal{"s" * (len(subgoals) > 1)}, '
+            + (f'no object maps: {lacking}' if lacking else f'maps of {", ".join(names)}'))
         if len(subgoals) < num_samples * depth:
-            response.message += '; weights without a latent variable give one sample only'
+            response.message += (f'; one sample instead of {num_samples}, as these weights have '
+                                 'no latent variable and all samples would be the same')
+        # For planners and people: where to go first, the earliest subgoal of the first sample.
         self._subgoal.publish(response.subgoals[0])
         self._picture.publish(response.subgoals[0].image)
         picture = overlay(start.image, subgoals[0].object_maps, OVERLAY_SCALE, start_pixels,
                           goal_pixels)
         self._overlay.publish(encode_image(picture, start.stamp, start.frame_id))
 
-    def _view(self, image, objects, name, newest):
+    def _view(self, name, image, objects, size):
         """Decode a picture and its objects; take the newest ones if it was left empty."""
+        lacking = '' if objects.objects else f'{name}_objects are empty'
         if is_empty(image):
-            found = newest.newest('image')
-            if found is None:
-                topic = {'start': 'camera/image_raw', 'goal': 'goal/image'}[name]
-                raise ImageError(
-                    f'{name}: the request has none and nothing has come on '
-                    f'{self.resolve_topic_name(topic)}; publish one there (the simulator does at '
-                    'sim/reset), or send it along')
+            found = self._find(name)
             image = found['image']
-            objects = objects if objects.objects else found.get('objects', objects)
-        size = self._predictor.image_size
+            if not objects.objects:
+                objects = found.get('objects', objects)
+                lacking = '' if objects.objects else self._explain(name, found)
         picture = decode_image(image, name, size, resize=self.params['resize_images'])
         names, pixels = decode_objects(objects, f'{name}_objects')
         pixels = resize_pixels(pixels, (image.height, image.width), size)
-        return View(picture, names, pixels, image.header.stamp,
+        return View(picture, names, pixels, lacking, image.header.stamp,
                     image.header.frame_id or CAMERA_FRAME)
 
+    def _find(self, name):
+        """Return the newest picture, and its objects if there are any with its stamp."""
+        newest = self._newest[name]
+        found = newest.newest('image')
+        if found is None:
+            advice = ''
+            if name == 'goal' and 'forward' in self._predictors:
+                advice = '; or ask for mode forward, which needs no goal'
+            raise ImageError(
+                f'{name}: the request has none and nothing has come on '
+                f'{self._topic(name, "image")}; publish one there (the simulator does at '
+                f'sim/reset), or send it along{advice}')
+        if 'objects' not in found and not newest.missing(['objects']):
+            stamp = to_nanoseconds(found['image'].header.stamp)
+            found = newest.wait(
+                ('image', 'objects'), OBJECTS_TIMEOUT, after_ns=stamp - 1) or found
+        return found
 
-def declare_parameters(node):
-    """Declare the parameters of the node."""
-    parameters = Parameters(node)
-    parameters.declare('weights', str(DEFAULT_WEIGHTS),
-                       'File of weights (.safetensors) of a subgoal predictor.')
-    parameters.declare('device', 'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
-                       choices=['cpu', 'cuda'])
-    parameters.declare('resize_images', False,
-                       'Resize pictures of another size than the weights are made for, instead of '
-                       'refusing them; answers have the size of the weights.', read_only=False)
-    return parameters
+    def _explain(self, name, found):
+        """Say why what was found has no objects."""
+        topic, newest = self._topic(name, 'objects'), self._newest[name].newest('objects')
+        if 'objects' in found:
+            return f'the list on {topic} is empty'
+        if newest is None:
+            return f'nothing has come on {topic}'
+        stamps = [f'{to_nanoseconds(message.header.stamp) / 1e9:.9f} s'
+                  for message in (newest['objects'], found['image'])]
+        return (f'the newest on {topic} has the stamp {stamps[0]}, the picture on '
+                f'{self._topic(name, "image")} {stamps[1]}; publish both with the same')
 
-
-def load_predictor(path, device):
-    """
-    Load weights, and predict once, so that the first request is as fast as the others.
-
-    :raises WeightsError: when the file cannot be used or predicts nonsense.
-    :raises ConfigError: when the device is not there.
-    """
-    check_device(device)
-    predictor = SubgoalPredictor.load(path, device=device)
-    height, width = predictor.image_size
-    picture = np.full((height, width, 3), 128, np.uint8)
-    pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
-    subgoal, = predictor.predict(picture, picture, pixels, pixels)
-    if not np.allclose(subgoal.object_maps.sum((1, 2)), 1, atol=1e-3):
-        raise WeightsError(
-            f'{path}: predicts object maps that do not sum to 1; the weights are damaged or were '
-            'not trained, train them again')
-    return predictor
-
-
-def check_count(value, name, highest):
-    """Return a count of a request, 1 for 0; raise ConfigError above the highest."""
-    if value > highest:
-        raise ConfigError(f'{name} is {value}; expected 1 to {highest}, or 0 for 1')
-    return value or 1
+    def _topic(self, name, what):
+        """Return the full name of a topic, for messages."""
+        return self.resolve_topic_name(TOPICS[name][what][1])
 
 
 def encode_subgoal(subgoal, names, stamp, frame_id):

@@ -22,11 +22,11 @@ from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.nodes.clients import call, CallError, Newest, send_goal, wait_for_result
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
-from tap_ros.nodes.planner_setup import DEFAULT_WEIGHTS
 from tap_ros.nodes.predictor_node import OVERLAY_SCALE
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.recording.reader import iter_episodes
+from tap_ros.weights import FORWARD_MODEL
 
 sys.path.insert(0, str(Path(__file__).parent))
 from processes import Client, NodeProcess  # noqa: E402
@@ -216,7 +216,7 @@ def test_the_nodes_act_as_the_same_classes_do_in_one_process(loop):
     loop.reset()
     status, result = loop.reach(mode='direct', step_budget=3, seed=5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    sim, mpc = Simulator('push2'), VisualMPC.load(DEFAULT_WEIGHTS)
+    sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
     try:
         seen = sim.reset(SEED)
         goals = sim.goal().object_pixels
@@ -364,12 +364,12 @@ def test_bad_weights_end_the_start_with_one_line_that_names_the_file(tmp_path, n
     other = shipped['predictor_node' if name == 'visual_mpc_node' else 'visual_mpc_node']
     weights = tmp_path / 'weights.safetensors'
     if damage == 'truncated':
-        whole = DEFAULT_WEIGHTS.with_name(f'{shipped[name]}.safetensors').read_bytes()
+        whole = FORWARD_MODEL.with_name(f'{shipped[name]}.safetensors').read_bytes()
         weights.write_bytes(whole[:len(whole) // 2])
     elif damage == 'text':
         weights.write_text('these are not weights')
     elif damage == 'of another kind':
-        weights.write_bytes(DEFAULT_WEIGHTS.with_name(f'{other}.safetensors').read_bytes())
+        weights.write_bytes(FORWARD_MODEL.with_name(f'{other}.safetensors').read_bytes())
     process = NodeProcess(MODULES[name], tmp_path / 'log.txt', {'weights': weights})
     try:
         assert process.process.wait(120) == 1

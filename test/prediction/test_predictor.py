@@ -4,11 +4,14 @@
 
 from dataclasses import replace
 
+from lively import lively_network
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, ImageError, WeightsError
+from tap_ros.images import to_float, to_uint8
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
 from tap_ros.prediction.weights import save_weights
 import torch
 
@@ -19,8 +22,17 @@ START_PIXELS, GOAL_PIXELS = np.random.default_rng(1).uniform(4, 28, (2, 2, 2))
 
 @pytest.fixture(scope='module')
 def predictor():
-    torch.manual_seed(0)
-    return SubgoalPredictor(Predictor(CONFIG))
+    return SubgoalPredictor(lively_network())
+
+
+@pytest.fixture(scope='module')
+def forward():
+    return SubgoalPredictor(lively_network(num_context=1))
+
+
+def differ(a, b):
+    """Return the mean absolute difference of two pictures, from 0 to 255."""
+    return np.abs(a.astype(int) - b).mean()
 
 
 def test_answer_has_the_promised_types(predictor):
@@ -63,17 +75,75 @@ def test_recursion_ends_with_the_single_prediction(predictor):
     chain = predictor.predict(START, GOAL, START_PIXELS, GOAL_PIXELS, recursion_depth=3)
     assert len(chain) == 3
     assert np.array_equal(chain[-1].image, single.image)
+    assert [subgoal.level for subgoal in chain] == [3, 2, 1]
     again, = predictor.predict(START, chain[-1].image, START_PIXELS, GOAL_PIXELS)
-    difference = again.image.astype(int) - chain[-2].image
-    assert np.abs(difference).max() <= 2  # pictures are rounded in between here
+    assert differ(again.image, chain[-2].image) < 1  # pictures are rounded in between here
+    assert differ(single.image, chain[-2].image) > 10
     for subgoal in chain:
         assert np.allclose(subgoal.object_maps.sum((1, 2)), 1, atol=1e-5)
 
 
-def test_samples_differ_by_z_and_repeat_by_seed():
-    torch.manual_seed(0)
-    network = Predictor(replace(CONFIG, latent_size=8))
+def test_forward_predicts_from_the_start_alone(forward):
+    assert forward.mode == 'forward' and forward.num_context == 1
+    subgoal, = forward.predict(START, start_pixels=START_PIXELS)
+    assert differ(subgoal.image, START) > 10
+    assert subgoal.object_maps.shape == (2, 32, 32)
+    assert np.allclose(subgoal.object_maps.sum((1, 2)), 1, atol=1e-5)
+    alone, = forward.predict(START)
+    assert np.array_equal(alone.image, subgoal.image) and alone.object_maps.shape == (0, 32, 32)
+
+
+def test_going_forward_each_prediction_is_the_next_context():
+    network = lively_network(num_context=1)
+    chain = SubgoalPredictor(network).predict(START, start_pixels=START_PIXELS, recursion_depth=3)
+    assert [subgoal.level for subgoal in chain] == [1, 2, 3]
+    context = to_float(START[None, None])
+    maps = one_hot_maps(torch.from_numpy(START_PIXELS)[None, None], (32, 32))
+    for subgoal in chain:
+        with torch.no_grad():
+            prediction = network(context)  # x <- G(x)
+        maps = warp_object_maps(maps, prediction.flow, prediction.masks).maps[:, None]
+        context = prediction.image[:, None]
+        assert differ(subgoal.image, to_uint8(prediction.image)[0]) < 0.1
+        assert np.allclose(subgoal.object_maps, maps[0, 0].numpy(), atol=1e-4)
+    assert differ(chain[0].image, chain[1].image) > 10
+    assert np.abs(chain[2].expected_pixels - chain[0].expected_pixels).max() > 0.2
+
+
+def test_what_the_weights_do_not_take_or_lack_is_refused(predictor, forward):
+    for goal in ({'goal': GOAL}, {'goal_pixels': GOAL_PIXELS}):
+        with pytest.raises(ConfigError, match='goal: these weights predict forward'):
+            forward.predict(START, start_pixels=START_PIXELS, **goal)
+    with pytest.raises(ConfigError, match='goal: these weights predict between'):
+        predictor.predict(START)
+
+
+@pytest.mark.parametrize('num_context', [1, 2])
+def test_samples_follow_each_other_and_say_where_they_belong(num_context):
+    predictor = SubgoalPredictor(lively_network(num_context=num_context, latent_size=8))
+    goal = (GOAL,) if num_context == 2 else ()
+    chains = predictor.predict(START, *goal, num_samples=3, recursion_depth=2, seed=5)
+    assert [subgoal.sample for subgoal in chains] == [0, 0, 1, 1, 2, 2]
+    assert [subgoal.level for subgoal in chains] == ([1, 2] if num_context == 1 else [2, 1]) * 3
+    firsts = [subgoal for subgoal in chains if subgoal.level == 1]
+    assert all(differ(a.image, b.image) > 5 for a, b in zip(firsts, firsts[1:]))
+    same = predictor.predict(START, *goal, num_samples=3, recursion_depth=1, seed=5)
+    assert all(differ(a.image, b.image) < 0.1 for a, b in zip(firsts, same))
+
+
+def test_every_level_of_every_sample_draws_its_own_z():
+    network = lively_network(latent_size=8)
     predictor = SubgoalPredictor(network)
+    drawn = []
+    network.register_forward_pre_hook(lambda _, inputs: drawn.append(inputs[1]))
+    predictor.predict(START, GOAL, num_samples=3, recursion_depth=2)
+    z = torch.cat(drawn)
+    assert z.shape == (6, 8)
+    assert torch.cdist(z, z).fill_diagonal_(9).min() > 0.5
+
+
+def test_samples_differ_by_z_and_repeat_by_seed():
+    predictor = SubgoalPredictor(lively_network(latent_size=8))
     first = predictor.predict(START, GOAL, num_samples=3, recursion_depth=2, seed=5)
     second = predictor.predict(START, GOAL, num_samples=3, recursion_depth=2, seed=5)
     assert len(first) == 6
@@ -134,7 +204,7 @@ def test_weights_of_something_else_are_refused(tmp_path):
     save_weights(path, Predictor(CONFIG), 'forward_model', CONFIG, {})
     with pytest.raises(WeightsError, match='forward_model'):
         SubgoalPredictor.load(path)
-    forward = replace(CONFIG, num_context=1)
-    save_weights(path, Predictor(forward), 'predictor', forward, {})
+    video = replace(CONFIG, num_context=3)
+    save_weights(path, Predictor(video), 'predictor', video, {})
     with pytest.raises(ConfigError, match='2 context pictures'):
         SubgoalPredictor.load(path)

@@ -1,0 +1,115 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters, weights and requests of predictor_node: what is checked before it predicts."""
+
+import numpy as np
+from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.nodes.image_messages import is_empty
+from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.prediction.methods import MODES
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.weights import PREDICTOR
+
+MAX_SAMPLES = 100
+MAX_DEPTH = 8
+HOW_TO_GET = {  # weights for each mode
+    'bidirectional': 'start it with -p weights:=FILE, trained for start and goal',
+    'forward': 'start it with -p forward_weights:=FILE, trained for the start alone'}
+
+
+def declare_parameters(node):
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('weights', str(PREDICTOR),
+                       'File of weights (.safetensors) of a subgoal predictor; what it was '
+                       'trained for, bidirectional or forward, is what the node can.')
+    parameters.declare('forward_weights', '',
+                       'File of weights of a forward predictor, if the node shall answer forward '
+                       'requests beside bidirectional ones; empty: none.')
+    parameters.declare('device', 'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
+                       choices=['cpu', 'cuda'])
+    parameters.declare('resize_images', False,
+                       'Resize pictures of another size than the weights are made for, instead of '
+                       'refusing them; answers have the size of the weights.', read_only=False)
+    return parameters
+
+
+def load_predictors(weights, forward_weights, device):
+    """
+    Load what the node serves.
+
+    :param weights: file of weights for either mode.
+    :param forward_weights: file of forward weights, or '' for none.
+    :param device: 'cpu' or 'cuda'.
+    :return: {mode: SubgoalPredictor}, with one mode or both.
+    :raises WeightsError: when a file cannot be used or predicts nonsense.
+    :raises ConfigError: when the device is not there, or no file is needed for what both are for.
+    """
+    check_device(device)
+    predictor = load_predictor(weights, device)
+    predictors = {predictor.mode: predictor}
+    if forward_weights:
+        if predictor.mode == 'forward':
+            raise ConfigError(f'parameter forward_weights: {weights}, given as weights, is for '
+                              'forward prediction already; leave one of them out')
+        forward = load_predictor(forward_weights, device)
+        if forward.mode != 'forward':
+            raise ConfigError(f'parameter forward_weights: {forward_weights} needs start and '
+                              'goal; give weights trained for the start alone, or give these as '
+                              'weights')
+        predictors['forward'] = forward
+    return predictors
+
+
+def load_predictor(path, device):
+    """
+    Load weights, and predict once, so that the first request is as fast as the others.
+
+    :raises WeightsError: when the file cannot be used or predicts nonsense.
+    :raises ConfigError: when it is for another number of context pictures than one or two.
+    """
+    predictor = SubgoalPredictor.load(path, device=device)
+    height, width = predictor.image_size
+    picture = np.full((height, width, 3), 128, np.uint8)
+    pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
+    goal = {} if predictor.mode == 'forward' else {'goal': picture, 'goal_pixels': pixels}
+    subgoal, = predictor.predict(picture, start_pixels=pixels, **goal)
+    if not np.allclose(subgoal.object_maps.sum((1, 2)), 1, atol=1e-3):
+        raise WeightsError(
+            f'{path}: predicts object maps that do not sum to 1; the weights are damaged or were '
+            'not trained, train them again')
+    return predictor
+
+
+def choose_mode(request, modes):
+    """
+    Choose how to predict.
+
+    :param request: PredictSubgoal request.
+    :param modes: the modes that the node has weights for.
+    :return: one of them.
+    :raises ConfigError: when the request names no mode or one without weights, or names none
+        and sends a goal that would be of no use.
+    """
+    if request.mode:
+        if request.mode not in MODES:
+            raise ConfigError(f'mode {request.mode!r} is unknown; valid: {", ".join(MODES)}, '
+                              'or empty for what the weights are for')
+        if request.mode not in modes:
+            raise ConfigError(f'mode {request.mode}: this node has no weights for it; '
+                              f'{HOW_TO_GET[request.mode]}')
+        return request.mode
+    if 'bidirectional' in modes:
+        return 'bidirectional'
+    if not is_empty(request.goal) or request.goal_objects.objects:
+        raise ConfigError(
+            'goal: this node has forward weights only, which do not use it; leave goal and '
+            f'goal_objects empty, or {HOW_TO_GET["bidirectional"]}')
+    return 'forward'
+
+
+def check_count(value, name, highest):
+    """Return a count of a request, 1 for 0; raise ConfigError above the highest."""
+    if value > highest:
+        raise ConfigError(f'{name} is {value}; expected 1 to {highest}, or 0 for 1')
+    return value or 1

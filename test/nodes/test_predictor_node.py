@@ -1,0 +1,223 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""predict_subgoal in all its modes, asked over DDS of real nodes with small untrained networks."""
+
+from pathlib import Path
+import sys
+
+import numpy as np
+import pytest
+from tap_msgs.msg import ObjectStates, Subgoal
+from tap_msgs.srv import PredictSubgoal
+from tap_ros.nodes.clients import call, Newest
+from tap_ros.nodes.image_messages import decode_image, encode_image
+from tap_ros.nodes.object_messages import encode_objects
+from tap_ros.nodes.topics import LATCHED, to_stamp
+from tap_ros.prediction.weights import save_weights
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
+from lively import lively_network  # noqa: E402
+from processes import Client, NodeProcess  # noqa: E402
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+MODULE = 'tap_ros.nodes.predictor_node'
+NAMES = ('cup', 'box')
+STAMP = to_stamp(2_500_000_000)
+PICTURES = np.random.default_rng(0).integers(0, 256, (2, 32, 32, 3), np.uint8)
+
+
+def objects(pixels, names=NAMES, stamp=STAMP):
+    return encode_objects(names, pixels, [[0, 0, 0, 0, 0, 0, 1]] * len(names), stamp, 'world',
+                          ObjectStates.SOURCE_TRACKED)
+
+
+START, GOAL = (encode_image(picture, STAMP, 'eye') for picture in PICTURES)
+START_OBJECTS, GOAL_OBJECTS = objects([(8, 9), (20, 21)]), objects([(12, 13), (24, 17)])
+WITH_GOAL = {'start': START, 'goal': GOAL, 'start_objects': START_OBJECTS,
+             'goal_objects': GOAL_OBJECTS}
+ALONE = {'start': START, 'start_objects': START_OBJECTS}
+
+
+def weights_file(path, **config):
+    """Write weights of an untrained network."""
+    network = lively_network(**config)
+    save_weights(path, network, 'predictor', network.config, {})
+    return path
+
+
+class Service:
+    """A node in a namespace of its own, so that several can live side by side, and its client."""
+
+    def __init__(self, node, name, folder, **parameters):
+        self.name, self.node = name, node
+        self.process = NodeProcess(MODULE, folder / f'{name}.log', parameters,
+                                   ['-r', f'__ns:=/{name}'])
+        self.client = node.create_client(PredictSubgoal, f'/{name}/predict_subgoal')
+        self.subgoal = Newest(node, Subgoal, f'/{name}/subgoal', LATCHED)
+
+    def ask(self, **fields):
+        return call(self.client, PredictSubgoal.Request(**fields), 60)
+
+    def answer(self, **fields):
+        """Ask for what must succeed."""
+        response = self.ask(**fields)
+        assert response.success, response.message
+        assert len(response.sample) == len(response.level) == len(response.subgoals)
+        return response
+
+    def refusal(self, **fields):
+        """Ask for what must be refused, and return the reason."""
+        response = self.ask(**fields)
+        assert not response.success and not response.subgoals
+        assert not len(response.sample) and not len(response.level)
+        return response.message
+
+    def publish(self, topic, message):
+        publisher = self.node.create_publisher(type(message), f'/{self.name}/{topic}', LATCHED)
+        publisher.publish(message)
+        return publisher
+
+
+@pytest.fixture(scope='module')
+def services(tmp_path_factory):
+    """Start nodes with both modes, forward only, and without z."""
+    folder = tmp_path_factory.mktemp('predictors')
+    between = weights_file(folder / 'between.safetensors', latent_size=8)
+    forward = weights_file(folder / 'forward.safetensors', num_context=1, latent_size=8)
+    plain = weights_file(folder / 'plain.safetensors')
+    started = {}
+    with Client() as node:
+        try:
+            for name, files in (('both', {'weights': between, 'forward_weights': forward}),
+                                ('forward', {'weights': forward}), ('plain', {'weights': plain})):
+                started[name] = Service(node, name, folder, **files)
+            for service in started.values():
+                service.process.wait_for('ready', 120)
+                assert service.client.wait_for_service(30)
+            yield started
+            for service in started.values():
+                assert service.process.end() == 0, service.process.text
+                assert 'Traceback' not in service.process.text
+        finally:
+            for service in started.values():
+                service.process.kill()
+
+
+def pictures(response):
+    return np.array([decode_image(s.image, 'subgoal').astype(int) for s in response.subgoals])
+
+
+def differ(a, b):
+    """Return the mean absolute difference of two pictures, from 0 to 255."""
+    return np.abs(a - b).mean()
+
+
+@pytest.mark.parametrize('mode', ['bidirectional', 'forward'])
+def test_samples_and_levels_are_told_apart(services, mode):
+    both = services['both']
+    response = both.answer(mode=mode, num_samples=3, recursion_depth=2, seed=4, **WITH_GOAL)
+    assert list(response.sample) == [0, 0, 1, 1, 2, 2]
+    assert list(response.level) == ([2, 1] if mode == 'bidirectional' else [1, 2]) * 3
+    seen = pictures(response)
+    assert all(differ(seen[i], seen[j]) > 3 for i in range(6) for j in range(i))
+    assert response.message.startswith(f'{mode}, 6 subgoals, maps of cup, box')
+    for subgoal in response.subgoals:
+        assert subgoal.header.stamp == STAMP and subgoal.header.frame_id == 'eye'
+        assert tuple(subgoal.object_names) == NAMES
+        assert len(subgoal.object_maps) == len(subgoal.expected_pixels) == 2
+    again = both.answer(mode=mode, num_samples=3, recursion_depth=2, seed=4, **WITH_GOAL)
+    assert again.subgoals == response.subgoals
+    other = both.answer(mode=mode, num_samples=3, recursion_depth=2, seed=5, **WITH_GOAL)
+    assert differ(pictures(other), seen) > 3
+    published = both.subgoal.wait(10, lambda m: m == other.subgoals[0])
+    assert published.image == other.subgoals[0].image  # the first sample's earliest
+
+
+def test_an_empty_mode_is_what_the_weights_are_for(services):
+    both, forward = services['both'], services['forward']
+    asked = both.answer(mode='bidirectional', **WITH_GOAL)
+    assert both.answer(**WITH_GOAL).subgoals == asked.subgoals
+    assert asked.message.startswith('bidirectional, 1 subgoal,')
+    ahead = both.answer(mode='forward', **ALONE)
+    assert forward.answer(**ALONE).subgoals == ahead.subgoals  # the same weights
+    assert forward.answer(mode='forward', **ALONE).subgoals == ahead.subgoals
+    assert differ(pictures(ahead), pictures(asked)) > 3
+
+
+def test_going_forward_needs_no_goal_and_uses_none(services):
+    both = services['both']
+    ahead = both.answer(mode='forward', **ALONE)
+    assert both.answer(mode='forward', **WITH_GOAL).subgoals == ahead.subgoals
+    no_objects = both.answer(mode='forward', start=START)
+    assert 'no object maps: start_objects are empty' in no_objects.message
+    assert (pictures(no_objects) == pictures(ahead)).all()
+    message = both.refusal(**ALONE)
+    for words in ('goal', '/both/goal/image', 'mode forward'):
+        assert words in message
+    # A sender of a goal expects it to matter.
+    message = services['forward'].refusal(**WITH_GOAL)
+    for words in ('goal', 'forward weights only', 'weights:=', 'leave goal'):
+        assert words in message
+
+
+def test_a_mode_without_weights_says_how_to_get_it(services):
+    assert '-p forward_weights:=' in services['plain'].refusal(mode='forward', **ALONE)
+    assert '-p weights:=' in services['forward'].refusal(mode='bidirectional', **WITH_GOAL)
+    message = services['both'].refusal(mode='backward', **WITH_GOAL)
+    for words in ('mode', 'backward', 'bidirectional, forward'):
+        assert words in message
+
+
+def test_weights_without_z_give_one_sample_and_say_so(services):
+    plain = services['plain']
+    response = plain.answer(num_samples=5, recursion_depth=2, **WITH_GOAL)
+    assert list(response.sample) == [0, 0] and list(response.level) == [2, 1]
+    assert 'one sample instead of 5' in response.message
+    assert 'latent variable' in response.message
+    single = plain.answer(recursion_depth=2, **WITH_GOAL)
+    assert single.subgoals == response.subgoals and 'latent' not in single.message
+    many = services['both'].answer(num_samples=5, **WITH_GOAL)
+    assert len(many.subgoals) == 5 and 'latent' not in many.message
+
+
+def test_why_there_are_no_maps_is_said_of_each_picture(services):
+    plain = services['plain']
+    response = plain.answer(start=START, goal=GOAL, start_objects=START_OBJECTS)
+    assert response.message.endswith('no object maps: goal_objects are empty')
+    publishers = [plain.publish('goal/image', GOAL)]
+
+    def reason(words):
+        """Ask until what was published has come."""
+        for _ in range(50):
+            response = plain.ask(**ALONE)
+            if words in response.message:
+                break
+        assert words in response.message
+        assert response.success
+        return response
+
+    reason('no object maps: nothing has come on /plain/goal/objects')
+    publishers += [plain.publish('goal/objects', objects(
+        [(12, 13), (24, 17)], stamp=to_stamp(1_250_000_000)))]
+    response = reason('/plain/goal/objects has the stamp 1.250000000 s')
+    assert 'the picture on /plain/goal/image 2.500000000 s' in response.message
+    assert 'start' not in response.message
+    publishers += [plain.publish('goal/objects', GOAL_OBJECTS)]
+    response = reason('maps of cup, box')
+    assert response.subgoals == plain.answer(**WITH_GOAL).subgoals
+
+
+@pytest.mark.parametrize('swapped', [False, True])
+def test_forward_weights_must_be_that_and_given_once(tmp_path, swapped):
+    between = weights_file(tmp_path / 'between.safetensors')
+    forward = weights_file(tmp_path / 'forward.safetensors', num_context=1)
+    given = {'weights': forward if swapped else between,
+             'forward_weights': forward if swapped else between}
+    process = NodeProcess(MODULE, tmp_path / 'log.txt', given)
+    try:
+        assert process.process.wait(120) == 1
+        line, = [line for line in process.text.splitlines() if line.strip()]
+        assert '[FATAL]' in line and 'forward_weights' in line
+        assert str(forward if swapped else between) in line
+    finally:
+        process.kill()
