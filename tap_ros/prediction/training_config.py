@@ -79,7 +79,7 @@ class TrainingConfig:
     goal_picture: str = 'mixed'
     recursion: int = 1
     pretrain_steps: int = 0
-    gan_weight: float = 5e-4
+    gan_weight: float = 5e-5
     kl_weight: float = 1e-4
     latent_size: int = 32
     video_frames: int = 16
@@ -142,7 +142,8 @@ class TrainingConfig:
         if self.recursion > 1 and method.loss == 'fix':
             raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
                               f'method {method.name}')
-        if self.posterior == 'frame' and (method.gan or self.recursion > 1):
+        if self.posterior == 'frame' and (
+                not method.vae or method.gan or self.recursion > 1):
             raise ConfigError("posterior: 'frame' goes with a -vae method without GAN and without "
                               'recursion')
 

@@ -24,21 +24,19 @@ class Scale:
     How large everything is.
 
     :param episodes: task to how many to collect.
-    :param steps: (task, mode) to the length of a training; empty: the paper's epochs.
+    :param steps: length of a training; 0: the paper's epochs.
     :param settings: of every training, beside the method's own.
     """
 
     episodes: dict
-    steps: dict = field(default_factory=dict)
+    steps: int = 0
     settings: dict = field(default_factory=dict)
 
 
 SCALES = {
     'small': Scale(
         episodes={'push2': 3000, 'grasp': 3000, 'pick_place': 3000, 'push3': 1500},
-        steps={('push2', 'bidirectional'): 3000, ('grasp', 'bidirectional'): 2000,
-               ('pick_place', 'bidirectional'): 2000, ('grasp', 'forward'): 2000,
-               ('push3', 'bidirectional'): 3000},
+        steps=1500,
         settings={'base_width': 16, 'batch_size': 32, 'threads': 1}),
     'full': Scale(
         episodes={'push2': 55000, 'grasp': 50000, 'pick_place': 75000, 'push3': 55000},
@@ -120,8 +118,7 @@ class PaperRun:
     @property
     def num_steps(self):
         """Length of the training."""
-        steps = self.steps or SCALES[self.scale].steps.get((self.task, self.mode))
-        return steps or self._steps_of(EPOCHS)
+        return self.steps or SCALES[self.scale].steps or self._steps_of(EPOCHS)
 
     @property
     def command(self):
