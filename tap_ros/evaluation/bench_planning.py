@@ -15,7 +15,7 @@ import time
 import numpy as np
 from sim_bridge.simulator import Simulator
 from tap_ros.evaluation.planning.scenes import FIRST_SCENE
-from tap_ros.evaluation.speed import MATRIX, matrix_rate
+from tap_ros.evaluation.speed import matrix_rate, matrix_side
 from tap_ros.images import to_float
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
@@ -73,7 +73,8 @@ def run(args):
     print(f'operations of a plan: {operations / 1e9:.2f} G (network {dtype})')
     for name, rate in rates.items():
         alone = 1000 * operations / rate
-        print(f'  alone, at {rate / 1e9:.0f} G/s of a {name} product of {MATRIX}: {alone:.1f} ms; '
+        print(f'  alone, at {rate / 1e9:.0f} G/s of a {name} product of '
+              f'{matrix_side(args.device)}: {alone:.1f} ms; '
               f'planned / alone: {median / alone:.1f}x')
     simulator.close()
 

@@ -8,19 +8,17 @@ same run.
 """
 
 from dataclasses import replace
-import json
 import os
-from pathlib import Path
 import tempfile
 
-from tap_ros.evaluation.speed import MATRIX, matrix_rate
+from tap_ros.evaluation.speed import matrix_rate, matrix_side
 from tap_ros.prediction.training import make_autocast, pick_device, train
 from tap_ros.prediction.training_config import TrainingConfig
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 METHODS = ('genmin-wo-gan', 'genmin', 'genmin-vae', 'genmin-vae-gan')
-_WARM_UP = 5  # steps
 
 
 def add_arguments(parser):
@@ -49,7 +47,8 @@ def run(args):
     peak = matrix_rate(device, dtype)
     print(f'batch {args.batch_size}, base width {args.base_width}, new pixels, {device.type}'
           + (f', {torch.get_num_threads()} threads' if device.type == 'cpu' else '')
-          + f'; peak: {peak / 1e12:.2f} T operations/s, a {dtype} product of {MATRIX}')
+          + f'; peak: {peak / 1e12:.2f} T operations/s, '
+          f'a {dtype} product of {matrix_side(device)}')
     print(f'{"method":<20}{"samples/s":>12}{"G operations a sample":>24}{"share of peak":>16}')
     for method in args.methods:
         with tempfile.TemporaryDirectory() as folder:
@@ -69,15 +68,13 @@ def time_step(config, steps):
     Time a step of training, all that belongs to it included.
 
     :param config: TrainingConfig, of a run that has not begun.
-    :param steps: how many to average over, after some to warm up.
+    :param steps: how many to average over, after as many to warm up and to compile.
     :return: seconds.
     """
-    seconds = []
-    for stop in (_WARM_UP, _WARM_UP + steps):
-        train(config, stop_at=stop, progress=False)
-        about = json.loads((Path(config.out) / 'run.json').read_text())
-        seconds.append(about['seconds'])
-    return (seconds[1] - seconds[0]) / steps
+    # A point of the curves waits for the GPU.
+    train(replace(config, log_every=steps), stop_at=2 * steps, progress=False)
+    first, last = EventAccumulator(config.out).Reload().Scalars('train/loss')
+    return (last.wall_time - first.wall_time) / steps
 
 
 def count_operations(config):

@@ -186,12 +186,13 @@ def relative_to_copying(error, copy_error, preference):
 
 
 @torch.no_grad()
-def path_length(start, targets):
+def path_length(start, targets, valid=None):
     """
     Measure how much changed on the way to each target: a cost of reaching it that pictures show.
 
     :param start: uint8 (B, H, W, 3), the start picture.
     :param targets: uint8 (B, T, H, W, 3), in the order of time.
+    :param valid: bool (B, T), False where an episode is padded; None: all are valid.
     :return: (B, T), the l1 length on [0, 1] of the way from the start picture through the
         targets, as a share of the way to the last one: 0 to 1, never falling.
     """
@@ -199,6 +200,8 @@ def path_length(start, targets):
     steps = torch.stack([(before.float() - after.float()).abs().mean(-1)
                          for before, after in zip(frames[:, :-1].unbind(1),
                                                   frames[:, 1:].unbind(1))], 1)
+    if valid is not None:
+        steps = steps.masked_fill(~valid, 0)  # padding is no way
     length = steps.cumsum(1)
     return length / length[:, -1:].clamp(min=1e-6)
 

@@ -11,7 +11,6 @@ from tap_ros.prediction.losses import (
     bell_preference,
     cost_of_reaching,
     fixed_time_loss,
-    generalized_minimum_loss,
     l1_error,
     l1_errors,
     linear_preference,
@@ -124,7 +123,7 @@ def selection_errors(error, copy_error, batch, config):
     if config.chosen.selection == 'relative_to_copying':
         return relative_to_copying(error, copy_error, preference)
     if config.chosen.selection == 'cost_of_reaching':
-        cost = path_length(batch.context[:, 0], batch.targets)
+        cost = path_length(batch.context[:, 0], batch.targets, batch.valid)
         return cost_of_reaching(error, cost, preference)
     return preferred_error(error, preference)
 
@@ -150,19 +149,26 @@ class _Targets:
         """
         if self.config.chosen.loss == 'fix':
             return torch.zeros_like(self.rows)  # the batch begins with the fixed frame
-        images = torch.cat([image.detach()[:, None], context.detach()], 1)
-        if self.augmentation:
-            images = self.augmentation.undo(images)
-        errors = l1_errors(images, self.batch.targets.movedim(-1, 2))
+        errors = self.errors(torch.cat([image.detach()[:, None], context.detach()], 1))
         selection_error = selection(errors[:, 0], errors[:, 1:], self.batch, self.config)
         return match_step(selection_error, valid)
 
+    def errors(self, images):
+        """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
+        if self.augmentation:
+            images = self.augmentation.undo(images)
+        return l1_errors(images, self.batch.targets.movedim(-1, 2))
+
     def loss(self, image, step):
         """Return E_t: the l1 error at step, to the configured power, as a mean."""
-        def error(step):
-            value, power = l1_error(image, self.frame(step)), self.config.outer_power
-            return value if power == 1 else (value + _POWER_OFFSET) ** power
-        return fixed_time_loss(error, step)
+        return fixed_time_loss(
+            lambda step: _outer(l1_error(image, self.frame(step)), self.config), step)
+
+
+def _outer(error, config):
+    """Raise l1 errors to the configured power."""
+    power = config.outer_power
+    return error if power == 1 else (error + _POWER_OFFSET) ** power
 
 
 def predictor_loss(networks, batch, augmentation, config, draws=None,
@@ -189,7 +195,8 @@ def predictor_loss(networks, batch, augmentation, config, draws=None,
     context = to_float(batch.context)  # B, C, 3, H, W
     context = augmentation.apply(context) if augmentation else context
     if networks.recognition is not None and config.posterior == 'frame':
-        return _frame_posterior_loss(networks, targets, context, config, draws, autocast)
+        return _frame_posterior_loss(
+            networks, targets, context, config, draws, autocast, selection)
     parts, z = {}, None
     if networks.recognition is not None:
         video = to_float(batch.video)
@@ -270,23 +277,22 @@ def _recursive_loss(networks, prediction, targets, context, match, loss, config,
         with autocast():
             prediction = networks.predictor(context, z)
         match = targets.match(prediction.image, context, valid | ~left[:, None], selection)
-        errors = l1_error(prediction.image, targets.frame(match))
-        if config.outer_power != 1:
-            errors = (errors + _POWER_OFFSET) ** config.outer_power
+        errors = _outer(l1_error(prediction.image, targets.frame(match)), config)
         losses.append(errors[left].mean())
         counts.append(left.sum().item())
     return recursive_loss(losses, counts)
 
 
-def _frame_posterior_loss(networks, targets, context, config, draws, autocast):
+def _frame_posterior_loss(networks, targets, context, config, draws, autocast, selection):
     """
     Compute the alternative of appendix B: the minimum over time of the whole CVAE loss.
 
-    Recognition network and predictor run once for every target; num_targets keeps that small.
+    Recognition network and predictor run once for every target; num_targets keeps that small. With
+    genmin the selection error is that of the whole loss instead of the l1 error.
     """
     batch = targets.batch
     B, T = batch.times.shape
-    terms, predictions = [], []
+    divergences, errors, predictions = [], [], []
     for t in range(T):
         step = torch.full_like(targets.rows, t)
         frame = targets.frame(step)
@@ -294,14 +300,16 @@ def _frame_posterior_loss(networks, targets, context, config, draws, autocast):
             mean, log_variance = networks.recognition(torch.cat([context, frame[:, None]], 1))
             prediction = networks.predictor(
                 context, sample_latent(mean, log_variance, draws.posterior[:, t]))
-        terms.append(config.kl_weight * kl_divergence(mean, log_variance)
-                     + l1_error(prediction.image, frame))
+        divergences.append(config.kl_weight * kl_divergence(mean, log_variance))
+        errors.append(l1_error(prediction.image, frame))
         predictions.append(prediction)
-    terms = torch.stack(terms, 1)  # B, T
-    match = match_step(terms.detach(), batch.valid)
-    loss = generalized_minimum_loss(terms, terms, batch.valid)
-    shown = _choose(predictions, match)
-    return Outcome(loss, match, shown, {'error': loss.detach()})
+    divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
+    whole, copying = (divergences + errors).detach(), targets.errors(context)
+    match = match_step(selection(whole, copying, batch, config), batch.valid)
+    parts = {'kl': fixed_time_loss(divergences, match),
+             'error': fixed_time_loss(_outer(errors, config), match)}
+    return Outcome(sum(parts.values()), match, _choose(predictions, match),
+                   {name: value.detach() for name, value in parts.items()})
 
 
 def _choose(predictions, match):

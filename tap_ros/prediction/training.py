@@ -78,8 +78,8 @@ def train(config, stop_at=None, minutes=None, progress=True):
     model = torch.compile(state.network) if config.compile else state.network
     networks = Networks(model, **dict(state.helpers.items()))
     last = min(config.steps, stop_at or config.steps)
-    report = partial(_report, config=config, store=store, training=training, held_out=held_out,
-                     autocast=autocast)
+    report = partial(_report, config=config, store=store, frames=frames, training=training,
+                     held_out=held_out, autocast=autocast)
     bar = tqdm(total=config.steps, initial=state.step, desc=config.method, unit='step',
                disable=not progress)
     with SummaryWriter(config.out, purge_step=state.step) as curves, bar:
@@ -263,14 +263,20 @@ def _log(curves, bar, step, outcome, batch, norm, rate):
     bar.set_postfix(loss=f'{loss:.4f}', match=f'{fraction.mean().item():.2f}')
 
 
-def _report(state, curves, config, store, training, held_out, autocast):
+def _name(device):
+    """Say what computes: 'cpu', or the name of the GPU."""
+    return torch.cuda.get_device_name(device) if device.type == 'cuda' else device.type
+
+
+def _report(state, curves, config, store, frames, training, held_out, autocast):
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
     device = next(state.average.parameters()).device
 
     def batch(episodes):
         goal_picture = 'recorded' if config.goal_picture == 'recorded' else 'last'
         return make_batch(store, episodes, config.margin, fraction=config.chosen.fraction,
-                          goal_picture=goal_picture, forward=config.forward).to(device)
+                          goal_picture=goal_picture, forward=config.forward,
+                          frames=frames).to(device)
 
     scores = {}
     if len(held_out):
@@ -286,7 +292,7 @@ def _report(state, curves, config, store, training, held_out, autocast):
     about = {
         'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
         'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
-        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device.type}',
+        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {_name(device)}',
         'torch': torch.__version__, 'python': platform.python_version()}
     for name, values in (('config', asdict(config)), ('run', about), ('scores', scores)):
         path = Path(config.out) / f'{name}.json'

@@ -109,6 +109,10 @@ def test_copying_is_seen_as_beside_an_input():
     rows = rows_of(made_run('min', scores(0.01, [0.03] * 20 + [0.98] * 10 + [0.5] * 10)))
     assert find(rows, method='min', metric='match_beside_input')['value'] == 0.75
     assert find(rows, method='copy-goal', metric='match_beside_input')['value'] > 0.7
+    # In forward prediction the last frame is no input.
+    rows = rows_of(made_run('fix1.00', scores(0.01, [0.03] * 20 + [0.98] * 20), task='grasp',
+                            mode='forward'))
+    assert find(rows, method='fix1.00', metric='match_beside_input')['value'] == 0.5
 
 
 def test_the_papers_best_of_100_is_of_the_model_with_gan():

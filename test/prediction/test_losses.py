@@ -166,6 +166,10 @@ def test_the_way_grows_from_0_to_1_and_stands_where_nothing_changes():
     length = path_length(frames[:, 0], frames[:, 1:])
     assert torch.allclose(length, torch.tensor([[0.25, 0.25, 0.5, 0.75, 1.0]]))
     assert path_length(frames[:, 0], frames[:, :1]).tolist() == [[0.0]]
+    # An episode that is padded, here with its start, has the same way as without.
+    padded = torch.cat([frames[:, 1:], frames[:, :1], frames[:, :1]], 1)
+    valid = torch.tensor([[True] * 5 + [False] * 2])
+    assert path_length(frames[:, 0], padded, valid)[:, :5].equal(length)
 
 
 def test_cheap_states_are_preferred_and_weight_0_prefers_none(error):

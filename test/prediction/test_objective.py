@@ -173,6 +173,92 @@ def test_gan_terms_stand_at_the_matched_time():
     assert networks.discriminator.weight.grad.nonzero().flatten().tolist() == [2]
 
 
+class Shade(torch.nn.Module):
+    """Predicts a picture of one brightness, the first number of z."""
+
+    def forward(self, context, z=None):
+        size = context.shape[-1]
+        return Prediction(z[:, :1, None, None].expand(-1, 3, size, size), None, None, None)
+
+
+class Brightness(torch.nn.Module):
+    """Takes the mean of some pictures for the mean of z, whose variance is that of the prior."""
+
+    def __init__(self, last):
+        super().__init__()
+        self.scale, self.last, self.seen = torch.nn.Parameter(torch.ones(())), last, []
+
+    def forward(self, images):
+        self.seen.append(images)
+        mean = self.scale * images[:, -self.last:].mean((1, 2, 3, 4))[:, None]
+        return mean, torch.zeros_like(mean)
+
+
+class Watching(Judge):
+    """Remembers what it was shown."""
+
+    def forward(self, context, image):
+        self.shown = image
+        return super().forward(context, image)
+
+
+def still_draws(batch, prior=0.0):
+    """Make draws with the posterior's own mean and a fixed sample of the prior."""
+    B, T = batch.times.shape
+    return Draws(torch.zeros(B, T, 1), torch.full((B, 1), prior), torch.rand(B, T))
+
+
+def test_eq_10_l1_and_one_judge_see_the_posterior_the_other_judge_the_prior():
+    batch = replace(make_batch(B=4), video=make_batch(B=4, seed=7).targets)
+    config = replace(CONFIG, method='min-vae-gan', gan_weight=0.3, kl_weight=0.01)
+    networks = Networks(Shade(), Brightness(6), Watching(7), Watching(7))
+    augmentation = Augmentation.draw(4, True, True, 0.2, np.random.default_rng(0))
+    outcome = predictor_loss(networks, batch, augmentation, config, still_draws(batch, 0.5))
+    video = augmentation.apply(to_float(batch.video))
+    assert networks.recognition.seen[0].equal(video)  # changed as the context is
+    mean = video.mean((1, 2, 3, 4))
+    assert networks.discriminator.shown.eq(0.5).all()
+    posterior = networks.posterior_discriminator.shown
+    assert posterior.mean((1, 2, 3)).allclose(mean, atol=1e-6)
+    target = augmentation.apply(to_float(
+        batch.targets[torch.arange(4), outcome.match])[:, None])[:, 0]
+    softplus = torch.nn.functional.softplus
+    expected = {
+        'kl': 0.01 * (mean ** 2 / 2).mean(), 'error': l1_error(posterior, target).mean(),
+        'gan': 0.3 * (softplus(torch.tensor(-0.5)) + softplus(-mean).mean())}
+    assert set(outcome.parts) == set(expected)
+    for name, value in expected.items():
+        assert outcome.parts[name].item() == pytest.approx(value.item(), rel=1e-4), name
+    outcome.loss.backward()
+    assert networks.recognition.scale.grad.abs() > 0
+    before = networks.recognition.scale.grad.clone()
+    discriminators_loss(outcome.judged).backward()
+    assert networks.recognition.scale.grad.equal(before)
+
+
+def test_appendix_b_is_the_minimum_over_the_whole_loss():
+    batch = make_batch(B=2, T=5)
+    shades = torch.tensor([[250, 30, 128, 30, 250], [250, 140, 30, 250, 100]], dtype=torch.uint8)
+    batch = replace(batch, targets=shades[..., None, None, None].expand(-1, -1, 8, 8, 3))
+    config = replace(CONFIG, method='min-vae', posterior='frame', kl_weight=0.01)
+    # z says which frame it was: the l1 error is 0 at all times, and the KL divergence decides.
+    divergence = 0.01 * to_float(batch.targets).mean((2, 3, 4)) ** 2 / 2
+    networks = Networks(Shade(), Brightness(1))
+    outcome = predictor_loss(networks, batch, None, config, still_draws(batch))
+    assert outcome.match.tolist() == [2, 1]
+    assert outcome.loss.item() == pytest.approx(divergence.amin(1).mean().item(), abs=1e-6)
+    assert all(seen.shape[1] == 3 for seen in networks.recognition.seen)  # context and one frame
+    # With genmin, preferences choose among whole losses too.
+    def latest(error, copy_error, batch, config):
+        assert error.allclose(divergence, atol=1e-6) and copy_error.shape == (2, 2, 5)
+        return -batch.times.float()
+
+    outcome = predictor_loss(networks, batch, None, replace(config, method='genmin-vae'),
+                             still_draws(batch), selection=latest)
+    assert outcome.match.tolist() == [4, 4]
+    assert outcome.loss.item() == pytest.approx(divergence[:, 4].mean().item(), abs=1e-6)
+
+
 class Moving(torch.nn.Module):
     """Predicts one target after the other."""
 

@@ -116,7 +116,8 @@ def test_learning_rate_rises_and_falls():
     {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
     {'bell_edge': 0.0}, {'max_frames': 2}, {'method': 'genmin2'}, {'method': 'fix1.5'},
     {'method': 'min+relative'}, {'recursion': 2, 'method': 'fix'},
-    {'posterior': 'frame', 'method': 'genmin-vae-gan'}, {'gan_weight': -1.0}])
+    {'posterior': 'frame', 'method': 'genmin-vae-gan'},
+    {'posterior': 'frame', 'method': 'genmin-wo-gan'}, {'gan_weight': -1.0}])
 def test_settings_that_make_no_sense_are_refused_by_name(values):
     with pytest.raises(ConfigError, match=next(iter(values))):
         TrainingConfig(**{'recordings': ('bag',), 'out': 'out', **values})

@@ -288,5 +288,7 @@ def _commands(runs):
               run['training'].get('torch', '-')] for run in runs]
     commands = '\n'.join(run['command'] for run in runs)
     return ['<details><summary>All runs and their commands</summary>\n',
+            'A command leaves alone what is done: to make a run again, give `--runs` and '
+            '`--results` other folders.\n',
             markdown(['run', 'steps', 'seconds', 'machine', 'torch'], lines),
             f'```bash\n{commands}\n```\n', '</details>\n']

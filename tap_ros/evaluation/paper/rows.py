@@ -126,8 +126,10 @@ def make_rows(groups):
         if 'match_step' in scores:
             rows.append(_row(group, 'match_step_std', _over_seeds(_std), scores['match_step']))
             share = scores['match_fraction']
-            rows.append(_row(group, 'match_beside_input', _over_seeds(_mean),
-                             (share < BESIDE) | (share > 1 - BESIDE)))
+            beside = share < BESIDE
+            if group.key['mode'] == 'bidirectional':
+                beside |= share > 1 - BESIDE
+            rows.append(_row(group, 'match_beside_input', _over_seeds(_mean), beside))
         for metric in SPREADS:
             known = scores.get(metric, np.full((1, 1), np.nan))
             known = known[:, np.isfinite(known).all(0)]
