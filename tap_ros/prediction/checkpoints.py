@@ -9,6 +9,7 @@ Batches and augmentation are drawn from (seed, step), so that there are no rando
 import copy
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.weights import load_tensors, save_tensors
@@ -98,7 +99,7 @@ def save_checkpoint(path, state, settings, data_hash):
         'settings': settings, 'data_hash': data_hash})
 
 
-def load_checkpoint(path, state, settings, data_hash):
+def load_checkpoint(path, state, settings, data_hash, defaults=MappingProxyType({})):
     """
     Put the state of a run back.
 
@@ -106,6 +107,7 @@ def load_checkpoint(path, state, settings, data_hash):
     :param state: TrainingState as start made it; changed in place.
     :param settings: dict of the run's settings.
     :param data_hash: of the recordings.
+    :param defaults: dict of what settings were before they existed.
     :raises ConfigError: if the checkpoint is of other settings or other recordings.
     :raises WeightsError: if it is damaged.
     """
@@ -113,7 +115,7 @@ def load_checkpoint(path, state, settings, data_hash):
         return
     tensors, about = load_tensors(path)
     for name, value in settings.items():
-        before = about['settings'].get(name)
+        before = about['settings'].get(name, defaults.get(name))
         if name not in FREE and before != value:
             raise ConfigError(
                 f'{path}: made with {name}={before!r}, not {value!r}; to go on with it give the '

@@ -63,8 +63,7 @@ def parse_method(name):
     if loss == 'min' and number is not None:
         raise ConfigError(f'method: {name!r}: min takes no number; genmin<beta> does')
     if loss == 'genmin' and number == 0:
-        raise ConfigError('method: genmin0 prefers nothing else to the last frame; expected a '
-                          'beta above 0')
+        raise ConfigError('method: genmin0: expected a beta above 0, such as genmin0.5')
     if loss != 'genmin' and found['selection']:
         raise ConfigError(f'method: {name!r}: only genmin chooses by another error')
     return Method(

@@ -3,30 +3,21 @@
 """What the predictor is trained to do: from a batch to its loss."""
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tap_ros.images import to_float
 from tap_ros.prediction.discriminator import discriminator_loss, generator_loss
 from tap_ros.prediction.losses import (
-    bell_preference,
-    cost_of_reaching,
     fixed_time_loss,
     l1_error,
-    l1_errors,
-    linear_preference,
     match_step,
-    path_length,
-    preferred_error,
     recursive_loss,
-    relative_to_copying,
     remaining_targets,
 )
-from tap_ros.prediction.methods import DEFAULT_BETA
 from tap_ros.prediction.networks import Prediction, Predictor
 from tap_ros.prediction.recognition import kl_divergence, Recognition, sample_latent
+from tap_ros.prediction.selection import outer_error, selection_errors, Targets
 import torch
-
-_POWER_OFFSET = 1e-4  # keeps the slope of a power finite at an error of 0
 
 
 @dataclass(frozen=True)
@@ -92,85 +83,6 @@ class Outcome:
     judged: dict | None = None
 
 
-def time_preference(batch, config):
-    """
-    Compute w(t) for the configured method: linear in forward prediction, else a bell.
-
-    :param batch: batches.Batch.
-    :param config: TrainingConfig.
-    :return: (B, T).
-    """
-    if config.forward:
-        beta = config.chosen.beta
-        return linear_preference(
-            batch.times, batch.end, DEFAULT_BETA if beta is None else beta)
-    return bell_preference(batch.times, batch.first, batch.last, config.bell_edge)
-
-
-def selection_errors(error, copy_error, batch, config):
-    """
-    Compute E'_t of Eq. 5 for the configured method.
-
-    :param error: (B, T), of the prediction against each target.
-    :param copy_error: (B, C, T), of the context pictures against each target.
-    :param batch: batches.Batch.
-    :param config: TrainingConfig.
-    :return: (B, T).
-    """
-    if config.chosen.loss == 'min':
-        return error
-    preference = time_preference(batch, config)
-    if config.chosen.selection == 'relative_to_copying':
-        return relative_to_copying(error, copy_error, preference)
-    if config.chosen.selection == 'cost_of_reaching':
-        cost = path_length(batch.context[:, 0], batch.targets, batch.valid)
-        return cost_of_reaching(error, cost, preference)
-    return preferred_error(error, preference)
-
-
-class _Targets:
-    """The frames of a batch that predictions are compared with."""
-
-    def __init__(self, batch, augmentation, config):
-        self.batch, self.augmentation, self.config = batch, augmentation, config
-        self.rows = torch.arange(len(batch.context), device=batch.context.device)
-
-    def frame(self, step):
-        """Return the augmented frames (B, 3, H, W) at indices step (B,) into T."""
-        frame = to_float(self.batch.targets[self.rows, step])[:, None]
-        return (self.augmentation.apply(frame) if self.augmentation else frame)[:, 0]
-
-    def match(self, image, context, valid, selection):
-        """
-        Find the target that each prediction is trained towards, the argmin of Eq. 5.
-
-        Chosen among the frames as recorded: undoing the augmentation of one picture is cheaper
-        than applying it to all targets.
-        """
-        if self.config.chosen.loss == 'fix':
-            return torch.zeros_like(self.rows)  # the batch begins with the fixed frame
-        errors = self.errors(torch.cat([image.detach()[:, None], context.detach()], 1))
-        selection_error = selection(errors[:, 0], errors[:, 1:], self.batch, self.config)
-        return match_step(selection_error, valid)
-
-    def errors(self, images):
-        """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
-        if self.augmentation:
-            images = self.augmentation.undo(images)
-        return l1_errors(images, self.batch.targets.movedim(-1, 2))
-
-    def loss(self, image, step):
-        """Return E_t: the l1 error at step, to the configured power, as a mean."""
-        return fixed_time_loss(
-            lambda step: _outer(l1_error(image, self.frame(step)), self.config), step)
-
-
-def _outer(error, config):
-    """Raise l1 errors to the configured power."""
-    power = config.outer_power
-    return error if power == 1 else (error + _POWER_OFFSET) ** power
-
-
 def predictor_loss(networks, batch, augmentation, config, draws=None,
                    autocast=contextlib.nullcontext, selection=selection_errors):
     """
@@ -187,11 +99,10 @@ def predictor_loss(networks, batch, augmentation, config, draws=None,
     :param config: TrainingConfig.
     :param draws: Draws; needed with GAN or VAE.
     :param autocast: makes the context manager to run the networks in.
-    :param selection: function (error (B, T), copy_error (B, C, T), batch, config) -> E'_t (B, T):
-        any preference.
+    :param selection: function as selection.selection_errors: any preference.
     :return: Outcome.
     """
-    targets = _Targets(batch, augmentation, config)
+    targets = Targets(batch, augmentation, config)
     context = to_float(batch.context)  # B, C, 3, H, W
     context = augmentation.apply(context) if augmentation else context
     if networks.recognition is not None and config.posterior == 'frame':
@@ -207,7 +118,7 @@ def predictor_loss(networks, batch, augmentation, config, draws=None,
         parts['kl'] = config.kl_weight * kl_divergence(mean, log_variance).mean()
     with autocast():
         prediction = networks.predictor(context, z)
-    match = targets.match(prediction.image, context, batch.valid, selection)
+    match = targets.match(prediction.image, context, selection)
     parts['error'] = targets.loss(prediction.image, match)
     judged = None
     if networks.discriminator is not None:
@@ -276,8 +187,14 @@ def _recursive_loss(networks, prediction, targets, context, match, loss, config,
         context = following if config.forward else torch.cat([context[:, :1], following], 1)
         with autocast():
             prediction = networks.predictor(context, z)
-        match = targets.match(prediction.image, context, valid | ~left[:, None], selection)
-        errors = _outer(l1_error(prediction.image, targets.frame(match)), config)
+        # Preferences lie between the inputs of this level.
+        between = replace(batch, valid=valid | ~left[:, None])
+        if not config.forward:
+            end = torch.where(left[:, None], matched, batch.end)
+            between = replace(between, end=end, last=torch.where(
+                left[:, None], matched - 1, batch.last))
+        match = targets.match(prediction.image, context, selection, between)
+        errors = outer_error(l1_error(prediction.image, targets.frame(match)), config)
         losses.append(errors[left].mean())
         counts.append(left.sum().item())
     return recursive_loss(losses, counts)
@@ -304,10 +221,11 @@ def _frame_posterior_loss(networks, targets, context, config, draws, autocast, s
         errors.append(l1_error(prediction.image, frame))
         predictions.append(prediction)
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
-    whole, copying = (divergences + errors).detach(), targets.errors(context)
-    match = match_step(selection(whole, copying, batch, config), batch.valid)
+    whole = (divergences + errors).detach()
+    match = match_step(selection(
+        whole, lambda: targets.errors(context), batch, config), batch.valid)
     parts = {'kl': fixed_time_loss(divergences, match),
-             'error': fixed_time_loss(_outer(errors, config), match)}
+             'error': fixed_time_loss(outer_error(errors, config), match)}
     return Outcome(sum(parts.values()), match, _choose(predictions, match),
                    {name: value.detach() for name, value in parts.items()})
 
@@ -319,44 +237,3 @@ def _choose(predictions, match):
         return None if values[0] is None else torch.stack(values, 1)[
             torch.arange(len(match), device=match.device), match]
     return Prediction(*(pick(name) for name in ('image', 'flow', 'masks', 'new_pixels')))
-
-
-@torch.no_grad()
-def matched(network, batch, config, autocast=contextlib.nullcontext):
-    """
-    Predict, with z at 0, and find the frames that the method chooses.
-
-    :param network: Predictor in eval mode.
-    :param batch: batches.Batch, on the network's device.
-    :param config: TrainingConfig.
-    :param autocast: makes the context manager to run the network in.
-    :return: (Prediction, int64 (B,) indices into T).
-    """
-    context = to_float(batch.context)
-    with autocast():
-        prediction = network(context)
-    targets = _Targets(batch, None, config)
-    return prediction, targets.match(prediction.image, context, batch.valid, selection_errors)
-
-
-@torch.no_grad()
-def held_out_scores(network, batches, config, autocast=contextlib.nullcontext):
-    """
-    Measure a network by the error at the frames that its method chooses; z is 0.
-
-    :param network: Predictor in eval mode.
-    :param batches: iterable of batches.Batch, on the network's device.
-    :param config: TrainingConfig.
-    :param autocast: makes the context manager to run the network in.
-    :return: dict of loss (the l1 error), match_fraction and match_fraction_std.
-    """
-    losses, fractions = [], []
-    for batch in batches:
-        prediction, match = matched(network, batch, config, autocast)
-        rows = torch.arange(len(match), device=match.device)
-        losses.append(l1_error(prediction.image, to_float(batch.targets[rows, match])).cpu())
-        fractions.append((batch.times.gather(1, match[:, None]) / batch.end)[:, 0].cpu())
-    fractions = torch.cat(fractions)
-    return {'loss': torch.cat(losses).mean().item(),
-            'match_fraction': fractions.mean().item(),
-            'match_fraction_std': fractions.std(correction=0).item()}

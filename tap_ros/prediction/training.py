@@ -19,18 +19,18 @@ from tap_ros.prediction.batches import episode_order, make_batch, split_episodes
 from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
 from tap_ros.prediction.discriminator import Discriminator
 from tap_ros.prediction.frames import MappedFrames, ResidentFrames
+from tap_ros.prediction.held_out import held_out_scores, matched
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.objective import (
     discriminators_loss,
     Draws,
-    held_out_scores,
-    matched,
     Networks,
     predictor_loss,
 )
 from tap_ros.prediction.pictures import sample_grid
 from tap_ros.prediction.pretraining import pretrain_decoders
 from tap_ros.prediction.recognition import Recognition
+from tap_ros.prediction.training_config import DEFAULTS
 from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings
 import torch
@@ -65,18 +65,20 @@ def train(config, stop_at=None, minutes=None, progress=True):
     network = Predictor(network_config(config, store.image_size))
     state = start(network, config.learning_rate, device, _helpers(config, network.config, store))
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
-    load_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+    load_checkpoint(checkpoint, state, asdict(config), store.data_hash, DEFAULTS)
     autocast = make_autocast(config.precision, device)
-    if config.pretrain_steps and not state.step:
-        pretrain_decoders(state.network, partial(_frames, store, training, config),
-                          config.pretrain_steps, seed=config.seed, autocast=autocast,
-                          progress=progress)
-        state.average.load_state_dict(state.network.state_dict())
     # Decoding and copying would be most of the time of a step on a GPU.
     frames = (ResidentFrames(store, device, progress) if device.type == 'cuda'
               else MappedFrames(store))
-    model = torch.compile(state.network) if config.compile else state.network
-    networks = Networks(model, **dict(state.helpers.items()))
+    if config.pretrain_steps and not checkpoint.exists():
+        pretrain_decoders(state.network, partial(_single_frames, store, frames, training, config),
+                          config.pretrain_steps, seed=config.seed, autocast=autocast,
+                          progress=progress)
+        state.average.load_state_dict(state.network.state_dict())
+        save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+    compiled = torch.compile if config.compile else lambda module: module
+    networks = Networks(compiled(state.network), **{
+        name: compiled(helper) for name, helper in state.helpers.items()})
     last = min(config.steps, stop_at or config.steps)
     report = partial(_report, config=config, store=store, frames=frames, training=training,
                      held_out=held_out, autocast=autocast)
@@ -168,11 +170,11 @@ def _helpers(config, shape, store):
     return helpers
 
 
-def _frames(store, episodes, config, step):
+def _single_frames(store, frames, episodes, config, step):
     """Draw single frames of the training episodes, for the decoders' pretraining."""
     rng = np.random.default_rng([config.seed, 3, step])
     chosen = rng.choice(episodes, config.batch_size)
-    return np.stack([store.frames(i)[rng.integers(store.lengths[i])] for i in chosen])
+    return frames(chosen, rng.integers(store.lengths[chosen])[:, None])[:, 0]
 
 
 def learning_rate(step, config, highest):

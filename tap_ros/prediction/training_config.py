@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The settings of a training run of the predictor."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 from tap_ros.errors import ConfigError
@@ -156,3 +156,6 @@ class TrainingConfig:
     def forward(self):
         """Whether the start picture is all of the context."""
         return self.mode == 'forward'
+
+
+DEFAULTS = {field.name: field.default for field in fields(TrainingConfig)}

@@ -9,15 +9,16 @@ import pytest
 from tap_ros.images import to_float
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch
-from tap_ros.prediction.losses import l1_error, minimum_loss
+from tap_ros.prediction.held_out import held_out_scores
+from tap_ros.prediction.losses import bell_preference, l1_error, minimum_loss
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.objective import (
     discriminators_loss,
     Draws,
-    held_out_scores,
     Networks,
     predictor_loss,
 )
+from tap_ros.prediction.selection import selection_errors
 from tap_ros.prediction.training_config import TrainingConfig
 import torch
 
@@ -250,7 +251,7 @@ def test_appendix_b_is_the_minimum_over_the_whole_loss():
     assert all(seen.shape[1] == 3 for seen in networks.recognition.seen)  # context and one frame
     # With genmin, preferences choose among whole losses too.
     def latest(error, copy_error, batch, config):
-        assert error.allclose(divergence, atol=1e-6) and copy_error.shape == (2, 2, 5)
+        assert error.allclose(divergence, atol=1e-6) and copy_error().shape == (2, 2, 5)
         return -batch.times.float()
 
     outcome = predictor_loss(networks, batch, None, replace(config, method='genmin-vae'),
@@ -285,6 +286,21 @@ def test_recursion_goes_on_from_its_own_prediction(mode, second, expected):
     # A frame on the other side is no target of the second level.
     wrong = Moving(frames[:, 2], frames[:, 4 - second])
     assert predictor_loss(Networks(wrong), batch, None, config).loss > 0.1
+
+
+def test_the_preference_of_a_level_lies_between_its_own_inputs():
+    batch, seen = make_batch(T=9), []
+
+    def selection(error, copy_error, batch, config):
+        seen.append(bell_preference(batch.times, batch.first, batch.last))
+        return selection_errors(error, copy_error, batch, config)
+
+    frames = to_float(batch.targets)
+    network = Moving(frames[:, 6], frames[:, 3])  # times 7 and 4
+    predictor_loss(Networks(network), batch, None,
+                   replace(CONFIG, method='genmin-wo-gan', recursion=2), selection=selection)
+    assert seen[0].argmax(1).tolist() == [4] * 4  # time 5 of 1 to 9
+    assert seen[1].argmax(1).tolist() == [2] * 4  # 3.5 of 1 to 6; the first of two
 
 
 def test_recursion_ends_where_no_target_is_left():

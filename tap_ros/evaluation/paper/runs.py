@@ -41,7 +41,8 @@ SCALES = {
     'full': Scale(
         episodes={'push2': 55000, 'grasp': 50000, 'pick_place': 75000, 'push3': 55000},
         settings={'base_width': 32, 'batch_size': 64, 'learning_rate': 1e-4,
-                  'precision': 'bfloat16', 'compile': True}),
+                  'discriminator_rate': 1e-4, 'precision': 'bfloat16', 'compile': True,
+                  'save_every': 5000}),
 }
 
 # The paper's rows: every frame between the inputs is a target, the error is its own mean.
@@ -195,6 +196,6 @@ def paper_runs(scale, seeds=(0,), episodes=0, steps=0):
     # For use in planning.
     add(['push2', 'push3'], ['genmin+relative'], new_pixels=False, variant='+mixed')
     # What the parts of genmin+relative are worth.
-    add(['push2'], ['genmin'], new_pixels=False, variant='+root')
+    add(['push2'], ['genmin', 'fix'], new_pixels=False, variant='+root')
     add(['push2'], ['genmin+relative'], new_pixels=False, variant='+mean')
     return [replace(run, seed=seed) for seed in seeds for run in rows]

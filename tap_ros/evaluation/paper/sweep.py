@@ -8,7 +8,7 @@ them.
 """
 
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 import json
 import math
 import os
@@ -22,7 +22,7 @@ from tap_ros.evaluation.paper.job import BUSY, DONE, UNFINISHED
 from tap_ros.evaluation.paper.places import is_collected, read_json, recording_hash
 from tap_ros.evaluation.paper.runs import PaperRun
 from tap_ros.prediction.checkpoints import FREE
-from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.prediction.training_config import DEFAULTS
 from tqdm import tqdm
 
 _ENDS = {DONE: 'done', BUSY: 'busy', UNFINISHED: 'unfinished', -signal.SIGTERM: 'unfinished'}
@@ -105,8 +105,7 @@ def find_state(run, places, data_hash=None):
 def _same(settings, config):
     """Compare settings of a run, all that training depends on; new ones count as the default."""
     wanted = json.loads(json.dumps(asdict(config)))
-    default = {field.name: field.default for field in fields(TrainingConfig)}
-    return all(settings.get(name, default[name]) == value for name, value in wanted.items()
+    return all(settings.get(name, DEFAULTS[name]) == value for name, value in wanted.items()
                if name not in FREE)
 
 

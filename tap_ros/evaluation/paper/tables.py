@@ -99,11 +99,11 @@ def gains_table(rows, new_pixels=True):
                             for name in ('match_step', 'match_fraction'))
             equal = '-' if share is None else 'yes' if abs(share['value']) <= EQUAL else 'no'
             theirs = GAINS.get(task) if method == 'genmin' and new_pixels else None
-            lines.append([title, method, with_interval(gain, 0, 100), plain(theirs, 0, 100),
-                          with_interval(steps, 1, sign='+'), equal])
+            lines.append([title, method, gain['baseline'], with_interval(gain, 0, 100),
+                          plain(theirs, 0, 100), with_interval(steps, 1, sign='+'), equal])
     return lines and markdown(
-        ['task', 'method', 'error below fix, %', 'paper', 'match-step minus that of fix, frames',
-         'equal'], lines, left=2)
+        ['task', 'method', 'beside', 'error below fix, %', 'paper',
+         'match-step minus that of fix, frames', 'equal'], lines, left=3)
 
 
 def forward_table(rows, task='grasp'):

@@ -1,0 +1,51 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a network scores by its own method while it is trained."""
+
+import contextlib
+
+from tap_ros.images import to_float
+from tap_ros.prediction.losses import l1_error
+from tap_ros.prediction.selection import selection_errors, Targets
+import torch
+
+
+@torch.no_grad()
+def matched(network, batch, config, autocast=contextlib.nullcontext):
+    """
+    Predict, with z at 0, and find the frames that the method chooses.
+
+    :param network: Predictor in eval mode.
+    :param batch: batches.Batch, on the network's device.
+    :param config: TrainingConfig.
+    :param autocast: makes the context manager to run the network in.
+    :return: (Prediction, int64 (B,) indices into T).
+    """
+    context = to_float(batch.context)
+    with autocast():
+        prediction = network(context)
+    targets = Targets(batch, None, config)
+    return prediction, targets.match(prediction.image, context, selection_errors)
+
+
+@torch.no_grad()
+def held_out_scores(network, batches, config, autocast=contextlib.nullcontext):
+    """
+    Measure a network by the error at the frames that its method chooses; z is 0.
+
+    :param network: Predictor in eval mode.
+    :param batches: iterable of batches.Batch, on the network's device.
+    :param config: TrainingConfig.
+    :param autocast: makes the context manager to run the network in.
+    :return: dict of loss (the l1 error), match_fraction and match_fraction_std.
+    """
+    losses, fractions = [], []
+    for batch in batches:
+        prediction, match = matched(network, batch, config, autocast)
+        rows = torch.arange(len(match), device=match.device)
+        losses.append(l1_error(prediction.image, to_float(batch.targets[rows, match])).cpu())
+        fractions.append((batch.times.gather(1, match[:, None]) / batch.end)[:, 0].cpu())
+    fractions = torch.cat(fractions)
+    return {'loss': torch.cat(losses).mean().item(),
+            'match_fraction': fractions.mean().item(),
+            'match_fraction_std': fractions.std(correction=0).item()}

@@ -1,0 +1,122 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Which frame a prediction is trained towards: the selection error E' and its argmin (Eq. 5)."""
+
+from tap_ros.images import to_float
+from tap_ros.prediction.losses import (
+    bell_preference,
+    cost_of_reaching,
+    fixed_time_loss,
+    l1_error,
+    l1_errors,
+    linear_preference,
+    match_step,
+    path_length,
+    preferred_error,
+    relative_to_copying,
+)
+from tap_ros.prediction.methods import DEFAULT_BETA
+import torch
+
+_POWER_OFFSET = 1e-4  # keeps the slope of a power finite at an error of 0
+
+
+def time_preference(batch, config):
+    """
+    Compute w(t) for the configured method: linear in forward prediction, else a bell.
+
+    :param batch: batches.Batch.
+    :param config: TrainingConfig.
+    :return: (B, T).
+    """
+    if config.forward:
+        beta = config.chosen.beta
+        return linear_preference(
+            batch.times, batch.end, DEFAULT_BETA if beta is None else beta)
+    return bell_preference(batch.times, batch.first, batch.last, config.bell_edge)
+
+
+def selection_errors(error, copy_error, batch, config):
+    """
+    Compute E'_t of Eq. 5 for the configured method.
+
+    :param error: (B, T), of the prediction against each target.
+    :param copy_error: function without arguments that returns (B, C, T), the errors of the context
+        pictures against each target.
+    :param batch: batches.Batch.
+    :param config: TrainingConfig.
+    :return: (B, T).
+    """
+    if config.chosen.loss == 'min':
+        return error
+    preference = time_preference(batch, config)
+    if config.chosen.selection == 'relative_to_copying':
+        return relative_to_copying(error, copy_error(), preference)
+    if config.chosen.selection == 'cost_of_reaching':
+        cost = path_length(batch.context[:, 0], batch.targets, batch.valid)
+        return cost_of_reaching(error, cost, preference)
+    return preferred_error(error, preference)
+
+
+class Targets:
+    """
+    The frames of a batch that predictions are compared with.
+
+    :param batch: batches.Batch.
+    :param augmentation: Augmentation of all pictures that networks see, or None.
+    :param config: TrainingConfig.
+    """
+
+    def __init__(self, batch, augmentation, config):
+        self.batch, self.augmentation, self.config = batch, augmentation, config
+        self.rows = torch.arange(len(batch.context), device=batch.context.device)
+
+    def frame(self, step):
+        """Return the augmented frames (B, 3, H, W) at indices step (B,) into T."""
+        frame = to_float(self.batch.targets[self.rows, step])[:, None]
+        return (self.augmentation.apply(frame) if self.augmentation else frame)[:, 0]
+
+    def match(self, image, context, selection, batch=None):
+        """
+        Find the target that each prediction is trained towards, the argmin of Eq. 5.
+
+        Chosen among the frames as recorded: undoing the augmentation of one picture is cheaper
+        than applying it to all targets.
+
+        :param image: (B, 3, H, W), predictions, augmented.
+        :param context: (B, C, 3, H, W), what they come from, augmented.
+        :param selection: function as selection_errors.
+        :param batch: with the valid targets and the bounds of the preference, where these are not
+            the batch's own.
+        :return: int64 (B,), indices into T.
+        """
+        if self.config.chosen.loss == 'fix':
+            return torch.zeros_like(self.rows)  # the batch begins with the fixed frame
+        batch = batch or self.batch
+        error = self.errors(image.detach()[:, None])[:, 0]
+        selection_error = selection(
+            error, lambda: self.errors(context.detach()), batch, self.config)
+        return match_step(selection_error, batch.valid)
+
+    def errors(self, images):
+        """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
+        if self.augmentation:
+            images = self.augmentation.undo(images)
+        return l1_errors(images, self.batch.targets.movedim(-1, 2))
+
+    def loss(self, image, step):
+        """Return E_t: the l1 error at step, to the configured power, as a mean."""
+        return fixed_time_loss(
+            lambda step: outer_error(l1_error(image, self.frame(step)), self.config), step)
+
+
+def outer_error(error, config):
+    """
+    Raise errors to the configured power; not in the paper, see objective.predictor_loss.
+
+    :param error: l1 errors on [0, 1].
+    :param config: TrainingConfig.
+    :return: the same shape.
+    """
+    power = config.outer_power
+    return error if power == 1 else (error + _POWER_OFFSET) ** power
