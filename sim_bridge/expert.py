@@ -18,7 +18,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from sim_bridge.grasp_expert import run_grasp_episode
-from sim_bridge.scene import WORKSPACE_HIGH
+from sim_bridge.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, SUBSTEPS
 
 LIFTED = 0.13  # m, height that clears every object
@@ -40,7 +40,9 @@ class ExpertConfig:
     nearest: float = 0.06  # m, worth of pushing the object nearest to the gripper first
     step_cost: float = 0.001  # m per control period
     done_distance: float = 0.02  # m, an object this near its goal is left alone
-    travel_speed: tuple = (0.045, 0.08)  # m per control period
+    wander: tuple = (1, 10)  # control periods of a random walk before the first push
+    wiggle: float = 0.035  # m per control period, of the random walk
+    travel_speed: tuple = (0.06, 0.08)  # m per control period
     push_speed: tuple = (0.02, 0.05)
 
 
@@ -61,6 +63,23 @@ class Expert:
         self._goals = simulator.goal().object_poses[:, :3]
         self._num_samples = rng.integers(*config.num_samples, endpoint=True)
         self._preference = rng.uniform(0, config.preference, simulator.task.num_objects)
+
+    def wander(self):
+        """
+        Plan to rise and walk about at random before the first push.
+
+        Without it, the middle of most episodes is where one object is in place and the other
+        untouched, and a prediction for a fixed time finds that bottleneck by itself.
+
+        :return: (n, 4) actions.
+        """
+        steps = self._rng.integers(*self._config.wander, endpoint=True)
+        wiggle = self._config.wiggle
+        path = self._simulator.target[None, :3] + np.cumsum(
+            self._rng.normal(0, [wiggle, wiggle, 0], (steps, 3)), 0)
+        path = np.clip(path, [*WORKSPACE_LOW[:2], LIFTED], WORKSPACE_HIGH)
+        path = np.concatenate([self._simulator.target[None, :3], path])
+        return np.column_stack([np.diff(path, axis=0), np.zeros(steps)])
 
     def plan(self, steps_left):
         """
@@ -183,7 +202,7 @@ def run_episode(simulator, seed, config=None, rollout=None):
     seconds = {'search': 0.0, 'step': 0.0}
     while (steps_left := simulator.task.num_frames - len(observations)) > 0:
         begin = time.perf_counter()
-        plan = expert.plan(steps_left)
+        plan = expert.plan(steps_left) if actions else expert.wander()
         planned = time.perf_counter()
         seconds['search'] += planned - begin
         if plan is None:
