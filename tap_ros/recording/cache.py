@@ -14,6 +14,7 @@ import os
 from pathlib import Path
 import shutil
 import tempfile
+import threading
 
 import numpy as np
 from safetensors import SafetensorError
@@ -29,6 +30,7 @@ FORMAT = 1  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _MAX_BUFFERS = 1024  # of one writev
 _NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
+_PARSING = threading.Lock()
 
 
 class EpisodeStore:
@@ -200,8 +202,15 @@ def _sort_frames(path, arrays):
     """Bring the frames into the order of their log times, which they nearly always have."""
     order = arrays.pop('frame_order', None)
     if order is not None and (np.diff(order) != 1).any():
-        frames = np.load(path)
+        frames = _map_frames(path)
         np.save(path, frames[order], allow_pickle=False)
+
+
+def _map_frames(path):
+    """Map the frames of a cache folder."""
+    # numpy reads the header with ast, which now and then fails when threads do so at once.
+    with _PARSING:
+        return np.load(path, mmap_mode='r')
 
 
 def _load(folder, source):
@@ -212,7 +221,7 @@ def _load(folder, source):
             length = int.from_bytes(stream.read(8), 'little')
             about = json.loads(json.loads(stream.read(length))['__metadata__']['columns'])
         count = len(arrays.get('frame_log', ()))
-        frames = np.load(folder / 'frames.npy', mmap_mode='r') if count else None
+        frames = _map_frames(folder / 'frames.npy') if count else None
         if count and frames.shape != (count, *about['image_size'], 3):
             return None
     except (OSError, EOFError, SafetensorError, ValueError, KeyError):
