@@ -40,10 +40,9 @@ class ExpertConfig:
     nearest: float = 0.06  # m, worth of pushing the object nearest to the gripper first
     step_cost: float = 0.001  # m per control period
     done_distance: float = 0.02  # m, an object this near its goal is left alone
-    wander: tuple = (1, 10)  # control periods of a random walk before the first push
-    wiggle: float = 0.035  # m per control period, of the random walk
+    wander: tuple = (5, 10)  # control periods of a random walk before the first push
     travel_speed: tuple = (0.06, 0.08)  # m per control period
-    push_speed: tuple = (0.02, 0.05)
+    push_speed: tuple = (0.03, 0.055)
 
 
 class Expert:
@@ -74,10 +73,12 @@ class Expert:
         :return: (n, 4) actions.
         """
         steps = self._rng.integers(*self._config.wander, endpoint=True)
-        wiggle = self._config.wiggle
-        path = self._simulator.target[None, :3] + np.cumsum(
-            self._rng.normal(0, [wiggle, wiggle, 0], (steps, 3)), 0)
-        path = np.clip(path, [*WORKSPACE_LOW[:2], LIFTED], WORKSPACE_HIGH)
+        # As fast as it travels: pictures of a slow walk would be easy to predict from the start.
+        angles = self._rng.uniform(0, 2 * np.pi, steps)
+        lengths = self._rng.uniform(*self._config.travel_speed, steps)
+        path = self._simulator.target[None, :3] + np.cumsum(np.column_stack(
+            [lengths * np.cos(angles), lengths * np.sin(angles), np.full(steps, LIFTED)]), 0)
+        path = np.clip(path, [*WORKSPACE_LOW[:2], LIFTED], [*WORKSPACE_HIGH[:2], LIFTED])
         path = np.concatenate([self._simulator.target[None, :3], path])
         return np.column_stack([np.diff(path, axis=0), np.zeros(steps)])
 

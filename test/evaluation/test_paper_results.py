@@ -145,6 +145,25 @@ def test_forward_gains_compare_at_the_same_match_step():
     assert not find(rows, method='genmin0.5', metric=metric)
 
 
+def test_between_start_and_goal_copying_is_fixed_time_prediction_too():
+    def constant(l1, at):
+        return scores([l1] * EPISODES, [at] * EPISODES, frames=101)
+
+    def run(method, l1, at):
+        return made_run(method, constant(l1, at), **{
+            'copy-start': constant(0.02, 0.1), 'copy-goal': constant(0.02, 0.9)})
+
+    metric = 'gain_over_fix_at_match_step'
+    # On the line between fix (0.5) and copying the goal (0.9).
+    rows = rows_of(run('fix', 0.04, 0.5), run('genmin', 0.01, 0.7))
+    row = find(rows, method='genmin', metric=metric)
+    assert row['value'] == pytest.approx(1 - 0.01 / 0.02)
+    rows = rows_of(run('fix', 0.01, 0.5), run('genmin', 0.01, 0.7))
+    assert find(rows, method='genmin', metric=metric)['value'] == pytest.approx(1 - 0.01 / 0.015)
+    assert not find(rows, method='copy-goal', metric=metric)
+    assert not find(rows_of(run('genmin', 0.01, 0.7)), metric=metric)  # without any fix
+
+
 def test_methods_stand_in_the_order_of_the_paper():
     order = ['copy-start', 'copy-goal', 'fix', 'fix0.75', 'min', 'genmin30', 'genmin2', 'genmin',
              'genmin+relative', 'genmin-vae-gan', 'genmin-vae-best-of-100']

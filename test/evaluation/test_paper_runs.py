@@ -48,7 +48,7 @@ def test_names_are_unique_and_the_first_seed_comes_first():
         runs = paper_runs(scale, seeds=(0, 1))
         assert len({run.name for run in runs}) == len(runs)
         assert runs[:len(runs) // 2] == paper_runs(scale)
-        assert runs[0].name == 'push2-bidirectional-genmin-warp-s0'
+        assert runs[0].name == 'push2-bidirectional-genmin+relative-warp-s0'
 
 
 def test_rows_of_a_task_and_mode_differ_in_the_method_only():
@@ -72,7 +72,8 @@ def test_full_has_the_papers_length():
 def test_the_command_says_what_was_set():
     run = replace(paper_runs('small', episodes=40)[0], seed=2, steps=7)
     assert run.command == ('python -m tap_ros paper --scale small --only '
-                           'push2-bidirectional-genmin-warp-s2 --seeds 2 --episodes 40 --steps 7')
+                           'push2-bidirectional-genmin+relative-warp-s2 --seeds 2 --episodes 40 '
+                           '--steps 7')
     assert PaperRun(**json.loads(json.dumps(vars(run)))) == run
 
 

@@ -242,10 +242,13 @@ def gains(rows):
     """
     Draw how far each method's error is below fix's, with the paper's gains of genmin.
 
+    Dots compare with fix, squares with fixed-time prediction at the same match-step.
+
     :param rows: of one scale.
     :return: bytes of a PNG, or None without such rows.
     """
-    chosen = [row for row in rows if row['metric'] == 'gain_over_fix'
+    markers = {'gain_over_fix': 'o', 'gain_over_fix_at_match_step': 's'}
+    chosen = [row for row in rows if row['metric'] in markers
               and row['mode'] == 'bidirectional' and row.get('new_pixels', True)]
     if not chosen:
         return None
@@ -255,13 +258,15 @@ def gains(rows):
     for axis, task in zip(axes[0], tasks):
         axis.axvline(0, color='#a0a0a0', linewidth=1)
         for y, method in enumerate(methods):
-            row = find(chosen, task=task, method=method)
-            if row is None:
-                continue
-            value, low, high = (100 * row[name] for name in ('value', 'ci_low', 'ci_high'))
-            colour = COLOURS[family(method)]
-            axis.plot([low, high], [y, y], color=colour, linewidth=2.2, alpha=0.45)
-            axis.plot(value, y, 'o', color=colour, markersize=6, markeredgecolor='white')
+            for shift, (metric, marker) in zip((-0.16, 0.16), markers.items()):
+                row = find(chosen, task=task, method=method, metric=metric)
+                if row is None:
+                    continue
+                value, low, high = (100 * row[name] for name in ('value', 'ci_low', 'ci_high'))
+                colour = COLOURS[family(method)]
+                axis.plot([low, high], [y + shift] * 2, color=colour, linewidth=2.2, alpha=0.45)
+                axis.plot(value, y + shift, marker, color=colour, markersize=5.5,
+                          markeredgecolor='white')
         if task in GAINS and 'genmin' in methods:
             axis.plot(100 * GAINS[task], methods.index('genmin'), 'D', color=COLOURS['genmin'],
                       markerfacecolor='none', markersize=7, markeredgewidth=1.3)

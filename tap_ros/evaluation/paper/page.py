@@ -174,12 +174,16 @@ def _gains(rows, scale, pictures):
         return [*parts, 'None yet: they need runs of fix and of another method.\n']
     parts += _plot('gains', scale, pictures, 'how far each error is below that of fix, in percent')
     if f'{file_name("gains", scale)}' in pictures:
-        parts.append("Diamonds: the paper's gains of genmin.\n")
+        parts.append(
+            "Dots: beside fix. Squares: beside fixed-time prediction at the same match-step. "
+            "Diamonds: the paper's gains of genmin, beside fix.\n")
     parts.append(
         'Paired by episode. A gain counts where both predict equally far from the start: '
         f'*equal* says whether the mean match-steps are within {EQUAL:.0%} of the episode (in the '
         'paper they are up to 11% apart). Equal means can hide opposite ends; the histograms show '
-        'that.\n')
+        'that. The last column compares with fixed-time prediction at just the same mean '
+        'match-step: with what choosing at random between two of its models would score, where '
+        'copying the start and copying the goal are the best models for the times 0 and 1.\n')
     for new_pixels, table in tables:
         if table:
             parts += [*([] if new_pixels else ['Models without new pixels:\n']), table]
@@ -191,7 +195,8 @@ def _forward(rows, scale, pictures):
     parts = ['## From the start alone (Fig. 4)\n',
              *_plot('forward_scatter', scale, pictures, 'error against match-step, ours and the '
                     "authors'"), forward_table(rows)]
-    gains = [row for row in rows if row['metric'] == 'gain_over_fix_at_match_step']
+    gains = [row for row in rows if row['metric'] == 'gain_over_fix_at_match_step'
+             and row['mode'] == 'forward']
     if gains:
         below = sum(row['ci_low'] > 0 for row in gains)
         above = sum(row['ci_high'] < 0 for row in gains)

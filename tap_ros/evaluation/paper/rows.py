@@ -141,7 +141,7 @@ def make_rows(groups):
                 rows.append(_row(group, f'bottleneck_frequency_{threshold}px', _over_seeds(_mean),
                                  placed <= threshold))
             rows.append(_row(group, 'bottleneck_median_px', _over_seeds(_median), placed))
-    return rows + _gain_rows(groups) + _forward_gain_rows(groups)
+    return rows + _gain_rows(groups) + _equal_gain_rows(groups)
 
 
 def _mean(values):
@@ -219,26 +219,32 @@ def _difference(values, baseline):
     return values.mean((0, -1)) - baseline.mean((0, -1))
 
 
-def _forward_gain_rows(groups):
+def _equal_gain_rows(groups):
     """
-    Compare forward methods with fixed-time ones at the same mean match-step (Fig. 4).
+    Compare methods with fixed-time ones at the same mean match-step (as Fig. 4 does by eye).
 
     That of fixed-time prediction is the lower hull of the fix models: what choosing at random
-    between two of them would score. A method with a match-step beyond theirs gets no row.
+    between two of them would score. Between start and goal, copying belongs to them: it is the
+    best prediction for the times 0 and 1. A method with a match-step beyond theirs gets no row.
     """
     rows = []
-    forward = [group for group in groups if group.key['mode'] == 'forward']
-    for group in forward:
-        if group.key['method'] in COPIES or 'match_step' not in group.scores:
+    for group in groups:
+        name, mode = group.key['method'], group.key['mode']
+        if name in COPIES or name.startswith('fix') or 'match_step' not in group.scores:
             continue
-        fixes = [other for other in forward if other.data_hash == group.data_hash
-                 and other.key == {**group.key, 'method': other.key['method']}
-                 and re.fullmatch(r'fix[\d.]*', other.key['method'])]
-        if group.key['method'].startswith('fix') or len(fixes) < 2:
+        baselines = [
+            other for other in groups if other.data_hash == group.data_hash
+            and all(other.key[part] == group.key[part] for part in ('task', 'mode', 'scale'))
+            and (other.key['method'] in COPIES if 'new_pixels' not in other.key else
+                 other.key['new_pixels'] == group.key['new_pixels']
+                 and re.fullmatch(r'fix[\d.]*', other.key['method']))
+            and not (mode == 'forward' and other.key['method'] in COPIES)]
+        if len(baselines) < 2 or all(other.key['method'] in COPIES for other in baselines):
             continue
         row = _row(group, 'gain_over_fix_at_match_step', _gain_at_match_step,
-                   *(g.scores[name] for g in (group, *fixes) for name in ('match_step', 'min_l1')),
-                   baseline=' '.join(other.key['method'] for other in fixes))
+                   *(g.scores[score] for g in (group, *baselines)
+                     for score in ('match_step', 'min_l1')),
+                   baseline=' '.join(other.key['method'] for other in baselines))
         if np.isfinite(row['value']):
             rows.append(row)
     return rows

@@ -99,11 +99,14 @@ def gains_table(rows, new_pixels=True):
                             for name in ('match_step', 'match_fraction'))
             equal = '-' if share is None else 'yes' if abs(share['value']) <= EQUAL else 'no'
             theirs = GAINS.get(task) if method == 'genmin' and new_pixels else None
+            same = find(rows, **about, metric='gain_over_fix_at_match_step')
             lines.append([title, method, gain['baseline'], with_interval(gain, 0, 100),
-                          plain(theirs, 0, 100), with_interval(steps, 1, sign='+'), equal])
+                          plain(theirs, 0, 100), with_interval(steps, 1, sign='+'), equal,
+                          with_interval(same, 0, 100)])
     return lines and markdown(
         ['task', 'method', 'beside', 'error below fix, %', 'paper',
-         'match-step minus that of fix, frames', 'equal'], lines, left=3)
+         'match-step minus that of fix, frames', 'equal',
+         'error below fixed-time prediction at the same match-step, %'], lines, left=3)
 
 
 def forward_table(rows, task='grasp'):
