@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from tap_ros.cli import main
 from tap_ros.recording.reader import iter_episodes
+from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / 'bags' / 'sample_push2'
@@ -45,13 +46,13 @@ def test_collect_then_inspect(tmp_path, capsys):
     assert picture.read_bytes().startswith(b'\x89PNG')
 
 
-@pytest.mark.parametrize('name', ['predictor_push', 'forward_model_push'])
-def test_shipped_weights_say_what_they_are(name, capsys):
-    path = ROOT / 'tap_ros' / 'weights' / f'{name}.safetensors'
+@pytest.mark.parametrize('path', [FORWARD_MODEL, *PREDICTORS.values()], ids=lambda path: path.stem)
+def test_shipped_weights_say_what_they_are(path, capsys):
     assert main(['inspect', str(path)]) == 0
     assert 'data_hash' in capsys.readouterr().out
     card = path.with_suffix('.md').read_text()
-    assert 'python -m tap_ros train' in card and 'python -m tap_ros collect' in card
+    assert 'python -m tap_ros train' in card or 'python -m tap_ros paper' in card
+    assert 'python -m tap_ros collect' in card and path.name in card
 
 
 def test_the_sample_recording_is_readable():

@@ -8,12 +8,14 @@ Object positions are the recordings', that is, the simulator's ground truth; the
 
 import numpy as np
 from tap_ros.prediction.batches import uses_recorded_goal
-from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
+from tap_ros.prediction.warp import one_hot_maps, warp_object_maps, WarpedMaps
 import torch
 
 THRESHOLDS = tuple(range(11))  # px
 # An object that hardly moves is at its start and its goal at once: a bottleneck for free.
 MIN_MOTION = 4.0  # px
+# A map is normalised, so an object that a prediction leaves out is still somewhere by its map.
+VISIBLE = 0.5  # least mass, of 1, that the maps of all objects keep if these are to be seen
 
 
 def expected_distances(maps, pixels):
@@ -81,11 +83,12 @@ def predicted_maps(pixels, prediction, b):
     :param pixels: float32 (2, K, 2), of context_pixels; a forward prediction uses the start only.
     :param prediction: networks.Prediction of a batch.
     :param b: which one of the batch.
-    :return: (K, H, W), each sums to 1.
+    :return: warp.WarpedMaps of (K, H, W) maps, each sums to 1, and (K,) masses.
     """
     flow, masks = prediction.flow[b:b + 1], prediction.masks[b:b + 1]
     pixels = torch.from_numpy(pixels[:flow.shape[1]]).to(flow.device)
-    return warp_object_maps(one_hot_maps(pixels, flow.shape[-2:])[None], flow, masks).maps[0]
+    warped = warp_object_maps(one_hot_maps(pixels, flow.shape[-2:])[None], flow, masks)
+    return WarpedMaps(warped.maps[0], warped.mass[0])
 
 
 def score_bottlenecks(episodes, prediction, goal_picture):
@@ -95,18 +98,22 @@ def score_bottlenecks(episodes, prediction, goal_picture):
     :param episodes: list of B Episodes.
     :param prediction: networks.Prediction of them.
     :param goal_picture: see batches.uses_recorded_goal.
-    :return: float32 (B, 3), prediction, copy-start, copy-goal, in pixels. NaN where it is
+    :return: float32 (B, 3), prediction, copy-start, copy-goal, in pixels, and float32 (B, 3), the
+        mass that the map of that object has kept which lost most, of 1. NaN where it is
         undefined: for other than two objects, unknown positions, or an object that stays.
     """
     result = np.full((len(episodes), 3), np.nan, np.float32)
+    mass = result.copy()
     for b, episode in enumerate(episodes):
         pixels = context_pixels(episode, goal_picture)
         if pixels.shape[1] != 2 or not np.isfinite(pixels).all():
             continue
         if np.linalg.norm(pixels[1] - pixels[0], axis=-1).min() < MIN_MOTION:
             continue
-        maps = predicted_maps(pixels, prediction, b)[None]
-        pixels = torch.from_numpy(pixels).to(maps.device)
-        maps = torch.cat([maps, one_hot_maps(pixels, maps.shape[-2:])])  # prediction, start, goal
+        warped = predicted_maps(pixels, prediction, b)
+        pixels = torch.from_numpy(pixels).to(warped.maps.device)
+        maps = torch.cat([  # of the prediction, the start and the goal
+            warped.maps[None], one_hot_maps(pixels, warped.maps.shape[-2:])])
         result[b] = bottleneck_scores(maps, pixels[:1], pixels[1:]).cpu().numpy()
-    return result
+        mass[b] = warped.mass.min().item(), 1, 1
+    return result, mass

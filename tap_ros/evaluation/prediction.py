@@ -20,6 +20,7 @@ from tap_ros.evaluation.bottleneck import (
     predicted_maps,
     score_bottlenecks,
     THRESHOLDS,
+    VISIBLE,
 )
 from tap_ros.evaluation.intervals import bootstrap, gain_interval, mean_interval
 from tap_ros.evaluation.samples import draw_latents, SAMPLES, score_samples
@@ -29,12 +30,13 @@ from tap_ros.prediction.batches import make_batch, split_episodes
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
+from tap_ros.weights import PREDICTORS
 import torch
 
 METHODS = ('prediction', 'copy-start', 'copy-goal')
 _BATCH = 64
 _SHOWN = ('min_l1', 'match_fraction', 'match_fraction_std', 'bottleneck_median', 'bottleneck_1px',
-          'bottleneck_2px', 'bottleneck_5px')
+          'bottleneck_2px', 'visible_bottleneck_2px', 'bottleneck_5px')
 
 
 @dataclass(frozen=True)
@@ -47,19 +49,22 @@ class EpisodeScores:
     :param match_step: (N,), the time of that frame; the start picture is time 0.
     :param match_fraction: (N,), that time as a share of the episode.
     :param bottleneck: (N,), see bottleneck.score_bottlenecks; NaN where it is undefined.
+    :param object_mass: (N,), likewise; below bottleneck.VISIBLE an object is left out.
     """
 
     min_l1: np.ndarray
     match_step: np.ndarray
     match_fraction: np.ndarray
     bottleneck: np.ndarray
+    object_mass: np.ndarray
 
     def intervals(self):
         """
         Average over the episodes.
 
         :return: dict from names to Intervals; bottleneck_<n>px is the share of episodes with a
-            score of at most n pixels, among those where it is defined.
+            score of at most n pixels, among those where it is defined; visible_bottleneck_<n>px
+            the share of those in which no object is left out either.
         """
         result = {
             'min_l1': mean_interval(self.min_l1),
@@ -69,10 +74,14 @@ class EpisodeScores:
             'match_fraction_std': bootstrap(_std, self.match_fraction)}
         scores = self.bottleneck[np.isfinite(self.bottleneck)]
         if len(scores):
+            visible = np.where(self.object_mass[np.isfinite(self.bottleneck)] < VISIBLE, np.inf,
+                               scores)
             result['bottleneck_median'] = bootstrap(_median, scores)
             for threshold in THRESHOLDS:
                 result[f'bottleneck_{threshold}px'] = bootstrap(
                     partial(bottleneck_frequency, threshold=threshold), scores)
+                result[f'visible_bottleneck_{threshold}px'] = bootstrap(
+                    partial(bottleneck_frequency, threshold=threshold), visible)
         return result
 
     def summary(self):
@@ -117,12 +126,13 @@ def evaluate(network, store, episodes, margin=0, goal_picture='last', seed=0):
             prediction = network(context, z)
             images = torch.cat([prediction.image[:, None], context], 1)  # B, 1 + C, 3, H, W
             errors = l1_errors(images, batch.targets.movedim(-1, 2))     # B, 1 + C, T
-            placed = score_bottlenecks([store[i] for i in chosen], prediction, goal_picture)
+            placed, mass = score_bottlenecks([store[i] for i in chosen], prediction, goal_picture)
         for m, method in enumerate(methods):
             match = match_step(errors[:, m], batch.valid)[:, None]
             times = batch.times.gather(1, match)
             row = [errors[:, m].gather(1, match), times, times / batch.end]
-            parts[method].append([*(part[:, 0].cpu().numpy() for part in row), placed[:, m]])
+            parts[method].append([*(part[:, 0].cpu().numpy() for part in row), placed[:, m],
+                                  mass[:, m]])
     return {method: EpisodeScores(*(np.concatenate(column) for column in zip(*rows)))
             for method, rows in parts.items()}
 
@@ -155,14 +165,16 @@ def write_pictures(path, network, store, episodes, goal_picture='last', scale=2)
         row = [*batch.context[b].numpy(), images[b], batch.targets[b, match[b]].numpy()]
         pixels = context_pixels(store[i], goal_picture)
         if pixels.size and np.isfinite(pixels).all() and prediction.new_pixels is None:
-            row.append(overlay(images[b], predicted_maps(pixels, prediction, b).cpu().numpy()))
+            maps = predicted_maps(pixels, prediction, b).maps
+            row.append(overlay(images[b], maps.cpu().numpy()))
         rows.append(row)
     imsave(path, grid(rows, scale))
 
 
 def add_arguments(parser):
     """Add the options of `python -m tap_ros evaluate prediction` to a parser."""
-    parser.add_argument('--weights', required=True, metavar='FILE', help='of a predictor')
+    parser.add_argument('--weights', required=True, metavar='FILE',
+                        help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}')
     parser.add_argument('--recordings', nargs='+', required=True, metavar='BAG',
                         help='bag folders, folders of bag folders, or .mcap files')
     parser.add_argument('--all', action='store_true',

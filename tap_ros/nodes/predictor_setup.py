@@ -8,7 +8,7 @@ from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.weights import PREDICTOR
+from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
@@ -20,11 +20,13 @@ HOW_TO_GET = {  # weights for each mode
 def declare_parameters(node):
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('weights', str(PREDICTOR),
-                       'File of weights (.safetensors) of a subgoal predictor; what it was '
-                       'trained for, bidirectional or forward, is what the node can.')
+    shipped = ', '.join(PREDICTORS)
+    parameters.declare('weights', DEFAULT_PREDICTOR,
+                       f'Weights of a subgoal predictor: shipped ones ({shipped}), or a file '
+                       '(.safetensors); what they were trained for, bidirectional or forward, is '
+                       'what the node can.')
     parameters.declare('forward_weights', '',
-                       'File of weights of a forward predictor, if the node shall answer forward '
+                       'Weights of a forward predictor, if the node shall answer forward '
                        'requests beside bidirectional ones; empty: none.')
     parameters.declare('device', 'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
                        choices=['cpu', 'cuda'])

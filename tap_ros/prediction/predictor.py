@@ -10,6 +10,7 @@ from tap_ros.images import check_image, to_float, to_uint8
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
 from tap_ros.prediction.weights import load_into, load_weights, make_config
+from tap_ros.weights import find_predictor
 import torch
 
 
@@ -154,11 +155,12 @@ def load_network(path, device='cpu'):
     """
     Load the network of a weights file, in eval mode.
 
-    :param path: written by training.
+    :param path: written by training, or the name of shipped weights, see weights.PREDICTORS.
     :param device: where to run it.
     :return: (Predictor, dict saying how the weights were made).
     :raises WeightsError: if the file is missing, damaged or for something else.
     """
+    path = find_predictor(path)
     values, state, training = load_weights(path, 'predictor')
     network = Predictor(make_config(PredictorConfig, values, path))
     load_into(network, state, path)

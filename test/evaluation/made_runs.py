@@ -9,13 +9,14 @@ import numpy as np
 EPISODES = 40
 
 
-def scores(l1, at=0.5, frames=40, bottleneck=None, seed=0):
+def scores(l1, at=0.5, frames=40, bottleneck=None, mass=None, seed=0):
     """
     Invent the scores of one method.
 
     :param l1: mean of min_l1, or its values.
     :param at: mean of match_fraction, or its values.
     :param bottleneck: values, None for a task without.
+    :param mass: values, None for 1.
     """
     rng = np.random.default_rng(seed)
     if np.ndim(l1) == 0:
@@ -25,7 +26,8 @@ def scores(l1, at=0.5, frames=40, bottleneck=None, seed=0):
     N = len(l1)
     return {'min_l1': list(map(float, l1)), 'match_fraction': list(map(float, at)),
             'match_step': [round(x * (frames - 1)) for x in at],
-            'bottleneck': [None] * N if bottleneck is None else list(bottleneck)}
+            'bottleneck': [None] * N if bottleneck is None else list(bottleneck),
+            'object_mass': [None] * N if bottleneck is None else list(mass or [1.0] * N)}
 
 
 def made_run(method, prediction, task='push2', mode='bidirectional', new_pixels=True, seed=0,

@@ -80,6 +80,15 @@ def test_bottlenecks_are_counted_where_they_are_defined():
     assert not find(rows, method='copy-start', metric='bottleneck_frequency_2px')
 
 
+def test_an_object_that_is_left_out_is_no_visible_bottleneck():
+    rows = rows_of(made_run('genmin', scores(
+        0.01, bottleneck=[1.0] * 20 + [9.0] * 20, mass=[0.1] * 10 + [0.5] * 30),
+        new_pixels=False))
+    shares = [find(rows, method='genmin', metric=metric + 'bottleneck_frequency_2px')['value']
+              for metric in ('', 'visible_')]
+    assert shares == [0.5, 0.25]
+
+
 def test_no_bottlenecks_are_counted_where_pixels_are_painted():
     rows = rows_of(made_run('genmin', scores(0.01, bottleneck=[1.0] * 40)))
     assert not find(rows, method='genmin', metric='bottleneck_frequency_2px')

@@ -24,7 +24,7 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.recording.episode import check_episode
-from tap_ros.weights import FORWARD_MODEL, PREDICTOR
+from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 import torch
 
 QUICK = VisualMPCConfig(search=CEMConfig(16, 1, 4), proposals=8, batch_size=16, threads=1)
@@ -45,7 +45,7 @@ def mpc():
 
 @pytest.fixture(scope='module')
 def predictor():
-    return SubgoalPredictor.load(PREDICTOR)
+    return SubgoalPredictor.load(DEFAULT_PREDICTOR)
 
 
 def test_doing_nothing_ends_20_cm_away(simulator, mpc):

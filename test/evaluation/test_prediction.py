@@ -19,7 +19,7 @@ from tap_ros.evaluation.prediction import add_arguments, evaluate, run, write_pi
 from tap_ros.evaluation.samples import draw_latents, score_samples
 from tap_ros.images import to_float
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
-from tap_ros.prediction.warp import combine, one_hot_maps
+from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.writer import EpisodeWriter
@@ -120,6 +120,27 @@ def test_a_perfect_bottleneck_is_found_and_matched():
     assert np.allclose(scores.match_fraction, 0.5)
     assert scores.summary()['bottleneck_0px'] == 0 or scores.bottleneck.max() == 0
     assert scores.summary()['bottleneck_1px'] == 1
+
+
+def test_an_object_that_is_left_out_is_not_to_be_seen():
+    class Erasing(Pasting):
+        """Like Pasting, but shows a tenth of object 0 only, and elsewhere the start."""
+
+        def forward(self, context, z=None):
+            masks = super().forward(context).masks
+            masks[:, 1] *= 0.1
+            masks[:, 0] = 1 - masks[:, 1]
+            flow = torch.zeros(len(context), 2, 2, SIZE, SIZE)
+            flow[:, 0, 1, :, :SIZE // 2] = SIZE  # the start is read from its lowest row
+            return Prediction(combine(warp(context, flow), masks), flow, masks, None)
+
+    whole, left_out = (evaluate(made(), EPISODES, range(3))['prediction']
+                       for made in (Pasting, Erasing))
+    assert np.allclose(whole.object_mass, 1, atol=1e-4)
+    assert np.allclose(left_out.object_mass, 0.1, atol=1e-4)
+    for scores, visible in ((whole, 1), (left_out, 0)):
+        summary = scores.summary()
+        assert (summary['bottleneck_1px'], summary['visible_bottleneck_1px']) == (1, visible)
 
 
 def test_copying_matches_the_frame_beside_it_and_is_no_bottleneck():

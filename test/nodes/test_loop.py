@@ -360,7 +360,7 @@ def test_a_predictor_alone_says_what_is_missing_and_may_resize(tmp_path):
 @pytest.mark.parametrize('name', ['predictor_node', 'visual_mpc_node'])
 @pytest.mark.parametrize('damage', ['absent', 'truncated', 'text', 'of another kind'])
 def test_bad_weights_end_the_start_with_one_line_that_names_the_file(tmp_path, name, damage):
-    shipped = {'predictor_node': 'predictor_push', 'visual_mpc_node': 'forward_model_push'}
+    shipped = {'predictor_node': 'predictor_push2', 'visual_mpc_node': 'forward_model_push'}
     other = shipped['predictor_node' if name == 'visual_mpc_node' else 'visual_mpc_node']
     weights = tmp_path / 'weights.safetensors'
     if damage == 'truncated':

@@ -176,55 +176,53 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
     """
     Draw the bottleneck frequency over the threshold, copying beside it (appendix E).
 
+    On the left as in the paper, on the right without predictions that leave out an object.
+
     :param rows: of one scale.
     :param task: whose.
     :param new_pixels: which variant; the paper's curve is of the one without.
     :return: bytes of a PNG, or None without such rows.
     """
-    curves = {}
-    for row in rows:
-        if (row['metric'], row['task'], row['mode']) == (
-                'bottleneck_frequency_0px', task, 'bidirectional'):
-            if row.get('new_pixels', new_pixels) == new_pixels:
-                curves[row['method']] = [find(
-                    rows, task=task, mode='bidirectional', method=row['method'],
-                    new_pixels=new_pixels, metric=f'bottleneck_frequency_{threshold}px')
-                    for threshold in THRESHOLDS]
-    if not set(curves) - set(COPIES):
+    methods = sorted({row['method'] for row in rows if row['mode'] == 'bidirectional' and (
+        row['metric'], row['task']) == ('bottleneck_frequency_0px', task)
+        and row.get('new_pixels', new_pixels) == new_pixels}, key=method_order)
+    if not set(methods) - set(COPIES):
         return None
-    figure, axes = _new_figure(4.2, 1)
-    axis = axes[0, 0]
-    styles, ends = _line_styles(curves), {}
-    for method in sorted(curves, key=method_order):
-        points = curves[method]
-        value, low, high = (np.array([100 * p[name] for p in points])
-                            for name in ('value', 'ci_low', 'ci_high'))
-        colour = COLOURS[family(method)]
-        axis.fill_between(THRESHOLDS, low, high, color=colour, alpha=0.10, linewidth=0)
-        axis.plot(THRESHOLDS, value, styles[method], color=colour, linewidth=1.8)
-        ends[method] = value[-1]
-    if task == 'push2':
-        for method, share in BOTTLENECK_2PX.items():
-            axis.plot(2, 100 * share, 'D', color=COLOURS[method], markersize=6,
-                      markerfacecolor='white', markeredgewidth=1.4, clip_on=False, zorder=4)
-            axis.annotate(f"the paper's {method}", (2, 100 * share), (-8, 2),
-                          textcoords='offset points', ha='right', va='bottom', fontsize=8,
-                          color=COLOURS[method], zorder=5,
-                          bbox={'color': 'white', 'alpha': 0.75, 'pad': 0.5})
+    figure, axes = _new_figure(4.2, 2, sharey=True)
+    styles = _line_styles(methods)
+    for axis, prefix, title in zip(axes[0], ('', 'visible_'), (
+            ': bottleneck frequency', ', no object left out')):
+        ends = {}
+        for method in methods:
+            points = [find(rows, task=task, mode='bidirectional', method=method,
+                           new_pixels=new_pixels,
+                           metric=f'{prefix}bottleneck_frequency_{threshold}px')
+                      for threshold in THRESHOLDS]
+            value, low, high = (np.array([100 * p[name] for p in points])
+                                for name in ('value', 'ci_low', 'ci_high'))
+            colour = COLOURS[family(method)]
+            axis.fill_between(THRESHOLDS, low, high, color=colour, alpha=0.10, linewidth=0)
+            axis.plot(THRESHOLDS, value, styles[method], color=colour, linewidth=1.8)
+            ends[method] = value[-1]
+        axis.set(xlim=(0, 10), ylim=(0, 100), xticks=THRESHOLDS)
+        axis.grid(axis='y', color='#f0f0f0')
+        axis.set_xlabel('sum over both objects of the expected distance, px', fontsize=9,
+                        color=_INK)
+        axis.set_title(TITLES[task] + title, fontsize=10, loc='left', color=_INK)
+    axes[0, 0].set_ylabel('predictions within so many pixels, %', fontsize=9, color=_INK)
+    for method, share in BOTTLENECK_2PX.items() if task == 'push2' else ():
+        axes[0, 0].plot(2, 100 * share, 'D', color=COLOURS[method], markersize=6,
+                        markerfacecolor='white', markeredgewidth=1.4, clip_on=False, zorder=4)
+        axes[0, 0].annotate(
+            f"the paper's {method}", (2, 100 * share), (-8, 2), textcoords='offset points',
+            ha='right', va='bottom', fontsize=8, color=COLOURS[method], zorder=5,
+            bbox={'color': 'white', 'alpha': 0.75, 'pad': 0.5})
     for method, y in zip(ends, _spread(list(ends.values()), 4.5)):
         colour = COLOURS[family(method)]
-        axis.plot([10.12, 10.5], [y, y], styles[method], color=colour, linewidth=1.8,
+        axis.plot([10.15, 10.7], [y, y], styles[method], color=colour, linewidth=1.8,
                   clip_on=False)
-        axis.annotate(method, (10.6, y), fontsize=8.5, color=colour, va='center',
+        axis.annotate(method, (10.9, y), fontsize=8.5, color=colour, va='center',
                       annotation_clip=False)
-    axis.set(xlim=(0, 10), ylim=(0, 100), xticks=THRESHOLDS)
-    axis.grid(axis='y', color='#f0f0f0')
-    axis.set_xlabel('threshold: sum over both objects of the expected distance, px', fontsize=9,
-                    color=_INK)
-    axis.set_ylabel('predictions that are a bottleneck, %', fontsize=9, color=_INK)
-    axis.set_title(f'{TITLES[task]}: bottleneck frequency'
-                   + ('' if new_pixels else ', models without new pixels'),
-                   fontsize=10, loc='left', color=_INK)
     return _png(figure)
 
 

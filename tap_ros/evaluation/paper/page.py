@@ -215,6 +215,10 @@ def _bottleneck(rows, scale, pictures):
              'started and the other at its goal, to within so many pixels (sum over both objects '
              'of the expected distance). Object positions are ground truth of the simulator, used '
              'to score only.\n',
+             'The maps are normalised as in the paper, so that an object that a prediction '
+             'leaves out is still somewhere by its map. On the right, and in the last column, '
+             'predictions count only if the maps of both objects keep at least half of their '
+             'mass.\n',
              *_plot('bottleneck_curve', scale, pictures,
                     'bottleneck frequency over the threshold'),
              *(f'{TITLES[task]}:\n\n{bottleneck_table(rows, task)}' for task in TITLES
@@ -223,13 +227,14 @@ def _bottleneck(rows, scale, pictures):
              and row['task'] == 'push2' and row.get('new_pixels') is False]
     if found:
         best = max(found, key=lambda row: row['value'])
-        plain = find(found, method='genmin')
+        plain, fixed = (find(found, method=method) for method in ('genmin', 'fix'))
         goal = BOTTLENECK_2PX['genmin']
         parts.append(
             f'At 2 px the most comes from {best["method"]}: {_percent(best)}, '
             + ('at least' if best['value'] >= goal else 'less than') + f' the {goal:.0%} of the '
             "paper's genmin." + ('' if plain in (None, best) else
-                                 f' Plain genmin: {_percent(plain)}.') + '\n')
+                                 f' Plain genmin: {_percent(plain)}.')
+            + ('' if fixed in (None, best) else f' fix: {_percent(fixed)}.') + '\n')
     return parts
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import re
 
 import numpy as np
-from tap_ros.evaluation.bottleneck import THRESHOLDS
+from tap_ros.evaluation.bottleneck import THRESHOLDS, VISIBLE
 from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.evaluation.paper.runs import VARIANTS
 from tap_ros.prediction.methods import parse_method
@@ -88,7 +88,8 @@ def group_runs(runs):
 def _group(key, runs, part, of=''):
     """Stack the scores of runs."""
     parts = [run['evaluation'][part] for run in runs]
-    names = [name for name in ('min_l1', 'match_step', 'match_fraction', 'bottleneck')
+    names = [name for name in ('min_l1', 'match_step', 'match_fraction', 'bottleneck',
+                              'object_mass')
              if all(name in part for part in parts)]
     scores = {name: np.array([part[name] for part in parts], float) for name in names}
     if not np.isfinite(scores.get('bottleneck', np.nan)).any():
@@ -115,7 +116,8 @@ def make_rows(groups):
         the best of 100.
         Bottlenecks are scored without new pixels only, which have no origin to follow (App. E).
         min_l1 is the per-pixel mean on [0, 1], match_step counts frames from the start picture
-        (0), bottleneck_frequency and gains are shares, bottleneck_median_px is in pixels.
+        (0), bottleneck_frequency and gains are shares, bottleneck_median_px is in pixels. In
+        visible_bottleneck_frequency no object may be left out, see bottleneck.VISIBLE.
     """
     rows = []
     for group in groups:
@@ -136,10 +138,14 @@ def make_rows(groups):
             if known.size:
                 rows.append(_row(group, metric, _over_seeds(_mean), known))
         if 'bottleneck' in scores and not group.key.get('new_pixels'):
-            placed = scores['bottleneck'][:, np.isfinite(scores['bottleneck']).all(0)]
+            defined = np.isfinite(scores['bottleneck']).all(0)
+            placed = scores['bottleneck'][:, defined]
+            visible = scores['object_mass'][:, defined] >= VISIBLE
             for threshold in THRESHOLDS:
                 rows.append(_row(group, f'bottleneck_frequency_{threshold}px', _over_seeds(_mean),
                                  placed <= threshold))
+                rows.append(_row(group, f'visible_bottleneck_frequency_{threshold}px',
+                                 _over_seeds(_mean), (placed <= threshold) & visible))
             rows.append(_row(group, 'bottleneck_median_px', _over_seeds(_median), placed))
     return rows + _gain_rows(groups) + _equal_gain_rows(groups)
 

@@ -191,7 +191,8 @@ def paper_runs(scale, seeds=(0,), episodes=0, steps=0):
     add(['grasp'], ['genmin4', 'fix0.50', 'min', 'genmin0.5', 'genmin10', 'fix0.25', 'fix0.75',
                     'fix1.00'], mode='forward')
     # Fixed-time prediction at other match-steps.
-    add(SINGLE, ['fix0.75', 'fix0.25'])
+    add(['grasp', 'pick_place'], ['fix0.75', 'fix0.25'])
+    add(['push2'], ['fix0.75', 'fix0.25'], new_pixels=False)
     # What planning with three objects and recursion use.
     add(['push3'], ['genmin+relative', 'fix', 'genmin'], new_pixels=False)
     add(['pick_place'], ['genmin'], recursion=2)

@@ -17,7 +17,7 @@ from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
-from tap_ros.weights import FORWARD_MODEL, PREDICTOR
+from tap_ros.weights import find_predictor, FORWARD_MODEL
 
 DEFAULT_METHODS = ['nothing', 'direct', 'fix', 'genmin', 'one_object', 'oracle_order',
                    'true_subgoal', 'true_model']
@@ -109,7 +109,7 @@ def make_jobs(args):
     planner = with_preset(args.preset)
     if args.plan_samples or args.plan_iterations or args.replan_every:
         planner = changed(planner, args.plan_samples, args.plan_iterations, args.replan_every)
-    weights = {'shipped': str(PREDICTOR)}
+    weights = {'shipped': '{task}'}
     for text in args.predictor:
         name, found, file = text.partition('=')
         if not found:
@@ -124,7 +124,7 @@ def make_jobs(args):
             file = ''
             if method.predicted:
                 file = weights.get(method.base, TRAINED.replace('{name}', method.base))
-                file = file.replace('{task}', task)
+                file = str(find_predictor(file.replace('{task}', task)))
                 if not Path(file).is_file():
                     raise ConfigError(
                         f'method {method.name!r}: no weights {file}; name them with --predictor '
