@@ -69,7 +69,9 @@ def build_parser(arguments):
             # An option rather than a word, as the predictor is what most want to train.
             command.add_argument(
                 '--model', choices=list(modules), default=TRAIN_DEFAULT,
-                help='what to train (default: %(default)s); --help shows its options')
+                help='what to train: the predictor, or the forward model of the planner (default: '
+                     '%(default)s); --help shows its options. To predict from the start alone is '
+                     '--mode forward of the predictor')
             known, _ = _quiet(modules).parse_known_args(arguments[1:])
             _use(command, modules[known.model])
         else:

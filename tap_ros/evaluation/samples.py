@@ -13,6 +13,7 @@ from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_m
 import torch
 
 SAMPLES = 100  # of the paper's last row of Table 1
+NEAR = 6.0  # px
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,9 @@ class SampleScores:
     :param match_step: (N,), the time of that target.
     :param match_fraction: (N,), that time as a share of the episode.
     :param spread: (N,), standard deviation over the samples, on [0, 1], mean over the pixels.
+    :param spread_near: (N,), the same over the pixels within NEAR of where an object starts or
+        ends; NaN where that is unknown.
+    :param spread_elsewhere: (N,), over the others.
     :param spread_px: (N,), how far from their mean the samples place an object: root mean square
         in pixels, mean over the objects; NaN with new pixels, which have no origin, or where
         positions are unknown.
@@ -33,6 +37,8 @@ class SampleScores:
     match_step: np.ndarray
     match_fraction: np.ndarray
     spread: np.ndarray
+    spread_near: np.ndarray
+    spread_elsewhere: np.ndarray
     spread_px: np.ndarray
 
 
@@ -75,13 +81,26 @@ def score_samples(network, store, episodes, margin=0, goal_picture='last', count
         with torch.inference_mode():
             prediction = network(to_float(batch.context).expand(count, -1, -1, -1, -1), z)
             errors = l1_errors(prediction.image[None], batch.targets.movedim(-1, 2))[0]
-            spread = (prediction.image.std(0, correction=0) / 2).mean().item()
-            placed = _spread_px(prediction, context_pixels(store[i], goal_picture))
+            pixels = context_pixels(store[i], goal_picture)
+            spread = (prediction.image.std(0, correction=0) / 2).mean(0).cpu()  # H, W
+            placed = _spread_px(prediction, pixels)
+        near = _near(pixels, spread.shape)
+        spreads = [part.mean().item() if part.numel() else np.nan
+                   for part in (spread, spread[near], spread[~near if near.any() else near])]
         errors = errors.amin(0, keepdim=True)  # the best sample for each target
         match = match_step(errors, batch.valid)
         step = batch.times[0, match].item()
-        rows.append((errors[0, match].item(), step, step / batch.end.item(), spread, placed))
+        rows.append((errors[0, match].item(), step, step / batch.end.item(), *spreads, placed))
     return SampleScores(*(np.array(column) for column in zip(*rows)))
+
+
+def _near(pixels, size):
+    """Mark the pixels near an object in a context picture; pixels (2, K, 2), bool (H, W)."""
+    v, u = np.indices(size)
+    at = pixels.reshape(-1, 2)
+    at = at[np.isfinite(at).all(1)]
+    return torch.from_numpy((np.hypot(u - at[:, 0, None, None], v - at[:, 1, None, None])
+                             <= NEAR).any(0))
 
 
 def _spread_px(prediction, pixels):

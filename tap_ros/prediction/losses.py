@@ -118,7 +118,7 @@ def remaining_targets(valid, times, matched, forward):
 
     :param valid: bool (B, T), the targets of this level.
     :param times: int64 (B, T).
-    :param matched: int64 (B, 1), the time that this level's prediction was closest to.
+    :param matched: int64 (B, 1), the time that this level's prediction was matched to.
     :param forward: whether predictions go on after it, as Eq. 3 says; else they go back towards
         the start, as the paper's recursive bidirectional figure has it.
     :return: bool (B, T).

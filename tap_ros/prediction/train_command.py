@@ -37,7 +37,8 @@ def add_arguments(parser):
                                 default=field.default, help=about)
         else:
             parser.add_argument(option, type=type(field.default), default=field.default,
-                                choices=_CHOICES.get(field.name), help=about)
+                                choices=_CHOICES.get(field.name),
+                                help=f'{about} (default: %(default)s)')
 
 
 def run(args):

@@ -105,8 +105,8 @@ def train(config, stop_at=None, minutes=None, progress=True):
             late = time.monotonic() > deadline
             if state.step % config.save_every == 0 or state.step == last or late:
                 state.seconds = time.monotonic() - began
+                report(state, curves)  # first: a run that is stopped in between reports again
                 save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
-                report(state, curves)
             if late:
                 break
     return str(Path(config.out) / 'predictor.safetensors')
@@ -298,6 +298,8 @@ def _report(state, curves, config, store, frames, training, held_out, autocast):
         'torch': torch.__version__, 'python': platform.python_version()}
     for name, values in (('config', asdict(config)), ('run', about), ('scores', scores)):
         path = Path(config.out) / f'{name}.json'
-        path.write_text(json.dumps(values, indent=2) + '\n')
+        part = path.with_suffix('.part')
+        part.write_text(json.dumps(values, indent=2) + '\n')
+        part.replace(path)  # in one step: whoever reads it finds it whole
     save_weights(Path(config.out) / 'predictor.safetensors', state.average, 'predictor',
                  state.network.config, about | {'settings': asdict(config), 'scores': scores})

@@ -14,6 +14,7 @@ from tap_ros.evaluation.paper.results import write_results
 from tap_ros.evaluation.paper.runs import paper_runs
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.weights import save_weights
+from tap_ros.recording.cache import open_recordings
 import torch
 
 SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
@@ -103,8 +104,10 @@ def test_grids_show_each_method_that_has_weights(tmp_path):
     runs = [made_run('fix', scores(0.02)), made_run('genmin', scores(0.01)),
             made_run('genmin-vae-gan', scores(0.01)),
             made_run('genmin4', scores(0.01), mode='forward')]
+    data_hash = open_recordings([str(SAMPLE)]).data_hash
     for run in runs:
         run['config'] = {'recordings': [str(SAMPLE)], 'test_fraction': 0.5}
+        run['data'] = run['data'] | {'hash': data_hash}
         weights_for(tmp_path / 'weights', run, num_context=1 if run['mode'] == 'forward' else 2,
                     latent_size=8 if 'vae' in run['method'] else 0)
     write_grids(tmp_path, runs, tmp_path / 'weights')
@@ -118,8 +121,10 @@ def test_grids_show_each_method_that_has_weights(tmp_path):
 
 def test_a_picture_that_shows_more_is_not_replaced(tmp_path):
     runs = [made_run('fix', scores(0.02)), made_run('genmin', scores(0.01))]
+    data_hash = open_recordings([str(SAMPLE)]).data_hash
     for run in runs:
         run['config'] = {'recordings': [str(SAMPLE)], 'test_fraction': 0.5}
+        run['data'] = run['data'] | {'hash': data_hash}
     weights_for(tmp_path / 'weights', runs[0])
     there = tmp_path / 'push2-bidirectional.png'
     there.write_bytes(b'of both')

@@ -111,6 +111,8 @@ def test_samples_and_forward_prediction_are_scored(places):
     best, single = scores['best_of_100']['min_l1'], scores['prediction']['min_l1']
     assert all(a <= b for a, b in zip(best, single))
     assert all(spread >= 0 for spread in scores['sample_spread'])
+    assert len(scores['sample_spread_near']) == len(scores['sample_spread_elsewhere']) == len(
+        single)
     assert scores['sample_spread_px'] == [None] * len(single)
     scores = find_state(forward, places).result['evaluation']
     assert 'copy-start' in scores and 'copy-goal' not in scores

@@ -220,6 +220,9 @@ def test_the_best_of_more_samples_is_never_worse_and_of_one_is_what_evaluate_mea
     assert (few.min_l1 <= one.min_l1 + 1e-7).all() and (more.min_l1 <= few.min_l1 + 1e-7).all()
     assert (more.min_l1 < one.min_l1).all()
     assert (one.spread == 0).all() and (more.spread > 0).all()
+    whole = more.spread
+    assert (np.minimum(more.spread_near, more.spread_elsewhere) <= whole).all()
+    assert (np.maximum(more.spread_near, more.spread_elsewhere) >= whole).all()
     assert np.isnan(more.spread_px).all()
 
 

@@ -69,6 +69,13 @@ def test_min_is_eq_2():
     assert outcome.loss.item() == pytest.approx(minimum_loss(errors).item(), abs=1e-6)
 
 
+def test_fix_stays_at_its_frame_where_another_is_nearer():
+    batch = make_batch(T=2)  # with a GAN the second frame is there to be judged
+    outcome = predictor_loss(showing(to_float(batch.targets[:, 1])), batch, None,
+                             replace(CONFIG, method='fix-wo-gan'))
+    assert outcome.match.tolist() == [0] * 4 and outcome.loss > 0.1
+
+
 def test_padding_is_never_matched():
     batch = make_batch(padded=3)
     outcome = predictor_loss(showing(to_float(batch.targets[:, 4])), batch, None, CONFIG)
@@ -172,6 +179,14 @@ def test_gan_terms_stand_at_the_matched_time():
     discriminators_loss(outcome.judged).backward()
     assert image.grad.equal(before)  # the discriminators' loss does not reach the predictor
     assert networks.discriminator.weight.grad.nonzero().flatten().tolist() == [2]
+
+
+def test_padding_is_never_judged():
+    batch = make_batch(B=32, padded=4)
+    networks = Networks(Showing(to_float(batch.targets[:, 0])), discriminator=Judge(7))
+    outcome = predictor_loss(networks, batch, None, replace(CONFIG, method='min'),
+                             Draws.make(batch, 3, 0, 0))
+    assert outcome.judged['other_step'].tolist() == [1] * 32  # the only other one
 
 
 class Shade(torch.nn.Module):
@@ -286,6 +301,30 @@ def test_recursion_goes_on_from_its_own_prediction(mode, second, expected):
     # A frame on the other side is no target of the second level.
     wrong = Moving(frames[:, 2], frames[:, 4 - second])
     assert predictor_loss(Networks(wrong), batch, None, config).loss > 0.1
+
+
+class Following(torch.nn.Module):
+    """Predicts a given picture, then half of what it was given as the goal."""
+
+    def __init__(self, image):
+        super().__init__()
+        self.image = image
+
+    def forward(self, context, z=None):
+        image, self.image = self.image, None
+        return Prediction(context[:, -1] / 2 if image is None else image, None, None, None)
+
+
+def test_gradients_pass_through_predictions_as_inputs():
+    batch = make_batch()
+    image = to_float(batch.targets[:, 2]).requires_grad_()  # nothing to gain at the first level
+
+    def first_two(error, copy_error, batch, config):
+        return (batch.times - 3).abs().float() if batch.end.max() > 3 else error
+
+    predictor_loss(Networks(Following(image)), batch, None, replace(
+        CONFIG, method='genmin-wo-gan', recursion=2), selection=first_two).loss.backward()
+    assert image.grad.abs().sum() > 0
 
 
 def test_the_preference_of_a_level_lies_between_its_own_inputs():

@@ -9,11 +9,14 @@ from pathlib import Path
 
 import pytest
 from tap_ros.errors import ConfigError
-from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.images import to_float
+from tap_ros.prediction.batches import make_batch
+from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.train_command import add_arguments, run
 from tap_ros.prediction.training import learning_rate, train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.prediction.weights import load_tensors, load_weights
+from tap_ros.recording.cache import open_recordings
 import torch
 
 
@@ -101,6 +104,34 @@ def test_a_finished_run_stays_as_it_is(config):
     before = weights(config)
     train(config, progress=False)
     assert all(before[name].equal(tensor) for name, tensor in weights(config).items())
+
+
+@pytest.mark.parametrize('where', ['save_weights', 'save_checkpoint'])
+def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(config, monkeypatch, where):
+    def killed(*_):
+        raise KeyboardInterrupt
+    train(config, stop_at=2, progress=False)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(f'tap_ros.prediction.training.{where}', killed)
+        train(config, progress=False)
+    train(config, progress=False)
+    out = Path(config.out)
+    assert json.loads((out / 'run.json').read_text())['steps'] == config.steps
+    served = load_weights(out / 'predictor.safetensors', 'predictor')[1]
+    for name, tensor in served.items():
+        assert weights(config)[f'average.{name}'].equal(tensor), name
+    assert not list(out.glob('*.part'))
+
+
+def test_a_network_in_use_predicts_as_in_training(config):
+    config = replace(config, steps=40, average_decay=0.0, save_every=40, method='genmin-wo-gan')
+    network, _ = load_network(train(config, progress=False))
+    store = open_recordings(list(config.recordings), progress=False)
+    context = to_float(make_batch(store, range(len(store))).context)
+    with torch.no_grad():
+        used, trained = network(context).image, network.train()(context).image
+    # Batch norm's averages lag behind, but must not spoil the picture.
+    assert (used - trained).abs().mean() < 0.05
 
 
 def test_learning_rate_rises_and_falls():

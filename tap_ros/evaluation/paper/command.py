@@ -114,12 +114,13 @@ def choose_runs(args):
 def show(runs, places):
     """Print a line for each run: its state and scores."""
     hashes = data_hashes(runs, places)
-    print(f'{"run":46s}{"state":>16s}{"min l1":>9s}{"match":>8s}{"2 px":>8s}')
+    width = max(len(run.name) for run in runs)
+    print(f'{"run":{width}s}{"state":>16s}{"min l1":>9s}{"match (share)":>15s}{"2 px":>8s}')
     for run in runs:
         state = find_state(run, places, hashes.get(run.task))
         text = {'partial': f'{state.steps}/{run.num_steps} steps',
                 'other': 'other settings'}.get(state.kind, state.kind)
-        print(f'{run.name:46s}{text:>16s}{_scores(state.result)}')
+        print(f'{run.name:{width}s}{text:>16s}{_scores(state.result)}')
 
 
 def _scores(result):
@@ -128,7 +129,7 @@ def _scores(result):
         return ''
     scores = result['evaluation']['prediction']
     placed = [x for x in scores['bottleneck'] if x is not None]
-    text = f'{np.mean(scores["min_l1"]):9.4f}{np.mean(scores["match_fraction"]):8.2f}'
+    text = f'{np.mean(scores["min_l1"]):9.4f}{np.mean(scores["match_fraction"]):15.2f}'
     return text + (f'{np.mean(np.array(placed) <= 2):8.0%}' if placed else '')
 
 

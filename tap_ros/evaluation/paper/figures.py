@@ -214,9 +214,9 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
         axes[0, 0].plot(2, 100 * share, 'D', color=COLOURS[method], markersize=6,
                         markerfacecolor='white', markeredgewidth=1.4, clip_on=False, zorder=4)
         axes[0, 0].annotate(
-            f"the paper's {method}", (2, 100 * share), (-8, 2), textcoords='offset points',
-            ha='right', va='bottom', fontsize=8, color=COLOURS[method], zorder=5,
-            bbox={'color': 'white', 'alpha': 0.75, 'pad': 0.5})
+            f"the paper's {method}", (2, 100 * share), (7, 1), textcoords='offset points',
+            ha='left', va='top' if share else 'bottom', fontsize=8, color=COLOURS[method],
+            zorder=5, bbox={'color': 'white', 'alpha': 0.75, 'pad': 0.5})
     for method, y in zip(ends, _spread(list(ends.values()), 4.5)):
         colour = COLOURS[family(method)]
         axis.plot([10.15, 10.7], [y, y], styles[method], color=colour, linewidth=1.8,

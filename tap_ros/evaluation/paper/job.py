@@ -102,8 +102,8 @@ def score(run, config, weights, places):
               evaluate(network, store, held_out).items()}
     if network.config.latent_size:
         samples = _rounded(score_samples(network, store, held_out))
-        scores['sample_spread'] = samples.pop('spread')
-        scores['sample_spread_px'] = samples.pop('spread_px')
+        for name in [name for name in samples if name.startswith('spread')]:
+            scores[f'sample_{name}'] = samples.pop(name)
         scores['best_of_100'] = samples
     seconds = round(time.perf_counter() - began, 1)
     return {

@@ -6,6 +6,7 @@ The results page, in Markdown, from rows and runs.
 Sentences that judge depend on the numbers; what a person has to say stands in findings.md.
 """
 
+from tap_ros.evaluation.bottleneck import MIN_MOTION
 from tap_ros.evaluation.paper.figures import file_name
 from tap_ros.evaluation.paper.published import BOTTLENECK_2PX, FRAMES, TITLES
 from tap_ros.evaluation.paper.rows import BEST, find, method_order
@@ -210,11 +211,16 @@ def _forward(rows, scale, pictures):
 
 
 def _bottleneck(rows, scale, pictures):
+    counted, all_of = (find(rows, task='push2', mode='bidirectional', method='copy-start',
+                            metric=metric) for metric in ('bottleneck_frequency_2px', 'min_l1'))
     parts = ['## Bottlenecks (appendix E)\n',
              'Share of predictions, in percent, whose object maps show one object where it '
              'started and the other at its goal, to within so many pixels (sum over both objects '
              'of the expected distance). Object positions are ground truth of the simulator, used '
-             'to score only.\n',
+             'to score only. Episodes in which an object moves less than '
+             f'{MIN_MOTION:.0f} px do not count, since it is then at its start and its goal at '
+             'once' + (f': {counted["n"]} of {all_of["n"]} held-out episodes remain.'
+                       if counted and all_of else '.') + '\n',
              'The maps are normalised as in the paper, so that an object that a prediction '
              'leaves out is still somewhere by its map. On the right, and in the last column, '
              'predictions count only if the maps of both objects keep at least half of their '
@@ -234,7 +240,8 @@ def _bottleneck(rows, scale, pictures):
             + ('at least' if best['value'] >= goal else 'less than') + f' the {goal:.0%} of the '
             "paper's genmin." + ('' if plain in (None, best) else
                                  f' Plain genmin: {_percent(plain)}.')
-            + ('' if fixed in (None, best) else f' fix: {_percent(fixed)}.') + '\n')
+            + ('' if fixed in (None, best) else f' fix: {_percent(fixed)}; in the paper '
+               f'{BOTTLENECK_2PX["fix"]:.0%}.') + '\n')
     return parts
 
 
@@ -248,7 +255,9 @@ def _best(rows):
     if not table:
         return [*parts, 'None yet: they need runs of genmin-vae-gan.\n']
     parts += ["The paper's genmin + vae has the GAN too: that is genmin-vae-gan here, and "
-              '`genmin-vae-best-of-100` takes its samples.\n', table]
+              '`genmin-vae-best-of-100` takes its samples. The spread is the standard deviation '
+              'of a pixel over the samples, on [0, 1], within 6 px of where an object starts or '
+              'ends, and elsewhere.\n', table]
     for task, title in TITLES.items():
         best = find(rows, task=task, mode='bidirectional', new_pixels=True, metric='min_l1',
                     method=f'genmin-vae-{BEST}')

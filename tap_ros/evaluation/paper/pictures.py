@@ -90,7 +90,8 @@ def _held_out(run, recordings):
         return None
     store = open_recordings(paths)
     _, held_out = split_episodes(store, run['config'].get('test_fraction', 0.05))
-    if not len(held_out):
+    # Of other recordings the pictures would not be those that the scores are of.
+    if not len(held_out) or store.data_hash != run['data']['hash']:
         return None
     return store, held_out[:EPISODES], run['evaluation'].get('goal_picture', 'last')
 

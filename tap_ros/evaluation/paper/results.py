@@ -101,17 +101,15 @@ def told_apart(rows):
     """
     Name metrics so that task, mode, method, metric and scale belong to one row.
 
-    Where a method was trained with and without new pixels, the metrics of the latter end in
-    _warp_only.
+    The metrics of models without new pixels end in _warp_only, but for bottlenecks, which only
+    these have.
 
     :param rows: of make_rows.
     :return: list of dicts.
     """
-    def place(row):
-        return tuple(row[name] for name in ('task', 'mode', 'method', 'metric', 'scale'))
-    painted = {place(row) for row in rows if row.get('new_pixels')}
     return [{**row, 'metric': f'{row["metric"]}_warp_only'}
-            if row.get('new_pixels') is False and place(row) in painted else row for row in rows]
+            if row.get('new_pixels') is False and 'bottleneck' not in row['metric'] else row
+            for row in rows]
 
 
 def rows_as_json(rows):

@@ -18,7 +18,8 @@ from tap_ros.prediction.methods import parse_method
 
 COPIES = ('copy-start', 'copy-goal')
 BEST = 'best-of-100'
-SPREADS = ('sample_spread', 'sample_spread_px')  # of the samples of a VAE
+# Of the samples of a VAE.
+SPREADS = ('sample_spread', 'sample_spread_near', 'sample_spread_elsewhere', 'sample_spread_px')
 RESAMPLES = 1000
 BESIDE = 0.1  # a match within this share of the episode from an input lies beside it
 _DIGITS = 6

@@ -159,7 +159,7 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
             elif run.task in hashes:
                 waiting.remove(run)
                 active.append(_start_run(
-                    run, places, deadline, fresh and states[run].kind == 'other'))
+                    run, places, deadline, fresh and states[run].kind != 'partial'))
                 return True
             elif run.task not in collecting:
                 active.append(_start_collecting(run, runs, places, jobs))

@@ -101,7 +101,7 @@ def gains_table(rows, new_pixels=True):
             theirs = GAINS.get(task) if method == 'genmin' and new_pixels else None
             same = find(rows, **about, metric='gain_over_fix_at_match_step')
             lines.append([title, method, gain['baseline'], with_interval(gain, 0, 100),
-                          plain(theirs, 0, 100), with_interval(steps, 1, sign='+'), equal,
+                          plain(theirs, 1, 100), with_interval(steps, 1, sign='+'), equal,
                           with_interval(same, 0, 100)])
     return lines and markdown(
         ['task', 'method', 'beside', 'error below fix, %', 'paper',
@@ -167,15 +167,17 @@ def best_table(rows):
                 method = best_of_name(of)
                 best = find(rows, **about, method=method, metric='min_l1')
                 lowest = lowest_deterministic(rows, task, new_pixels)
-                spread = find(rows, **about, method=of, metric='sample_spread')
+                spreads = [find(rows, **about, method=of, metric=f'sample_spread_{where}')
+                           for where in ('near', 'elsewhere')]
                 theirs = TABLE_1.get(task, {}).get(method, (None,))[0] if new_pixels else None
                 lines.append([title, method, of + ('' if new_pixels else ', no new pixels'),
                               with_interval(best) if best else NOT_RUN,
                               f'{lowest["method"]}: {lowest["value"]:.4f}' if lowest else '-',
-                              plain(spread and spread['value']), plain(theirs)])
+                              *(plain(spread and spread['value']) for spread in spreads),
+                              plain(theirs)])
     return lines and markdown(
         ['task', 'method', 'samples of', 'min l1 (95% interval)', 'lowest without VAE',
-         'spread of the samples', 'paper'], lines, left=3)
+         'spread of the samples near the objects', 'elsewhere', 'paper'], lines, left=3)
 
 
 def lowest_deterministic(rows, task, new_pixels=True):
