@@ -113,7 +113,8 @@ def resize_pixels(pixels, old_size, new_size):
     :return: float32 (..., 2).
     """
     scale = np.array([new_size[1] / old_size[1], new_size[0] / old_size[0]])
-    return ((np.asarray(pixels) + 0.5) * scale - 0.5).astype(np.float32)
+    # in float64, so that pixels of the same size stay the same to the last bit
+    return ((np.asarray(pixels, np.float64) + 0.5) * scale - 0.5).astype(np.float32)
 
 
 def _rows(message, name, bytes_per_pixel):

@@ -11,7 +11,7 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 
 MODES = ('subgoal', 'direct')
-DEFAULT_BUDGET, MAX_BUDGET = 40, 1000
+MAX_BUDGET = 1000
 
 
 def declare_parameters(node):
@@ -39,7 +39,7 @@ def declare_parameters(node):
             ('max_step_xy', 0.08, 0.08, 'Largest |dx| and |dy| of a command in metres.'),
             ('max_step_z', 0.15, 0.15, 'Largest |dz| of a command in metres.'),
             ('goal_tolerance', 1.0, 64.0,
-             'The goal is reached at this mean distance of the objects in pixels.')):
+             'A goal or subgoal is reached at this mean distance of the objects in pixels.')):
         parameters.declare(name, default, description, low=0.0, high=high, read_only=False)
     parameters.declare('image_timeout', 5.0, 'Seconds to wait for an image before giving up.',
                        low=0.1, high=600.0, read_only=False)
@@ -68,7 +68,7 @@ def load_planner(parameters):
 
 def check_request(request):
     """
-    Return mode and step budget of a goal, defaults filled in.
+    Check what can be checked of a goal alone, and return its mode, the default filled in.
 
     :raises ConfigError: for an unknown mode, or a budget or seed out of range.
     """
@@ -77,8 +77,12 @@ def check_request(request):
     mode = request.mode or 'subgoal'
     if mode not in MODES:
         raise ConfigError(f'mode is {mode!r}; valid modes: {", ".join(MODES)}')
-    budget = request.step_budget or DEFAULT_BUDGET
-    if budget > MAX_BUDGET:
-        raise ConfigError(f'step_budget is {budget}; expected 1 to {MAX_BUDGET}, or 0 for '
-                          f'{DEFAULT_BUDGET}')
-    return mode, budget
+    if request.step_budget > MAX_BUDGET:
+        raise ConfigError(f'step_budget is {request.step_budget}; expected 1 to {MAX_BUDGET}, or '
+                          f'0 for {default_budget(2)}, with three objects {default_budget(3)}')
+    return mode
+
+
+def default_budget(num_objects):
+    """Return how many steps a goal may take, as in the paper's Table 2."""
+    return 40 if num_objects <= 2 else 75

@@ -7,7 +7,6 @@ import sys
 import time
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -15,13 +14,7 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ImageError, TapError
-from tap_ros.nodes.image_messages import (
-    decode_image,
-    encode_image,
-    encode_map,
-    is_empty,
-    resize_pixels,
-)
+from tap_ros.nodes.image_messages import decode_image, encode_image, is_empty, resize_pixels
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.predictor_setup import (
@@ -33,6 +26,7 @@ from tap_ros.nodes.predictor_setup import (
     MAX_SAMPLES,
 )
 from tap_ros.nodes.run import run_node
+from tap_ros.nodes.subgoal_messages import encode_subgoal
 from tap_ros.nodes.topics import CAMERA_FRAME, LATCHED, STREAM, to_nanoseconds
 from tap_ros.pictures import overlay
 
@@ -176,17 +170,6 @@ class PredictorNode(Node):
     def _topic(self, name, what):
         """Return the full name of a topic, for messages."""
         return self.resolve_topic_name(TOPICS[name][what][1])
-
-
-def encode_subgoal(subgoal, names, stamp, frame_id):
-    """Turn a Subgoal of the predictor into a message."""
-    message = Subgoal(
-        image=encode_image(subgoal.image, stamp, frame_id), object_names=list(names),
-        object_maps=[encode_map(values, stamp, frame_id) for values in subgoal.object_maps],
-        expected_pixels=[Point(x=float(u), y=float(v)) for u, v in subgoal.expected_pixels])
-    message.header.stamp = stamp
-    message.header.frame_id = frame_id
-    return message
 
 
 def main(args=None):

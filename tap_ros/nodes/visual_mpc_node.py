@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Serves reach_goal: asks for a subgoal, plans with VisualMPC, sends one command per image."""
+"""Serves reach_goal: asks for subgoals, plans with VisualMPC, sends one command per image."""
 
 import sys
 import threading
@@ -18,12 +18,19 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import PlanningError, TapError
 from tap_ros.nodes.clients import call, CallError
-from tap_ros.nodes.image_messages import decode_image, decode_map, is_empty
+from tap_ros.nodes.image_messages import decode_image, is_empty
 from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.planner_setup import check_request, declare_parameters, load_planner
+from tap_ros.nodes.planner_setup import (
+    check_request,
+    declare_parameters,
+    default_budget,
+    load_planner,
+)
 from tap_ros.nodes.run import run_node
+from tap_ros.nodes.subgoal_messages import decode_subgoals
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.planning.hierarchy import choose_sample, Itinerary, targets_by
 
 SENSORS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
            'joints': (JointState, 'joint_states')}
@@ -106,10 +113,14 @@ class VisualMpcNode(Node):
     def _reach(self, handle, result):
         """Plan and act until the goal is reached or the budget spent, filling the result."""
         request = handle.request
-        mode, budget = check_request(request)
+        mode = check_request(request)
 
         def cancelled():
             return handle.is_cancel_requested or self._ending
+
+        def go_on():
+            if cancelled():
+                raise Cancelled('cancelled')
 
         goal, goal_names, goal_pixels = self._find_goal(request, mode)
         seen = self._observe(-1, cancelled)
@@ -118,33 +129,31 @@ class VisualMpcNode(Node):
             raise PlanningError(
                 'objects: none are seen, so there is nothing to push; publish their pixels')
         goal_pixels = match_objects(names, goal_names, goal_pixels, 'objects', 'goal_objects')
-        maps = centres = None
+        budget = request.step_budget or default_budget(len(names))
+        tolerance = self.params['goal_tolerance']
+        subgoals = []
         if mode == 'subgoal':
-            maps, centres = self._ask_for_subgoal(seen, goal, names, request.seed, cancelled)
+            found = self._ask_for_subgoals(seen, goal, names, request, cancelled)
+            subgoals = choose_sample(
+                self._mpc, *self._decode(seen, names), goal_pixels, found, request.seed, go_on)
+            seen = self._observe(-1, cancelled)  # the newest: asking and choosing take time
+        targets = targets_by(subgoals, goal_pixels)
+        itinerary = Itinerary(targets, budget, reached=tolerance)
         self._mpc.reset(request.seed)
         while True:
-            pixels = match_objects(
-                names, *decode_objects(seen['objects'], 'objects'), 'the first objects', 'objects')
-            distance = mean_distance(pixels, goal_pixels)
-            result.expected_distance = distance
-            result.success = distance <= self.params['goal_tolerance']
+            image, gripper, pixels = self._decode(seen, names)
+            distance = result.expected_distance = targets[-1].distance(pixels)
+            result.success = distance <= tolerance
             if result.success or result.steps >= budget:
                 break
-            if maps is not None and (
-                    result.steps >= budget // 2
-                    or mean_distance(pixels, centres) <= self.params['goal_tolerance']):
-                maps = None  # from now on straight to the goal
-            stage = 'goal' if maps is None else 'subgoal'
-            plan = self._mpc.act(
-                decode_image(seen['image'], 'camera/image_raw', self._mpc.image_size),
-                decode_gripper(seen['joints']), pixels,
-                goal_maps=maps, goal_pixels=goal_pixels if maps is None else None)
-            if cancelled():
-                raise Cancelled('cancelled')
+            target = itinerary.target(result.steps, pixels)
+            plan = self._mpc.act(image, gripper, pixels, **target.goal(pixels))
+            go_on()
             sent_ns = self._send(plan.action, seen['image'].header.stamp)
             result.steps += 1
             handle.publish_feedback(ReachGoal.Feedback(
-                step=result.steps, stage=stage, expected_distance=float(plan.expected_distance),
+                step=result.steps, stage=stage_name(len(itinerary.switches), len(subgoals)),
+                expected_distance=float(plan.expected_distance),
                 planning_ms=float(plan.planning_ms)))
             seen = self._observe(sent_ns, cancelled)
         result.message = (
@@ -186,11 +195,19 @@ class VisualMpcNode(Node):
                 + ', '.join(names))
         return seen
 
-    def _ask_for_subgoal(self, seen, goal, names, seed, cancelled):
-        """Return the subgoal's maps (K, H, W) and their means (K, 2), in the order of `names`."""
+    def _decode(self, seen, names):
+        """Return picture, gripper (4,) and pixels (K, 2) of what is seen, ordered like `names`."""
+        pixels = match_objects(
+            names, *decode_objects(seen['objects'], 'objects'), 'the first objects', 'objects')
+        image = decode_image(seen['image'], 'camera/image_raw', self._mpc.image_size)
+        return image, decode_gripper(seen['joints']), pixels
+
+    def _ask_for_subgoals(self, seen, goal, names, wanted, cancelled):
+        """Return the Subgoals of all samples, their objects in the order of `names`."""
         request = PredictSubgoal.Request(
             start=seen['image'], goal=goal['image'], start_objects=seen['objects'],
-            goal_objects=goal['objects'], seed=seed)
+            goal_objects=goal['objects'], num_samples=wanted.num_samples,
+            recursion_depth=wanted.recursion_depth, seed=wanted.seed)
         try:
             response = call(self._predict, request, self.params['predictor_timeout'], cancelled)
         except CallError as error:
@@ -199,12 +216,7 @@ class VisualMpcNode(Node):
             raise
         if not response.success:
             raise PlanningError(f'service {self._predict.service_name}: {response.message}')
-        subgoal = response.subgoals[0]
-        maps = np.stack([decode_map(message, f'object map of {name}') for name, message in zip(
-            subgoal.object_names, subgoal.object_maps)])
-        centres = np.array([(point.x, point.y) for point in subgoal.expected_pixels])
-        return [match_objects(names, tuple(subgoal.object_names), values, 'objects', 'subgoal')
-                for values in (maps, centres)]
+        return decode_subgoals(response, names, self._mpc.image_size)
 
     # Commands
 
@@ -235,9 +247,11 @@ class VisualMpcNode(Node):
         self._twist.publish(TwistStamped())
 
 
-def mean_distance(pixels, goals):
-    """Return the distance between pixels (K, 2) and their goals (K, 2), mean over K."""
-    return float(np.linalg.norm(pixels - goals, axis=1).mean())
+def stage_name(index, num_subgoals):
+    """Return what feedback calls the target of this index; after the subgoals comes the goal."""
+    if index == num_subgoals:
+        return 'goal'
+    return 'subgoal' if num_subgoals == 1 else f'subgoal {index + 1} of {num_subgoals}'
 
 
 def main(args=None):

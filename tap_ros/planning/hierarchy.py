@@ -82,7 +82,36 @@ class Itinerary:
         return self._targets[len(self.switches)]
 
 
-def choose_subgoals(mpc, image, gripper, pixels, goal_pixels, candidates, seed=0):
+def targets_by(subgoals, goal_pixels):
+    """
+    Return the Targets of a way to the goal.
+
+    :param subgoals: list of prediction.predictor.Subgoal to pass by, earliest first; may be empty.
+    :param goal_pixels: (K, 2), the last target.
+    """
+    return [*(Target(s.expected_pixels, s.object_maps) for s in subgoals), Target(goal_pixels)]
+
+
+def choose_sample(mpc, image, gripper, pixels, goal_pixels, subgoals, seed=0, before_plan=None):
+    """
+    Take the predicted subgoals of one sample; of several samples by choose_subgoals.
+
+    :param subgoals: list of prediction.predictor.Subgoal of any samples, earliest first in each.
+    :return: those of the sample taken, earliest first. The other parameters are choose_subgoals'.
+    """
+    samples = {}
+    for subgoal in subgoals:
+        samples.setdefault(subgoal.sample, []).append(subgoal)
+    chains = list(samples.values())
+    if len(chains) == 1:
+        return chains[0]
+    best, _ = choose_subgoals(
+        mpc, image, gripper, pixels, goal_pixels, chains, seed, before_plan)
+    return chains[best]
+
+
+def choose_subgoals(mpc, image, gripper, pixels, goal_pixels, candidates, seed=0,
+                    before_plan=None):
     """
     Choose among sampled subgoals by what the planner itself expects them to cost.
 
@@ -95,6 +124,7 @@ def choose_subgoals(mpc, image, gripper, pixels, goal_pixels, candidates, seed=0
     :param goal_pixels: (K, 2).
     :param candidates: list of lists of prediction.predictor.Subgoal, earliest first.
     :param seed: of the planner.
+    :param before_plan: called before every plan; what it raises ends the choice.
     :return: index of the candidate of least cost, the first of equals; costs (N,).
     """
     costs = []
@@ -102,6 +132,8 @@ def choose_subgoals(mpc, image, gripper, pixels, goal_pixels, candidates, seed=0
         seen, hand, places, total = image, np.asarray(gripper, np.float32), pixels, 0.0
         legs = [{'goal_maps': subgoal.object_maps} for subgoal in chain]
         for leg, subgoal in zip([*legs, {'goal_pixels': goal_pixels}], [*chain, None]):
+            if before_plan is not None:
+                before_plan()
             mpc.reset(seed)
             plan = mpc.act(seen, hand, places, **leg)
             total += plan.cost

@@ -19,16 +19,21 @@ from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
+from tap_ros.evaluation.planning.episode import run_episode
+from tap_ros.evaluation.planning.methods import parse_method
 from tap_ros.nodes.clients import call, CallError, Newest, send_goal, wait_for_result
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.predictor_node import OVERLAY_SCALE
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.weights import FORWARD_MODEL
+from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
+from lively import lively_network  # noqa: E402
 from processes import Client, NodeProcess  # noqa: E402
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -65,7 +70,7 @@ class Loop:
 
     def reset(self, seed=SEED):
         """Start a scene, and wait for what is published at its start."""
-        before = to_nanoseconds(self.image.wait(10).header.stamp) if self.image.count else -1
+        before = to_nanoseconds(self.image.wait(30).header.stamp)  # in lock-step one always comes
         response = call(self.reset_client, ResetScene.Request(task='push2', seed=seed), 30)
         assert response.success, response.message
         image = self.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > before)
@@ -231,6 +236,61 @@ def test_the_nodes_act_as_the_same_classes_do_in_one_process(loop):
     assert np.array_equal(loop.moves().astype(np.float32), np.array(actions))
 
 
+def acts_like(loop, method, weights, **fields):
+    """
+    Reach a goal by the nodes and in this process, and compare.
+
+    Where a plan is expected to end shows what it was for, as first actions often do not.
+
+    :return: the PlannedEpisode and the stages that feedback told.
+    """
+    feedback = []
+    loop.reset()
+    status, result = loop.reach(feedback.append, seed=SEED, **fields)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
+    plans, act = [], mpc.act
+    mpc.act = lambda *args, **goal: plans.append(act(*args, **goal)) or plans[-1]
+    try:
+        run = run_episode(sim, mpc, parse_method(method), fields['step_budget'], SEED,
+                          SubgoalPredictor.load(weights))
+    finally:
+        sim.close()
+    assert np.array_equal(loop.moves().astype(np.float32), run.actions[:, :3])
+    made = plans[-len(run.actions):]  # before these come plans to choose by
+    assert [f.expected_distance for f in feedback] == [p.expected_distance for p in made]
+    return run, [f.stage for f in feedback]
+
+
+def test_the_nodes_go_through_a_chain_as_one_process_does(loop):
+    run, stages = acts_like(loop, 'shipped:recursion2', DEFAULT_PREDICTOR, recursion_depth=2,
+                            num_samples=3, step_budget=3)  # these weights have but one sample
+    assert stages == ['subgoal 1 of 2', 'subgoal 2 of 2', 'goal'] and run.switches == [1, 2]
+
+
+def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
+    network = lively_network(image_size=64, latent_size=8)
+    weights = tmp_path / 'sampling.safetensors'
+    save_weights(weights, network, 'predictor', network.config, {})
+    assert loop.processes['predictor_node'].end() == 0
+    loop.start('predictor_node', weights=weights)
+    try:
+        loop.processes['predictor_node'].wait_for('ready', 120)
+        run, stages = acts_like(
+            loop, 'sampling:samples3', weights, num_samples=3, step_budget=2)
+        loop.reset()
+        handle = send_goal(loop.reach_client, ReachGoal.Goal(num_samples=100), 30)
+        threading.Event().wait(3)  # it would make 200 plans before it moves
+        handle.cancel_goal_async()
+        status, result = wait_for_result(handle, 20)
+        assert status == GoalStatus.STATUS_CANCELED and result.steps == 0
+    finally:
+        loop.processes['predictor_node'].end()
+        loop.start('predictor_node')
+        loop.processes['predictor_node'].wait_for('ready', 120)
+    assert stages == ['subgoal', 'goal'] and run.subgoals[0].sample > 0
+
+
 def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
     loop.reset()
     moving = threading.Event()
@@ -255,6 +315,8 @@ def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
     ({'mode': 'sideways'}, ['mode', 'sideways', 'subgoal, direct']),
     ({'step_budget': 100_000}, ['step_budget', '100000', '1000']),
     ({'seed': -1}, ['seed', '-1']),
+    ({'recursion_depth': 99}, ['/predict_subgoal', 'recursion_depth', '99', '1 to 8']),
+    ({'num_samples': 1000}, ['/predict_subgoal', 'num_samples', '1000', '1 to 100']),
     ({'goal_image': Image(width=64, height=64, encoding='nope')}, ['goal', 'nope', 'rgb8']),
 ])
 def test_a_bad_goal_is_aborted_with_the_reason_and_moves_nothing(loop, fields, words):

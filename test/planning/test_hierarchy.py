@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
 from tap_ros.planning.cem import CEMConfig
-from tap_ros.planning.hierarchy import choose_subgoals, Itinerary, Target
+from tap_ros.planning.hierarchy import (
+    choose_sample,
+    choose_subgoals,
+    Itinerary,
+    Target,
+    targets_by,
+)
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import Subgoal
@@ -67,15 +73,20 @@ def test_unknown_switches_are_named():
         Itinerary(targets(2), 12, 'sometimes')
 
 
-def subgoal(pixels):
+def subgoal(pixels, sample=0, level=1):
     maps = one_hot_maps(torch.tensor(pixels), (32, 32)).numpy()
     picture = np.full((32, 32, 3), 90, np.uint8)
-    return Subgoal(picture, maps, np.asarray(pixels, np.float32), np.ones(2, np.float32), 0, 0)
+    return Subgoal(picture, maps, np.asarray(pixels, np.float32), np.ones(2, np.float32),
+                   sample, level)
+
+
+def small_planner(model):
+    return VisualMPC(model, VisualMPCConfig(
+        search=CEMConfig(16, 1, 4), proposals=4, batch_size=16, threads=1))
 
 
 def test_the_subgoal_on_the_way_is_chosen_and_the_first_of_equals(model):
-    mpc = VisualMPC(model, VisualMPCConfig(
-        search=CEMConfig(16, 1, 4), proposals=4, batch_size=16, threads=1))
+    mpc = small_planner(model)
     image, gripper = np.full((32, 32, 3), 90, np.uint8), np.zeros(4, np.float32)
     start, goal = PLACES, PLACES + [4.0, 0.0]
     between, astray = start + [2.0, 0.0], np.array([[28.0, 28.0], [3.0, 3.0]])
@@ -84,3 +95,35 @@ def test_the_subgoal_on_the_way_is_chosen_and_the_first_of_equals(model):
     assert best == 1 and costs[1] == costs[2] < costs[0]
     again, _ = choose_subgoals(mpc, image, gripper, start, goal, chains[::-1])
     assert again == 0
+
+
+def test_subgoals_are_divided_by_their_sample_and_one_sample_needs_no_plan(model):
+    image, gripper = np.full((32, 32, 3), 90, np.uint8), np.zeros(4, np.float32)
+    start, goal = PLACES, PLACES + [6.0, 0.0]
+    astray = np.array([[28.0, 28.0], [3.0, 3.0]])
+    between = [start + [2.0, 0.0], start + [4.0, 0.0]]
+    found = [subgoal(astray, 0, 2), subgoal(astray, 0, 1),
+             subgoal(between[0], 1, 2), subgoal(between[1], 1, 1)]
+    plans = []
+    taken = choose_sample(small_planner(model), image, gripper, start, goal, found,
+                          before_plan=lambda: plans.append(0))
+    assert taken == found[2:] and len(plans) == 6  # two legs and the last, for two samples
+    assert choose_sample(None, image, gripper, start, goal, found[:2]) == found[:2]
+    way = targets_by(taken, goal)
+    np.testing.assert_array_equal([target.pixels for target in way], [*between, goal])
+    assert [target.maps is None for target in way] == [False, False, True]
+
+
+def test_a_choice_can_be_broken_off_between_two_plans(model):
+    image, gripper = np.full((32, 32, 3), 90, np.uint8), np.zeros(4, np.float32)
+    chains, plans = [[subgoal(PLACES)]] * 5, []
+
+    def before_plan():
+        plans.append(0)
+        if len(plans) == 3:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        choose_subgoals(small_planner(model), image, gripper, PLACES, PLACES + 4, chains,
+                        before_plan=before_plan)
+    assert len(plans) == 3

@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.planning.scenes import nearest_first
-from tap_ros.planning.hierarchy import choose_subgoals, Itinerary, Target
+from tap_ros.planning.hierarchy import choose_sample, Itinerary, Target, targets_by
 from tap_ros.planning.tracking import ObjectTracker
 from tap_ros.recording.episode import Episode
 
@@ -107,11 +107,14 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed):
     start, end = seen.object_pixels, goal.object_pixels
     last = Target(end)
     if method.predicted:
-        subgoals = predict_chain(mpc, method, seen, goal, predictor, seed)
+        found = predictor.predict(
+            seen.image, goal.image, start, end, num_samples=method.samples,
+            recursion_depth=method.recursion, seed=seed)
+        subgoals = choose_sample(mpc, seen.image, seen.gripper, start, end, found, seed)
         if method.maps == 'true':
             return [*(Target(true_configuration(simulator, s.image, seen, goal))
                       for s in subgoals), last], subgoals
-        return [*(Target(s.expected_pixels, s.object_maps) for s in subgoals), last], subgoals
+        return targets_by(subgoals, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []
     order = nearest_first(
@@ -123,19 +126,6 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed):
     moved = [order[:max(1, i * K // (n + 1))] for i in range(1, n + 1)]
     return [*(Target(np.where(np.isin(np.arange(K), done)[:, None], end, start))
               for done in moved), last], []
-
-
-def predict_chain(mpc, method, seen, goal, predictor, seed):
-    """Return the predicted Subgoals, earliest first; of several samples the cheapest to plan."""
-    found = predictor.predict(
-        seen.image, goal.image, seen.object_pixels, goal.object_pixels,
-        num_samples=method.samples, recursion_depth=method.recursion, seed=seed)
-    chains = [found[i:i + method.recursion] for i in range(0, len(found), method.recursion)]
-    if len(chains) == 1:
-        return chains[0]
-    best, _ = choose_subgoals(
-        mpc, seen.image, seen.gripper, seen.object_pixels, goal.object_pixels, chains, seed)
-    return chains[best]
 
 
 def true_configuration(simulator, picture, seen, goal):

@@ -1,0 +1,61 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Subgoals that went through messages are the same to the last bit."""
+
+import numpy as np
+import pytest
+from tap_msgs.srv import PredictSubgoal
+from tap_ros.errors import ImageError, PlanningError
+from tap_ros.nodes.image_messages import resize_pixels
+from tap_ros.nodes.subgoal_messages import decode_subgoals, encode_subgoal
+from tap_ros.nodes.topics import to_stamp
+from tap_ros.prediction.predictor import Subgoal
+
+RNG = np.random.default_rng(0)
+NAMES, SIZE = ('cup', 'box'), (8, 8)
+
+
+def subgoal(sample, level):
+    return Subgoal(
+        RNG.integers(0, 256, (*SIZE, 3), np.uint8), RNG.random((2, *SIZE), np.float32),
+        8 * RNG.random((2, 2), np.float32), np.ones(2, np.float32), sample, level)
+
+
+def answer(subgoals, names=NAMES):
+    return PredictSubgoal.Response(
+        success=True, subgoals=[encode_subgoal(s, names, to_stamp(1), 'eye') for s in subgoals],
+        sample=[s.sample for s in subgoals], level=[s.level for s in subgoals])
+
+
+def test_what_was_encoded_is_decoded_in_the_order_asked_for():
+    sent = [subgoal(0, 2), subgoal(0, 1), subgoal(1, 2), subgoal(1, 1)]
+    for names, order in ((NAMES, [0, 1]), (NAMES[::-1], [1, 0]), (('box',), [1])):
+        for got, true in zip(decode_subgoals(answer(sent), names, SIZE), sent, strict=True):
+            assert (got.sample, got.level) == (true.sample, true.level)
+            np.testing.assert_array_equal(got.image, true.image)
+            np.testing.assert_array_equal(got.object_maps, true.object_maps[order])
+            np.testing.assert_array_equal(got.expected_pixels, true.expected_pixels[order])
+            assert got.expected_pixels.dtype == np.float32
+
+
+def test_answers_that_lack_something_are_refused_with_what():
+    good = [subgoal(0, 1)]
+    with pytest.raises(PlanningError, match='0 subgoals'):
+        decode_subgoals(answer([]), NAMES, SIZE)
+    response = answer(good)
+    response.level = []
+    with pytest.raises(PlanningError, match='1 subgoals, 1 entries of sample and 0 of level'):
+        decode_subgoals(response, NAMES, SIZE)
+    response = answer(good)
+    response.subgoals[0].expected_pixels = response.subgoals[0].expected_pixels[:1]
+    with pytest.raises(PlanningError, match='2 object_maps and 1 expected_pixels for 2'):
+        decode_subgoals(response, NAMES, SIZE)
+    with pytest.raises(PlanningError, match='subgoal: lacks jug'):
+        decode_subgoals(answer(good), ('cup', 'jug'), SIZE)
+    with pytest.raises(ImageError, match='16x16.*8x8'):
+        decode_subgoals(answer(good), NAMES, (16, 16))
+
+
+def test_pixels_of_the_same_size_stay_the_same():
+    pixels = 64 * RNG.random((1000, 2), np.float32)
+    np.testing.assert_array_equal(resize_pixels(pixels, (64, 64), (64, 64)), pixels)
