@@ -27,7 +27,7 @@ from tap_ros.evaluation.samples import draw_latents, SAMPLES, score_samples
 from tap_ros.images import to_float, to_uint8
 from tap_ros.pictures import grid, overlay
 from tap_ros.prediction.batches import make_batch, split_episodes
-from tap_ros.prediction.losses import l1_errors, match_step
+from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights import PREDICTORS
@@ -35,8 +35,8 @@ import torch
 
 METHODS = ('prediction', 'copy-start', 'copy-goal')
 _BATCH = 64
-_SHOWN = ('min_l1', 'match_fraction', 'match_fraction_std', 'bottleneck_median', 'bottleneck_1px',
-          'bottleneck_2px', 'visible_bottleneck_2px', 'bottleneck_5px')
+_SHOWN = ('min_l1', 'changed_l1', 'match_fraction', 'match_fraction_std', 'bottleneck_median',
+          'bottleneck_1px', 'bottleneck_2px', 'visible_bottleneck_2px', 'bottleneck_5px')
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,9 @@ class EpisodeScores:
         the start where no goal is given.
     :param match_step: (N,), the time of that frame; the start picture is time 0.
     :param match_fraction: (N,), that time as a share of the episode.
+    :param changed_l1: (N,), error against the same frame over the pixels alone in which it
+        differs from every input (losses.changed_pixels): what copying or leaving out does not
+        give; NaN where there are none.
     :param bottleneck: (N,), see bottleneck.score_bottlenecks; NaN where it is undefined.
     :param object_mass: (N,), likewise; below bottleneck.VISIBLE an object is left out.
     """
@@ -55,6 +58,7 @@ class EpisodeScores:
     min_l1: np.ndarray
     match_step: np.ndarray
     match_fraction: np.ndarray
+    changed_l1: np.ndarray
     bottleneck: np.ndarray
     object_mass: np.ndarray
 
@@ -72,6 +76,9 @@ class EpisodeScores:
             'match_step_std': bootstrap(_std, self.match_step),
             'match_fraction': mean_interval(self.match_fraction),
             'match_fraction_std': bootstrap(_std, self.match_fraction)}
+        changed = self.changed_l1[np.isfinite(self.changed_l1)]
+        if len(changed):
+            result['changed_l1'] = mean_interval(changed)
         scores = self.bottleneck[np.isfinite(self.bottleneck)]
         if len(scores):
             visible = np.where(self.object_mass[np.isfinite(self.bottleneck)] < VISIBLE, np.inf,
@@ -130,11 +137,20 @@ def evaluate(network, store, episodes, margin=0, goal_picture='last', seed=0):
         for m, method in enumerate(methods):
             match = match_step(errors[:, m], batch.valid)[:, None]
             times = batch.times.gather(1, match)
-            row = [errors[:, m].gather(1, match), times, times / batch.end]
+            row = [errors[:, m].gather(1, match), times, times / batch.end,
+                   _changed_l1(images[:, m], batch, match[:, 0], context)[:, None]]
             parts[method].append([*(part[:, 0].cpu().numpy() for part in row), placed[:, m],
                                   mass[:, m]])
     return {method: EpisodeScores(*(np.concatenate(column) for column in zip(*rows)))
             for method, rows in parts.items()}
+
+
+def _changed_l1(images, batch, match, context):
+    """Measure EpisodeScores.changed_l1 of pictures (B, 3, H, W); return (B,)."""
+    targets = to_float(batch.targets[torch.arange(len(match)), match])
+    changed = changed_pixels(targets, context)  # B, 1, H, W
+    error = ((images - targets).abs().mean(1, keepdim=True) / 2 * changed).sum((1, 2, 3))
+    return error / changed.sum((1, 2, 3))  # 0 / 0 is NaN
 
 
 def write_pictures(path, network, store, episodes, goal_picture='last', scale=2):

@@ -9,7 +9,6 @@ from tap_ros.images import to_float
 from tap_ros.prediction.discriminator import discriminator_loss, generator_loss
 from tap_ros.prediction.losses import (
     fixed_time_loss,
-    l1_error,
     match_step,
     recursive_loss,
     remaining_targets,
@@ -119,7 +118,7 @@ def predictor_loss(networks, batch, augmentation, config, draws=None,
     with autocast():
         prediction = networks.predictor(context, z)
     match = targets.match(prediction.image, context, selection)
-    parts['error'] = targets.loss(prediction.image, match)
+    parts['error'] = targets.loss(prediction.image, match, context)
     judged = None
     if networks.discriminator is not None:
         judged = _judge(networks, prediction, z, targets, context, match, draws, autocast)
@@ -194,7 +193,7 @@ def _recursive_loss(networks, prediction, targets, context, match, loss, config,
             between = replace(between, end=end, last=torch.where(
                 left[:, None], matched - 1, batch.last))
         match = targets.match(prediction.image, context, selection, between)
-        errors = outer_error(l1_error(prediction.image, targets.frame(match)), config)
+        errors = outer_error(targets.outer_l1(prediction.image, match, context), config)
         losses.append(errors[left].mean())
         counts.append(left.sum().item())
     return recursive_loss(losses, counts)
@@ -218,7 +217,7 @@ def _frame_posterior_loss(networks, targets, context, config, draws, autocast, s
             prediction = networks.predictor(
                 context, sample_latent(mean, log_variance, draws.posterior[:, t]))
         divergences.append(config.kl_weight * kl_divergence(mean, log_variance))
-        errors.append(l1_error(prediction.image, frame))
+        errors.append(targets.outer_l1(prediction.image, step, context))
         predictions.append(prediction)
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
     whole = (divergences + errors).detach()

@@ -7,13 +7,13 @@ from tap_ros.prediction.losses import (
     bell_preference,
     cost_of_reaching,
     fixed_time_loss,
-    l1_error,
     l1_errors,
     linear_preference,
     match_step,
     path_length,
     preferred_error,
     relative_to_copying,
+    weighted_l1_error,
 )
 from tap_ros.prediction.methods import DEFAULT_BETA
 import torch
@@ -104,10 +104,21 @@ class Targets:
             images = self.augmentation.undo(images)
         return l1_errors(images, self.batch.targets.movedim(-1, 2))
 
-    def loss(self, image, step):
+    def outer_l1(self, image, step, context):
+        """
+        Measure the l1 error of E_t, with the configured weight on changed pixels.
+
+        :param image: (B, 3, H, W), predictions.
+        :param step: int64 (B,), the targets, as indices into T.
+        :param context: (B, C, 3, H, W), what the predictions come from.
+        :return: (B,).
+        """
+        return weighted_l1_error(image, self.frame(step), context, self.config.changed_weight)
+
+    def loss(self, image, step, context):
         """Return E_t: the l1 error at step, to the configured power, as a mean."""
         return fixed_time_loss(
-            lambda step: outer_error(l1_error(image, self.frame(step)), self.config), step)
+            lambda step: outer_error(self.outer_l1(image, step, context), self.config), step)
 
 
 def outer_error(error, config):

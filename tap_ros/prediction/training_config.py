@@ -28,6 +28,8 @@ class TrainingConfig:
     :param bell_edge: w at both ends of the targets; 2/3 in the paper.
     :param margin: frames left out of the targets next to each context picture.
     :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
+    :param changed_weight: how much more pixels of the target weigh in the outer error that differ
+        from every input; 0 in the paper, see losses.weighted_l1_error.
     :param num_targets: at most so many random targets an episode and step; 0: all of them.
     :param max_frames: longer episodes are cut to a random piece of this length; 0: never.
     :param min_crop: cut episodes to a random piece of at least this share; 1: never.
@@ -73,6 +75,7 @@ class TrainingConfig:
     bell_edge: float = 2 / 3
     margin: int = 3
     outer_power: float = 0.5
+    changed_weight: float = 0.0
     num_targets: int = 0
     max_frames: int = 0
     min_crop: float = 1.0
@@ -121,7 +124,7 @@ class TrainingConfig:
             if getattr(self, name) < 1:
                 raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
         for name in ('margin', 'num_targets', 'max_frames', 'warmup', 'threads',
-                     'pretrain_steps', 'gan_weight', 'kl_weight'):
+                     'pretrain_steps', 'gan_weight', 'kl_weight', 'changed_weight'):
             if getattr(self, name) < 0:
                 raise ConfigError(f'{name}: expected 0 or more, got {getattr(self, name)}')
         if 0 < self.max_frames < 3:

@@ -26,6 +26,7 @@ def scores(l1, at=0.5, frames=40, bottleneck=None, mass=None, seed=0):
     N = len(l1)
     return {'min_l1': list(map(float, l1)), 'match_fraction': list(map(float, at)),
             'match_step': [round(x * (frames - 1)) for x in at],
+            'changed_l1': [0.2] * N,
             'bottleneck': [None] * N if bottleneck is None else list(bottleneck),
             'object_mass': [None] * N if bottleneck is None else list(mass or [1.0] * N)}
 

@@ -52,7 +52,8 @@ def test_names_are_unique_and_the_first_seed_comes_first():
 
 
 def test_rows_of_a_task_and_mode_differ_in_the_method_only():
-    free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'outer_power', 'goal_picture'}
+    free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'outer_power', 'goal_picture',
+            'kl_weight'}
     for scale in SCALES:
         settings = {}
         for run in paper_runs(scale):

@@ -7,6 +7,7 @@ import math
 import pytest
 from tap_ros.prediction.losses import (
     bell_preference,
+    changed_pixels,
     cost_of_reaching,
     fixed_time_loss,
     generalized_minimum_loss,
@@ -20,6 +21,7 @@ from tap_ros.prediction.losses import (
     recursive_loss,
     relative_to_copying,
     remaining_targets,
+    weighted_l1_error,
 )
 import torch
 
@@ -178,3 +180,27 @@ def test_cheap_states_are_preferred_and_weight_0_prefers_none(error):
     same = torch.full((1, 9), 0.3)
     assert match_step(cost_of_reaching(same, cost[:1], preference[:1])).item() == 0
     assert match_step(cost_of_reaching(same, 1 - cost[:1], preference[:1])).item() == 8
+
+
+def test_changed_pixels_differ_from_every_input():
+    start, goal = torch.zeros(1, 3, 2, 2), torch.zeros(1, 3, 2, 2)
+    goal[..., 0, 0] = 1
+    frame = torch.zeros(1, 3, 2, 2)
+    frame[..., 0, 0] = 1  # as in the goal
+    frame[:, 2, 0, 1] = 1  # new, in one channel
+    frame[..., 1, 0] = 0.1  # nearly as in both
+    changed = changed_pixels(frame, torch.stack([start, goal], 1))
+    assert changed.tolist() == [[[[False, True], [False, False]]]]
+    assert changed_pixels(frame, start[:, None])[0, 0, 0, 0]
+
+
+@pytest.mark.parametrize('weight, painted', [(0, False), (0.9, False), (1.1, True), (5, True)])
+def test_what_is_there_with_a_chance_of_a_third_is_painted_from_a_weight_of_1_on(weight, painted):
+    table, thing = torch.zeros(3, 3, 4, 4), torch.zeros(3, 3, 4, 4)
+    thing[..., 1, 2] = 1
+    targets = torch.cat([table[:2], thing[:1]])
+    left_out, shown = (weighted_l1_error(images, targets, table[:, None], weight).mean()
+                       for images in (table, thing))
+    assert (shown < left_out) == painted
+    if weight == 0:
+        assert left_out == l1_error(table, targets).mean()

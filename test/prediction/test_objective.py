@@ -10,7 +10,12 @@ from tap_ros.images import to_float
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.held_out import held_out_scores
-from tap_ros.prediction.losses import bell_preference, l1_error, minimum_loss
+from tap_ros.prediction.losses import (
+    bell_preference,
+    l1_error,
+    minimum_loss,
+    weighted_l1_error,
+)
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.objective import (
     discriminators_loss,
@@ -74,6 +79,19 @@ def test_fix_stays_at_its_frame_where_another_is_nearer():
     outcome = predictor_loss(showing(to_float(batch.targets[:, 1])), batch, None,
                              replace(CONFIG, method='fix-wo-gan'))
     assert outcome.match.tolist() == [0] * 4 and outcome.loss > 0.1
+
+
+def test_changed_pixels_weigh_more_in_the_loss_but_not_in_the_choice():
+    batch = make_batch()
+    image = to_float(batch.targets).mean(1)
+    plain, weighted = (predictor_loss(showing(image), batch, None, replace(
+        CONFIG, method='genmin-wo-gan', changed_weight=weight)) for weight in (0, 3))
+    assert plain.match.equal(weighted.match)
+    rows = torch.arange(4)
+    expected = weighted_l1_error(
+        image, to_float(batch.targets[rows, weighted.match]), to_float(batch.context), 3).mean()
+    assert weighted.loss.item() == pytest.approx(expected.item(), rel=1e-6)
+    assert weighted.loss > 2 * plain.loss  # in random pictures nearly all pixels change
 
 
 def test_padding_is_never_matched():

@@ -89,8 +89,8 @@ def group_runs(runs):
 def _group(key, runs, part, of=''):
     """Stack the scores of runs."""
     parts = [run['evaluation'][part] for run in runs]
-    names = [name for name in ('min_l1', 'match_step', 'match_fraction', 'bottleneck',
-                              'object_mass')
+    names = [name for name in ('min_l1', 'match_step', 'match_fraction', 'changed_l1',
+                              'bottleneck', 'object_mass')
              if all(name in part for part in parts)]
     scores = {name: np.array([part[name] for part in parts], float) for name in names}
     if not np.isfinite(scores.get('bottleneck', np.nan)).any():
@@ -126,6 +126,10 @@ def make_rows(groups):
         for metric in ('min_l1', 'match_step', 'match_fraction'):
             if metric in scores:
                 rows.append(_row(group, metric, _over_seeds(_mean), scores[metric]))
+        changed = scores.get('changed_l1', np.full((1, 1), np.nan))
+        changed = changed[:, np.isfinite(changed).all(0)]
+        if changed.size:
+            rows.append(_row(group, 'changed_l1', _over_seeds(_mean), changed))
         if 'match_step' in scores:
             rows.append(_row(group, 'match_step_std', _over_seeds(_std), scores['match_step']))
             share = scores['match_fraction']

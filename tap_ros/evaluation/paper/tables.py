@@ -70,18 +70,19 @@ def scores_table(rows, task, mode, new_pixels=True):
         about = {'task': task, 'mode': mode, 'method': method, 'new_pixels': new_pixels}
         error = find(rows, **about, metric='min_l1')
         theirs = published.get(method, (None,) * 3)
-        line = [method, NOT_RUN, *['-'] * 3]
+        line = [method, NOT_RUN, *['-'] * 4]
         if error:
-            step, spread, beside = (find(rows, **about, metric=metric) for metric in (
-                'match_step', 'match_step_std', 'match_beside_input'))
-            line = [method, with_interval(error),
+            step, spread, beside, changed = (find(rows, **about, metric=metric) for metric in (
+                'match_step', 'match_step_std', 'match_beside_input', 'changed_l1'))
+            line = [method, with_interval(error), with_interval(changed, 3),
                     f'{step["value"]:.1f} ± {spread["value"]:.1f}',
                     plain(beside['value'], 0, 100, '%'), str(error['seeds'])]
         if published:
             line += [plain(theirs[0]),
                      '-' if theirs[1] is None else f'{theirs[1]:.1f} ± {theirs[2]:.1f}']
         lines.append(line)
-    header = ['method', 'min l1 (95% interval)', 'match-step', 'beside an input', 'seeds']
+    header = ['method', 'min l1 (95% interval)', 'of changed pixels', 'match-step',
+              'beside an input', 'seeds']
     return markdown(header + (['paper: min l1', 'match-step'] if published else []), lines)
 
 
