@@ -173,6 +173,14 @@ def test_between_start_and_goal_copying_is_fixed_time_prediction_too():
     assert not find(rows_of(run('genmin', 0.01, 0.7)), metric=metric)  # without any fix
 
 
+def test_more_weight_on_changed_pixels_is_compared_with_fix_of_that_kind():
+    rows = rows_of(*(made_run(method, scores(l1)) for method, l1 in (
+        ('fix', 0.04), ('fix+changed', 0.02), ('genmin', 0.02), ('genmin+changed', 0.01))))
+    for method, baseline in (('genmin', 'fix'), ('genmin+changed', 'fix+changed')):
+        row = find(rows, method=method, metric='gain_over_fix')
+        assert row['baseline'] == baseline and row['value'] == pytest.approx(0.5, abs=0.01)
+
+
 def test_methods_stand_in_the_order_of_the_paper():
     order = ['copy-start', 'copy-goal', 'fix', 'fix0.75', 'min', 'genmin30', 'genmin2', 'genmin',
              'genmin+relative', 'genmin-vae-gan', 'genmin-vae-best-of-100']

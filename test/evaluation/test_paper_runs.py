@@ -53,13 +53,14 @@ def test_names_are_unique_and_the_first_seed_comes_first():
 
 def test_rows_of_a_task_and_mode_differ_in_the_method_only():
     free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'outer_power', 'goal_picture',
-            'kl_weight'}
+            'kl_weight'}  # and what +changed changes, for all rows with it
     for scale in SCALES:
         settings = {}
         for run in paper_runs(scale):
             values = {name: value for name, value in asdict(run.config('b', 'r')).items()
                       if name not in free}
-            assert settings.setdefault((run.task, run.mode), values) == values
+            assert settings.setdefault(
+                (run.task, run.mode, run.variant == '+changed'), values) == values
 
 
 def test_full_has_the_papers_length():

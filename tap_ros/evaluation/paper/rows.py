@@ -18,6 +18,7 @@ from tap_ros.prediction.methods import parse_method
 
 COPIES = ('copy-start', 'copy-goal')
 BEST = 'best-of-100'
+CHANGED = '+changed'  # the variant with more weight on changed pixels
 # Of the samples of a VAE.
 SPREADS = ('sample_spread', 'sample_spread_near', 'sample_spread_elsewhere', 'sample_spread_px')
 RESAMPLES = 1000
@@ -194,13 +195,17 @@ def find_baseline(group, groups):
     """
     Find the fixed-time predictor that a method is to be compared with: fix in the same setting.
 
-    A method without GAN is compared with fix-wo-gan where that was run.
+    A method without GAN is compared with fix-wo-gan where that was run, one with more weight on
+    changed pixels with fix+changed.
 
     :return: Group or None.
     """
     name = group.key['method']
     wo_gan = '-wo-gan' in name or (re.search(r'-vae(?!-gan)', name) and BEST not in name)
-    for method in (('fix-wo-gan', 'fix') if wo_gan else ('fix', 'fix-wo-gan')):
+    names = ('fix-wo-gan', 'fix') if wo_gan else ('fix', 'fix-wo-gan')
+    if name.endswith(CHANGED):
+        names = ('fix' + CHANGED,)
+    for method in names:
         for other in groups:
             if (other.key == {**group.key, 'new_pixels': group.key.get('new_pixels', True),
                               'method': method}
@@ -243,12 +248,13 @@ def _equal_gain_rows(groups):
         name, mode = group.key['method'], group.key['mode']
         if name in COPIES or name.startswith('fix') or 'match_step' not in group.scores:
             continue
+        fixed = r'fix[\d.]*' + (re.escape(CHANGED) if name.endswith(CHANGED) else '')
         baselines = [
             other for other in groups if other.data_hash == group.data_hash
             and all(other.key[part] == group.key[part] for part in ('task', 'mode', 'scale'))
             and (other.key['method'] in COPIES if 'new_pixels' not in other.key else
                  other.key['new_pixels'] == group.key['new_pixels']
-                 and re.fullmatch(r'fix[\d.]*', other.key['method']))
+                 and re.fullmatch(fixed, other.key['method']))
             and not (mode == 'forward' and other.key['method'] in COPIES)]
         if len(baselines) < 2 or all(other.key['method'] in COPIES for other in baselines):
             continue
