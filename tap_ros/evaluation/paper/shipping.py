@@ -20,8 +20,8 @@ import torch
 
 THRESHOLD = 2  # px, of the bottleneck frequency on the card
 _SETTINGS = ('method', 'mode', 'new_pixels', 'base_width', 'steps', 'batch_size', 'learning_rate',
-             'margin', 'outer_power', 'goal_picture', 'recursion', 'gan_weight', 'kl_weight',
-             'latent_size', 'seed')
+             'margin', 'outer_power', 'changed_weight', 'goal_picture', 'recursion', 'gan_weight',
+             'kl_weight', 'latent_size', 'seed')
 
 
 def ship(run, file, places):
