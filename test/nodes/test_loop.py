@@ -31,6 +31,7 @@ from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
+import torch
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
 from lively import lively_network  # noqa: E402
@@ -105,7 +106,9 @@ class Loop:
 @pytest.fixture(scope='module')
 def loop(tmp_path_factory):
     folder = tmp_path_factory.mktemp('loop')
-    with Client() as node:
+    # With more threads the predictor's last digits differ from process to process.
+    with pytest.MonkeyPatch.context() as patch, Client() as node:
+        patch.setenv('OMP_NUM_THREADS', '1')
         loop = Loop(node, folder)
         try:
             loop.start('recorder_node', folder=folder / 'bag')
@@ -249,12 +252,15 @@ def acts_like(loop, method, weights, **fields):
     status, result = loop.reach(feedback.append, seed=SEED, **fields)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     plans, act = [], mpc.act
     mpc.act = lambda *args, **goal: plans.append(act(*args, **goal)) or plans[-1]
     try:
         run = run_episode(sim, mpc, parse_method(method), fields['step_budget'], SEED,
                           SubgoalPredictor.load(weights))
     finally:
+        torch.set_num_threads(threads)
         sim.close()
     assert np.array_equal(loop.moves().astype(np.float32), run.actions[:, :3])
     made = plans[-len(run.actions):]  # before these come plans to choose by
