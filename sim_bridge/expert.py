@@ -68,7 +68,7 @@ class Expert:
         Plan to rise and walk about at random before the first push.
 
         Without it, the middle of most episodes is where one object is in place and the other
-        untouched, and a prediction for a fixed time finds that bottleneck by itself.
+        untouched, and a prediction for a fixed time finds that bottleneck nearly always.
 
         :return: (n, 4) actions.
         """
@@ -76,10 +76,11 @@ class Expert:
         # As fast as it travels: pictures of a slow walk would be easy to predict from the start.
         angles = self._rng.uniform(0, 2 * np.pi, steps)
         lengths = self._rng.uniform(*self._config.travel_speed, steps)
-        path = self._simulator.target[None, :3] + np.cumsum(np.column_stack(
-            [lengths * np.cos(angles), lengths * np.sin(angles), np.full(steps, LIFTED)]), 0)
-        path = np.clip(path, [*WORKSPACE_LOW[:2], LIFTED], [*WORKSPACE_HIGH[:2], LIFTED])
-        path = np.concatenate([self._simulator.target[None, :3], path])
+        here = self._simulator.target[:3]
+        path = here[:2] + np.cumsum(
+            lengths[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 0)
+        path = np.clip(path, WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])
+        path = np.concatenate([here[None], np.column_stack([path, np.full(steps, LIFTED)])])
         return np.column_stack([np.diff(path, axis=0), np.zeros(steps)])
 
     def plan(self, steps_left):

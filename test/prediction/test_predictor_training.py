@@ -124,14 +124,19 @@ def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(config, monke
 
 
 def test_a_network_in_use_predicts_as_in_training(config):
-    config = replace(config, steps=40, average_decay=0.0, save_every=40, method='genmin-wo-gan')
+    config = replace(config, steps=60, average_decay=0.0, save_every=60, method='genmin-wo-gan',
+                     new_pixels=True)
     network, _ = load_network(train(config, progress=False))
     store = open_recordings(list(config.recordings), progress=False)
     context = to_float(make_batch(store, range(len(store))).context)
     with torch.no_grad():
         used, trained = network(context).image, network.train()(context).image
-    # Batch norm's averages lag behind, but must not spoil the picture.
-    assert (used - trained).abs().mean() < 0.05
+        for module in network.modules():
+            if isinstance(module, torch.nn.BatchNorm2d):
+                module.reset_running_stats()
+        without = network.eval()(context).image
+    # Batch norm's averages lag behind, but serve far better than none.
+    assert (used - trained).abs().mean() < 0.5 * (without - trained).abs().mean()
 
 
 def test_learning_rate_rises_and_falls():

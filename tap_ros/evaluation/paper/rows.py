@@ -18,7 +18,6 @@ from tap_ros.prediction.methods import parse_method
 
 COPIES = ('copy-start', 'copy-goal')
 BEST = 'best-of-100'
-CHANGED = '+changed'  # the variant with more weight on changed pixels
 # Of the samples of a VAE.
 SPREADS = ('sample_spread', 'sample_spread_near', 'sample_spread_elsewhere', 'sample_spread_px')
 RESAMPLES = 1000
@@ -127,10 +126,6 @@ def make_rows(groups):
         for metric in ('min_l1', 'match_step', 'match_fraction'):
             if metric in scores:
                 rows.append(_row(group, metric, _over_seeds(_mean), scores[metric]))
-        changed = scores.get('changed_l1', np.full((1, 1), np.nan))
-        changed = changed[:, np.isfinite(changed).all(0)]
-        if changed.size:
-            rows.append(_row(group, 'changed_l1', _over_seeds(_mean), changed))
         if 'match_step' in scores:
             rows.append(_row(group, 'match_step_std', _over_seeds(_std), scores['match_step']))
             share = scores['match_fraction']
@@ -138,7 +133,7 @@ def make_rows(groups):
             if group.key['mode'] == 'bidirectional':
                 beside |= share > 1 - BESIDE
             rows.append(_row(group, 'match_beside_input', _over_seeds(_mean), beside))
-        for metric in SPREADS:
+        for metric in ('changed_l1', *SPREADS):  # not known of every episode
             known = scores.get(metric, np.full((1, 1), np.nan))
             known = known[:, np.isfinite(known).all(0)]
             if known.size:
@@ -195,17 +190,15 @@ def find_baseline(group, groups):
     """
     Find the fixed-time predictor that a method is to be compared with: fix in the same setting.
 
-    A method without GAN is compared with fix-wo-gan where that was run, one with more weight on
-    changed pixels with fix+changed.
+    A method without GAN is compared with fix-wo-gan where that was run, a variant with fix of that
+    variant.
 
     :return: Group or None.
     """
     name = group.key['method']
     wo_gan = '-wo-gan' in name or (re.search(r'-vae(?!-gan)', name) and BEST not in name)
     names = ('fix-wo-gan', 'fix') if wo_gan else ('fix', 'fix-wo-gan')
-    if name.endswith(CHANGED):
-        names = ('fix' + CHANGED,)
-    for method in names:
+    for method in (*(['fix' + variant_of(name)] if variant_of(name) else []), *names):
         for other in groups:
             if (other.key == {**group.key, 'new_pixels': group.key.get('new_pixels', True),
                               'method': method}
@@ -248,15 +241,15 @@ def _equal_gain_rows(groups):
         name, mode = group.key['method'], group.key['mode']
         if name in COPIES or name.startswith('fix') or 'match_step' not in group.scores:
             continue
-        fixed = r'fix[\d.]*' + (re.escape(CHANGED) if name.endswith(CHANGED) else '')
-        baselines = [
-            other for other in groups if other.data_hash == group.data_hash
-            and all(other.key[part] == group.key[part] for part in ('task', 'mode', 'scale'))
-            and (other.key['method'] in COPIES if 'new_pixels' not in other.key else
-                 other.key['new_pixels'] == group.key['new_pixels']
-                 and re.fullmatch(fixed, other.key['method']))
-            and not (mode == 'forward' and other.key['method'] in COPIES)]
-        if len(baselines) < 2 or all(other.key['method'] in COPIES for other in baselines):
+        same = [other for other in groups if other.data_hash == group.data_hash
+                and all(other.key[part] == group.key[part] for part in ('task', 'mode', 'scale'))
+                and other.key.get('new_pixels') in (None, group.key['new_pixels'])]
+        fixed = [[other for other in same if re.fullmatch(
+            r'fix[\d.]*' + re.escape(variant), other.key['method'])]
+            for variant in (variant_of(name), '')]
+        copies = [other for other in same if other.key['method'] in COPIES]
+        baselines = (fixed[0] or fixed[1]) + (copies if mode == 'bidirectional' else [])
+        if not any(fixed) or len(baselines) < 2:
             continue
         row = _row(group, 'gain_over_fix_at_match_step', _gain_at_match_step,
                    *(g.scores[score] for g in (group, *baselines)
@@ -307,6 +300,12 @@ def find(rows, **wanted):
     return None
 
 
+def variant_of(method):
+    """Return which of runs.VARIANTS a method's name stands for; '' for the method as it is."""
+    name = re.sub(r'-r\d+$', '', method)
+    return max((variant for variant in VARIANTS if name.endswith(variant)), key=len)
+
+
 def method_order(method):
     """
     Give the place of a method in tables and pictures, as a sort key: copying, fix, min, genmin.
@@ -317,7 +316,7 @@ def method_order(method):
         return (0, 0, COPIES.index(method), False, method)
     name = method.replace(f'-wo-gan-{BEST}', '').replace(f'-{BEST}', '')
     name = re.sub(r'-r\d+$', '', name)
-    variant = max((v for v in VARIANTS if name.endswith(v)), key=len)
+    variant = variant_of(name)
     parsed = parse_method(name.removesuffix(variant))
     number = (parsed.fraction if parsed.loss == 'fix' else
               -parsed.beta if parsed.beta is not None else 0)

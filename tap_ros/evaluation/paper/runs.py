@@ -49,7 +49,7 @@ SCALES = {
 _PAPER = {'margin': 0, 'outer_power': 1.0, 'goal_picture': 'last'}
 # Choosing by the error relative to copying needs both, see docs/paper_map.md.
 _RELATIVE = {**_PAPER, 'margin': 3, 'outer_power': 0.5}
-# With the default of 1e-4 all samples were the same: z is worth less than 0.005 of error here.
+# With the default of 1e-4 samples hardly differed: z is worth less than 0.005 of error here.
 _VAE = {'kl_weight': 1e-5}
 VARIANTS = {
     '': {},
