@@ -28,6 +28,7 @@ from tap_ros.prediction.objective import (
     predictor_loss,
 )
 from tap_ros.prediction.pictures import sample_grid
+from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.pretraining import pretrain_decoders
 from tap_ros.prediction.recognition import Recognition
 from tap_ros.prediction.training_config import DEFAULTS
@@ -55,6 +56,7 @@ def train(config, stop_at=None, minutes=None, progress=True):
     :return: path of the weights file.
     :raises ConfigError: if the folder holds a run with other settings or recordings.
     :raises RecordingError: if the recordings cannot be trained on.
+    :raises WeightsError: if the initial weights cannot be used.
     """
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
@@ -63,8 +65,10 @@ def train(config, stop_at=None, minutes=None, progress=True):
     training, held_out = split_episodes(store, config.test_fraction)
     torch.manual_seed(config.seed)
     network = Predictor(network_config(config, store.image_size))
-    state = start(network, config.learning_rate, device, _helpers(config, network.config, store))
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
+    if config.initial_weights and not checkpoint.exists():
+        _begin_with(network, config.initial_weights)
+    state = start(network, config.learning_rate, device, _helpers(config, network.config, store))
     load_checkpoint(checkpoint, state, asdict(config), store.data_hash, DEFAULTS)
     autocast = make_autocast(config.precision, device)
     # Decoding and copying would be most of the time of a step on a GPU.
@@ -129,6 +133,17 @@ def network_config(config, image_size):
                            num_context=1 if config.forward else 2,
                            latent_size=config.latent_size if config.chosen.vae else 0,
                            new_pixels=config.new_pixels, flow_scale=config.flow_scale)
+
+
+def _begin_with(network, weights):
+    """Copy the weights of another training into a fresh network."""
+    other, _ = load_network(weights)
+    if other.config != network.config:
+        mine, others = asdict(network.config), asdict(other.config)
+        raise ConfigError(f'initial_weights: {weights} are for another network: ' + ', '.join(
+            f'{name} {others[name]!r} instead of {mine[name]!r}'
+            for name in mine if mine[name] != others[name]))
+    network.load_state_dict(other.state_dict())
 
 
 def _step(state, networks, batch, augmentation, draws, config, autocast):

@@ -36,6 +36,8 @@ class TrainingConfig:
     :param goal_picture: the goal picture is the episode's 'last' frame; the 'recorded' goal
         where the episode reached it; or 'mixed', one or the other at random.
     :param recursion: levels of Eq. 3; 1: none. The GAN's and the VAE's terms stand at the first.
+    :param initial_weights: begin with these instead of fresh ones: a file, or the name of shipped
+        weights; to learn another task from few episodes. The network must have the same shape.
     :param pretrain_steps: steps of training the decoders as a frame generator first, at a rate of
         1e-4 (appendix C).
     :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
@@ -81,6 +83,7 @@ class TrainingConfig:
     min_crop: float = 1.0
     goal_picture: str = 'mixed'
     recursion: int = 1
+    initial_weights: str = ''
     pretrain_steps: int = 0
     gan_weight: float = 5e-5
     kl_weight: float = 1e-4
@@ -118,6 +121,9 @@ class TrainingConfig:
             if getattr(self, name) not in choices:
                 raise ConfigError(f'{name}: expected one of {", ".join(choices)}, '
                                   f'got {getattr(self, name)!r}')
+        if self.initial_weights and self.pretrain_steps:
+            raise ConfigError('initial_weights: they have decoders already; expected '
+                              f'pretrain_steps 0, got {self.pretrain_steps}')
         self._check_method()
         for name in ('steps', 'batch_size', 'base_width', 'log_every', 'save_every',
                      'latent_size', 'recursion', 'video_frames'):

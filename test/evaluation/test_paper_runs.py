@@ -53,7 +53,7 @@ def test_names_are_unique_and_the_first_seed_comes_first():
 
 def test_rows_of_a_task_and_mode_differ_in_the_method_only():
     free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'outer_power', 'goal_picture',
-            'kl_weight'}  # and what +changed changes, for all rows with it
+            'kl_weight', 'initial_weights'}  # and what +changed changes, for all rows with it
     for scale in SCALES:
         settings = {}
         for run in paper_runs(scale):
@@ -61,6 +61,12 @@ def test_rows_of_a_task_and_mode_differ_in_the_method_only():
                       if name not in free}
             assert settings.setdefault(
                 (run.task, run.mode, run.variant == '+changed'), values) == values
+
+
+def test_the_command_of_three_objects_makes_what_it_begins_with():
+    run = PaperRun('push3', 'bidirectional', 'fix', new_pixels=False)
+    assert run.before in paper_runs('small')
+    assert f'--only {run.before.name} {run.name}' in run.command
 
 
 def test_full_has_the_papers_length():

@@ -200,6 +200,18 @@ def test_what_cannot_be_collected_fails_and_is_tried_once(places):
     assert 'other settings' in ends[0].reason
 
 
+def test_three_objects_begin_with_the_weights_for_two(places):
+    write_bag(Path(places.recordings) / 'push3', SEEDS)
+    run = replace(RUN, task='push3')
+    assert [(end.name, end.kind) for end in sweep([run], places, progress=False)] == [
+        (run.name, 'failed')]  # those are not trained
+    ends = sweep([run, run.before], places, jobs=2, progress=False)
+    assert [(end.name, end.kind) for end in ends] == [
+        (RUN.name, 'done'), (run.name, 'done')]
+    config = json.loads(places.result(run).read_text())['config']
+    assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
+
+
 @pytest.mark.slow
 def test_missing_recordings_are_collected(places):
     run = replace(RUN, task='grasp', episodes=2)

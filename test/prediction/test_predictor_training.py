@@ -52,6 +52,26 @@ def test_two_steps_and_two_more_equal_four(config, tmp_path, values):
     assert not halfway['network.head.0.weight'].equal(resumed['network.head.0.weight'])
 
 
+def test_a_training_can_begin_with_the_weights_of_another(config, tmp_path):
+    first = train(config, progress=False)
+    tuned = replace(config, out=str(tmp_path / 'tuned'), initial_weights=first, seed=1,
+                    learning_rate=1e-12, steps=2)
+    expected, begun = load_network(first)[0], load_network(train(tuned, progress=False))[0]
+    weights = dict(begun.named_parameters())
+    for name, tensor in expected.named_parameters():
+        assert torch.allclose(weights[name], tensor, atol=1e-6), name
+    Path(first).unlink()  # once begun, it goes on without them
+    train(replace(tuned, steps=2), progress=False)
+
+
+def test_weights_of_another_network_are_no_beginning(config, tmp_path):
+    first = train(config, stop_at=1, progress=False)
+    other = replace(config, out=str(tmp_path / 'other'), initial_weights=first, base_width=8)
+    with pytest.raises(ConfigError, match='base_width 4 instead of 8'):
+        train(other, progress=False)
+    assert not (Path(other.out) / 'checkpoint.safetensors').exists()
+
+
 def test_seed_decides(config, tmp_path):
     train(config, stop_at=1, progress=False)
     other = replace(config, seed=1, out=str(tmp_path / 'other'))

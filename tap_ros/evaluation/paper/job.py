@@ -58,6 +58,7 @@ def perform(run, places, minutes=None, fresh=False):
     :param minutes: stop training after so many; None: never.
     :param fresh: forget a training that was begun.
     :return: DONE, UNFINISHED if the time was not enough, BUSY if another process is at it.
+    :raises ConfigError: if the run that it begins with is not trained.
     """
     from tap_ros.prediction.training import train
 
@@ -67,11 +68,22 @@ def perform(run, places, minutes=None, fresh=False):
             return BUSY
         for name in _LEFT_BY_TRAINING if fresh else ():
             (folder / name).unlink(missing_ok=True)
+        _check_before(run.before, places)
         weights = train(config, minutes=minutes, progress=False)
         if read_json(folder / 'run.json')['steps'] < config.steps:
             return UNFINISHED
         write_json(places.result(run), score(run, config, weights, places))
     return DONE
+
+
+def _check_before(run, places):
+    """Refuse to begin with weights that are not there or half trained."""
+    if run is None:
+        return
+    steps = (read_json(run.folder(places.runs) / 'run.json') or {'steps': 0})['steps']
+    if steps < run.num_steps:
+        raise ConfigError(f'the weights of {run.name}, to begin with, are trained for {steps} of '
+                          f'{run.num_steps} steps; first: {run.command}')
 
 
 def score(run, config, weights, places):

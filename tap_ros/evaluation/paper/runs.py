@@ -126,9 +126,15 @@ class PaperRun:
         return self.steps or SCALES[self.scale].steps or self._steps_of(EPOCHS)
 
     @property
+    def before(self):
+        """The run whose weights this one begins with: three objects with those for two."""
+        return replace(self, task='push2') if self.task == 'push3' else None
+
+    @property
     def command(self):
         """The command that makes this run."""
-        words = ['python', '-m', 'tap_ros', 'paper', '--scale', self.scale, '--only', self.name]
+        names = [run.name for run in (self.before, self) if run]
+        words = ['python', '-m', 'tap_ros', 'paper', '--scale', self.scale, '--only', *names]
         for option, value in (('--seeds', self.seed), ('--episodes', self.episodes),
                               ('--steps', self.steps)):
             words += [option, str(value)] if value else []
@@ -150,7 +156,10 @@ class PaperRun:
         if parse_method(self.method).vae:
             settings |= _VAE
         settings |= VARIANTS[self.variant]
-        if not SCALES[self.scale].steps:
+        if self.before:
+            settings['initial_weights'] = str(
+                self.before.folder(runs) / 'predictor.safetensors')
+        elif not SCALES[self.scale].steps:
             settings['pretrain_steps'] = self._steps_of(PRETRAIN_EPOCHS)
         return TrainingConfig(
             recordings=(str(Path(recordings) / self.task),), out=str(self.folder(runs)),

@@ -156,6 +156,9 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
         for run in list(waiting):
             if run.task in failed or (collect_only and run.task in hashes):
                 waiting.remove(run)
+            elif run.before in [*waiting, *(job.run for job in active if job.run)] and (
+                    not collect_only):
+                continue
             elif run.task in hashes:
                 waiting.remove(run)
                 active.append(_start_run(
