@@ -14,7 +14,13 @@ from tap_ros.evaluation.paper.published import (
     GAINS,
     TITLES,
 )
-from tap_ros.evaluation.paper.rows import COPIES, find, lower_hull, method_order
+from tap_ros.evaluation.paper.rows import (
+    COPIES,
+    find,
+    lower_hull,
+    method_order,
+    variant_of,
+)
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
 COLOURS = {'copy': '#8c8c8c', 'fix': '#0072b2', 'min': '#e69f00', 'genmin': '#d55e00',
@@ -92,7 +98,7 @@ def forward_scatter(rows, task='grasp'):
     :param task: whose.
     :return: bytes of a PNG, or None without such rows.
     """
-    ours = {}
+    ours = {}  # a panel for each variant: errors are compared with fix of the same one
     for row in rows:
         if (row['metric'], row['task'], row['mode']) == ('min_l1', task, 'forward'):
             if row['method'] in COPIES or not row['new_pixels']:
@@ -100,21 +106,25 @@ def forward_scatter(rows, task='grasp'):
             step = find(rows, **{name: row[name] for name in (
                 'task', 'mode', 'method', 'new_pixels')}, metric='match_step')
             if step:
-                ours[row['method']] = (step['value'], row['value'], step, row)
+                variant = variant_of(row['method'])
+                ours.setdefault(variant, {})[row['method'].removesuffix(variant)] = (
+                    step['value'], row['value'], step, row)
     if not ours:
         return None
-    authors = {name: (*point, None, None) for name, point in FORWARD_GRASP.items()}
-    panels = [('ours', ours)] + ([("the authors'", authors)] if task == 'grasp' else [])
+    panels = [(f'ours {variant}'.strip(), ours[variant]) for variant in sorted(ours)]
+    if task == 'grasp':
+        panels.append(("the authors'", {
+            name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
     figure, axes = _new_figure(3.9, len(panels))
     for axis, (title, points) in zip(axes[0], panels):
-        _scatter(axis, points, FRAMES[task])
-        axis.set_title(f'{TITLES[task]}, forward: {title}', fontsize=10, loc='left', color=_INK)
+        _scatter(axis, points, FRAMES[task], 0.008 * len(panels))
+        axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
         axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
-        axis.set_ylabel('min l1', fontsize=9, color=_INK)
+    axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)
     return _png(figure)
 
 
-def _scatter(axis, points, frames):
+def _scatter(axis, points, frames, letter):
     """Draw one panel: a point for each method, and the lower hull of the fixed-time ones."""
     methods = sorted(points, key=method_order)
     high = 1.18 * max(points[m][1] for m in methods)
@@ -133,7 +143,7 @@ def _scatter(axis, points, frames):
         axis.plot(x, y, 's' if family(m) == 'fix' else 'o', color=colour, markersize=6,
                   markeredgecolor='white', markeredgewidth=0.6, zorder=3)
     at = np.array([points[m][:2] for m in methods]) / (frames, high)
-    for m, (x, y, align) in zip(methods, _place_labels(at, methods)):
+    for m, (x, y, align) in zip(methods, _place_labels(at, methods, letter)):
         axis.text(x * frames, y * high, m, fontsize=8, color=COLOURS[family(m)], va='center',
                   ha=align)
     axis.set_xlim(0, frames)
@@ -141,18 +151,19 @@ def _scatter(axis, points, frames):
     axis.grid(color='#f0f0f0')
 
 
-def _place_labels(at, texts):
+def _place_labels(at, texts, letter):
     """
     Put each label on that side of its point where it covers the least.
 
     :param at: (N, 2), points in shares of the panel.
     :param texts: N labels.
+    :param letter: width of a letter, in shares of the panel.
     :return: list of (x, y, horizontal alignment).
     """
     taken = [(x - 0.018, y - 0.022, x + 0.018, y + 0.022) for x, y in at]
     placed = []
     for (x, y), text in zip(at, texts):
-        width, best, tried = 0.0165 * len(text), None, []
+        width, best, tried = letter * len(text), None, []
         for dx, dy, align in ((0.028, 0, 'left'), (-0.028, 0, 'right'), (0.02, 0.04, 'left'),
                               (0.02, -0.04, 'left'), (-0.02, 0.04, 'right'),
                               (-0.02, -0.04, 'right'), (0, 0.055, 'center'),
