@@ -22,6 +22,7 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
         'forward': 'tap_ros.planning.train_command'}),
     'evaluate': ('score trained weights', {
         'prediction': 'tap_ros.evaluation.prediction',
+        'forward': 'tap_ros.evaluation.forward',
         'planning': 'tap_ros.evaluation.planning.command'}),
     'paper': ("make the paper's prediction results again", 'tap_ros.evaluation.paper.command'),
     'demo': ('push objects by way of a subgoal, with real nodes', 'tap_ros.nodes.demo'),

@@ -10,21 +10,37 @@ SCORED_STEPS = (1, 5, 10, 15)
 MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than this by then
 
 
-@torch.no_grad()
 def map_errors(model, store, episodes, stride=8, max_windows=400):
     """
-    Score the maps' expected pixels on recorded episodes.
+    Score the maps' expected pixels on recorded episodes, see measure_maps.
+
+    :return: dict of `map_error_px_{t}`, `true_simulator_px_{t}`, `nothing_moves_px_{t}`, means
+        over the objects that moved by step t, and `moved_{t}`, how many those are; empty without
+        object pixels.
+    """
+    scores = {}
+    for t, measured in measure_maps(model, store, episodes, stride, max_windows).items():
+        for name, values in measured.items():
+            scores[f'{name}_px_{t}'] = float(values.mean())
+        scores[f'moved_{t}'] = len(values)
+    return scores
+
+
+@torch.no_grad()
+def measure_maps(model, store, episodes, stride=8, max_windows=400):
+    """
+    Measure how far the maps' expected pixels end from where recorded objects went.
 
     Maps start at the recorded object pixels; these ground truths are used here only, never in
-    training. Every value is a mean over objects that moved.
+    training.
 
     :param model: ForwardModel.
     :param store: EpisodeStore; episodes: indices to score.
     :param stride: frames from one window's start to the next.
-    :return: dict of `map_error_px_{t}` (expected pixel against true pixel, per step t),
-        `nothing_moves_px_{t}`, `true_simulator_px_{t}` (maps put where the objects truly are by
-        then: what projection and the table's cells alone cost) and `moved_{t}` (how many
-        objects); empty without object pixels.
+    :return: dict from steps t to dicts of arrays (N,) in pixels, for the N objects that moved by
+        then: `map_error`, expected pixel against true pixel; `true_simulator`, maps put where the
+        objects truly are by then (what projection and the table's cells alone cost); and
+        `nothing_moves`, how far they moved. Steps at which none moved are left out.
     """
     horizon = SCORED_STEPS[-1]
     errors, moves, exact, table = [], [], [], model.pixel_table().flatten(0, 1)
@@ -48,15 +64,12 @@ def map_errors(model, store, episodes, stride=8, max_windows=400):
             ideal = (ideal.flatten(1) @ table).cpu().numpy().reshape(true[1:].shape)
             exact.append(np.linalg.norm(ideal - true[1:], axis=-1))
             moves.append(np.linalg.norm(true[1:] - true[:1], axis=-1))
-    scores = {}
-    for t in SCORED_STEPS:
-        moved = np.concatenate([m[t - 1] for m in moves]) if moves else np.zeros(0)
+    measured = {}
+    for t in SCORED_STEPS if moves else ():
+        moved, exact_t, error = (
+            np.concatenate([values[t - 1] for values in part]) for part in (moves, exact, errors))
         chosen = moved > MOVED_PIXELS
         if chosen.any():
-            error = np.concatenate([e[t - 1] for e in errors])
-            scores[f'map_error_px_{t}'] = float(error[chosen].mean())
-            floor = np.concatenate([e[t - 1] for e in exact])
-            scores[f'true_simulator_px_{t}'] = float(floor[chosen].mean())
-            scores[f'nothing_moves_px_{t}'] = float(moved[chosen].mean())
-            scores[f'moved_{t}'] = int(chosen.sum())
-    return scores
+            measured[t] = {'map_error': error[chosen], 'true_simulator': exact_t[chosen],
+                           'nothing_moves': moved[chosen]}
+    return measured

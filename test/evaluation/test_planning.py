@@ -19,7 +19,7 @@ from tap_ros.evaluation.planning.scenes import nearest_first, step_budget
 from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.images import to_float
 from tap_ros.planning.cem import CEMConfig
-from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_config import PAPER, VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.warp import one_hot_maps
@@ -162,6 +162,7 @@ def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):
 @pytest.mark.parametrize('text', [
     *BASES, 'genmin', 'true_model', 'genmin:half', 'fix0.25:recursion2:samples8:carried',
     'genmin+relative:true_maps', 'genmin:true_model:more_search', 'direct:every3',
+    'fix:paper',
     'true_subgoal:half:recursion2'])
 def test_the_name_of_a_method_reads_as_that_method(text):
     method = parse_method(text)
@@ -186,6 +187,7 @@ def test_impossible_methods_are_named(text):
 
 def test_options_change_the_planner():
     assert parse_method('direct:more_search').planner(QUICK).search.num_samples == 64
+    assert parse_method('fix:half:paper').planner(QUICK) == PAPER
     assert parse_method('direct:every3').planner(QUICK).replan_every == 3
     assert parse_method('direct').planner(QUICK) == QUICK
 

@@ -3,10 +3,12 @@
 """Laws of the planning results: resumed, paired, refused when damaged; the whole command."""
 
 import json
+from pathlib import Path
 
 import pytest
 from tap_ros.cli import main
 from tap_ros.errors import ConfigError
+from tap_ros.evaluation import forward
 from tap_ros.evaluation.planning.films import pick_scenes
 from tap_ros.evaluation.planning.methods import parse_method
 from tap_ros.evaluation.planning.page import make_page
@@ -17,6 +19,7 @@ from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
+SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
 QUICK = VisualMPCConfig(search=CEMConfig(8, 1, 4), proposals=4, batch_size=8, threads=1)
 
 
@@ -68,7 +71,8 @@ def test_damaged_files_are_named_and_kept(tmp_path, damage):
 
 def test_rows_are_means_with_intervals_and_paired_differences():
     results = dict([stored('direct', [10.0, 14.0, 12.0]), stored('fix', [12.0, 16.0], 1),
-                    stored('genmin', [4.0, 8.0, 6.0]), stored('nothing', [20.0])])
+                    stored('genmin', [4.0, 8.0, 6.0]), stored('nothing', [20.0]),
+                    stored('genmin:true_maps', [2.0, 6.0, 4.0])])
     rows = {(r['method'], r['metric'], r.get('against')): r for r in make_rows(results)}
     direct = rows['direct', 'final_distance_cm', None]
     assert direct['value'] == 12 and direct['n'] == 3 and direct['seeds'] == 1
@@ -76,6 +80,8 @@ def test_rows_are_means_with_intervals_and_paired_differences():
     assert direct['standard_error'] == pytest.approx(2 / 3 ** 0.5, abs=1e-4)
     gain = rows['genmin', 'final_distance_difference_cm', 'direct']
     assert gain['value'] == gain['ci_low'] == gain['ci_high'] == -6  # in each scene
+    replaced = rows['genmin:true_maps', 'final_distance_difference_cm', 'genmin']
+    assert replaced['value'] == pytest.approx(-2)
     paired = rows['genmin', 'final_distance_difference_cm', 'fix']
     assert paired['n'] == 2 and paired['value'] == pytest.approx((8 - 12 + 6 - 16) / 2)
     assert rows['genmin', 'success_5cm', None]['value'] == pytest.approx(1 / 3, abs=1e-4)
@@ -91,6 +97,27 @@ def test_the_page_shows_the_papers_numbers_beside_ours():
     assert '12.9 ± 0.6' in line and '12.0 [10.0, 14.0]' in line and '| 2 |' in line
     line, = [line for line in page.splitlines() if line.startswith('| `genmin:half`')]
     assert '-6.0 [-6.0, -6.0]' in line and '![direct](planning/x.png)' in page
+
+
+def test_the_page_tells_what_replacing_a_part_changes_and_how_good_the_maps_are():
+    rows = make_rows(dict([stored('genmin', [4.0, 8.0]), stored('genmin:true_maps', [2.0, 6.0])]))
+    measured = {5: {'map_error': [1.0, 2.0], 'nothing_moves': [6.0, 6.0],
+                    'true_simulator': [0.1, 0.1]}}
+    page = make_page(rows, {}, forward.make_rows('push3', measured, 'abc', 'do it'), 'We found x.')
+    assert '| `genmin:true_maps` | -2.0 [-2.0, -2.0] | 2 |' in page
+    assert '| push3 | forward_model | 1.50 [1.00, 2.00], n = 2 |' in page
+    assert page.index('We found x.') < page.index('## Two objects')
+
+
+def test_forward_models_are_scored_beside_standing_still(tmp_path, capsys):
+    words = ['evaluate', 'forward', '--recordings', str(SAMPLE), '--out', str(tmp_path)]
+    assert main([*words, '--test-fraction', '1']) == 0
+    rows = json.loads((tmp_path / forward.FILE).read_text())
+    last = {row['method']: row['value'] for row in rows if row['step'] == 15}
+    assert last['true_simulator'] < last['forward_model'] < last['nothing']
+    assert {row['task'] for row in rows} == {SAMPLE.name}
+    assert main([*words, '--test-fraction', '0']) == 1
+    assert '--test-fraction 1' in capsys.readouterr().err
 
 
 def test_films_show_the_best_the_median_and_the_worst_scene():

@@ -3,11 +3,13 @@
 """The command line of Table 2: python -m tap_ros evaluate planning."""
 
 from dataclasses import replace
+import json
 import os
 from pathlib import Path
 import shlex
 
 from tap_ros.errors import ConfigError
+from tap_ros.evaluation import forward
 from tap_ros.evaluation.planning.films import write_films
 from tap_ros.evaluation.planning.methods import parse_method
 from tap_ros.evaluation.planning.page import make_page
@@ -32,8 +34,8 @@ def add_arguments(parser):
     add('--methods', nargs='+', default=DEFAULT_METHODS, metavar='METHOD',
         help='nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped (the '
         'shipped predictor) or the name of another one; with options behind colons: half, '
-        'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, every<n>, for '
-        'example genmin:half:carried (default: ' + ' '.join(DEFAULT_METHODS) + ')')
+        'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper, every<n>, '
+        'for example genmin:half:carried (default: ' + ' '.join(DEFAULT_METHODS) + ')')
     add('--predictor', nargs='+', default=[], metavar='NAME=FILE',
         help='weights of predictors; {task} in FILE stands for the task (default: what '
         f'the command paper trained: {TRAINED})')
@@ -92,7 +94,11 @@ def run(args):
     if not rows:
         raise ConfigError(f'{out / "planning"}: holds no results; run without --results-only')
     write_rows(out / 'planning.json', rows)
-    (out / 'planning.md').write_text(make_page(rows, _all_films(out, rows, films)))
+    maps, findings = out / forward.FILE, out / 'planning_findings.md'
+    (out / 'planning.md').write_text(make_page(
+        rows, _all_films(out, rows, films),
+        json.loads(maps.read_text()) if maps.exists() else (),
+        findings.read_text() if findings.exists() else ''))
     for row in rows:
         if row['metric'] == 'final_distance_cm':
             print(f'  {row["task"]} {row["method"]:24} {row["value"]:5.1f} cm '

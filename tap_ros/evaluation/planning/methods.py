@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields, replace
 import re
 
 from tap_ros.errors import ConfigError
+from tap_ros.planning.mpc_config import PAPER
 
 BASES = ('nothing', 'direct', 'one_object', 'oracle_order', 'true_subgoal')
 BOUNDS = ('one_object', 'oracle_order', 'true_subgoal', 'true_model')
@@ -20,6 +21,7 @@ OPTIONS = {  # option: (field, value; None: the number behind it)
     'recursion': ('recursion', None), 'samples': ('samples', None),
     'carried': ('tracking', 'carried'), 'true_maps': ('maps', 'true'),
     'true_model': ('model', 'true'), 'more_search': ('search', 'more'),
+    'paper': ('search', 'paper'),
     'every': ('replan_every', None)}
 SUBGOALS_ONLY = ('switch', 'recursion', 'samples', 'maps')
 
@@ -38,7 +40,8 @@ class Method:
     :param tracking: 'ground_truth': object pixels from the simulator at every step; 'carried':
         only in the first picture, then followed by planning.tracking.
     :param model: 'learned' or 'true', the simulator itself.
-    :param search: 'preset', or 'more': four times the samples, five iterations.
+    :param search: 'preset'; 'more': four times the samples, five iterations; 'paper': the paper's
+        planner, mpc_config.PAPER.
     :param replan_every: see VisualMPCConfig; 0: as the preset has it.
     """
 
@@ -76,6 +79,8 @@ class Method:
 
     def planner(self, config):
         """Return a VisualMPCConfig changed as this method wants it."""
+        if self.search == 'paper':
+            config = PAPER
         search = config.search
         if self.search == 'more':
             search = replace(search, num_samples=4 * search.num_samples, num_iterations=5)

@@ -30,31 +30,38 @@ the paper does, otherwise a subgoal is left when it is reached or half the budge
 `recursion2` takes two subgoals in a row; `samples8` chooses among 8 by the planner's own cost;
 `true_maps` takes the objects' positions from the true configuration that looks most like the
 predicted picture; `true_model` plans with the simulator; `more_search` searches with four times
-the samples and five iterations; `every2` plans anew at every second action. Object pixels come
-from the simulator's ground truth at every step, except with `carried`: there only in the first
-picture, then the forward model carries them and the camera's pictures correct them.
+the samples and five iterations; `paper` searches as the paper does, with displacements drawn
+from a Gaussian instead of whole pushes and no warm start; `every2` plans anew at every second
+action. Object pixels come from the simulator's ground truth at every step, except with `carried`:
+there only in the first picture, then the forward model carries them and the camera's pictures
+correct them.
 """
 
 
-def make_page(rows, strips):
+def make_page(rows, strips, maps=(), findings=''):
     """
     Write the page.
 
     :param rows: of results.make_rows.
     :param strips: dict (task, method) -> (file name of the film strip, caption).
+    :param maps: rows of evaluation.forward; may be empty.
+    :param findings: Markdown that a person wrote, to stand first.
     :return: Markdown.
     """
     parts = [
         '# Planning results\n',
         'Made by `python -m tap_ros evaluate planning` from the files in [planning](planning), '
-        'never typed; as data: [planning.json](planning.json).\n', HOW_TO_READ]
+        'never typed; as data: [planning.json](planning.json).\n',
+        *([findings] if findings else []), HOW_TO_READ]
     for task in dict.fromkeys(row['task'] for row in rows):
         own = [row for row in rows if row['task'] == task]
         budget = own[0]['step_budget']
         parts += [f'## {TITLES.get(task, task)}, at most {budget} steps\n', _table(task, own)]
+        parts += _replaced(own)
         for (of, method), (name, caption) in strips.items():
             if of == task:
                 parts.append(f'**{method}**, {caption}:\n\n![{method}]({name})\n')
+    parts += _maps(maps)
     parts.append('## Commands\n')
     parts += [f'    {command}' for command in dict.fromkeys(row['command'] for row in rows)]
     return '\n'.join(parts) + '\n'
@@ -78,6 +85,39 @@ def _table(task, rows):
             f'{own["plan_ms", None]["value"]:.0f}' if ('plan_ms', None) in own else '',
             search if method != 'nothing' else '', str(final['n'])]) + ' |')
     return '\n'.join(lines) + '\n'
+
+
+def _replaced(rows):
+    """Say what replacing one part of the chain changes."""
+    changed = [row for row in rows if row['metric'] == 'final_distance_difference_cm'
+               and row['against'] == row['method'].split(':')[0]]
+    if not changed:
+        return []
+    lines = ['| one part replaced | minus the method as it is, cm | scenes |', '|---|---:|---:|']
+    lines += [f'| `{row["method"]}` | {_value(row, "+.1f")} | {row["n"]} |'
+              for row in sorted(changed, key=lambda row: _rank(row['method']))]
+    return ['\n'.join(lines) + '\n']
+
+
+def _maps(rows):
+    """Write the table of the forward model's maps."""
+    if not rows:
+        return []
+    steps = list(dict.fromkeys(row['step'] for row in rows))
+    lines = ['| recording | | ' + ' | '.join(f'step {step}' for step in steps) + ' |',
+             '|---|---|' + '---:|' * len(steps)]
+    for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
+        own = {row['step']: row for row in rows if (row['task'], row['method']) == (task, method)}
+        lines.append(f'| {task} | {method} | ' + ' | '.join(
+            f'{_value(own[step], ".2f")}, n = {own[step]["n"]}' if step in own else ''
+            for step in steps) + ' |')
+    return ['## Object maps carried by the forward model\n',
+            'Pixels from the expected pixel of the map to the true one, so many control periods '
+            'ahead, on held-out episodes, for objects that moved more than 2 px; maps begin at '
+            'the true pixels. A pixel is about 1.6 cm on the table. The true simulator has an '
+            'error, too: that of the grid on which maps are kept.\n', '\n'.join(lines) + '\n',
+            *(f'    {command}' for command in dict.fromkeys(
+                row['command'] for row in rows)), '']
 
 
 def _rank(method):

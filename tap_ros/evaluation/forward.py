@@ -1,0 +1,83 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m tap_ros evaluate forward`: how well object maps are carried."""
+
+import json
+from pathlib import Path
+import shlex
+
+from tap_ros.errors import ConfigError
+from tap_ros.evaluation.intervals import mean_interval
+from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
+from tap_ros.prediction.batches import split_episodes
+from tap_ros.recording.cache import open_recordings
+from tap_ros.weights import FORWARD_MODEL
+
+METHODS = {'map_error': 'forward_model', 'nothing_moves': 'nothing',
+           'true_simulator': 'true_simulator'}
+FILE = 'forward_model.json'
+
+
+def add_arguments(parser):
+    """Add the options of the command to a parser."""
+    parser.add_argument('--recordings', nargs='+', required=True, metavar='BAG',
+                        help='bag folders with object pixels; each is scored on its own')
+    parser.add_argument('--weights', default=str(FORWARD_MODEL), metavar='FILE',
+                        help='of a forward model (default: the shipped ones)')
+    parser.add_argument('--test-fraction', type=float, default=0.05,
+                        help='share of the episodes that training held out, by seed; 1: all '
+                        '(default: %(default)s)')
+    parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
+    parser.add_argument('--out', metavar='FOLDER', help=f'write {FILE} there')
+
+
+def run(args):
+    """
+    Print a table, and write what --out asks for.
+
+    :raises ConfigError: if there is nothing to score, or the pictures have another size.
+    """
+    model = load_forward_model(args.weights, args.device)
+    rows = []
+    for recording in args.recordings:
+        store = open_recordings([recording])
+        if store.image_size != (model.config.image_size,) * 2:
+            raise ConfigError(f'{args.weights}: made for {model.config.image_size} pixels a side, '
+                              f'{recording} has {store.image_size}; use matching ones')
+        fraction = min(args.test_fraction, 1)
+        held_out = range(len(store)) if fraction == 1 else split_episodes(store, fraction)[1]
+        measured = measure_maps(model, store, held_out)
+        if not measured:
+            raise ConfigError(f'{recording}: no held-out episode of 16 frames or more has object '
+                              'pixels that move; give more of them, or --test-fraction 1')
+        command = shlex.join(['python', '-m', 'tap_ros', 'evaluate', 'forward', '--recordings',
+                              recording])
+        rows += make_rows(Path(recording).name, measured, store.data_hash, command)
+    print(f'error of the expected pixel, px, for objects that moved more than {MOVED_PIXELS:.0f} '
+          'px; maps begin at the true pixels; in brackets 95% intervals over the objects')
+    for row in rows:
+        print(f'{row["task"]:12s} step {row["step"]:2d}  {row["method"]:16s}{row["value"]:6.2f} '
+              f'({row["ci_low"]:.2f}, {row["ci_high"]:.2f}), {row["n"]} objects')
+    if args.out:
+        path = Path(args.out) / FILE
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text('[\n' + ',\n'.join(json.dumps(row) for row in rows) + '\n]\n')
+
+
+def make_rows(task, measured, data_hash, command):
+    """
+    Turn measurements into rows.
+
+    :param task: name of the recording; measured: of measure_maps; data_hash: of the recording.
+    :return: list of dicts: task, method, metric, step, value, ci_low, ci_high (px), n, data_hash,
+        command.
+    """
+    rows = []
+    for step, parts in measured.items():
+        for name, method in METHODS.items():
+            value, low, high = (round(x, 4) for x in mean_interval(parts[name]))
+            rows.append({'task': task, 'method': method, 'metric': 'map_error_px', 'step': step,
+                         'value': value, 'ci_low': low, 'ci_high': high, 'n': len(parts[name]),
+                         'data_hash': data_hash, 'command': command})
+    return rows
