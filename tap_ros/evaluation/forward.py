@@ -51,8 +51,11 @@ def run(args):
         if not measured:
             raise ConfigError(f'{recording}: no held-out episode of 16 frames or more has object '
                               'pixels that move; give more of them, or --test-fraction 1')
-        command = shlex.join(['python', '-m', 'tap_ros', 'evaluate', 'forward', '--recordings',
-                              recording])
+        words = ['python', '-m', 'tap_ros', 'evaluate', 'forward', '--recordings', recording]
+        for option, value, usual in (('--weights', args.weights, str(FORWARD_MODEL)),
+                                     ('--test-fraction', args.test_fraction, 0.05)):
+            words += [option, str(value)] if value != usual else []
+        command = shlex.join(words)
         rows += make_rows(Path(recording).name, measured, store.data_hash, command)
     print(f'error of the expected pixel, px, for objects that moved more than {MOVED_PIXELS:.0f} '
           'px; maps begin at the true pixels; in brackets 95% intervals over the objects')

@@ -38,6 +38,7 @@ import torch
 from torch import nn
 
 MOVE_LIMIT = (0.08, 0.08, 0.15)  # m per control period
+LEAST_MASS = 0.05  # of a carried map, beneath which it is lost
 CLEAR = 0.1  # m, gripper height above which no object is touched
 
 
@@ -236,10 +237,12 @@ class ForwardModel(nn.Module):
 
         :param maps: (N, K, n, n) on the table grid, in the first picture.
         :param flow: (N, n, n, 2), table units.
-        :return: (N, K, n, n), each summing to 1; mass that left the table is gone.
+        :return: (N, K, n, n), each summing to 1, or to 0 where nearly all of it was lost: a flow
+            that jumps over an object or off the table does not say where it went.
         """
         carried = sample(maps, self.grid + flow, 'zeros')
-        return carried / carried.sum((-1, -2), keepdim=True).clamp_min(1e-6)
+        mass = carried.sum((-1, -2), keepdim=True)
+        return torch.where(mass < LEAST_MASS, 0, carried / mass.clamp_min(LEAST_MASS))
 
     def picture(self, scene, flow, arm, homography=None):
         """

@@ -177,7 +177,7 @@ class VisualMPC:
         :param actions: (N, horizon, 4).
         :return: costs (N,) numpy; expected distance at the horizon's end, px, mean over objects.
         """
-        config = self.config
+        config, worst = self.config, distance.amax(1)
 
         @torch.inference_mode()
         def judge(part):
@@ -186,7 +186,9 @@ class VisualMPC:
             part = torch.cat([part, part[-1:].expand(config.batch_size - count, -1, -1)])
             for carried in self.model.carried_maps(
                     features, gripper, maps, part, config.cost_every):
-                last = torch.einsum('nkc,kc->nk', carried.flatten(2), distance)
+                carried = carried.flatten(2)
+                last = torch.einsum('nkc,kc->nk', carried, distance)
+                last = last + (1 - carried.sum(2)) * worst  # a lost object is as far as can be
                 total, seen = total + last.sum(1), seen + 1
             steps = config.segments * config.repeat
             total = (total - last.sum(1)) * (steps - 1) / max(1, seen - 1)

@@ -159,6 +159,13 @@ def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):
     np.testing.assert_array_equal(runs[0].actions, runs[1].actions)
 
 
+def test_objects_can_be_followed_by_pictures_while_the_simulator_plans(simulator, mpc):
+    method = parse_method('true_model:carried')
+    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(QUICK))
+    run = run_episode(simulator, planner, method, 2, 5)
+    assert len(run.actions) == 2 and run.tracking_error() < 2
+
+
 @pytest.mark.parametrize('text', [
     *BASES, 'genmin', 'true_model', 'genmin:half', 'fix0.25:recursion2:samples8:carried',
     'genmin+relative:true_maps', 'genmin:true_model:more_search', 'direct:every3',

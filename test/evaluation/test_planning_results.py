@@ -12,7 +12,7 @@ from tap_ros.evaluation import forward
 from tap_ros.evaluation.planning.films import pick_scenes
 from tap_ros.evaluation.planning.methods import parse_method
 from tap_ros.evaluation.planning.page import make_page
-from tap_ros.evaluation.planning.results import make_rows
+from tap_ros.evaluation.planning.results import make_rows, partners
 from tap_ros.evaluation.planning.runs import Job, read_results, ResultFile, run_jobs
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.mpc_config import VisualMPCConfig
@@ -74,6 +74,7 @@ def test_rows_are_means_with_intervals_and_paired_differences():
                     stored('genmin', [4.0, 8.0, 6.0]), stored('nothing', [20.0]),
                     stored('genmin:true_maps', [2.0, 6.0, 4.0])])
     rows = {(r['method'], r['metric'], r.get('against')): r for r in make_rows(results)}
+    assert {r['compares'] for r in rows.values() if r.get('against') == 'genmin'} == {'maps'}
     direct = rows['direct', 'final_distance_cm', None]
     assert direct['value'] == 12 and direct['n'] == 3 and direct['seeds'] == 1
     assert direct['ci_low'] <= 12 <= direct['ci_high']
@@ -90,6 +91,28 @@ def test_rows_are_means_with_intervals_and_paired_differences():
     assert all(row['tracking'] == 'ground_truth' for row in rows.values())
 
 
+def test_methods_are_compared_in_the_same_planner():
+    names = {'direct', 'direct:paper', 'true_model', 'fix', 'fix:half', 'genmin', 'genmin:half',
+             'genmin:half:paper', 'genmin:true_model', 'true_subgoal', 'nothing'}
+
+    def compared(name):
+        return dict(partners(parse_method(name), names))
+
+    assert compared('genmin:half:paper') == {'direct': 'direct:paper', 'search': 'genmin:half'}
+    assert compared('genmin:half') == {'direct': 'direct', 'fix': 'fix:half', 'switch': 'genmin'}
+    assert compared('genmin:true_model') == {'direct': 'true_model', 'model': 'genmin'}
+    assert compared('true_model') == {'model': 'direct'}
+    assert partners(parse_method('true_subgoal'), names)[2:] == [
+        ('subgoal', 'fix'), ('subgoal', 'genmin')]
+    assert compared('nothing') == {}
+
+
+def test_results_of_other_settings_are_not_subtracted():
+    results = dict([stored('direct', [9.0]), stored('genmin', [4.0])])
+    results['push2', 'direct'][0]['preset'] = 'quick'
+    assert not any('against' in row for row in make_rows(results))
+
+
 def test_the_page_shows_the_papers_numbers_beside_ours():
     rows = make_rows(dict([stored('direct', [10.0, 14.0]), stored('genmin:half', [4.0, 8.0])]))
     page = make_page(rows, {('push2', 'direct'): ('planning/x.png', 'three scenes')})
@@ -104,7 +127,7 @@ def test_the_page_tells_what_replacing_a_part_changes_and_how_good_the_maps_are(
     measured = {5: {'map_error': [1.0, 2.0], 'nothing_moves': [6.0, 6.0],
                     'true_simulator': [0.1, 0.1]}}
     page = make_page(rows, {}, forward.make_rows('push3', measured, 'abc', 'do it'), 'We found x.')
-    assert '| `genmin:true_maps` | -2.0 [-2.0, -2.0] | 2 |' in page
+    assert '| its maps | `genmin:true_maps` | `genmin` | -2.0 [-2.0, -2.0] | 2 |' in page
     assert '| push3 | forward_model | 1.50 [1.00, 2.00], n = 2 |' in page
     assert page.index('We found x.') < page.index('## Two objects')
 

@@ -16,7 +16,6 @@ from tap_ros.evaluation.planning.page import make_page
 from tap_ros.evaluation.planning.results import load_results, make_rows, write_rows
 from tap_ros.evaluation.planning.runs import Job, run_jobs
 from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS
-from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.weights import find_predictor, FORWARD_MODEL
@@ -34,8 +33,9 @@ def add_arguments(parser):
     add('--methods', nargs='+', default=DEFAULT_METHODS, metavar='METHOD',
         help='nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped (the '
         'shipped predictor) or the name of another one; with options behind colons: half, '
-        'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper, every<n>, '
-        'for example genmin:half:carried (default: ' + ' '.join(DEFAULT_METHODS) + ')')
+        'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper (its search, '
+        'whatever --preset says), every<n>, for example genmin:half:carried (default: '
+        + ' '.join(DEFAULT_METHODS) + ')')
     add('--predictor', nargs='+', default=[], metavar='NAME=FILE',
         help='weights of predictors; {task} in FILE stands for the task (default: what '
         f'the command paper trained: {TRAINED})')
@@ -136,7 +136,7 @@ def make_jobs(args):
                         f'method {method.name!r}: no weights {file}; name them with --predictor '
                         f'{method.base}=FILE, or leave the method out with --methods')
             jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
-                            args.step_budget, _command(args, task, method)))
+                            args.step_budget, args.preset, _command(args, task, method)))
     return jobs
 
 
@@ -144,10 +144,10 @@ def changed(planner, samples, iterations, replan_every):
     """Return a VisualMPCConfig with what is not 0 changed, its other numbers in proportion."""
     search = planner.search
     share = (samples or search.num_samples) / search.num_samples
-    search = CEMConfig(
-        samples or search.num_samples, iterations or search.num_iterations,
-        max(2, round(share * search.num_elites)) if samples else search.num_elites,
-        search.smoothing, search.min_std)
+    search = replace(
+        search, num_samples=samples or search.num_samples,
+        num_iterations=iterations or search.num_iterations,
+        num_elites=max(2, round(share * search.num_elites)) if samples else search.num_elites)
     return replace(planner, search=search, proposals=int(share * planner.proposals),
                    replan_every=replan_every or planner.replan_every)
 
@@ -165,10 +165,12 @@ def _command(args, task, method):
     """Return the command that makes the numbers of one method again."""
     words = ['python -m tap_ros evaluate planning --tasks', task, '--methods', method.name,
              '--scenes', str(args.scenes)]
-    for option in ('preset', 'plan_samples', 'plan_iterations', 'replan_every', 'step_budget'):
+    for option, usual in (('seed', FIRST_SCENE), ('preset', 'default'), ('plan_samples', 0),
+                          ('plan_iterations', 0), ('replan_every', 0), ('step_budget', 0),
+                          ('forward_weights', str(FORWARD_MODEL)), ('device', 'cpu')):
         value = getattr(args, option)
-        if value and value != 'default':
-            words += ['--' + option.replace('_', '-'), str(value)]
+        if value != usual:
+            words += ['--' + option.replace('_', '-'), shlex.quote(str(value))]
     words += [word for text in args.predictor if text.split('=')[0] == method.base
               for word in ('--predictor', shlex.quote(text))]
     return ' '.join(words)

@@ -71,7 +71,8 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
         targets = [Target(goal.object_pixels[chosen])]
     tracker = None
     if method.tracking == 'carried':
-        tracker = ObjectTracker(mpc.model, seen.image, seen.gripper, seen.object_pixels)
+        model = getattr(mpc.model, 'learned', mpc.model)
+        tracker = ObjectTracker(model, seen.image, seen.gripper, seen.object_pixels)
     itinerary = Itinerary(targets, step_budget, method.switch, reached)
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
     pixels = seen.object_pixels

@@ -5,13 +5,14 @@
 from pathlib import Path
 
 import numpy as np
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.evaluation.planning.episode import as_recording
 from tap_ros.evaluation.planning.runs import plan_scene
 from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import EpisodeWriter
 
+SAME_CM = 0.01
 PICTURES = 10  # in a strip, besides the subgoals and the goal
 
 
@@ -30,6 +31,7 @@ def write_films(job, scenes, picture, recording):
     :param picture: .png file: a row for each scene.
     :param recording: .mcap file: an episode for each scene.
     :return: caption of the picture.
+    :raises ConfigError: if a scene does not end as it did.
     """
     seeds = pick_scenes(scenes)
     words = [f'{scenes[s]["final_cm"]:.1f} cm (scene {s})' for s in seeds]
@@ -44,7 +46,12 @@ def write_films(job, scenes, picture, recording):
     with EpisodeWriter(recording) as writer:
         for seed in seeds:
             runs, final = plan_scene(job, seed)
-            run = runs[0]
+            run, before = runs[0], scenes[seed]['final_cm']
+            if abs(100 * final.mean() - before) > SAME_CM:
+                raise ConfigError(
+                    f'{job.method.name}: scene {seed} ended at {100 * final.mean():.2f} cm, not '
+                    f'at {before:.2f} cm as in the results, which are of another machine or '
+                    'version; remove them, or give --no-films')
             outcome = 'success' if (final < 0.05).all() else 'failure'
             writer.write(as_recording(run, job.task, seed, outcome))
             rows.append([*film_strip(run.frames, PICTURES),

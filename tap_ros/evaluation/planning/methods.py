@@ -66,7 +66,7 @@ class Method:
         parts = []
         for word, (field, value) in OPTIONS.items():
             mine = getattr(self, field)
-            if mine != _DEFAULTS[field] and value in (None, mine):
+            if mine != DEFAULTS[field] and value in (None, mine):
                 parts.append(word if value else f'{word}{mine}')
         if self.base == 'direct' and parts == ['true_model']:
             return 'true_model'
@@ -92,7 +92,7 @@ class Method:
         return config
 
 
-_DEFAULTS = {field.name: field.default for field in fields(Method)}
+DEFAULTS = {field.name: field.default for field in fields(Method)}
 
 
 def parse_method(text, **defaults):
@@ -124,8 +124,8 @@ def parse_method(text, **defaults):
     if base in ('oracle_order',):
         unused.remove('switch')
     if base == 'nothing':
-        unused = [f for f in _DEFAULTS if f != 'base']
-    method = Method(**(values | {field: _DEFAULTS[field] for field in unused}))
+        unused = [f for f in DEFAULTS if f != 'base']
+    method = Method(**(values | {field: DEFAULTS[field] for field in unused}))
     if min(method.recursion, method.samples) < 1:
         raise ConfigError(f'method {text!r}: recursion and samples are at least 1')
     if method.samples > 1 and method.model == 'true':

@@ -10,16 +10,21 @@ PAPER = {  # Table 2: mean final distance in cm and its standard error
     ('push3', 'fix'): (17.6, 0.6), ('push3', 'genmin'): (12.9, 0.7)}
 PAPER_NOTHING, PAPER_ONE_OBJECT = '20', 'about 5'
 TITLES = {'push2': 'Two objects', 'push3': 'Three objects'}
+PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward model',
+         'search': 'the search', 'tracking': 'object pixels', 'switch': 'when to go on',
+         'recursion': 'number of subgoals', 'samples': 'number of samples',
+         'replan_every': 'how often to plan'}
 FIRST = ('nothing', 'direct', 'fix', 'genmin')
 
 HOW_TO_READ = """\
 Final distances are in three dimensions from each object's origin to its goal, mean over the
-objects, in centimetres; a success has every object within 5 cm. In brackets are 95% bootstrap
-intervals over scenes. All methods push the same scenes, so that differences are paired: less than
-0 is better. The time of a plan is that of one thread beside others that plan at the same time;
-`python -m tap_ros bench planning` measures the speed. The paper's numbers (with their standard
-error) are from its own world, objects and planner: the order of methods can be compared, the
-centimetres only roughly.
+objects, in centimetres, with their standard error; a success has every object within 5 cm. In
+brackets are 95% bootstrap intervals over scenes. All methods push the same scenes, so that
+differences are paired: less than 0 is better. Each method is compared with `direct` and `fix` in
+the same planner. The time of a plan is that of one thread beside others that plan at the same
+time; `python -m tap_ros bench planning` measures the speed. The paper's numbers (with their
+standard error) are from its own world, objects and planner: the order of methods can be compared,
+the centimetres only roughly.
 
 `one_object`, `oracle_order`, `true_subgoal` and `true_model` are bounds, which know more than a
 robot would: each object alone with the whole budget; one object after another, the nearest first;
@@ -73,14 +78,15 @@ def _table(task, rows):
              '| all within 5 cm | steps | ms a plan | samples | scenes |', '|---' * 10 + '|']
     methods = list(dict.fromkeys(row['method'] for row in rows))
     for method in sorted(methods, key=_rank):
-        own = {(r['metric'], r.get('against')): r for r in rows if r['method'] == method}
+        own = {(r['metric'], r.get('compares')): r for r in rows if r['method'] == method}
         final = own['final_distance_cm', None]
         search = f'{final["planner_samples"]} x {final["planner_iterations"]}'
         lines.append('| ' + ' | '.join([
-            f'`{method}`', _paper(task, method), _value(final),
+            f'`{method}`', _paper(task, method),
+            f'{_value(final)} ± {final["standard_error"]:.1f}',
             _value(own.get(('final_distance_difference_cm', 'direct')), '+.1f'),
             _value(own.get(('final_distance_difference_cm', 'fix')), '+.1f'),
-            f'{100 * own["success_5cm", None]["value"]:.0f}%',
+            _share(own['success_5cm', None]),
             f'{own["steps", None]["value"]:.0f}',
             f'{own["plan_ms", None]["value"]:.0f}' if ('plan_ms', None) in own else '',
             search if method != 'nothing' else '', str(final['n'])]) + ' |')
@@ -88,14 +94,17 @@ def _table(task, rows):
 
 
 def _replaced(rows):
-    """Say what replacing one part of the chain changes."""
+    """Say what replacing one part of the chain by another, or by its true counterpart, changes."""
     changed = [row for row in rows if row['metric'] == 'final_distance_difference_cm'
-               and row['against'] == row['method'].split(':')[0]]
+               and row['compares'] in PARTS]
     if not changed:
         return []
-    lines = ['| one part replaced | minus the method as it is, cm | scenes |', '|---|---:|---:|']
-    lines += [f'| `{row["method"]}` | {_value(row, "+.1f")} | {row["n"]} |'
-              for row in sorted(changed, key=lambda row: _rank(row['method']))]
+    lines = ['| part replaced | | instead of | changes the final distance by, cm | scenes |',
+             '|---|---|---|---:|---:|']
+    lines += [f'| {PARTS[row["compares"]]} | `{row["method"]}` | `{row["against"]}` '
+              f'| {_value(row, "+.1f")} | {row["n"]} |'
+              for row in sorted(changed, key=lambda row: (
+                  list(PARTS).index(row['compares']), _rank(row['method'])))]
     return ['\n'.join(lines) + '\n']
 
 
@@ -130,8 +139,13 @@ def _rank(method):
 def _paper(task, method):
     if method in ('nothing', 'one_object'):
         return PAPER_NOTHING if method == 'nothing' else PAPER_ONE_OBJECT
-    value = PAPER.get((task, method))
+    value = PAPER.get((task, method.replace(':half', '').replace(':paper', '')))
     return f'{value[0]} ± {value[1]}' if value else ''
+
+
+def _share(row):
+    return '{:.0f}% [{:.0f}, {:.0f}]'.format(
+        *(100 * row[name] for name in ('value', 'ci_low', 'ci_high')))
 
 
 def _value(row, form='.1f'):

@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbers from result files: means with intervals, and differences between paired scenes."""
 
+from dataclasses import replace
 import json
 from pathlib import Path
 
 import numpy as np
 from tap_ros.evaluation.intervals import mean_interval
-from tap_ros.evaluation.planning.methods import parse_method
+from tap_ros.evaluation.planning.methods import BASES, DEFAULTS, parse_method, SUBGOALS_ONLY
 from tap_ros.evaluation.planning.runs import read_results
 
-BASELINES = ('direct', 'fix')
+# Results are compared where these settings agree; what an option changes is not among them.
+SAME = ('step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
 SUCCESS_CM = 5.0
 
 
@@ -33,14 +35,15 @@ def make_rows(results):
     """
     Turn results into the rows of planning.json.
 
-    A difference is this method minus a baseline, over the scenes that both were run on, so that
-    less than 0 is better: minus direct, minus fix, and minus the same method without options.
-    Intervals are of 95%, by bootstrap over scenes.
+    A difference is this method minus another, over the scenes that both were run on, so that less
+    than 0 is better; see partners. Intervals are of 95%, by bootstrap over scenes.
 
     :param results: of load_results.
     :return: list of dicts.
     """
-    rows = []
+    rows, names = [], {}
+    for task, name in results:
+        names.setdefault(task, set()).add(name)
     for (task, name), (settings, scenes) in results.items():
         runs = [scenes[seed] for seed in sorted(scenes)]
         finals = [run['final_cm'] for run in runs]
@@ -50,12 +53,13 @@ def make_rows(results):
             ('steps', [run['steps'] for run in runs], {}),
             ('plan_ms', [run['plan_ms'] for run in runs], {}),
             ('tracking_error_px', [run.get('tracking_error_px') for run in runs], {})]
-        for baseline in dict.fromkeys((*BASELINES, name.split(':')[0])):
-            other = results.get((task, baseline), (None, {}))[1]
+        for compares, partner in partners(parse_method(name), names[task]):
+            others, other = results[task, partner]
             both = sorted(set(scenes) & set(other))
-            if name not in (baseline, 'nothing') and both:
+            if both and all(settings[key] == others[key] for key in SAME):
                 gaps = [scenes[seed]['final_cm'] - other[seed]['final_cm'] for seed in both]
-                measured.append(('final_distance_difference_cm', gaps, {'against': baseline}))
+                measured.append(('final_distance_difference_cm', gaps,
+                                 {'against': partner, 'compares': compares}))
         for metric, values, more in measured:
             values = np.array([value for value in values if value is not None], float)
             if len(values):
@@ -68,6 +72,31 @@ def make_rows(results):
     return rows
 
 
+def partners(method, names):
+    """
+    Say which methods one is compared with: those that differ in one part only.
+
+    :param method: Method.
+    :param names: of all methods that there are results of.
+    :return: list of (what is compared, name of the other): 'direct' and 'fix' with the same
+        planner (fix with the same switch and recursion, too); for each option the method without
+        it, under the name of Method's field; for true_subgoal every predictor, as 'subgoal'.
+    """
+    if method.base == 'nothing':
+        return []
+    plain = {field: DEFAULTS[field] for field in SUBGOALS_ONLY}
+    once = {field: DEFAULTS[field] for field in ('samples', 'maps')}
+    found = [('direct', replace(method, base='direct', **plain)),
+             ('fix', replace(method, base='fix', **once))]
+    found += [(field, replace(method, **{field: default})) for field, default in DEFAULTS.items()
+              if field != 'base' and getattr(method, field) != default]
+    if method.base == 'true_subgoal':
+        predictors = {parse_method(name).base for name in names} - set(BASES)
+        found += [('subgoal', replace(method, base=base)) for base in sorted(predictors)]
+    return [(what, other.name) for what, other in found
+            if other.name in names and other != method]
+
+
 def _how(name, settings):
     """Say in what way a method was planned, for its rows."""
     method, planner = parse_method(name), settings['planner']
@@ -77,7 +106,8 @@ def _how(name, settings):
         'model': method.model, 'step_budget': settings['step_budget'],
         'planner_samples': planner['search']['num_samples'],
         'planner_iterations': planner['search']['num_iterations'],
-        'replan_every': planner['replan_every']}
+        'replan_every': planner['replan_every'], 'preset': settings['preset'],
+        'device': settings['device'], 'precision': settings['precision']}
 
 
 def standard_error(values):

@@ -39,6 +39,7 @@ class Job:
     predictor: str = ''  # weights file; '' when nothing is predicted
     device: str = 'cpu'
     budget: int = 0  # control periods; 0: the task's
+    preset: str = ''  # name of the planner's settings
     command: str = ''  # that makes the numbers again
 
     def steps(self):
@@ -52,6 +53,9 @@ class Job:
             'task': self.task, 'method': self.method.name, 'step_budget': self.steps(),
             'reached_px': REACHED, 'object_pixels': self.method.tracking,
             'planner': {k: v for k, v in planner.items() if k not in SPEED_ONLY},
+            'preset': self.preset, 'device': self.device,
+            'precision': str(next(_model(
+                self.forward_weights, self.device).push.parameters()).dtype),
             'forward_weights': digest(self.forward_weights),
             'predictor_weights': digest(self.predictor) if self.predictor else None}
         return json.loads(json.dumps(settings))
@@ -183,6 +187,7 @@ def plan_scene(job, seed):
 
     :return: list of PlannedEpisodes, one or, each object alone, K; final distances (K,) metres.
     """
+    torch.set_num_threads(1)  # with more, the predictor's last digits differ
     simulator, predictor = _simulator(job.task), None
     if job.predictor:
         predictor = _predictor(job.predictor, job.device)

@@ -24,6 +24,7 @@ class TrueModel:
         self.config, self.grid, self.pixels = model.config, model.grid, model.pixels
         self.pixel_table, self.seed_maps = model.pixel_table, model.seed_maps
         self.objects = objects
+        self.learned = model  # for what looks at pictures
         self._simulator = simulator
         self._rollout = mujoco.rollout.Rollout(nthread=0)
 
