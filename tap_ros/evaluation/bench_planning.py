@@ -8,7 +8,6 @@ picture's full size. Arithmetic alone is what the plan's floating-point operatio
 the rate of a large matrix product, measured in the same run.
 """
 
-from dataclasses import replace
 import os
 import time
 
@@ -52,8 +51,7 @@ def run(args):
           + (f', {cores} cores' if args.device == 'cpu' else ''))
     print(f'{"":<34}{"p50, ms":>10}{"p90, ms":>10}')
     for name in PRESETS:
-        mpc = VisualMPC.load(args.weights, planner_for(args.device, with_preset(name)),
-                             args.device)
+        mpc = VisualMPC.load(args.weights, with_preset(name), args.device)
         times = time_plans(mpc, seen, goal, args.plans)
         if name == 'default':
             planner, median = mpc, np.median(times)
@@ -77,11 +75,6 @@ def run(args):
               f'{matrix_side(args.device)}: {alone:.1f} ms; '
               f'planned / alone: {median / alone:.1f}x')
     simulator.close()
-
-
-def planner_for(device, config):
-    """Return the configuration that suits a device: a GPU predicts all samples at once."""
-    return config if device == 'cpu' else replace(config, batch_size=config.search.num_samples)
 
 
 def time_plans(mpc, seen, goal, count):

@@ -31,6 +31,7 @@ class SequenceShape:
     :param move_limit: m per control period, |x| and |y|; max_lift: segments.
     :param push_limit: m per control period, length of a displacement while the gripper is low.
     :param upright: go up and down without moving sideways.
+    :param climb_limit: m per control period, up and down.
     """
 
     segments: int = 5
@@ -40,6 +41,7 @@ class SequenceShape:
     max_lift: int = 4
     push_limit: float = 0.05
     upright: bool = True
+    climb_limit: float = CLIMB_LIMIT
 
     @property
     def horizon(self):
@@ -91,9 +93,13 @@ class SequenceShape:
         :return: climb (N, horizon) m per control period, and whether the arm may move sideways.
         """
         heights = np.where(self.segment()[None] < lifted[:, None], LIFTED, LOW)
-        before = np.column_stack([np.full(len(lifted), height), heights[:, :-1]])
-        climb = np.clip(heights - before, -CLIMB_LIMIT, CLIMB_LIMIT)
-        return climb, (np.abs(climb) < VERTICAL) | (not self.upright)
+        missing, climb = np.empty(heights.shape), np.empty(heights.shape)
+        now = np.full(len(lifted), height, float)
+        for t in range(self.horizon):
+            missing[:, t] = heights[:, t] - now
+            climb[:, t] = np.clip(missing[:, t], -self.climb_limit, self.climb_limit)
+            now = now + climb[:, t]
+        return climb, (np.abs(missing) < VERTICAL) | (not self.upright)
 
     def actions(self, parameters, height):
         """
@@ -121,7 +127,8 @@ class SequenceShape:
         :return: (N, 2) metres; NaN for sequences that stay up or low.
         """
         path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, horizon, 3)
-        down = actions[..., 2] < -VERTICAL
+        before = path[..., 2] - actions[..., 2]
+        down = (before > LOW + VERTICAL) & (path[..., 2] <= LOW + VERTICAL)
         first = down.argmax(1)
         return np.where(
             down.any(1)[:, None], path[np.arange(len(path)), first, :2], np.nan)

@@ -325,9 +325,9 @@ class ForwardModel(nn.Module):
             # above all objects the gripper moves none, whatever the network says
             following = self.move_gripper(gripper, action)
             low = torch.minimum(gripper[:, 2], following[:, 2]) < CLEAR
-            if low.any():
+            if low.is_cuda or low.any():  # asking makes a GPU wait
                 moved = self.advance(features, flow, gripper, action)[0]
-                flow = moved if low.all() else torch.where(low[:, None, None, None], moved, flow)
+                flow = torch.where(low[:, None, None, None], moved, flow)
             gripper = following
             if t % every == 0:
                 yield self.carry(maps, flow)

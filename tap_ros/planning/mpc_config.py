@@ -5,6 +5,7 @@
 from dataclasses import dataclass, replace
 
 from tap_ros.errors import ConfigError
+from tap_ros.planning.action_sequences import CLIMB_LIMIT
 from tap_ros.planning.cem import CEMConfig
 
 
@@ -18,6 +19,7 @@ class VisualMPCConfig:
     :param std_move: m per control period, of x and y in the first Gaussian; move_limit their clip.
     :param push_limit: m per control period while the gripper is low, so that pushes are like the
         recorded ones; upright: go up and down without moving sideways, like them.
+    :param climb_limit: m per control period, up and down.
     :param clearance: m from any object's pixel to where the gripper may come down.
     :param max_lift: segments, at most, that the gripper travels lifted before it goes down.
     :param last_weight: weight of the horizon's last step in the cost; the others have 1.
@@ -40,6 +42,7 @@ class VisualMPCConfig:
     move_limit: float = 0.08
     push_limit: float = 0.05
     upright: bool = True
+    climb_limit: float = CLIMB_LIMIT
     clearance: float = 0.1
     max_lift: int = 4
     last_weight: float = 10.0

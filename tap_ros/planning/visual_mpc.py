@@ -8,7 +8,7 @@ carry the maps, take the one that brings them closest to their goals, execute it
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 import os
 import time
@@ -48,8 +48,10 @@ class VisualMPC:
     """
 
     def __init__(self, model, config=None):
-        self.model = model
-        self.config = config or VisualMPCConfig()
+        self.model, config = model, config or VisualMPCConfig()
+        if model.grid.device.type != 'cpu':  # a GPU predicts all samples at once
+            config = replace(config, batch_size=config.search.num_samples)
+        self.config = self._own_config = config
         # Each thread predicts whole batches: operators split among threads would wait for each
         # other at every one of some thousand small steps, and for anything else that runs.
         threads = self.config.threads or len(os.sched_getaffinity(0))
@@ -79,8 +81,20 @@ class VisualMPC:
         self._seed, self._count, self._age = seed, 0, 0
         self._first_shape = self._shape = SequenceShape(
             config.segments, config.repeat, 0, config.move_limit, config.max_lift,
-            config.push_limit, config.upright)
+            config.push_limit, config.upright, config.climb_limit)
         self._last = self._plan = self._goal = None  # _last: parameters of what is left of _plan
+
+    def limit(self, move, climb):
+        """
+        Plan within limits, from the next reset on.
+
+        :param move: m per control period, |x| and |y|; climb: m, |z|; above the configuration's
+            own limits they change nothing.
+        """
+        own = self._own_config
+        self.config = replace(
+            own, move_limit=min(move, own.move_limit), push_limit=min(move, own.push_limit),
+            climb_limit=min(climb, own.climb_limit))
 
     @torch.inference_mode()
     def act(self, image, gripper, object_pixels, goal_maps=None, goal_pixels=None):

@@ -99,3 +99,17 @@ def test_nothing_is_proposed_when_all_is_in_place():
     places = np.array([[0.1, 0.1]])
     rng = np.random.default_rng(0)
     assert len(push_proposals(SHAPE, LOW_GRIPPER, places, places, 10, rng)) == 0
+
+
+def test_with_a_small_limit_the_gripper_climbs_in_several_periods_and_waits_meanwhile():
+    shape = SequenceShape(climb_limit=0.03)
+    parameters = np.full((1, shape.size), 0.05)
+    parameters[0, -1] = 4
+    actions = shape.actions(parameters, LOW)[0]
+    assert np.abs(actions[:, 2]).max() <= 0.03 + 1e-7
+    heights = LOW + actions[:, 2].cumsum()
+    assert heights.max() == pytest.approx(LIFTED, abs=1e-6)
+    still = ~actions[:, :2].any(1)
+    assert still[0] and heights[still][0] < heights[~still].max()
+    landing, = shape.landings(actions[None], np.array([0, 0, LOW, 0]))
+    assert np.isfinite(landing).all()  # it comes down again, in steps

@@ -12,6 +12,7 @@ from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig, with_preset
 from tap_ros.planning.visual_mpc import landing_clash, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
+from tap_ros.weights import FORWARD_MODEL
 import torch
 
 SMALL = VisualMPCConfig(search=CEMConfig(24, 2, 5), proposals=8, batch_size=24, threads=1)
@@ -60,6 +61,40 @@ def test_reset_forgets_the_last_plan(model):
 @pytest.mark.parametrize('changes', [{'batch_size': 5}, {'batch_size': 50}, {'threads': 2}])
 def test_batch_size_and_threads_change_nothing(model, changes):
     assert same(plans(model), plans(model, replace(SMALL, **changes)))
+
+
+@pytest.mark.parametrize('batch_size', [32, 50])
+def test_trained_weights_plan_the_same_in_any_batch(batch_size):
+    image = IMAGE.repeat(2, 0).repeat(2, 1)
+
+    def chosen(batch_size):
+        mpc = VisualMPC.load(FORWARD_MODEL, with_preset('quick', batch_size=batch_size))
+        return mpc.act(image, GRIPPER, 2 * PIXELS, goal_pixels=2 * GOALS)
+
+    assert same([chosen(64)], [chosen(batch_size)])
+
+
+def test_the_planner_stays_within_limits_that_are_set(model):
+    mpc = VisualMPC(model, SMALL)
+    mpc.limit(0.02, 0.05)
+    mpc.reset(0)
+    actions = np.concatenate([
+        mpc.act(IMAGE, GRIPPER, PIXELS, goal_pixels=GOALS).actions for _ in range(3)])
+    assert 0.01 < np.abs(actions[:, :2]).max() <= 0.02 + 1e-6
+    assert np.abs(actions[:, 2]).max() <= 0.05 + 1e-6
+    mpc.limit(1.0, 1.0)
+    mpc.reset(0)
+    assert same(plans(model), [mpc.act(IMAGE, GRIPPER, PIXELS, goal_pixels=GOALS)
+                               for _ in range(3)])
+
+
+def test_an_object_that_the_flow_loses_is_dear(model):
+    mpc = VisualMPC(model, SMALL)
+    lost = torch.zeros(24, 2, 44, 44)
+    model.carried_maps = lambda *_: iter([lost])
+    costs, _ = mpc._cost(None, torch.zeros(1, 4), None, torch.from_numpy(DISTANCE).float(),
+                         np.zeros((24, 15, 4), np.float32))
+    assert (costs >= 10 * DISTANCE.max(1).sum() - 0.1).all()
 
 
 def test_equal_sequences_cost_the_same_in_any_batch(model):

@@ -33,7 +33,7 @@ def add_arguments(parser):
     add('--methods', nargs='+', default=DEFAULT_METHODS, metavar='METHOD',
         help='nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped (the '
         'shipped predictor) or the name of another one; with options behind colons: half, '
-        'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper (its search, '
+        'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper (its search '
         'whatever --preset says), every<n>, for example genmin:half:carried (default: '
         + ' '.join(DEFAULT_METHODS) + ')')
     add('--predictor', nargs='+', default=[], metavar='NAME=FILE',
