@@ -6,11 +6,13 @@ import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.topics import WORLD_FRAME
+from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 
 MODES = ('subgoal', 'direct')
+TRACKING = ('ground_truth', 'carried')
 MAX_BUDGET = 1000
 
 
@@ -35,12 +37,20 @@ def declare_parameters(node):
                        'Stamp commands with the time of sending, as MoveIt Servo wants them, '
                        'instead of the stamp of the image that they answer.')
     parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
-    for name, default, high, description in (
-            ('max_step_xy', 0.08, 0.08, 'Largest |dx| and |dy| of a command in metres.'),
-            ('max_step_z', 0.15, 0.15, 'Largest |dz| of a command in metres.'),
-            ('goal_tolerance', 1.0, 64.0,
+    for name, default, low, high, description in (
+            ('max_step_xy', 0.08, 0.001, 0.08, 'Largest |dx| and |dy| of a command in metres; '
+             'the planner knows it, from the next goal on.'),
+            ('max_step_z', 0.15, 0.001, 0.15, 'Largest |dz| of a command in metres; likewise.'),
+            ('goal_tolerance', 1.0, 0.0, 64.0,
              'A goal or subgoal is reached at this mean distance of the objects in pixels.')):
-        parameters.declare(name, default, description, low=0.0, high=high, read_only=False)
+        parameters.declare(name, default, description, low=low, high=high, read_only=False)
+    parameters.declare('switch', 'reached', 'When to go on from a subgoal: when it is reached, '
+                       'or its share of the budget spent; or at its share (half), as the paper '
+                       'does.', choices=SWITCHES, read_only=False)
+    parameters.declare('tracking', 'ground_truth', 'Where the objects are: as objects says at '
+                       'every picture (ground_truth), or there only at first, then carried by '
+                       'the forward model and found again in the pictures.', choices=TRACKING,
+                       read_only=False)
     parameters.declare('image_timeout', 5.0, 'Seconds to wait for an image before giving up.',
                        low=0.1, high=600.0, read_only=False)
     parameters.declare('predictor_timeout', 20.0, 'Seconds to wait for a subgoal.',

@@ -4,6 +4,7 @@
 
 import sys
 import threading
+import traceback
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
@@ -31,9 +32,11 @@ from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subgoal_messages import decode_subgoals
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 from tap_ros.planning.hierarchy import choose_sample, Itinerary, targets_by
+from tap_ros.planning.tracking import ObjectTracker
 
 SENSORS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
            'joints': (JointState, 'joint_states')}
+LATE_PERIODS = 4  # control periods without a picture until the arm is stopped
 GOAL = {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}
 
 
@@ -86,6 +89,7 @@ class VisualMpcNode(Node):
         return GoalResponse.ACCEPT
 
     def _on_cancel(self, _):
+        self._stop()  # at once: a plan may be in progress
         self._sensors.wake()
         return CancelResponse.ACCEPT
 
@@ -103,6 +107,10 @@ class VisualMpcNode(Node):
                 handle.abort()
         except TapError as error:
             result.message = str(error)
+            handle.abort()
+        except Exception as error:
+            result.message = f'{type(error).__name__}: {error}'
+            self.get_logger().error(traceback.format_exc())
             handle.abort()
         finally:
             self._stop()
@@ -131,17 +139,22 @@ class VisualMpcNode(Node):
         goal_pixels = match_objects(names, goal_names, goal_pixels, 'objects', 'goal_objects')
         budget = request.step_budget or default_budget(len(names))
         tolerance = self.params['goal_tolerance']
-        subgoals = []
+        self._mpc.limit(self.params['max_step_xy'], self.params['max_step_z'])
+        scene, subgoals = self._decode(seen, names), []
         if mode == 'subgoal':
             found = self._ask_for_subgoals(seen, goal, names, request, cancelled)
             subgoals = choose_sample(
-                self._mpc, *self._decode(seen, names), goal_pixels, found, request.seed, go_on)
+                self._mpc, *scene, goal_pixels, found, request.seed, go_on)
             seen = self._observe(-1, cancelled)  # the newest: asking and choosing take time
+            scene = self._decode(seen, names)
         targets = targets_by(subgoals, goal_pixels)
-        itinerary = Itinerary(targets, budget, reached=tolerance)
+        itinerary = Itinerary(targets, budget, self.params['switch'], tolerance)
+        tracker = None
+        if self.params['tracking'] == 'carried':
+            tracker = ObjectTracker(self._mpc.model, *scene)
         self._mpc.reset(request.seed)
         while True:
-            image, gripper, pixels = self._decode(seen, names)
+            image, gripper, pixels = scene
             distance = result.expected_distance = targets[-1].distance(pixels)
             result.success = distance <= tolerance
             if result.success or result.steps >= budget:
@@ -149,13 +162,19 @@ class VisualMpcNode(Node):
             target = itinerary.target(result.steps, pixels)
             plan = self._mpc.act(image, gripper, pixels, **target.goal(pixels))
             go_on()
-            sent_ns = self._send(plan.action, seen['image'].header.stamp)
+            sent_ns = self._send(plan.action, seen['image'])
             result.steps += 1
             handle.publish_feedback(ReachGoal.Feedback(
                 step=result.steps, stage=stage_name(len(itinerary.switches), len(subgoals)),
                 expected_distance=float(plan.expected_distance),
                 planning_ms=float(plan.planning_ms)))
-            seen = self._observe(sent_ns, cancelled)
+            if tracker is None:
+                seen = self._observe(sent_ns, cancelled)
+                scene = self._decode(seen, names)
+            else:
+                seen = self._observe(sent_ns, cancelled, ('image', 'joints'))
+                after = self._decode_arm(seen)
+                scene = (*after, tracker.update(image, gripper, plan.action, *after))
         result.message = (
             f'{distance:.1f} px from the goal, '
             + ('reached' if result.success else f'step budget of {budget} spent'))
@@ -180,15 +199,24 @@ class VisualMpcNode(Node):
         goal.update({topic: found[topic] for topic in needed})
         return goal, *decode_objects(goal['objects'], 'goal_objects')
 
-    def _observe(self, after_ns, cancelled):
-        """Wait for image, objects and joint states of one moment after `after_ns`."""
+    def _observe(self, after_ns, cancelled, topics=tuple(SENSORS)):
+        """
+        Wait for messages of one moment after `after_ns`.
+
+        When they are late the arm is stopped at once, long before they are given up: a driver may
+        go on with the last velocity.
+        """
         timeout = self.params['image_timeout']
-        seen = self._sensors.wait(SENSORS, timeout, after_ns, cancelled)
+        soon = min(timeout, LATE_PERIODS * self.params['control_period'])
+        seen = self._sensors.wait(topics, soon, after_ns, cancelled)
+        if seen is None and not cancelled():
+            self._stop()
+            seen = self._sensors.wait(topics, timeout - soon, after_ns, cancelled)
         if cancelled():
             raise Cancelled('cancelled')
         if seen is None:
-            missing = self._sensors.missing(SENSORS)
-            names = [self.resolve_topic_name(SENSORS[topic][1]) for topic in missing or SENSORS]
+            missing = self._sensors.missing(topics)
+            names = [self.resolve_topic_name(SENSORS[topic][1]) for topic in missing or topics]
             raise PlanningError(
                 f'no observation for {timeout:g} s: '
                 + ('nothing has come on ' if missing else 'no new messages of the same stamp on ')
@@ -199,8 +227,12 @@ class VisualMpcNode(Node):
         """Return picture, gripper (4,) and pixels (K, 2) of what is seen, ordered like `names`."""
         pixels = match_objects(
             names, *decode_objects(seen['objects'], 'objects'), 'the first objects', 'objects')
+        return *self._decode_arm(seen), pixels
+
+    def _decode_arm(self, seen):
+        """Return picture and gripper (4,)."""
         image = decode_image(seen['image'], 'camera/image_raw', self._mpc.image_size)
-        return image, decode_gripper(seen['joints']), pixels
+        return image, decode_gripper(seen['joints'])
 
     def _ask_for_subgoals(self, seen, goal, names, wanted, cancelled):
         """Return the Subgoals of all samples, their objects in the order of `names`."""
@@ -220,27 +252,28 @@ class VisualMpcNode(Node):
 
     # Commands
 
-    def _send(self, action, stamp):
+    def _send(self, action, image):
         """
-        Send one command within the limits, stamped like the image that it answers.
+        Send one command within the limits, stamped like the image message that it answers.
 
         :return: images count from this stamp on, in ns: later than the newest image that had
             already come, and with one control period between.
         """
         if not np.isfinite(action).all():
             raise PlanningError(f'the planner chose {action}; expected finite numbers')
+        # The planner keeps within them already.
         limit = np.array([self.params['max_step_xy']] * 2 + [self.params['max_step_z']])
         move = np.clip(np.asarray(action[:3], np.float64), -limit, limit)
         message = TwistStamped()
-        now = self.params['stamp_with_now']
-        message.header.stamp = self.get_clock().now().to_msg() if now else stamp
+        message.header.stamp = (self.get_clock().now().to_msg() if self.params['stamp_with_now']
+                                else image.header.stamp)
         message.header.frame_id = self.params['command_frame']
         linear = message.twist.linear
         linear.x, linear.y, linear.z = (self.params['twist_scale'] * move).tolist()
-        newest = to_nanoseconds(self._sensors.newest('image')['image'].header.stamp)
+        newest = (self._sensors.newest('image') or {'image': image})['image']
         self._gripper.publish(Float64(data=float(np.clip(action[3], 0, 1))))
         self._twist.publish(message)
-        return newest + int(0.9e9 * self.params['control_period'])
+        return to_nanoseconds(newest.header.stamp) + int(0.9e9 * self.params['control_period'])
 
     def _stop(self):
         """Send a zero command; it has no stamp, since it answers no image."""

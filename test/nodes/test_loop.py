@@ -8,121 +8,31 @@ import sys
 import threading
 
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import TwistStamped
 from mcap.reader import make_reader
 import numpy as np
 import pytest
-from rclpy.action import ActionClient
-from sensor_msgs.msg import Image, JointState
-from sim_bridge.simulator import Simulator
-from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
-from tap_msgs.msg import ObjectStates, Subgoal
-from tap_msgs.srv import PredictSubgoal, ResetScene
-from tap_ros.evaluation.planning.episode import run_episode
-from tap_ros.evaluation.planning.methods import parse_method
-from tap_ros.nodes.clients import call, CallError, Newest, send_goal, wait_for_result
+from tap_msgs.msg import ObjectStates
+from tap_msgs.srv import PredictSubgoal
+from tap_ros.nodes.clients import call, send_goal
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.predictor_node import OVERLAY_SCALE
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
-from tap_ros.planning.visual_mpc import VisualMPC
-from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.prediction.weights import save_weights
+from tap_ros.nodes.topics import to_stamp
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
-import torch
+from tap_ros.weights import FORWARD_MODEL
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
-from lively import lively_network  # noqa: E402
+from loop import MODULES, running_loop, SEED  # noqa: E402
 from processes import Client, NodeProcess  # noqa: E402
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-SEED = 1_000_003
-MODULES = {
-    'sim_node': 'sim_bridge.sim_node', 'predictor_node': 'tap_ros.nodes.predictor_node',
-    'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
-    'recorder_node': 'tap_ros.nodes.recorder_node'}
-
-
-class Loop:
-    """All nodes as processes, and a client that knows their topics, services and actions."""
-
-    def __init__(self, node, folder):
-        self.node, self.folder, self.processes = node, folder, {}
-        self.reset_client = node.create_client(ResetScene, 'sim/reset')
-        self.pause_client = node.create_client(SetBool, 'sim/pause')
-        self.predict_client = node.create_client(PredictSubgoal, 'predict_subgoal')
-        self.reach_client = ActionClient(node, ReachGoal, 'reach_goal')
-        self.image = Newest(node, Image, 'camera/image_raw', STREAM)
-        self.objects = Newest(node, ObjectStates, 'objects', STREAM)
-        self.joints = Newest(node, JointState, 'joint_states', STREAM)
-        self.goal_image = Newest(node, Image, 'goal/image', LATCHED)
-        self.goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
-        self.subgoal = Newest(node, Subgoal, 'subgoal', LATCHED)
-        self.overlay = Newest(node, Image, 'subgoal/overlay', LATCHED)
-        self.twists = []
-        node.create_subscription(
-            TwistStamped, 'arm/delta_twist_cmds', self.twists.append, STREAM)
-
-    def start(self, name, **parameters):
-        self.processes[name] = NodeProcess(
-            MODULES[name], self.folder / f'{name}.log', parameters)
-
-    def reset(self, seed=SEED):
-        """Start a scene, and wait for what is published at its start."""
-        before = to_nanoseconds(self.image.wait(30).header.stamp)  # in lock-step one always comes
-        response = call(self.reset_client, ResetScene.Request(task='push2', seed=seed), 30)
-        assert response.success, response.message
-        image = self.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > before)
-        for topic in (self.objects, self.joints, self.goal_image, self.goal_objects):
-            topic.wait(30, lambda m: m.header.stamp == image.header.stamp)
-        self.twists.clear()
-
-    def predict(self, **fields):
-        return call(self.predict_client, PredictSubgoal.Request(**fields), 60)
-
-    def reach(self, on_feedback=None, **fields):
-        """Send a goal and wait for its end."""
-        handle = send_goal(self.reach_client, ReachGoal.Goal(**fields), 30, on_feedback)
-        return wait_for_result(handle, 300)
-
-    def moves(self):
-        """Return the commands (N, 3) so far, without the stops."""
-        return np.array([
-            [t.twist.linear.x, t.twist.linear.y, t.twist.linear.z]
-            for t in list(self.twists) if to_nanoseconds(t.header.stamp)])
-
-    def stopped(self):
-        """Tell whether the last command is zero, once it has come."""
-        for _ in range(100):
-            last = self.twists[-1].twist.linear if self.twists else None
-            if last and (last.x, last.y, last.z) == (0, 0, 0):
-                return True
-            threading.Event().wait(0.05)
-        return False
 
 
 @pytest.fixture(scope='module')
 def loop(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('loop')
-    # With more threads the predictor's last digits differ from process to process.
-    with pytest.MonkeyPatch.context() as patch, Client() as node:
-        patch.setenv('OMP_NUM_THREADS', '1')
-        loop = Loop(node, folder)
-        try:
-            loop.start('recorder_node', folder=folder / 'bag')
-            loop.start('sim_node', lock_step='true')
-            loop.start('predictor_node')
-            loop.start('visual_mpc_node', image_timeout=4.0)
-            for process in loop.processes.values():
-                process.wait_for('ready', 120)
-            assert loop.predict_client.wait_for_service(30)
-            assert loop.reach_client.wait_for_server(30)
-            yield loop
-        finally:
-            for process in loop.processes.values():
-                process.kill()
+    with running_loop(tmp_path_factory.mktemp('loop')) as loop:
+        yield loop
 
 
 def positions(message):
@@ -218,150 +128,6 @@ def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
     assert result.expected_distance == pytest.approx(
         np.linalg.norm(pixels - goals, axis=1).mean(), abs=1e-3)
     assert loop.stopped()
-
-
-def test_the_nodes_act_as_the_same_classes_do_in_one_process(loop):
-    loop.reset()
-    status, result = loop.reach(mode='direct', step_budget=3, seed=5)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
-    try:
-        seen = sim.reset(SEED)
-        goals = sim.goal().object_pixels
-        mpc.reset(5)
-        actions = []
-        for _ in range(3):
-            plan = mpc.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goals)
-            actions.append(plan.action[:3])
-            seen = sim.step(plan.action)
-    finally:
-        sim.close()
-    assert np.array_equal(loop.moves().astype(np.float32), np.array(actions))
-
-
-def acts_like(loop, method, weights, **fields):
-    """
-    Reach a goal by the nodes and in this process, and compare.
-
-    Where a plan is expected to end shows what it was for, as first actions often do not.
-
-    :return: the PlannedEpisode and the stages that feedback told.
-    """
-    feedback = []
-    loop.reset()
-    status, result = loop.reach(feedback.append, seed=SEED, **fields)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    plans, act = [], mpc.act
-    mpc.act = lambda *args, **goal: plans.append(act(*args, **goal)) or plans[-1]
-    try:
-        run = run_episode(sim, mpc, parse_method(method), fields['step_budget'], SEED,
-                          SubgoalPredictor.load(weights))
-    finally:
-        torch.set_num_threads(threads)
-        sim.close()
-    assert np.array_equal(loop.moves().astype(np.float32), run.actions[:, :3])
-    made = plans[-len(run.actions):]  # before these come plans to choose by
-    assert [f.expected_distance for f in feedback] == [p.expected_distance for p in made]
-    return run, [f.stage for f in feedback]
-
-
-def test_the_nodes_go_through_a_chain_as_one_process_does(loop):
-    run, stages = acts_like(loop, 'shipped:recursion2', DEFAULT_PREDICTOR, recursion_depth=2,
-                            num_samples=3, step_budget=3)  # these weights have but one sample
-    assert stages == ['subgoal 1 of 2', 'subgoal 2 of 2', 'goal'] and run.switches == [1, 2]
-
-
-def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
-    network = lively_network(image_size=64, latent_size=8)
-    weights = tmp_path / 'sampling.safetensors'
-    save_weights(weights, network, 'predictor', network.config, {})
-    assert loop.processes['predictor_node'].end() == 0
-    loop.start('predictor_node', weights=weights)
-    try:
-        loop.processes['predictor_node'].wait_for('ready', 120)
-        run, stages = acts_like(
-            loop, 'sampling:samples3', weights, num_samples=3, step_budget=2)
-        loop.reset()
-        handle = send_goal(loop.reach_client, ReachGoal.Goal(num_samples=100), 30)
-        threading.Event().wait(3)  # it would make 200 plans before it moves
-        handle.cancel_goal_async()
-        status, result = wait_for_result(handle, 20)
-        assert status == GoalStatus.STATUS_CANCELED and result.steps == 0
-    finally:
-        loop.processes['predictor_node'].end()
-        loop.start('predictor_node')
-        loop.processes['predictor_node'].wait_for('ready', 120)
-    assert stages == ['subgoal', 'goal'] and run.subgoals[0].sample > 0
-
-
-def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
-    loop.reset()
-    moving = threading.Event()
-    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct', step_budget=40), 30,
-                       lambda feedback: moving.set())
-    assert moving.wait(120)
-    with pytest.raises(CallError, match='rejected'):
-        send_goal(loop.reach_client, ReachGoal.Goal(), 30)
-    assert 'another goal is in progress' in loop.processes['visual_mpc_node'].text
-    handle.cancel_goal_async()
-    status, result = wait_for_result(handle, 60)
-    assert status == GoalStatus.STATUS_CANCELED
-    assert 'cancelled' in result.message and 1 <= result.steps < 40
-    assert loop.stopped()
-    count = len(loop.twists)
-    status, result = loop.reach(mode='direct', step_budget=1)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    assert len(loop.moves()) == count  # the cancelled goal's, its stop taken off, and one more
-
-
-@pytest.mark.parametrize('fields, words', [
-    ({'mode': 'sideways'}, ['mode', 'sideways', 'subgoal, direct']),
-    ({'step_budget': 100_000}, ['step_budget', '100000', '1000']),
-    ({'seed': -1}, ['seed', '-1']),
-    ({'recursion_depth': 99}, ['/predict_subgoal', 'recursion_depth', '99', '1 to 8']),
-    ({'num_samples': 1000}, ['/predict_subgoal', 'num_samples', '1000', '1 to 100']),
-    ({'goal_image': Image(width=64, height=64, encoding='nope')}, ['goal', 'nope', 'rgb8']),
-])
-def test_a_bad_goal_is_aborted_with_the_reason_and_moves_nothing(loop, fields, words):
-    loop.reset()
-    status, result = loop.reach(**fields)
-    assert status == GoalStatus.STATUS_ABORTED and not result.success and result.steps == 0
-    for word in words:
-        assert word in result.message
-    assert loop.stopped() and len(loop.moves()) == 0
-
-
-def test_when_images_stop_coming_the_arm_is_stopped(loop):
-    loop.reset()
-    call(loop.pause_client, SetBool.Request(data=True), 10)
-    status, result = loop.reach(mode='direct', step_budget=10)
-    call(loop.pause_client, SetBool.Request(data=False), 10)
-    assert status == GoalStatus.STATUS_ABORTED and result.steps == 1
-    assert '/camera/image_raw' in result.message
-    assert loop.stopped()
-
-
-def test_when_the_predictor_dies_the_arm_stays_and_the_planner_lives(loop):
-    loop.reset()
-    loop.processes['predictor_node'].kill()
-    status, result = loop.reach(step_budget=4)
-    assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
-    assert '/predict_subgoal' in result.message
-    assert loop.stopped() and len(loop.moves()) == 0
-    status, result = loop.reach(mode='direct', step_budget=1)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    loop.start('predictor_node')
-    loop.processes['predictor_node'].wait_for('ready', 120)
-    for _ in range(100):  # no new image is sent; the newest one comes once it is discovered
-        response = loop.predict()
-        if response.success:
-            break
-        assert '/camera/image_raw' in response.message or '/goal/image' in response.message
-        threading.Event().wait(0.1)
-    assert response.success and response.subgoals[0].object_maps
 
 
 def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):

@@ -1,0 +1,171 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""All nodes as processes, over DDS, and how they are compared with one process."""
+
+from contextlib import contextmanager
+import os
+import threading
+
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import TwistStamped
+import numpy as np
+from processes import Client, NodeProcess
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Image, JointState
+from sim_bridge.simulator import Simulator
+from std_srvs.srv import SetBool
+from tap_msgs.action import ReachGoal
+from tap_msgs.msg import ObjectStates, Subgoal
+from tap_msgs.srv import PredictSubgoal, ResetScene
+from tap_ros.evaluation.planning.episode import run_episode
+from tap_ros.evaluation.planning.methods import parse_method
+from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.weights import FORWARD_MODEL
+import torch
+
+SEED = 1_000_003
+MODULES = {
+    'sim_node': 'sim_bridge.sim_node', 'predictor_node': 'tap_ros.nodes.predictor_node',
+    'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
+    'recorder_node': 'tap_ros.nodes.recorder_node'}
+
+
+class Loop:
+    """All nodes as processes, and a client that knows their topics, services and actions."""
+
+    def __init__(self, node, folder):
+        self.node, self.folder, self.processes = node, folder, {}
+        self.reset_client = node.create_client(ResetScene, 'sim/reset')
+        self.pause_client = node.create_client(SetBool, 'sim/pause')
+        self.predict_client = node.create_client(PredictSubgoal, 'predict_subgoal')
+        self.reach_client = ActionClient(node, ReachGoal, 'reach_goal')
+        self.image = Newest(node, Image, 'camera/image_raw', STREAM)
+        self.objects = Newest(node, ObjectStates, 'objects', STREAM)
+        self.joints = Newest(node, JointState, 'joint_states', STREAM)
+        self.goal_image = Newest(node, Image, 'goal/image', LATCHED)
+        self.goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
+        self.subgoal = Newest(node, Subgoal, 'subgoal', LATCHED)
+        self.overlay = Newest(node, Image, 'subgoal/overlay', LATCHED)
+        self.twists = []
+        node.create_subscription(
+            TwistStamped, 'arm/delta_twist_cmds', self.twists.append, STREAM)
+
+    def start(self, name, **parameters):
+        self.processes[name] = NodeProcess(
+            MODULES[name], self.folder / f'{name}.log', parameters)
+
+    def reset(self, seed=SEED):
+        """Start a scene, and wait for what is published at its start."""
+        before = to_nanoseconds(self.image.wait(30).header.stamp)  # in lock-step one always comes
+        response = call(self.reset_client, ResetScene.Request(task='push2', seed=seed), 30)
+        assert response.success, response.message
+        image = self.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > before)
+        for topic in (self.objects, self.joints, self.goal_image, self.goal_objects):
+            topic.wait(30, lambda m: m.header.stamp == image.header.stamp)
+        self.twists.clear()
+
+    @contextmanager
+    def set(self, name, **parameters):
+        """Change parameters of a node for a while."""
+        client = self.node.create_client(SetParameters, f'{name}/set_parameters')
+        getter = self.node.create_client(GetParameters, f'{name}/get_parameters')
+        before = call(getter, GetParameters.Request(names=list(parameters)), 30).values
+
+        def change(values):
+            results = call(client, SetParameters.Request(parameters=[
+                ParameterMessage(name=name, value=value)
+                for name, value in zip(parameters, values)]), 30).results
+            assert all(result.successful for result in results), results
+
+        change([Parameter(name, value=value).get_parameter_value()
+                for name, value in parameters.items()])
+        try:
+            yield
+        finally:
+            change(before)
+
+    def predict(self, **fields):
+        return call(self.predict_client, PredictSubgoal.Request(**fields), 60)
+
+    def reach(self, on_feedback=None, **fields):
+        """Send a goal and wait for its end."""
+        handle = send_goal(self.reach_client, ReachGoal.Goal(**fields), 30, on_feedback)
+        return wait_for_result(handle, 300)
+
+    def moves(self):
+        """Return the commands (N, 3) so far, without the stops."""
+        return np.array([
+            [t.twist.linear.x, t.twist.linear.y, t.twist.linear.z]
+            for t in list(self.twists) if to_nanoseconds(t.header.stamp)])
+
+    def stopped(self):
+        """Tell whether the last command is zero, once it has come."""
+        for _ in range(100):
+            last = self.twists[-1].twist.linear if self.twists else None
+            if last and (last.x, last.y, last.z) == (0, 0, 0):
+                return True
+            threading.Event().wait(0.05)
+        return False
+
+
+@contextmanager
+def running_loop(folder):
+    """Start all nodes, and kill them in the end."""
+    # With more threads the predictor's last digits differ from process to process.
+    before = os.environ.get('OMP_NUM_THREADS')
+    os.environ['OMP_NUM_THREADS'] = '1'
+    try:
+        with Client() as node:
+            loop = Loop(node, folder)
+            try:
+                loop.start('recorder_node', folder=folder / 'bag')
+                loop.start('sim_node', lock_step='true')
+                loop.start('predictor_node')
+                loop.start('visual_mpc_node', image_timeout=4.0)
+                for process in loop.processes.values():
+                    process.wait_for('ready', 120)
+                assert loop.predict_client.wait_for_service(30)
+                assert loop.reach_client.wait_for_server(30)
+                yield loop
+            finally:
+                for process in loop.processes.values():
+                    process.kill()
+    finally:
+        os.environ.pop('OMP_NUM_THREADS')
+        if before is not None:
+            os.environ['OMP_NUM_THREADS'] = before
+
+
+def acts_like(loop, method, weights, **fields):
+    """
+    Reach a goal by the nodes and in this process, and compare.
+
+    Where a plan is expected to end shows what it was for, as first actions often do not.
+
+    :return: the PlannedEpisode and the stages that feedback told.
+    """
+    feedback = []
+    loop.reset()
+    status, result = loop.reach(feedback.append, seed=SEED, **fields)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    plans, act = [], mpc.act
+    mpc.act = lambda *args, **goal: plans.append(act(*args, **goal)) or plans[-1]
+    try:
+        run = run_episode(sim, mpc, parse_method(method), fields['step_budget'], SEED,
+                          SubgoalPredictor.load(weights))
+    finally:
+        torch.set_num_threads(threads)
+        sim.close()
+    assert np.array_equal(loop.moves().astype(np.float32), run.actions[:, :3])
+    made = plans[-len(run.actions):]  # before these come plans to choose by
+    assert [f.expected_distance for f in feedback] == [p.expected_distance for p in made]
+    return run, [f.stage for f in feedback]

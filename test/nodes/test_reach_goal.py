@@ -1,0 +1,183 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The action reach_goal: the same acts as in one process, limits, and every way to stop."""
+
+from pathlib import Path
+import sys
+import threading
+
+from action_msgs.msg import GoalStatus
+import numpy as np
+import pytest
+from sensor_msgs.msg import Image
+from sim_bridge.simulator import Simulator
+from std_srvs.srv import SetBool
+from tap_msgs.action import ReachGoal
+from tap_ros.nodes.clients import call, CallError, send_goal, wait_for_result
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.prediction.weights import save_weights
+from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
+from lively import lively_network  # noqa: E402
+from loop import acts_like, running_loop, SEED  # noqa: E402
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+
+@pytest.fixture(scope='module')
+def loop(tmp_path_factory):
+    with running_loop(tmp_path_factory.mktemp('loop')) as loop:
+        yield loop
+
+
+def test_the_nodes_act_as_the_same_classes_do_in_one_process(loop):
+    loop.reset()
+    status, result = loop.reach(mode='direct', step_budget=3, seed=5)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
+    try:
+        seen = sim.reset(SEED)
+        goals = sim.goal().object_pixels
+        mpc.reset(5)
+        actions = []
+        for _ in range(3):
+            plan = mpc.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goals)
+            actions.append(plan.action[:3])
+            seen = sim.step(plan.action)
+    finally:
+        sim.close()
+    assert np.array_equal(loop.moves().astype(np.float32), np.array(actions))
+
+
+def test_the_nodes_go_through_a_chain_as_one_process_does(loop):
+    run, stages = acts_like(loop, 'shipped:recursion2', DEFAULT_PREDICTOR, recursion_depth=2,
+                            num_samples=3, step_budget=3)  # these weights have but one sample
+    assert stages == ['subgoal 1 of 2', 'subgoal 2 of 2', 'goal'] and run.switches == [1, 2]
+
+
+def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
+    network = lively_network(image_size=64, latent_size=8)
+    weights = tmp_path / 'sampling.safetensors'
+    save_weights(weights, network, 'predictor', network.config, {})
+    assert loop.processes['predictor_node'].end() == 0
+    loop.start('predictor_node', weights=weights)
+    try:
+        loop.processes['predictor_node'].wait_for('ready', 120)
+        run, stages = acts_like(
+            loop, 'sampling:samples3', weights, num_samples=3, step_budget=2)
+        loop.reset()
+        handle = send_goal(loop.reach_client, ReachGoal.Goal(num_samples=100), 30)
+        threading.Event().wait(3)  # it would make 200 plans before it moves
+        handle.cancel_goal_async()
+        status, result = wait_for_result(handle, 20)
+        assert status == GoalStatus.STATUS_CANCELED and result.steps == 0
+    finally:
+        loop.processes['predictor_node'].end()
+        loop.start('predictor_node')
+        loop.processes['predictor_node'].wait_for('ready', 120)
+    assert stages == ['subgoal', 'goal'] and run.subgoals[0].sample > 0
+
+
+def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
+    loop.reset()
+    moving = threading.Event()
+    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct', step_budget=40), 30,
+                       lambda feedback: moving.set())
+    assert moving.wait(120)
+    with pytest.raises(CallError, match='rejected'):
+        send_goal(loop.reach_client, ReachGoal.Goal(), 30)
+    assert 'another goal is in progress' in loop.processes['visual_mpc_node'].text
+    handle.cancel_goal_async()
+    status, result = wait_for_result(handle, 60)
+    assert status == GoalStatus.STATUS_CANCELED
+    assert 'cancelled' in result.message and 1 <= result.steps < 40
+    assert loop.stopped()
+    count = len(loop.moves())
+    status, result = loop.reach(mode='direct', step_budget=1)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    assert len(loop.moves()) == count + 1
+
+
+@pytest.mark.parametrize('fields, words', [
+    ({'mode': 'sideways'}, ['mode', 'sideways', 'subgoal, direct']),
+    ({'step_budget': 100_000}, ['step_budget', '100000', '1000']),
+    ({'seed': -1}, ['seed', '-1']),
+    ({'recursion_depth': 99}, ['/predict_subgoal', 'recursion_depth', '99', '1 to 8']),
+    ({'num_samples': 1000}, ['/predict_subgoal', 'num_samples', '1000', '1 to 100']),
+    ({'goal_image': Image(width=64, height=64, encoding='nope')}, ['goal', 'nope', 'rgb8']),
+])
+def test_a_bad_goal_is_aborted_with_the_reason_and_moves_nothing(loop, fields, words):
+    loop.reset()
+    status, result = loop.reach(**fields)
+    assert status == GoalStatus.STATUS_ABORTED and not result.success and result.steps == 0
+    for word in words:
+        assert word in result.message
+    assert loop.stopped() and len(loop.moves()) == 0
+
+
+def test_when_images_stop_coming_the_arm_is_stopped(loop):
+    loop.reset()
+    call(loop.pause_client, SetBool.Request(data=True), 10)
+    status, result = loop.reach(mode='direct', step_budget=10)
+    call(loop.pause_client, SetBool.Request(data=False), 10)
+    assert status == GoalStatus.STATUS_ABORTED and result.steps == 1
+    assert '/camera/image_raw' in result.message
+    assert loop.stopped()
+
+
+def test_when_the_predictor_dies_the_arm_stays_and_the_planner_lives(loop):
+    loop.reset()
+    loop.processes['predictor_node'].kill()
+    status, result = loop.reach(step_budget=4)
+    assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+    assert '/predict_subgoal' in result.message
+    assert loop.stopped() and len(loop.moves()) == 0
+    status, result = loop.reach(mode='direct', step_budget=1)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    loop.start('predictor_node')
+    loop.processes['predictor_node'].wait_for('ready', 120)
+    for _ in range(100):  # no new image is sent; the newest one comes once it is discovered
+        response = loop.predict()
+        if response.success and response.subgoals[0].object_maps:
+            break
+        words = response.message
+        assert response.success or '/camera/image_raw' in words or '/goal/image' in words
+        threading.Event().wait(0.1)
+    assert response.success and response.subgoals[0].object_maps
+
+
+def test_objects_are_followed_as_in_one_process_when_their_pixels_come_once(loop):
+    with loop.set('visual_mpc_node', tracking='carried'):
+        run, _ = acts_like(loop, 'direct:carried', DEFAULT_PREDICTOR, mode='direct', step_budget=8)
+    assert run.tracking_error() > 0  # it was not told where they are
+
+
+def test_half_of_the_budget_goes_to_the_subgoal_as_in_one_process(loop):
+    with loop.set('visual_mpc_node', switch='half', goal_tolerance=30.0):
+        feedback = []
+        loop.reset()
+        status, result = loop.reach(feedback.append, step_budget=4, seed=SEED)
+    assert status == GoalStatus.STATUS_SUCCEEDED and result.success and not feedback
+    with loop.set('visual_mpc_node', switch='half'):
+        run, stages = acts_like(loop, 'shipped:half', DEFAULT_PREDICTOR, step_budget=4)
+    assert stages == ['subgoal', 'subgoal', 'goal', 'goal'] and run.switches == [2]
+
+
+def test_the_planner_keeps_within_the_limits_of_the_parameters(loop):
+    loop.reset()
+    with loop.set('visual_mpc_node', max_step_xy=0.02, max_step_z=0.04):
+        status, result = loop.reach(mode='direct', step_budget=5, seed=5)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
+    try:
+        seen, goals = sim.reset(SEED), sim.goal().object_pixels
+        mpc.limit(0.02, 0.04)
+        mpc.reset(5)
+        plan = mpc.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goals)
+    finally:
+        sim.close()
+    moves = loop.moves().astype(np.float32)
+    assert np.array_equal(moves[0], plan.action[:3])  # nothing is cut off what was planned
+    assert np.abs(moves[:, :2]).max() <= 0.02 + 1e-6 and np.abs(moves[:, 2]).max() <= 0.04 + 1e-6
+    assert np.abs(moves).max() > 0.01
