@@ -1,10 +1,12 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Whether a prediction is a bottleneck: one object at its goal, the other still in place (app. E).
+Whether a prediction is a bottleneck: some objects at their goals, others in place (app. E).
 
 Object positions are the recordings', that is, the simulator's ground truth; they score only.
 """
+
+from itertools import product
 
 import numpy as np
 from tap_ros.prediction.batches import uses_recorded_goal
@@ -34,21 +36,23 @@ def expected_distances(maps, pixels):
 
 def bottleneck_scores(maps, start_pixels, goal_pixels):
     """
-    Score how near a prediction is to one object at its goal and the other at its start.
+    Score how near a prediction is to some objects at their goals and the others at their starts.
 
     Appendix E: the smaller one of two hypotheses, which object moves first; each is the sum over
-    both objects of the expected distance.
+    both objects of the expected distance. With three objects, which is not in the paper, there
+    are six: one of them moved, or two.
 
-    :param maps: (B, 2, H, W), object maps of the predictions.
-    :param start_pixels: (B, 2, 2), (u, v) of both objects in the start picture.
-    :param goal_pixels: (B, 2, 2), in the goal picture.
+    :param maps: (B, K, H, W), object maps of the predictions.
+    :param start_pixels: (B, K, 2), (u, v) of the objects in the start picture.
+    :param goal_pixels: (B, K, 2), in the goal picture.
     :return: (B,), in pixels.
     """
-    to_start = expected_distances(maps, start_pixels)  # B, 2
+    to_start = expected_distances(maps, start_pixels)  # B, K
     to_goal = expected_distances(maps, goal_pixels)
-    first = to_goal[:, 0] + to_start[:, 1]
-    second = to_start[:, 0] + to_goal[:, 1]
-    return torch.minimum(first, second)
+    halfway = list(product((False, True), repeat=maps.shape[1]))[1:-1]
+    scores = [torch.where(torch.tensor(moved, device=maps.device), to_goal, to_start).sum(1)
+              for moved in halfway]
+    return torch.stack(scores).amin(0)
 
 
 def bottleneck_frequency(scores, threshold):
@@ -100,13 +104,13 @@ def score_bottlenecks(episodes, prediction, goal_picture):
     :param goal_picture: see batches.uses_recorded_goal.
     :return: float32 (B, 3), prediction, copy-start, copy-goal, in pixels, and float32 (B, 3), the
         mass that the map of that object has kept which lost most, of 1. NaN where it is
-        undefined: for other than two objects, unknown positions, or an object that stays.
+        undefined: for fewer than two objects, unknown positions, or an object that stays.
     """
     result = np.full((len(episodes), 3), np.nan, np.float32)
     mass = result.copy()
     for b, episode in enumerate(episodes):
         pixels = context_pixels(episode, goal_picture)
-        if pixels.shape[1] != 2 or not np.isfinite(pixels).all():
+        if pixels.shape[1] < 2 or not np.isfinite(pixels).all():
             continue
         if np.linalg.norm(pixels[1] - pixels[0], axis=-1).min() < MIN_MOTION:
             continue

@@ -29,28 +29,6 @@ class Windows:
         return Windows(**{name: tensor.to(device) for name, tensor in vars(self).items()})
 
 
-def split_episodes(store, held_out, min_length):
-    """
-    Split a store into training and held-out episodes.
-
-    :param store: EpisodeStore.
-    :param held_out: share of the episodes, spread evenly over the store.
-    :param min_length: frames; shorter episodes are left out.
-    :return: two int arrays of episode indices.
-    :raises RecordingError: when a side would be empty.
-    """
-    usable = np.flatnonzero(np.asarray(store.lengths) >= min_length)
-    count = max(1, round(len(usable) * held_out))
-    if len(usable) < 2:
-        raise RecordingError(
-            f'{len(usable)} episodes of at least {min_length} frames in the recordings; '
-            'the forward model needs at least 2')
-    chosen = np.linspace(0, len(usable) - 1, count).round().astype(int)
-    mask = np.zeros(len(usable), bool)
-    mask[chosen] = True
-    return usable[~mask], usable[mask]
-
-
 def read_windows(store, episodes, starts, steps):
     """
     Read windows from a store.

@@ -4,6 +4,7 @@
 
 import argparse
 from dataclasses import replace
+from itertools import product
 import json
 
 import numpy as np
@@ -110,6 +111,16 @@ def test_bottleneck_is_either_object_first_and_the_sum_over_objects():
 def test_frequency_rises_with_the_threshold():
     frequency = [bottleneck_frequency([0.5, 1.5, 2.0, 9.0], pixels) for pixels in (0, 1, 2, 10)]
     assert frequency == [0, 0.25, 0.75, 1]
+
+
+def test_with_three_objects_one_or_two_may_have_moved_but_not_none_or_all():
+    start = torch.tensor([[[2.0, 2], [2, 10], [10, 2]]])
+    goal = start + 4
+    gap = 32 ** 0.5
+    for moved in product((0.0, 1.0), repeat=3):
+        pixels = start + 4 * torch.tensor(moved)[None, :, None]
+        score = bottleneck_scores(one_hot_maps(pixels[0], (16, 16))[None], start, goal)
+        assert score.item() == pytest.approx(gap if sum(moved) in (0, 3) else 0, abs=1e-4)
 
 
 def test_a_perfect_bottleneck_is_found_and_matched():
