@@ -3,6 +3,7 @@
 """The action reach_goal: the same acts as in one process, limits, and every way to stop."""
 
 from pathlib import Path
+import signal
 import sys
 import threading
 
@@ -145,6 +146,20 @@ def test_when_the_predictor_dies_the_arm_stays_and_the_planner_lives(loop):
         assert response.success or '/camera/image_raw' in words or '/goal/image' in words
         threading.Event().wait(0.1)
     assert response.success and response.subgoals[0].object_maps
+
+
+def test_a_predictor_that_hangs_is_given_up(loop):
+    loop.reset()
+    predictor = loop.processes['predictor_node'].process
+    predictor.send_signal(signal.SIGSTOP)
+    try:
+        with loop.set('visual_mpc_node', predictor_timeout=1.0):
+            status, result = loop.reach(step_budget=2)
+    finally:
+        predictor.send_signal(signal.SIGCONT)
+    assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+    assert '/predict_subgoal' in result.message and '1 s' in result.message
+    assert loop.stopped() and len(loop.moves()) == 0
 
 
 def test_objects_are_followed_as_in_one_process_when_their_pixels_come_once(loop):

@@ -208,13 +208,8 @@ def paper_runs(scale, seeds=(0,), episodes=0, steps=0):
                     ['fix0.25', 'fix0.75', 'fix1.00']):
         add(['grasp'], methods, mode='forward', variant='+changed')
     add(['grasp'], ['genmin4', 'fix0.50', 'min'], mode='forward')
-    add(['pick_place', 'grasp', 'push2'], ['genmin-vae-gan'], variant='+changed')
     # Fixed-time prediction at other match-steps.
     add(['push2'], ['fix0.75', 'fix0.25'], new_pixels=False)
-    add(['grasp', 'pick_place'], ['fix0.75', 'fix0.25'], variant='+changed')
-    add(['pick_place', 'grasp', 'push2'], ['min', 'genmin+relative'], variant='+changed')
-    # Recursion.
-    add(['pick_place'], ['genmin'], recursion=2, variant='+changed')
     # What the parts of genmin+relative are worth.
     add(['push2'], ['genmin', 'fix'], new_pixels=False, variant='+root')
     add(['push2'], ['genmin+relative'], new_pixels=False, variant='+mean')

@@ -133,8 +133,10 @@ def make_jobs(args):
                 file = str(find_predictor(file.replace('{task}', task)))
                 if not Path(file).is_file():
                     raise ConfigError(
-                        f'method {method.name!r}: no weights {file}; name them with --predictor '
-                        f'{method.base}=FILE, or leave the method out with --methods')
+                        f'method {method.name!r}: no weights {file}; train them with `python -m '
+                        f'tap_ros paper --only "{task}-bidirectional-{method.base}-warp-s0"`, '
+                        f'name them with --predictor {method.base}=FILE, or leave the method out '
+                        'with --methods')
             jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
                             args.step_budget, args.preset, _command(args, task, method)))
     return jobs

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from sim_bridge.simulator import Simulator
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.evaluation.planning.episode import REACHED, run_episode
 from tap_ros.evaluation.planning.methods import Method
 from tap_ros.evaluation.planning.scenes import step_budget
@@ -167,8 +167,12 @@ def run_scene(job, seed):
 
     :return: dict of seed, final_cm (mean over objects), objects_cm, steps, switches, plan_ms
         (median) and, with carried object pixels, tracking_error_px.
+    :raises PlanningError: if it cannot be planned; the message names task, method and scene.
     """
-    runs, final = plan_scene(job, seed)
+    try:
+        runs, final = plan_scene(job, seed)
+    except PlanningError as error:
+        raise PlanningError(f'{job.task}, {job.method.name}, scene {seed}: {error}') from error
     times = np.concatenate([run.planning_ms for run in runs])
     scene = {
         'seed': int(seed), 'final_cm': round(float(100 * final.mean()), 3),
