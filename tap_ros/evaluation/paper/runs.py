@@ -208,6 +208,7 @@ def paper_runs(scale, seeds=(0,), episodes=0, steps=0):
                     ['fix0.25', 'fix0.75', 'fix1.00']):
         add(['grasp'], methods, mode='forward', variant='+changed')
     add(['grasp'], ['genmin4', 'fix0.50', 'min'], mode='forward')
+    add(['pick_place'], ['genmin-vae-gan'], variant='+changed')
     # Fixed-time prediction at other match-steps.
     add(['push2'], ['fix0.75', 'fix0.25'], new_pixels=False)
     # What the parts of genmin+relative are worth.
