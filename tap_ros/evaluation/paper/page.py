@@ -217,9 +217,9 @@ def _bottleneck(rows, scale, pictures):
                             metric=metric) for metric in ('bottleneck_frequency_2px', 'min_l1'))
     parts = ['## Bottlenecks (appendix E)\n',
              'Share of predictions, in percent, whose object maps show one object where it '
-             'started and the other at its goal, to within so many pixels (sum over both objects '
-             'of the expected distance). Object positions are ground truth of the simulator, used '
-             'to score only. Episodes in which an object moves less than '
+             'started and the other at its goal (with three objects: one or two at their goals), '
+             'to within so many pixels (sum over the objects of the expected distance). Object '
+             'positions are ground truth of the simulator, used to score only. Episodes in which an object moves less than '
              f'{MIN_MOTION:.0f} px do not count, since it is then at its start and its goal at '
              'once' + (f': {counted["n"]} of {all_of["n"]} held-out episodes remain.'
                        if counted and all_of else '.') + '\n',
