@@ -219,7 +219,8 @@ def _bottleneck(rows, scale, pictures):
              'Share of predictions, in percent, whose object maps show one object where it '
              'started and the other at its goal (with three objects: one or two at their goals), '
              'to within so many pixels (sum over the objects of the expected distance). Object '
-             'positions are ground truth of the simulator, used to score only. Episodes in which an object moves less than '
+             'positions are ground truth of the simulator, used to score only. Episodes in '
+             'which an object moves less than '
              f'{MIN_MOTION:.0f} px do not count, since it is then at its start and its goal at '
              'once' + (f': {counted["n"]} of {all_of["n"]} held-out episodes remain.'
                        if counted and all_of else '.') + '\n',
