@@ -40,7 +40,7 @@ def declare_parameters(node):
     for name, default, low, high, description in (
             ('max_step_xy', 0.08, 0.001, 0.08, 'Largest |dx| and |dy| of a command in metres; '
              'the planner knows it, from the next goal on.'),
-            ('max_step_z', 0.15, 0.001, 0.15, 'Largest |dz| of a command in metres; likewise.'),
+            ('max_step_z', 0.15, 0.02, 0.15, 'Largest |dz| of a command in metres; likewise.'),
             ('goal_tolerance', 1.0, 0.0, 64.0,
              'A goal or subgoal is reached at this mean distance of the objects in pixels.')):
         parameters.declare(name, default, description, low=low, high=high, read_only=False)

@@ -4,6 +4,7 @@
 
 import sys
 import threading
+import time
 import traceback
 
 from geometry_msgs.msg import TwistStamped
@@ -56,6 +57,8 @@ class VisualMpcNode(Node):
         self.params = declare_parameters(self)
         self._mpc = load_planner(self.params)
         self._ending = False
+        self._sending = threading.Lock()  # no command may follow the stop of a cancel
+        self._cancelled = None  # the goal that was cancelled last
         self._busy = threading.Lock()  # held from the acceptance of a goal to its end
         self._sensors = Observations(*SENSORS)
         self._sensors.subscribe(self, SENSORS, STREAM)
@@ -73,7 +76,9 @@ class VisualMpcNode(Node):
 
     def close(self):
         """End the goal in progress, and see that the command to stop has left."""
-        self._ending = True
+        with self._sending:
+            self._ending = True
+            self._stop()
         self._sensors.wake()
         self._busy.acquire(timeout=10.0)  # longer than a plan takes
         self._stop()
@@ -88,8 +93,10 @@ class VisualMpcNode(Node):
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
-    def _on_cancel(self, _):
-        self._stop()  # at once: a plan may be in progress
+    def _on_cancel(self, handle):
+        with self._sending:
+            self._cancelled = handle  # who asks its state still finds it executing
+            self._stop()  # at once: a plan may be in progress
         self._sensors.wake()
         return CancelResponse.ACCEPT
 
@@ -101,7 +108,7 @@ class VisualMpcNode(Node):
             handle.succeed()
         except Cancelled as error:
             result.message = str(error)
-            if handle.is_cancel_requested:
+            if self._cancelled is handle and cancel_is_known(handle):
                 handle.canceled()
             else:
                 handle.abort()
@@ -124,7 +131,7 @@ class VisualMpcNode(Node):
         mode = check_request(request)
 
         def cancelled():
-            return handle.is_cancel_requested or self._ending
+            return self._cancelled is handle or self._ending
 
         def go_on():
             if cancelled():
@@ -139,19 +146,19 @@ class VisualMpcNode(Node):
         goal_pixels = match_objects(names, goal_names, goal_pixels, 'objects', 'goal_objects')
         budget = request.step_budget or default_budget(len(names))
         tolerance = self.params['goal_tolerance']
+        carried = self.params['tracking'] == 'carried'
         self._mpc.limit(self.params['max_step_xy'], self.params['max_step_z'])
         scene, subgoals = self._decode(seen, names), []
         if mode == 'subgoal':
             found = self._ask_for_subgoals(seen, goal, names, request, cancelled)
             subgoals = choose_sample(
                 self._mpc, *scene, goal_pixels, found, request.seed, go_on)
-            seen = self._observe(-1, cancelled)  # the newest: asking and choosing take time
-            scene = self._decode(seen, names)
+            # The newest: asking and choosing take time. With carried, objects may come once only.
+            seen = self._observe(-1, cancelled, ('image', 'joints') if carried else SENSORS)
+            scene = (*self._decode_arm(seen), scene[2]) if carried else self._decode(seen, names)
         targets = targets_by(subgoals, goal_pixels)
         itinerary = Itinerary(targets, budget, self.params['switch'], tolerance)
-        tracker = None
-        if self.params['tracking'] == 'carried':
-            tracker = ObjectTracker(self._mpc.model, *scene)
+        tracker = ObjectTracker(self._mpc.model, *scene) if carried else None
         self._mpc.reset(request.seed)
         while True:
             image, gripper, pixels = scene
@@ -162,7 +169,7 @@ class VisualMpcNode(Node):
             target = itinerary.target(result.steps, pixels)
             plan = self._mpc.act(image, gripper, pixels, **target.goal(pixels))
             go_on()
-            sent_ns = self._send(plan.action, seen['image'])
+            sent_ns = self._send(plan.action, seen['image'], handle)
             result.steps += 1
             handle.publish_feedback(ReachGoal.Feedback(
                 step=result.steps, stage=stage_name(len(itinerary.switches), len(subgoals)),
@@ -199,7 +206,7 @@ class VisualMpcNode(Node):
         goal.update({topic: found[topic] for topic in needed})
         return goal, *decode_objects(goal['objects'], 'goal_objects')
 
-    def _observe(self, after_ns, cancelled, topics=tuple(SENSORS)):
+    def _observe(self, after_ns, cancelled, topics=SENSORS):
         """
         Wait for messages of one moment after `after_ns`.
 
@@ -252,9 +259,11 @@ class VisualMpcNode(Node):
 
     # Commands
 
-    def _send(self, action, image):
+    def _send(self, action, image, handle):
         """
         Send one command within the limits, stamped like the image message that it answers.
+
+        Nothing is sent for a goal that was cancelled.
 
         :return: images count from this stamp on, in ns: later than the newest image that had
             already come, and with one control period between.
@@ -271,13 +280,24 @@ class VisualMpcNode(Node):
         linear = message.twist.linear
         linear.x, linear.y, linear.z = (self.params['twist_scale'] * move).tolist()
         newest = (self._sensors.newest('image') or {'image': image})['image']
-        self._gripper.publish(Float64(data=float(np.clip(action[3], 0, 1))))
-        self._twist.publish(message)
+        with self._sending:
+            if self._cancelled is handle or self._ending:
+                raise Cancelled('cancelled')
+            self._gripper.publish(Float64(data=float(np.clip(action[3], 0, 1))))
+            self._twist.publish(message)
         return to_nanoseconds(newest.header.stamp) + int(0.9e9 * self.params['control_period'])
 
     def _stop(self):
         """Send a zero command; it has no stamp, since it answers no image."""
         self._twist.publish(TwistStamped())
+
+
+def cancel_is_known(handle, seconds=1.0):
+    """Wait until rclpy knows that a goal is cancelled, which is after _on_cancel has returned."""
+    deadline = time.monotonic() + seconds
+    while not handle.is_cancel_requested and time.monotonic() < deadline:
+        time.sleep(0.01)
+    return handle.is_cancel_requested
 
 
 def stage_name(index, num_subgoals):

@@ -78,8 +78,10 @@ class SequenceShape:
         Return how many segments the gripper has to be lifted at least.
 
         Neither low nor lifted, it stands upon something: then it must go up before it can push.
+        Where it takes several periods to come down, it passes these heights every time.
         """
-        return int(self.upright and LOW + 0.02 < height < LIFTED - 0.03)
+        return int(self.upright and self.climb_limit >= LIFTED - LOW
+                   and LOW + 0.02 < height < LIFTED - 0.03)
 
     def segment(self):
         """Return the segment (horizon,) of each control period."""
@@ -99,7 +101,8 @@ class SequenceShape:
             missing[:, t] = heights[:, t] - now
             climb[:, t] = np.clip(missing[:, t], -self.climb_limit, self.climb_limit)
             now = now + climb[:, t]
-        return climb, (np.abs(missing) < VERTICAL) | (not self.upright)
+        near = min(VERTICAL, max(self.climb_limit, 0.02))  # slow ones wait until it is done
+        return climb, (np.abs(missing) < near) | (not self.upright)
 
     def actions(self, parameters, height):
         """
@@ -121,7 +124,7 @@ class SequenceShape:
 
     def landings(self, actions, gripper):
         """
-        Find where the gripper comes down.
+        Find where the gripper comes down: passes LOW + VERTICAL.
 
         :param actions: (N, horizon, 4); gripper: (4,).
         :return: (N, 2) metres; NaN for sequences that stay up or low.

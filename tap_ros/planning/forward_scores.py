@@ -58,7 +58,10 @@ def measure_maps(model, store, episodes, stride=8, max_windows=400):
             maps = model.seed_maps(torch.from_numpy(true[0].copy()).to(device))
             carried = model.carried_maps(
                 model.begin(image, gripper), gripper, maps, actions.to(device))
-            expected = torch.stack([m[0].flatten(1) @ table for m in carried]).cpu().numpy()
+            here = torch.from_numpy(true[0].copy()).to(device)
+            expected = torch.stack([  # a lost map is scored as one that did not move
+                m[0].flatten(1) @ table + (1 - m[0].sum((-1, -2)))[:, None] * here
+                for m in carried]).cpu().numpy()
             errors.append(np.linalg.norm(expected - true[1:], axis=-1))  # (T, K)
             ideal = model.seed_maps(torch.from_numpy(true[1:].reshape(-1, 2).copy()).to(device))
             ideal = (ideal.flatten(1) @ table).cpu().numpy().reshape(true[1:].shape)

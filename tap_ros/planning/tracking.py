@@ -67,7 +67,8 @@ class ObjectTracker:
         carried, = model.carried_maps(features, hand, maps, moves)
         # differences only, so that blurring and cells do not add up over the steps
         table = model.pixel_table().flatten(0, 1)
-        shift = (carried[0] - maps).flatten(1) @ table
+        kept = carried[0].sum((-1, -2)) > 0  # else nobody knows where it went
+        shift = (carried[0] - maps).flatten(1) @ table * kept[:, None]
         expected = self.pixels + shift.cpu().numpy()
         # correct: match what the objects looked like
         picture, arm = self._prepare(after, gripper)

@@ -97,6 +97,7 @@ def assemble(parts):
     data, names, marks = _join(parts)
     if len(data['frame_stamp']) > 1 and not data['frame_stamp'].any():
         data['frame_stamp'] = data['frame_log']
+    _drop_stops(data)
     for name in ('twist', 'joint', 'object'):
         _stamp_unstamped(data, name)
     spans = read_spans(data, marks)
@@ -194,6 +195,18 @@ def _join(parts):
     objects = pad_objects(data['object'] + data['goal_object'])
     data['object'], data['goal_object'] = objects[:len(parts)], objects[len(parts):]
     return {key: np.concatenate(value) for key, value in data.items()}, list(numbers), marks
+
+
+def _drop_stops(data):
+    """
+    Leave out zero twists without a stamp among stamped ones: they say stop, and answer no frame.
+
+    As the last command before the next frame, such a one would take the place of the action.
+    """
+    stops = (data['twist_stamp'] == 0) & ~data['twist'].any(1)
+    if (data['twist_stamp'] != 0).any():
+        for key in ('twist', 'twist_log', 'twist_stamp'):
+            data[key] = data[key][~stops]
 
 
 def _stamp_unstamped(data, name):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the planning results: resumed, paired, refused when damaged; the whole command."""
 
+from dataclasses import asdict
 import json
 from pathlib import Path
 
@@ -110,6 +111,12 @@ def test_methods_are_compared_in_the_same_planner():
 def test_results_of_other_settings_are_not_subtracted():
     results = dict([stored('direct', [9.0]), stored('genmin', [4.0])])
     results['push2', 'direct'][0]['preset'] = 'quick'
+    assert not any('against' in row for row in make_rows(results))
+    results['push2', 'direct'][0].update(preset='', planner={**asdict(QUICK), 'segments': 4})
+    assert not any('against' in row for row in make_rows(results))
+    results = dict([stored('genmin', [9.0]), stored('genmin:true_maps', [4.0])])
+    assert any('against' in row for row in make_rows(results))
+    results['push2', 'genmin'][0]['predictor_weights'] = 'others'
     assert not any('against' in row for row in make_rows(results))
 
 

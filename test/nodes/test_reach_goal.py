@@ -94,6 +94,9 @@ def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
     assert status == GoalStatus.STATUS_CANCELED
     assert 'cancelled' in result.message and 1 <= result.steps < 40
     assert loop.stopped()
+    sent = [t.twist.linear for t in list(loop.twists)]
+    still = [(v.x, v.y, v.z) == (0, 0, 0) for v in sent]
+    assert all(still[still.index(True):])  # no command follows the first stop
     count = len(loop.moves())
     status, result = loop.reach(mode='direct', step_budget=1)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
@@ -120,7 +123,13 @@ def test_a_bad_goal_is_aborted_with_the_reason_and_moves_nothing(loop, fields, w
 def test_when_images_stop_coming_the_arm_is_stopped(loop):
     loop.reset()
     call(loop.pause_client, SetBool.Request(data=True), 10)
-    status, result = loop.reach(mode='direct', step_budget=10)
+    acting = threading.Event()
+    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct', step_budget=10), 30,
+                       lambda feedback: acting.set())
+    assert acting.wait(60)
+    threading.Event().wait(2.5)
+    assert loop.stopped() and not handle.status == GoalStatus.STATUS_ABORTED  # it still waits
+    status, result = wait_for_result(handle, 60)
     call(loop.pause_client, SetBool.Request(data=False), 10)
     assert status == GoalStatus.STATUS_ABORTED and result.steps == 1
     assert '/camera/image_raw' in result.message

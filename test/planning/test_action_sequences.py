@@ -113,3 +113,13 @@ def test_with_a_small_limit_the_gripper_climbs_in_several_periods_and_waits_mean
     assert still[0] and heights[still][0] < heights[~still].max()
     landing, = shape.landings(actions[None], np.array([0, 0, LOW, 0]))
     assert np.isfinite(landing).all()  # it comes down again, in steps
+
+
+@pytest.mark.parametrize('limit', [0.02, 0.04, 0.09, 0.15])
+def test_replanning_with_small_limits_the_gripper_comes_down(limit):
+    shape, height = SequenceShape(climb_limit=limit), LIFTED
+    for _ in range(12):
+        parameters = np.zeros((1, shape.size))
+        parameters = shape.clip(parameters, least_lift=shape.least_lift(height))
+        height += shape.actions(parameters, height)[0, 0, 2]
+    assert height == pytest.approx(LOW, abs=1e-6)

@@ -66,9 +66,9 @@ def perform(run, places, minutes=None, fresh=False):
     with locked(folder / 'lock') as mine:
         if not mine:
             return BUSY
+        _check_before(run.before, places)
         for name in _LEFT_BY_TRAINING if fresh else ():
             (folder / name).unlink(missing_ok=True)
-        _check_before(run.before, places)
         weights = train(config, minutes=minutes, progress=False)
         if read_json(folder / 'run.json')['steps'] < config.steps:
             return UNFINISHED
@@ -80,10 +80,12 @@ def _check_before(run, places):
     """Refuse to begin with weights that are not there or half trained."""
     if run is None:
         return
-    steps = (read_json(run.folder(places.runs) / 'run.json') or {'steps': 0})['steps']
+    from tap_ros.evaluation.paper.sweep import trained_steps
+
+    steps = trained_steps(run, places)
     if steps < run.num_steps:
         raise ConfigError(f'the weights of {run.name}, to begin with, are trained for {steps} of '
-                          f'{run.num_steps} steps; first: {run.command}')
+                          f'{run.num_steps} steps with these settings; first: {run.command}')
 
 
 def score(run, config, weights, places):

@@ -102,11 +102,31 @@ def find_state(run, places, data_hash=None):
     return State('missing' if result is None else 'other')
 
 
+def trained_steps(run, places):
+    """
+    Find out for how many steps a run is trained, whatever its recording.
+
+    :param run: PaperRun.
+    :param places: Places.
+    :return: 0 too where it was trained with other settings.
+    """
+    folder, config = run.folder(places.runs), run.config(places.recordings, places.runs)
+    about = read_json(folder / 'run.json')
+    if about is None or not _same(read_json(folder / 'config.json') or {}, config):
+        return 0
+    return about['steps']
+
+
 def _same(settings, config):
     """Compare settings of a run, all that training depends on; new ones count as the default."""
-    wanted = json.loads(json.dumps(asdict(config)))
-    return all(settings.get(name, DEFAULTS[name]) == value for name, value in wanted.items()
-               if name not in FREE)
+    wanted = _comparable(json.loads(json.dumps(asdict(config))))
+    settings = _comparable({**DEFAULTS, **settings})
+    return all(settings[name] == value for name, value in wanted.items() if name not in FREE)
+
+
+def _comparable(settings):
+    """Name the weights to begin with by their run alone, wherever the folder of runs is."""
+    return {**settings, 'initial_weights': Path(settings['initial_weights']).parent.name}
 
 
 def data_hashes(runs, places):

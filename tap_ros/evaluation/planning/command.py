@@ -84,12 +84,23 @@ def run(args):
         jobs = make_jobs(args)
         seeds = range(args.seed, args.seed + args.scenes)
         files = run_jobs(jobs, seeds, out / 'planning', args.jobs)
+        _write_results(out, films)  # first: whatever happens to the films, these stay
         for job, file in zip(jobs, files):
             name = f'{job.task}-{job.method.file_name}'
             if not args.no_films and job.method.base != 'nothing':
                 caption = write_films(job, file.scenes, out / 'planning' / f'{name}.png',
                                       Path(args.recordings) / f'{name}.mcap')
                 films[job.task, job.method.name] = f'planning/{name}.png', caption
+    rows = _write_results(out, films)
+    for row in rows:
+        if row['metric'] == 'final_distance_cm':
+            print(f'  {row["task"]} {row["method"]:24} {row["value"]:5.1f} cm '
+                  f'[{row["ci_low"]:.1f}, {row["ci_high"]:.1f}], {row["n"]} scenes')
+    print(f'written: {out / "planning.json"}, {out / "planning.md"}')
+
+
+def _write_results(out, films):
+    """Write planning.json and planning.md from the scenes that were run; return the rows."""
     rows = make_rows(load_results(out / 'planning'))
     if not rows:
         raise ConfigError(f'{out / "planning"}: holds no results; run without --results-only')
@@ -99,11 +110,7 @@ def run(args):
         rows, _all_films(out, rows, films),
         json.loads(maps.read_text()) if maps.exists() else (),
         findings.read_text() if findings.exists() else ''))
-    for row in rows:
-        if row['metric'] == 'final_distance_cm':
-            print(f'  {row["task"]} {row["method"]:24} {row["value"]:5.1f} cm '
-                  f'[{row["ci_low"]:.1f}, {row["ci_high"]:.1f}], {row["n"]} scenes')
-    print(f'written: {out / "planning.json"}, {out / "planning.md"}')
+    return rows
 
 
 def make_jobs(args):

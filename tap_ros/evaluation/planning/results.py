@@ -56,7 +56,7 @@ def make_rows(results):
         for compares, partner in partners(parse_method(name), names[task]):
             others, other = results[task, partner]
             both = sorted(set(scenes) & set(other))
-            if both and all(settings[key] == others[key] for key in SAME):
+            if both and comparable(compares, settings, others):
                 gaps = [scenes[seed]['final_cm'] - other[seed]['final_cm'] for seed in both]
                 measured.append(('final_distance_difference_cm', gaps,
                                  {'against': partner, 'compares': compares}))
@@ -70,6 +70,22 @@ def make_rows(results):
                     'seeds': 1, 'first_scene': min(scenes), **more, **_how(name, settings),
                     'command': settings.get('command', '')})
     return rows
+
+
+def comparable(compares, settings, others):
+    """
+    Say whether two results differ in nothing but what is compared.
+
+    :param compares: of partners.
+    :param settings: of one result; others: of the other.
+    """
+    same = all(settings[key] == others[key] for key in SAME)
+    if compares not in ('search', 'replan_every'):  # which are settings of the planner
+        same &= settings['planner'] == others['planner']
+    bases = [parse_method(about['method']).base for about in (settings, others)]
+    if bases[0] == bases[1]:
+        same &= settings['predictor_weights'] == others['predictor_weights']
+    return same
 
 
 def partners(method, names):
