@@ -41,7 +41,7 @@ class Method:
         only in the first picture, then followed by planning.tracking.
     :param model: 'learned' or 'true', the simulator itself.
     :param search: 'preset'; 'more': four times the samples, five iterations; 'paper': the paper's
-        planner, mpc_config.PAPER.
+        planner, mpc_config.PAPER, whatever else is set.
     :param replan_every: see VisualMPCConfig; 0: as the preset has it.
     """
 
