@@ -90,6 +90,21 @@ class Loop:
         finally:
             change(before)
 
+    def wait_until_seen(self):
+        """
+        Wait until the predictor has found the simulator, and return its first whole answer.
+
+        No new image is sent meanwhile; the newest one comes once it is discovered.
+        """
+        for _ in range(300):
+            response = self.predict()
+            if response.success and response.subgoals[0].object_maps:
+                return response
+            words = response.message
+            assert response.success or '/camera/image_raw' in words or '/goal/image' in words
+            threading.Event().wait(0.1)
+        raise AssertionError(response.message)
+
     def predict(self, **fields):
         return call(self.predict_client, PredictSubgoal.Request(**fields), 60)
 
@@ -132,6 +147,8 @@ def running_loop(folder):
                     process.wait_for('ready', 120)
                 assert loop.predict_client.wait_for_service(30)
                 assert loop.reach_client.wait_for_server(30)
+                loop.reset()
+                loop.wait_until_seen()
                 yield loop
             finally:
                 for process in loop.processes.values():

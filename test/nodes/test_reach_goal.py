@@ -147,14 +147,7 @@ def test_when_the_predictor_dies_the_arm_stays_and_the_planner_lives(loop):
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     loop.start('predictor_node')
     loop.processes['predictor_node'].wait_for('ready', 120)
-    for _ in range(100):  # no new image is sent; the newest one comes once it is discovered
-        response = loop.predict()
-        if response.success and response.subgoals[0].object_maps:
-            break
-        words = response.message
-        assert response.success or '/camera/image_raw' in words or '/goal/image' in words
-        threading.Event().wait(0.1)
-    assert response.success and response.subgoals[0].object_maps
+    loop.wait_until_seen()
 
 
 def test_a_predictor_that_hangs_is_given_up(loop):
