@@ -327,7 +327,8 @@ class ForwardModel(nn.Module):
             low = torch.minimum(gripper[:, 2], following[:, 2]) < CLEAR
             if low.is_cuda or low.any():  # asking makes a GPU wait
                 moved = self.advance(features, flow, gripper, action)[0]
-                flow = torch.where(low[:, None, None, None], moved, flow)
+                flow = (moved if not low.is_cuda and low.all()
+                        else torch.where(low[:, None, None, None], moved, flow))
             gripper = following
             if t % every == 0:
                 yield self.carry(maps, flow)

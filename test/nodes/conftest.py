@@ -4,5 +4,15 @@
 
 import os
 
+import pytest
+
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+@pytest.fixture(scope='module')
+def loop(tmp_path_factory):
+    """All nodes as processes, for the tests of one file."""
+    from loop import running_loop  # needs ROS, which the other tests here may do without
+    with running_loop(tmp_path_factory.mktemp('loop')) as loop:
+        yield loop

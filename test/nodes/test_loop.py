@@ -23,16 +23,10 @@ from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
-from loop import MODULES, running_loop, SEED  # noqa: E402
+from loop import MODULES, SEED  # noqa: E402
 from processes import Client, NodeProcess  # noqa: E402
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-
-
-@pytest.fixture(scope='module')
-def loop(tmp_path_factory):
-    with running_loop(tmp_path_factory.mktemp('loop')) as loop:
-        yield loop
 
 
 def positions(message):

@@ -21,15 +21,9 @@ from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
 from lively import lively_network  # noqa: E402
-from loop import acts_like, running_loop, SEED  # noqa: E402
+from loop import acts_like, SEED  # noqa: E402
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-
-
-@pytest.fixture(scope='module')
-def loop(tmp_path_factory):
-    with running_loop(tmp_path_factory.mktemp('loop')) as loop:
-        yield loop
 
 
 def test_the_nodes_act_as_the_same_classes_do_in_one_process(loop):

@@ -123,8 +123,9 @@ def _maps(rows):
     return ['## Object maps carried by the forward model\n',
             'Pixels from the expected pixel of the map to the true one, so many control periods '
             'ahead, on held-out episodes, for objects that moved more than 2 px; maps begin at '
-            'the true pixels. A pixel is about 1.6 cm on the table. The true simulator has an '
-            'error, too: that of the grid on which maps are kept.\n', '\n'.join(lines) + '\n',
+            'the true pixels. A pixel is about 1.6 cm on the table. true_simulator puts the maps '
+            'where the objects went; its error is that of the grid on which maps are kept.\n',
+            '\n'.join(lines) + '\n',
             *(f'    {command}' for command in dict.fromkeys(
                 row['command'] for row in rows)), '']
 
