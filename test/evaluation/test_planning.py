@@ -169,7 +169,7 @@ def test_objects_can_be_followed_by_pictures_while_the_simulator_plans(simulator
 @pytest.mark.parametrize('text', [
     *BASES, 'genmin', 'true_model', 'genmin:half', 'fix0.25:recursion2:samples8:carried',
     'genmin+relative:true_maps', 'genmin:true_model:more_search', 'direct:every3',
-    'fix:paper',
+    'fix:paper', 'true_subgoal:plain_cost',
     'true_subgoal:half:recursion2'])
 def test_the_name_of_a_method_reads_as_that_method(text):
     method = parse_method(text)
@@ -196,6 +196,7 @@ def test_options_change_the_planner():
     assert parse_method('direct:more_search').planner(QUICK).search.num_samples == 64
     assert parse_method('fix:half:paper').planner(QUICK) == PAPER
     assert parse_method('direct:every3').planner(QUICK).replan_every == 3
+    assert parse_method('direct:plain_cost').planner(QUICK) == replace(QUICK, unfinished=0)
     assert parse_method('direct').planner(QUICK) == QUICK
 
 

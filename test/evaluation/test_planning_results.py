@@ -94,7 +94,8 @@ def test_rows_are_means_with_intervals_and_paired_differences():
 
 def test_methods_are_compared_in_the_same_planner():
     names = {'direct', 'direct:paper', 'true_model', 'fix', 'fix:half', 'genmin', 'genmin:half',
-             'genmin:half:paper', 'genmin:true_model', 'true_subgoal', 'nothing'}
+             'genmin:half:paper', 'genmin:true_model', 'true_subgoal', 'nothing',
+             'direct:plain_cost', 'genmin:plain_cost'}
 
     def compared(name):
         return dict(partners(parse_method(name), names))
@@ -103,6 +104,7 @@ def test_methods_are_compared_in_the_same_planner():
     assert compared('genmin:half') == {'direct': 'direct', 'fix': 'fix:half', 'switch': 'genmin'}
     assert compared('genmin:true_model') == {'direct': 'true_model', 'model': 'genmin'}
     assert compared('true_model') == {'model': 'direct'}
+    assert compared('genmin:plain_cost') == {'direct': 'direct:plain_cost', 'cost': 'genmin'}
     assert partners(parse_method('true_subgoal'), names)[2:] == [
         ('subgoal', 'fix'), ('subgoal', 'genmin')]
     assert compared('nothing') == {}

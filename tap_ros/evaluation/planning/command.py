@@ -34,7 +34,7 @@ def add_arguments(parser):
         help='nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped (the '
         'shipped predictor) or the name of another one; with options behind colons: half, '
         'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper (its search '
-        'whatever --preset says), every<n>, for example genmin:half:carried (default: '
+        'whatever --preset says), plain_cost, every<n>, for example genmin:half:carried (default: '
         + ' '.join(DEFAULT_METHODS) + ')')
     add('--predictor', nargs='+', default=[], metavar='NAME=FILE',
         help='weights of predictors; {task} in FILE stands for the task (default: what '

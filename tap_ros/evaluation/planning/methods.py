@@ -21,7 +21,7 @@ OPTIONS = {  # option: (field, value; None: the number behind it)
     'recursion': ('recursion', None), 'samples': ('samples', None),
     'carried': ('tracking', 'carried'), 'true_maps': ('maps', 'true'),
     'true_model': ('model', 'true'), 'more_search': ('search', 'more'),
-    'paper': ('search', 'paper'),
+    'paper': ('search', 'paper'), 'plain_cost': ('cost', 'plain'),
     'every': ('replan_every', None)}
 SUBGOALS_ONLY = ('switch', 'recursion', 'samples', 'maps')
 
@@ -42,6 +42,8 @@ class Method:
     :param model: 'learned' or 'true', the simulator itself.
     :param search: 'preset'; 'more': four times the samples, five iterations; 'paper': the paper's
         planner, mpc_config.PAPER, whatever else is set.
+    :param cost: 'preset'; 'plain': the sum of distances alone, as in the paper, nothing that
+        prefers to bring one object home before the next (VisualMPCConfig.unfinished).
     :param replan_every: see VisualMPCConfig; 0: as the preset has it.
     """
 
@@ -53,6 +55,7 @@ class Method:
     tracking: str = 'ground_truth'
     model: str = 'learned'
     search: str = 'preset'
+    cost: str = 'preset'
     replan_every: int = 0
 
     @property
@@ -85,6 +88,8 @@ class Method:
         if self.search == 'more':
             search = replace(search, num_samples=4 * search.num_samples, num_iterations=5)
             config = replace(config, search=search, proposals=4 * config.proposals)
+        if self.cost == 'plain':
+            config = replace(config, unfinished=0.0)
         if self.replan_every:
             config = replace(config, replan_every=self.replan_every)
         if self.model == 'true':  # the simulator rolls out all samples by itself

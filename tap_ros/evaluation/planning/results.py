@@ -80,7 +80,7 @@ def comparable(compares, settings, others):
     :param settings: of one result; others: of the other.
     """
     same = all(settings[key] == others[key] for key in SAME)
-    if compares not in ('search', 'replan_every'):  # which are settings of the planner
+    if compares not in ('search', 'cost', 'replan_every'):  # which are settings of the planner
         same &= settings['planner'] == others['planner']
     bases = [parse_method(about['method']).base for about in (settings, others)]
     if bases[0] == bases[1]:
@@ -119,7 +119,7 @@ def _how(name, settings):
     return {
         'tracking': settings['object_pixels'], 'switch': method.switch,
         'recursion': method.recursion, 'samples': method.samples, 'maps': method.maps,
-        'model': method.model, 'step_budget': settings['step_budget'],
+        'model': method.model, 'cost': method.cost, 'step_budget': settings['step_budget'],
         'planner_samples': planner['search']['num_samples'],
         'planner_iterations': planner['search']['num_iterations'],
         'replan_every': planner['replan_every'], 'preset': settings['preset'],
