@@ -117,14 +117,14 @@ def forward_scatter(rows, task='grasp'):
             name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
     figure, axes = _new_figure(3.9, len(panels))
     for axis, (title, points) in zip(axes[0], panels):
-        _scatter(axis, points, FRAMES[task], 0.008 * len(panels))
+        _scatter(axis, points, FRAMES[task])
         axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
         axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
     axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)
     return _png(figure)
 
 
-def _scatter(axis, points, frames, letter):
+def _scatter(axis, points, frames):
     """Draw one panel: a point for each method, and the lower hull of the fixed-time ones."""
     methods = sorted(points, key=method_order)
     high = 1.18 * max(points[m][1] for m in methods)
@@ -142,45 +142,16 @@ def _scatter(axis, points, frames, letter):
                 color=colour, elinewidth=0.8, alpha=0.5, zorder=2)
         axis.plot(x, y, 's' if family(m) == 'fix' else 'o', color=colour, markersize=6,
                   markeredgecolor='white', markeredgewidth=0.6, zorder=3)
-    at = np.array([points[m][:2] for m in methods]) / (frames, high)
-    for m, (x, y, align) in zip(methods, _place_labels(at, methods, letter)):
-        axis.text(x * frames, y * high, m, fontsize=8, color=COLOURS[family(m)], va='center',
-                  ha=align)
+    heights = _spread([points[m][1] for m in methods], 0.05 * high)
+    for m, height in zip(methods, heights):  # in a column: beside the points they would overlap
+        axis.annotate(
+            m, points[m][:2], (1.06 * frames, height), fontsize=8, color=COLOURS[family(m)],
+            va='center', annotation_clip=False, arrowprops={
+                'arrowstyle': '-', 'color': COLOURS[family(m)], 'alpha': 0.35, 'linewidth': 0.7,
+                'shrinkA': 1, 'shrinkB': 4})
     axis.set_xlim(0, frames)
     axis.set_ylim(0, high)
     axis.grid(color='#f0f0f0')
-
-
-def _place_labels(at, texts, letter):
-    """
-    Put each label on that side of its point where it covers the least.
-
-    :param at: (N, 2), points in shares of the panel.
-    :param texts: N labels.
-    :param letter: width of a letter, in shares of the panel.
-    :return: list of (x, y, horizontal alignment).
-    """
-    taken = [(x - 0.018, y - 0.022, x + 0.018, y + 0.022) for x, y in at]
-    placed = []
-    for (x, y), text in zip(at, texts):
-        width, best, tried = letter * len(text), None, []
-        for dx, dy, align in ((0.028, 0, 'left'), (-0.028, 0, 'right'), (0.02, 0.04, 'left'),
-                              (0.02, -0.04, 'left'), (-0.02, 0.04, 'right'),
-                              (-0.02, -0.04, 'right'), (0, 0.055, 'center'),
-                              (0, -0.055, 'center'), (0.05, 0.085, 'left'),
-                              (0.05, -0.085, 'left')):
-            left = x + dx - width * {'left': 0, 'right': 1, 'center': 0.5}[align]
-            box = (left, y + dy - 0.02, left + width, y + dy + 0.02)
-            covered = sum(max(0, min(box[2], other[2]) - max(box[0], other[0]))
-                          * max(0, min(box[3], other[3]) - max(box[1], other[1]))
-                          for other in taken) + 10 * (box[0] < 0 or box[2] > 1.05)
-            covered += 2e-4 * len(tried)  # the earlier ones look better
-            tried.append(box)
-            if best is None or covered < best[0] - 1e-9:
-                best = covered, (x + dx, y + dy, align), box
-        placed.append(best[1])
-        taken.append(best[2])
-    return placed
 
 
 def bottleneck_curve(rows, task='push2', new_pixels=False):
@@ -213,7 +184,7 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
                                 for name in ('value', 'ci_low', 'ci_high'))
             colour = COLOURS[family(method)]
             axis.fill_between(THRESHOLDS, low, high, color=colour, alpha=0.10, linewidth=0)
-            axis.plot(THRESHOLDS, value, styles[method], color=colour, linewidth=1.8)
+            axis.plot(THRESHOLDS, value, linestyle=styles[method], color=colour, linewidth=1.8)
             ends[method] = value[-1]
         axis.set(xlim=(0, 10), ylim=(0, 100), xticks=THRESHOLDS)
         axis.grid(axis='y', color='#f0f0f0')
@@ -230,7 +201,7 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
             zorder=5, bbox={'color': 'white', 'alpha': 0.75, 'pad': 0.5})
     for method, y in zip(ends, _spread(list(ends.values()), 4.5)):
         colour = COLOURS[family(method)]
-        axis.plot([10.15, 10.7], [y, y], styles[method], color=colour, linewidth=1.8,
+        axis.plot([10.15, 10.7], [y, y], linestyle=styles[method], color=colour, linewidth=1.8,
                   clip_on=False)
         axis.annotate(method, (10.9, y), fontsize=8.5, color=colour, va='center',
                       annotation_clip=False)
@@ -242,7 +213,8 @@ def _line_styles(methods):
     styles, used = {}, {}
     for method in sorted(methods, key=method_order):
         number = used[family(method)] = used.get(family(method), -1) + 1
-        order = ('--', ':') if family(method) == 'copy' else ('-', '--', '-.', ':')
+        order = ('--', ':') if family(method) == 'copy' else (
+            '-', '--', '-.', ':', (0, (6, 1, 1, 1, 1, 1)))
         styles[method] = order[number % len(order)]
     return styles
 
