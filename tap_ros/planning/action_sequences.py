@@ -4,11 +4,12 @@
 What the search varies: a few displacements, each repeated, and for how long the gripper is lifted.
 
 A sequence of `horizon` actions is made of segments of `repeat` control periods. Parameters (D,)
-are x, y of every segment in metres per control period, then the number of segments to stay lifted.
-Like the expert that was recorded, the arm goes up and down on the spot and pushes slowly: what the
-forward model has never seen, it cannot foresee. A plan that is carried over to the next control
-period starts inside a segment: with `phase` periods of the first one already executed, the horizon
-reaches into one segment more.
+are x, y of every segment in metres per control period, the number of segments to stay lifted and,
+where it is searched, how much shorter the first segment is: so a way may take any number of
+periods, not just whole segments. Like the expert that was recorded, the arm goes up and down on
+the spot and pushes slowly: what the forward model has never seen, it cannot foresee. A plan that
+is carried over to the next control period starts inside a segment, whose first `phase` periods are
+past; the horizon then reaches into one segment more.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +28,8 @@ class SequenceShape:
     How parameters become actions.
 
     :param segments: displacements within the horizon; repeat: control periods of each.
-    :param phase: periods of the first segment that are past, 0..repeat-1.
+    :param phase: periods that the first segment is shorter, 0..repeat-1; None: the last parameter
+        of a sequence says it.
     :param move_limit: m per control period, |x| and |y|; max_lift: segments.
     :param push_limit: m per control period, length of a displacement while the gripper is low.
     :param upright: go up and down without moving sideways.
@@ -36,7 +38,7 @@ class SequenceShape:
 
     segments: int = 5
     repeat: int = 3
-    phase: int = 0
+    phase: int | None = 0
     move_limit: float = 0.08
     max_lift: int = 4
     push_limit: float = 0.05
@@ -50,28 +52,44 @@ class SequenceShape:
     @property
     def num_moves(self):
         """Number of displacements that the horizon touches."""
-        return self.segments + (self.phase > 0)
+        return self.segments + (self.phase != 0)
 
     @property
     def size(self):
         """Number of parameters."""
-        return 2 * self.num_moves + 1
+        return 2 * self.num_moves + 1 + (self.phase is None)
 
     def split(self, parameters):
-        """Return displacements (N, M, 2) and the lifted segments, ints (N,)."""
-        moves = parameters[:, :-1].reshape(len(parameters), self.num_moves, 2)
-        return moves, np.rint(parameters[:, -1]).astype(int)
+        """Return displacements (N, M, 2), the lifted segments and the phases, ints (N,)."""
+        moves = parameters[:, :2 * self.num_moves].reshape(len(parameters), self.num_moves, 2)
+        counts = np.rint(parameters[:, 2 * self.num_moves:]).astype(int)
+        fixed = self.phase is not None
+        return moves, counts[:, 0], np.full(len(counts), self.phase) if fixed else counts[:, 1]
+
+    def join(self, moves, lifted, phase):
+        """Return the parameters (D,) of displacements (M, 2) or fewer, the others standing."""
+        parameters = np.zeros(self.size)
+        kept = moves[:self.num_moves].ravel()
+        parameters[:len(kept)] = kept
+        parameters[2 * self.num_moves:] = [lifted, phase][:1 + (self.phase is None)]
+        return parameters
+
+    def first_gaussian(self, std_move):
+        """Return mean and deviation (D,) to begin a search with."""
+        counts = np.array([self.max_lift, self.repeat - 1][:1 + (self.phase is None)]) / 2
+        still = np.zeros(2 * self.num_moves)
+        return np.append(still, counts), np.append(still + std_move, counts)
 
     def clip(self, parameters, least_lift=0):
         """
-        Limit parameters (N, D) to what the arm may do; the lift becomes a whole number.
+        Limit parameters (N, D) to what the arm may do; lift and phase become whole numbers.
 
         :param least_lift: segments to stay lifted at least.
         """
-        parameters = parameters.copy()
-        parameters[:, :-1] = np.clip(parameters[:, :-1], -self.move_limit, self.move_limit)
-        parameters[:, -1] = np.clip(np.rint(parameters[:, -1]), least_lift, self.max_lift)
-        return parameters
+        moves, counts = np.split(parameters, [2 * self.num_moves], axis=1)
+        lowest, highest = [least_lift, 0], [self.max_lift, self.repeat - 1]
+        counts = np.clip(np.rint(counts), lowest[:counts.shape[1]], highest[:counts.shape[1]])
+        return np.hstack([np.clip(moves, -self.move_limit, self.move_limit), counts])
 
     def least_lift(self, height):
         """
@@ -83,18 +101,25 @@ class SequenceShape:
         return int(self.upright and self.climb_limit >= LIFTED - LOW
                    and LOW + 0.02 < height < LIFTED - 0.03)
 
-    def segment(self):
-        """Return the segment (horizon,) of each control period."""
-        return (np.arange(self.horizon) + self.phase) // self.repeat
+    def lifts(self):
+        """Return the ways to be lifted, as (segments, phase), the shortest first."""
+        phases = range(self.repeat) if self.phase is None else [self.phase]
+        ways = [(n, phase) for n in range(1, min(self.max_lift, self.num_moves - 1) + 1)
+                for phase in phases]
+        return sorted(ways, key=lambda way: self.repeat * way[0] - way[1])
 
-    def climbs(self, lifted, height):
+    def segment(self, phase):
+        """Return the segment (N, horizon) of each control period, for phases (N,)."""
+        return (np.arange(self.horizon) + np.asarray(phase)[:, None]) // self.repeat
+
+    def climbs(self, lifted, phase, height):
         """
         Plan the heights.
 
-        :param lifted: (N,) segments; height: of the gripper now, m.
+        :param lifted: (N,) segments; phase: (N,); height: of the gripper now, m.
         :return: climb (N, horizon) m per control period, and whether the arm may move sideways.
         """
-        heights = np.where(self.segment()[None] < lifted[:, None], LIFTED, LOW)
+        heights = np.where(self.segment(phase) < lifted[:, None], LIFTED, LOW)
         missing, climb = np.empty(heights.shape), np.empty(heights.shape)
         now = np.full(len(lifted), height, float)
         for t in range(self.horizon):
@@ -111,13 +136,14 @@ class SequenceShape:
         :param parameters: (N, D); height: of the gripper now, m.
         :return: (N, horizon, 4) float32: metres per control period, gripper closed (0).
         """
-        moves, lifted = self.split(parameters)
-        climb, sideways = self.climbs(lifted, height)
+        moves, lifted, phase = self.split(parameters)
+        climb, sideways = self.climbs(lifted, phase, height)
+        segment = self.segment(phase)
         actions = np.zeros((len(parameters), self.horizon, 4), np.float32)
-        actions[..., :2] = moves[:, self.segment()] * sideways[..., None]
+        actions[..., :2] = moves[np.arange(len(moves))[:, None], segment] * sideways[..., None]
         actions[..., 2] = climb
         length = np.linalg.norm(actions[..., :2], axis=-1)
-        low = self.segment()[None] >= lifted[:, None]
+        low = segment >= lifted[:, None]
         slow = np.minimum(1, self.push_limit / np.maximum(length, 1e-9))
         actions[..., :2] *= np.where(low, slow, 1)[..., None]
         return actions
@@ -138,6 +164,8 @@ class SequenceShape:
 
     def following(self):
         """Return the shape one control period later."""
+        if self.phase is None:
+            return self
         return replace(self, phase=(self.phase + 1) % self.repeat)
 
     def shift(self, parameters):
@@ -146,12 +174,8 @@ class SequenceShape:
 
         :return: (D',) for `following()`: new segments at the end stand still.
         """
-        moves, lifted = self.split(parameters[None])
-        following = self.following()
-        if following.phase == 0:  # the first segment is over
-            moves, lifted = moves[:, 1:], np.maximum(lifted - 1, 0)
-        out = np.zeros(following.size)
-        kept = moves[0][:following.num_moves].ravel()
-        out[:len(kept)] = kept
-        out[-1] = lifted[0]
-        return out
+        (moves,), (lifted,), (phase,) = self.split(parameters[None])
+        phase = (phase + 1) % self.repeat
+        if phase == 0:  # the first segment is over
+            moves, lifted = moves[1:], max(lifted - 1, 0)
+        return self.following().join(moves, lifted, phase)

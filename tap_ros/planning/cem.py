@@ -40,7 +40,7 @@ class CEMConfig:
                 raise ConfigError(f'{name}: expected 0..1, got {getattr(self, name)}')
 
 
-def cem(cost, mean, std, config, rng, repair=None, proposals=None):
+def cem(cost, mean, std, config, rng, repair=None, proposals=None, recheck=None):
     """
     Search the minimum of a cost (cross-entropy method, App. F of the paper).
 
@@ -56,11 +56,13 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None):
     :param repair: function that clips samples (N, D) to what is allowed, or None.
     :param proposals: (P, D) that replace the first iteration's last samples, or None; P at most
         num_samples, else the last count.
+    :param recheck: cost that the best num_elites of all iterations are judged by once more, with
+        the same convention; of many noisy costs the least is an illusion.
     :return: best sample (D,), its cost, and the last mean (D,).
     """
     mean, std = np.array(mean, np.float64), np.array(std, np.float64)
     floor, kept = config.min_std * std, np.empty((0, len(mean)))
-    best, best_cost = None, np.inf
+    best, best_costs = np.empty((0, len(mean))), np.empty(0)
     for iteration in range(config.num_iterations):
         # draw
         samples = mean + std * rng.standard_normal((config.num_samples, len(mean)))
@@ -69,14 +71,21 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None):
         samples[:len(kept)] = kept
         samples = samples if repair is None else repair(samples)
         # judge
-        costs = np.nan_to_num(np.asarray(cost(samples), np.float64), nan=np.inf, posinf=np.inf)
+        costs = _finite(cost(samples))
         order = np.argsort(costs, kind='stable')
-        if best is None or costs[order[0]] < best_cost:
-            best, best_cost = samples[order[0]].copy(), float(costs[order[0]])
+        best, best_costs = np.concatenate([best, samples]), np.concatenate([best_costs, costs])
+        first = np.argsort(best_costs, kind='stable')[:config.num_elites]
+        best, best_costs = best[first], best_costs[first]
         # refit
         elites = samples[order[:config.num_elites]]
         mean = config.smoothing * mean + (1 - config.smoothing) * elites.mean(0)
         std = np.maximum(
             config.smoothing * std + (1 - config.smoothing) * elites.std(0), floor)
         kept = elites[:config.keep_elites]
-    return best, best_cost, mean
+    winner = 0 if recheck is None else int(np.argmin(_finite(recheck(best))))
+    return best[winner], float(best_costs[winner]), mean
+
+
+def _finite(costs):
+    """Return costs as float64, the worst where they are not numbers."""
+    return np.nan_to_num(np.asarray(costs, np.float64), nan=np.inf, posinf=np.inf)

@@ -16,6 +16,8 @@ class VisualMPCConfig:
 
     :param search: settings of the search; 200 samples, 3 iterations, 10 elites.
     :param segments: displacements of a sequence; repeat: control periods of each.
+    :param free_phase: search, too, for how many periods, 1..repeat, the first displacement lasts:
+        a way need not take whole segments.
     :param std_move: m per control period, of x and y in the first Gaussian; move_limit their clip.
     :param push_limit: m per control period while the gripper is low, so that pushes are like the
         recorded ones; upright: go up and down without moving sideways, like them.
@@ -28,6 +30,9 @@ class VisualMPCConfig:
     :param warm_start: begin with the last plan, carried on by one control period.
     :param warm_std: share of std_move that the warm-started search begins with.
     :param proposals: how many first samples are pushes aimed at the objects, see proposals.py.
+    :param recheck: from how many places, where the gripper is and others about recheck_std, m,
+        beside it, the elites are judged once more: a push that succeeds from one place only would
+        slip. 0: they are not.
     :param arm_hidden: the arm is not in the pictures.
     :param cost_every: the cost looks at every so many steps; 1: at all of them.
     :param replan_every: search anew at every so many actions, or when the goal changes; between
@@ -38,6 +43,7 @@ class VisualMPCConfig:
     search: CEMConfig = CEMConfig()
     segments: int = 5
     repeat: int = 3
+    free_phase: bool = True
     std_move: float = 0.04
     move_limit: float = 0.08
     push_limit: float = 0.05
@@ -50,6 +56,8 @@ class VisualMPCConfig:
     warm_start: bool = True
     warm_std: float = 0.5
     proposals: int = 80
+    recheck: int = 6
+    recheck_std: float = 0.01
     arm_hidden: bool = False
     cost_every: int = 3
     replan_every: int = 1
@@ -66,6 +74,9 @@ class VisualMPCConfig:
         if self.replan_every > self.segments * self.repeat:
             raise ConfigError(f'replan_every: expected at most the horizon '
                               f'{self.segments * self.repeat}, got {self.replan_every}')
+        if self.recheck < 0 or self.recheck_std < 0:
+            raise ConfigError(f'recheck, recheck_std: expected at least 0, got {self.recheck}, '
+                              f'{self.recheck_std}')
         if not 0 <= self.max_lift < self.segments:
             raise ConfigError(
                 f'max_lift: expected 0..{self.segments - 1} (segments - 1), got {self.max_lift}')
@@ -77,7 +88,7 @@ class VisualMPCConfig:
 # 0.08 m std and 0.16 m clip in the paper are for actions of 1 s; ours last 0.25 s.
 PAPER = VisualMPCConfig(
     warm_start=False, proposals=0, cost_every=1, push_limit=0.08, upright=False,
-    clearance=0.0, unfinished=0.0)
+    clearance=0.0, unfinished=0.0, free_phase=False, recheck=0)
 # A fifth of the samples: for long evaluations and weak machines.
 QUICK = VisualMPCConfig(search=CEMConfig(64, 2, 8), proposals=32, batch_size=32)
 PRESETS = {'default': VisualMPCConfig(), 'paper': PAPER, 'quick': QUICK}

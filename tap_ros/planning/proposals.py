@@ -50,29 +50,29 @@ def _go_and_push(shape, gripper, start, end, target, along):
     here = gripper[:2]
     ahead = (target - here) @ along
     beside = np.linalg.norm(target - here - ahead * along)
-    lifted = 0
+    lifted, phase = 0, (shape.phase or 0)
     if not (gripper[2] < 0.05 and 0.02 < ahead < 0.2 and beside < 0.05):
-        # as many lifted segments as the way needs at nearly full speed
-        while lifted < min(shape.max_lift, shape.num_moves - 1):
-            lifted += 1
-            periods = _moving_periods(shape, gripper, lifted)
+        # as many lifted periods as the way needs at nearly full speed
+        for lifted, phase in shape.lifts():
+            periods = _moving_periods(shape, gripper, lifted, phase)
             if np.abs(start - here).max() <= PACE * shape.move_limit * periods[:lifted].sum():
                 break
-    periods = _moving_periods(shape, gripper, lifted)
+    start = start if lifted else here
+    needed = np.linalg.norm(end - start) / (PACE * shape.push_limit)
+    if not lifted and shape.phase is None:
+        phase = int(-np.ceil(needed) % shape.repeat)  # so that it ends with a segment
+    periods = _moving_periods(shape, gripper, lifted, phase)
     moves = np.zeros((shape.num_moves, 2))
     moves[:lifted] = (start - here) / max(1, periods[:lifted].sum())
-    if not lifted:
-        start = here
-    needed = np.linalg.norm(end - start) / (PACE * shape.push_limit)
     last = lifted + 1
     while last < shape.num_moves and periods[lifted:last].sum() < needed:
         last += 1
     moves[lifted:last] = (end - start) / max(1, periods[lifted:last].sum())
     moves = np.clip(moves, -shape.move_limit, shape.move_limit)
-    return np.append(moves.ravel(), lifted)
+    return shape.join(moves, lifted, phase)
 
 
-def _moving_periods(shape, gripper, lifted):
+def _moving_periods(shape, gripper, lifted, phase):
     """Return how many control periods of each segment (num_moves,) move sideways."""
-    _, sideways = shape.climbs(np.array([lifted]), gripper[2])
-    return np.bincount(shape.segment(), sideways[0], minlength=shape.num_moves)
+    _, (sideways,) = shape.climbs(np.array([lifted]), np.array([phase]), gripper[2])
+    return np.bincount(shape.segment([phase])[0], sideways, minlength=shape.num_moves)

@@ -80,8 +80,8 @@ class VisualMPC:
         config = self.config
         self._seed, self._count, self._age = seed, 0, 0
         self._first_shape = self._shape = SequenceShape(
-            config.segments, config.repeat, 0, config.move_limit, config.max_lift,
-            config.push_limit, config.upright, config.climb_limit)
+            config.segments, config.repeat, None if config.free_phase else 0, config.move_limit,
+            config.max_lift, config.push_limit, config.upright, config.climb_limit)
         self._last = self._plan = self._goal = None  # _last: parameters of what is left of _plan
 
     def limit(self, move, climb):
@@ -144,17 +144,24 @@ class VisualMPC:
         features = self.model.begin(to_float(image)[None].to(device), state, config.arm_hidden)
         here = maps.flatten(1).cpu().numpy() @ self._table_points()  # (K, 2) metres
 
-        def cost(samples):
+        def cost(samples, starts=state):
             actions = shape.actions(samples, gripper[2])
             clash = landing_clash(shape.landings(actions, gripper), here, config.clearance)
-            return self._cost(features, state, maps, price, actions)[0] + clash
+            costs, _ = self._cost(features, starts.repeat(len(samples), 1), maps, price,
+                                  actions.repeat(len(starts), 0))
+            return costs.reshape(len(samples), len(starts)).mean(1) + clash
 
+        aside = np.random.default_rng([self._seed, self._count, 1])  # rng draws the same without
+        starts = np.tile(gripper, (max(1, config.recheck), 1))
+        starts[1:, :2] += aside.normal(0, config.recheck_std, starts[1:, :2].shape)
+        recheck = partial(cost, starts=torch.from_numpy(starts).to(device))
         mean, std = self._first_gaussian(shape)
         proposals = self._propose(shape, gripper, here, distance, rng)
         if config.warm_start and self._last is not None:
             proposals = np.concatenate([proposals, self._last[None]])
         clip = partial(shape.clip, least_lift=shape.least_lift(gripper[2]))
-        best, best_cost, _ = cem(cost, mean, std, config.search, rng, clip, proposals)
+        best, best_cost, _ = cem(cost, mean, std, config.search, rng, clip, proposals,
+                                 recheck if config.recheck else None)
         actions = shape.actions(best[None], gripper[2])
         _, ends = self._cost(features, state, maps, distance, actions)
         return best, actions[0], float(ends[0]), best_cost
@@ -162,8 +169,7 @@ class VisualMPC:
     def _first_gaussian(self, shape):
         """Return mean and deviation (D,): fresh, or around the last plan."""
         config = self.config
-        mean, std = np.zeros(shape.size), np.full(shape.size, config.std_move)
-        mean[-1], std[-1] = config.max_lift / 2, config.max_lift / 2
+        mean, std = shape.first_gaussian(config.std_move)
         if config.warm_start and self._last is not None:
             mean, std = self._last, std * config.warm_std
         return mean, std
@@ -187,6 +193,7 @@ class VisualMPC:
         Cost: each object's expected distance to its goal, summed over objects and over the
         horizon, the last step with its own weight (10, as the authors' planner has).
 
+        :param gripper: (N, 4), where each sequence begins, or (1, 4).
         :param distance: (K, n n) pixels, what each object costs in every table cell.
         :param actions: (N, horizon, 4).
         :return: costs (N,) numpy; expected distance at the horizon's end, px, mean over objects.
@@ -194,12 +201,13 @@ class VisualMPC:
         config, worst = self.config, distance.amax(1)
 
         @torch.inference_mode()
-        def judge(part):
+        def judge(part, begin):
             count, total, seen = len(part), 0, 0
             # a fixed batch keeps results the same whatever the number of samples
-            part = torch.cat([part, part[-1:].expand(config.batch_size - count, -1, -1)])
+            part, begin = (torch.cat([t, t[-1:].expand(config.batch_size - count, *t.shape[1:])])
+                           for t in (part, begin))
             for carried in self.model.carried_maps(
-                    features, gripper, maps, part, config.cost_every):
+                    features, begin, maps, part, config.cost_every):
                 carried = carried.flatten(2)
                 last = torch.einsum('nkc,kc->nk', carried, distance)
                 last = last + (1 - carried.sum(2)) * worst  # a lost object is as far as can be
@@ -211,8 +219,10 @@ class VisualMPC:
         # together with others that come down as late: up there, nothing needs to be predicted
         order = np.argsort((actions[..., 2].cumsum(1) + gripper[0, 2].item() > LOW + 0.01).sum(1),
                            kind='stable')
-        parts = torch.from_numpy(actions[order]).to(distance.device).split(config.batch_size)
-        costs, ends = map(torch.cat, zip(*self._pool.map(judge, parts)))
+        begins = gripper.expand(len(actions), -1)[torch.from_numpy(order).to(gripper.device)]
+        parts = [t.split(config.batch_size) for t in (
+            torch.from_numpy(actions[order]).to(distance.device), begins)]
+        costs, ends = map(torch.cat, zip(*self._pool.map(judge, *parts)))
         back = np.argsort(order)
         costs, ends = costs.cpu().double().numpy()[back], ends.cpu().numpy()[back]
         # rounded so that the batch size, which moves the last bits, cannot change the ranking

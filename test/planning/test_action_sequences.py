@@ -8,13 +8,14 @@ from tap_ros.planning.action_sequences import LIFTED, LOW, SequenceShape
 from tap_ros.planning.proposals import push_proposals
 
 SHAPE = SequenceShape()
+FREE = SequenceShape(phase=None)
 LOW_GRIPPER = np.array([0.1, 0.2, 0.01, 0.0], np.float32)
 
 
 def random_parameters(shape, count=20, seed=0):
     rng = np.random.default_rng(seed)
     parameters = rng.normal(0, 0.06, (count, shape.size))
-    parameters[:, -1] = rng.integers(0, 5, count)
+    parameters[:, 2 * shape.num_moves:] = rng.integers(0, 5, (count, 1))
     return shape.clip(parameters)
 
 
@@ -42,6 +43,18 @@ def test_gripper_is_lifted_for_the_segments_asked_for(lifted):
     np.testing.assert_allclose(height[3 * lifted:], LOW, atol=1e-6)
 
 
+@pytest.mark.parametrize('phase', range(3))
+def test_the_first_segment_is_as_short_as_the_free_phase_says(phase):
+    moves = np.tile([[0.01, 0.0], [0.02, 0.0]], (3, 1))
+    parameters = FREE.join(moves, 1, phase)
+    actions, = FREE.actions(FREE.clip(parameters[None]), LIFTED)
+    first = 3 - phase
+    np.testing.assert_allclose(actions[:first, 0], 0.01, atol=1e-7)
+    assert actions[first, 2] < -0.1 and not actions[first, 0]  # it comes down on the spot
+    np.testing.assert_allclose(actions[first + 1:first + 3, 0], 0.02, atol=1e-7)
+    assert FREE.clip(parameters[None] + 9)[0, -1] == 2
+
+
 def test_upright_arm_does_not_move_sideways_while_it_climbs():
     actions = SHAPE.actions(random_parameters(SHAPE), 0.01)
     climbing = np.abs(actions[..., 2]) > 0.06
@@ -56,9 +69,9 @@ def test_low_pushes_are_slow():
     assert length.max() <= 0.03 + 1e-6
 
 
-def test_a_shifted_plan_goes_on_as_planned():
-    shape, parameters = SHAPE, random_parameters(SHAPE, 1)
-    height = 0.1
+@pytest.mark.parametrize('shape', [SHAPE, FREE])
+def test_a_shifted_plan_goes_on_as_planned(shape):
+    parameters, height = random_parameters(shape, 1), 0.1
     for _ in range(7):
         before = shape.actions(parameters, height)[0]
         parameters = shape.shift(parameters[0])[None]
@@ -86,6 +99,18 @@ def test_proposals_end_beyond_the_object_on_its_way_to_the_goal():
     landings = SHAPE.landings(actions, LOW_GRIPPER)
     assert (landings[:, 0] < -0.05).all()  # behind the only object that is not at its goal
     assert np.median(path[:, -1, 0]) > 0.05 and np.abs(path[:, -1, 1]).mean() < 0.1
+
+
+def test_a_free_phase_lets_the_gripper_travel_no_longer_than_needed():
+    rng, goal = np.random.default_rng(0), np.array([[0.15, 0.0]])
+    periods = {}
+    for shape in (SHAPE, FREE):
+        proposals = push_proposals(shape, LOW_GRIPPER, np.zeros((1, 2)), goal, 40, rng)
+        actions = shape.actions(shape.clip(proposals), LOW_GRIPPER[2])
+        assert np.isfinite(shape.landings(actions, LOW_GRIPPER)).all()
+        periods[shape] = (heights(actions, LOW_GRIPPER[2]) > 0.1).sum(1)
+    assert (periods[SHAPE] % 3 == 0).all() and (periods[FREE] % 3 > 0).any()
+    assert periods[FREE].mean() < periods[SHAPE].mean() - 0.5
 
 
 def test_a_gripper_already_behind_the_object_is_not_lifted():

@@ -62,6 +62,23 @@ def test_a_cost_that_is_not_a_number_never_wins():
     assert best[0] <= 0 and np.isfinite(cost)
 
 
+def test_the_elites_are_judged_once_more():
+    judged = []
+
+    def recheck(samples):
+        judged.append(samples)
+        costs = quadratic(samples)
+        costs[0] = np.nan  # the best one was an illusion
+        return costs
+
+    best, cost, _ = search(CEMConfig(num_elites=4), recheck=recheck)
+    samples, = judged
+    assert len(samples) == 4 and (np.diff(quadratic(samples)) >= 0).all()
+    np.testing.assert_array_equal(best, samples[1])
+    np.testing.assert_array_equal(samples[0], search(CEMConfig(num_elites=4))[0])
+    assert cost == quadratic(best[None])[0]
+
+
 @pytest.mark.parametrize('wrong, name', [
     ({'num_elites': 0}, 'num_elites'), ({'num_elites': 300}, 'num_elites'),
     ({'num_iterations': 0}, 'num_iterations'), ({'smoothing': 2.0}, 'smoothing'),

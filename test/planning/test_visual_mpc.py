@@ -63,6 +63,17 @@ def test_batch_size_and_threads_change_nothing(model, changes):
     assert same(plans(model), plans(model, replace(SMALL, **changes)))
 
 
+def test_elites_judged_again_from_the_same_place_rank_as_before():
+    def chosen(**changes):
+        mpc = VisualMPC.load(FORWARD_MODEL, replace(SMALL, **changes))
+        image = IMAGE.repeat(2, 0).repeat(2, 1)
+        return [mpc.act(image, GRIPPER, 2 * PIXELS, goal_pixels=2 * GOALS) for _ in range(4)]
+
+    assert same(chosen(recheck=0), chosen(recheck=1))
+    assert same(chosen(recheck=0)[:1], chosen(recheck=3, recheck_std=0.0)[:1])
+    assert not same(chosen(recheck=0), chosen(recheck=4, recheck_std=0.02))
+
+
 @pytest.mark.parametrize('batch_size', [32, 50])
 def test_trained_weights_plan_the_same_in_any_batch(batch_size):
     image = IMAGE.repeat(2, 0).repeat(2, 1)
@@ -167,7 +178,8 @@ def test_bad_input_is_named(model, wrong, name):
 @pytest.mark.parametrize('wrong, name', [
     ({'cost_every': 4}, 'cost_every'), ({'max_lift': 5}, 'max_lift'),
     ({'proposals': 500}, 'proposals'), ({'replan_every': 0}, 'replan_every'),
-    ({'replan_every': 16}, 'replan_every'), ({'batch_size': 0}, 'batch_size')])
+    ({'replan_every': 16}, 'replan_every'), ({'recheck': -1}, 'recheck'),
+    ({'batch_size': 0}, 'batch_size')])
 def test_impossible_settings_are_named(wrong, name):
     with pytest.raises(ConfigError, match=name):
         VisualMPCConfig(**wrong)
@@ -179,5 +191,6 @@ def test_paper_preset_has_the_papers_numbers():
         200, 3, 10)
     assert paper.segments * paper.repeat == 15 and paper.last_weight == 10
     assert not paper.warm_start and not paper.proposals
+    assert not paper.free_phase and not paper.recheck
     with pytest.raises(ConfigError, match='default, paper'):
         with_preset('fast')
