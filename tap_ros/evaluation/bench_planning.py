@@ -47,21 +47,21 @@ def run(args):
     seen = simulator.reset(FIRST_SCENE)
     goal = simulator.goal().object_pixels
     cores = len(os.sched_getaffinity(0))
-    default = with_preset('default')
-    search, horizon = default.search, default.segments * default.repeat
+    large = with_preset('large')
+    search, horizon = large.search, large.segments * large.repeat
     print(f'one plan: {search.num_samples} samples x {search.num_iterations} iterations x '
           f'horizon {horizon}, two objects, {args.device}'
           + (f', {cores} cores' if args.device == 'cpu' else ''))
     planners = {name: VisualMPC.load(args.weights, with_preset(name), args.device)
                 for name in PRESETS}
-    planner = planners['default']
+    planner = planners['large']
     pushing = push_until_low(simulator, planner, goal)
     print(f'{"":<34}{"at the start":>20}{"while pushing":>20}')
     print(f'{"":<34}' + f'{"p50, ms":>10}{"p90, ms":>10}' * 2)
     for name, mpc in planners.items():
         times = (time_plans(mpc, seen, goal, args.plans),
                  time_plans(mpc, pushing, goal, args.plans, warm=True))
-        if name == 'default':
+        if name == 'large':
             median = np.median(times[1])
         size = f'{mpc.config.search.num_samples} x {mpc.config.search.num_iterations}'
         print(f'{f"preset {name}, {size}":<34}' + ''.join(

@@ -95,6 +95,38 @@ def predicted_maps(pixels, prediction, b):
     return WarpedMaps(warped.maps[0], warped.mass[0])
 
 
+def target_bottlenecks(episodes, fraction, goal_picture):
+    """
+    Score the true frames at a fixed time: whether that time is a bottleneck by itself.
+
+    :param episodes: list of N Episodes.
+    :param fraction: of the episode, 0..1.
+    :param goal_picture: see batches.uses_recorded_goal.
+    :return: float32 (N,), in pixels; NaN as in score_bottlenecks.
+    """
+    result = np.full(len(episodes), np.nan, np.float32)
+    for n, episode in enumerate(episodes):
+        pixels, target = context_pixels(episode, goal_picture), fixed_frame(episode, fraction)
+        if can_be_bottleneck(pixels):
+            start, goal, now = torch.from_numpy(np.stack(
+                [*pixels, episode.object_pixels[target]]).astype(np.float32))
+            size = episode.frames.shape[1:3]
+            result[n] = bottleneck_scores(one_hot_maps(now[None], size), start[None], goal[None])
+    return result
+
+
+def fixed_frame(episode, fraction):
+    """Return the index of the frame at a share of an episode, neither the first nor the last."""
+    end = len(episode.frames) - 1
+    return int(np.clip(int(fraction * end + 0.5), 1, end - 1))
+
+
+def can_be_bottleneck(pixels):
+    """Say whether there are two objects or more, known and moved; pixels (2, K, 2)."""
+    return bool(pixels.shape[1] >= 2 and np.isfinite(pixels).all() and (
+        np.linalg.norm(pixels[1] - pixels[0], axis=-1).min() >= MIN_MOTION))
+
+
 def score_bottlenecks(episodes, prediction, goal_picture):
     """
     Score the predictions of a batch, and copying the start or the goal instead.
@@ -110,9 +142,7 @@ def score_bottlenecks(episodes, prediction, goal_picture):
     mass = result.copy()
     for b, episode in enumerate(episodes):
         pixels = context_pixels(episode, goal_picture)
-        if pixels.shape[1] < 2 or not np.isfinite(pixels).all():
-            continue
-        if np.linalg.norm(pixels[1] - pixels[0], axis=-1).min() < MIN_MOTION:
+        if not can_be_bottleneck(pixels):
             continue
         warped = predicted_maps(pixels, prediction, b)
         pixels = torch.from_numpy(pixels).to(warped.maps.device)

@@ -23,8 +23,8 @@ def declare_parameters(node):
                        'File of weights (.safetensors) of a forward model.')
     parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
                        choices=['cpu', 'cuda'])
-    parameters.declare('preset', 'default', 'Settings of the planner: what does best, or what the '
-                       'paper says.', choices=list(PRESETS))
+    parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
+                       'with more samples, or what the paper says.', choices=list(PRESETS))
     parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
     parameters.declare('control_period', 0.25,
                        'Seconds (of image stamps) that the arm takes for one command.',

@@ -58,9 +58,11 @@ def smoothed_labels(step, other_step, alpha=SMOOTHING):
 
 def discriminator_loss(real, generated, other, step, other_step, alpha=SMOOTHING):
     """
-    Compute the discriminators' loss: Eq. 11 at t = step with its sign changed, to be minimised.
+    Compute the discriminators' loss, to be minimised, at t = step.
 
-    The sum over t' is approximated by one frame, as in section 3.3.
+    -log D_t(c, x_t) - log(1 - D_t(c, G(c))) - sum_t' [l log D_t(c, x_t') + (1 - l) log(1 - D_t(c,
+    x_t'))] with l = l_{t,t'} of smoothed_labels (Eq. 11 with its sign changed). The sum over t' is
+    approximated by one frame, as in section 3.3.
 
     :param real: (B, |T|) logits of D(c, x_t).
     :param generated: (B, |T|) logits of D(c, G(c)).
@@ -80,7 +82,7 @@ def discriminator_loss(real, generated, other, step, other_step, alpha=SMOOTHING
 
 def generator_loss(generated, step):
     """
-    Compute the predictor's side of Eq. 11, in the form that does not saturate.
+    Compute the predictor's side, -log D_t(c, G(c)): Eq. 11 in the form that does not saturate.
 
     :param generated: (B, |T|) logits of D(c, G(c)).
     :param step: int64 (B,), t as an index into |T|.

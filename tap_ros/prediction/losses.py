@@ -98,7 +98,9 @@ def match_step(selection_error, valid=None):
 
 def fixed_time_loss(error, step):
     """
-    Fixed-time loss (Eq. 1): the error at a step chosen in advance.
+    Fixed-time loss: the error at a step chosen in advance.
+
+    L_0 = E(x_tau, G(c)) (Eq. 1).
 
     :param error: (B, T) errors E_t, or a function from steps (B,) to their errors (B,).
     :param step: int64 (B,), tau as an index into T.
@@ -110,7 +112,9 @@ def fixed_time_loss(error, step):
 
 def minimum_loss(error, valid=None):
     """
-    Minimum-over-time loss (Eq. 2): the least error over the targets.
+    Minimum-over-time loss: the least error over the targets.
+
+    L = min_{t in T} E(x_t, G(c)) (Eq. 2).
 
     :param error: (B, T) errors E_t.
     :param valid: bool (B, T), False where an episode is padded.
@@ -121,8 +125,9 @@ def minimum_loss(error, valid=None):
 
 def generalized_minimum_loss(error, selection_error, valid=None):
     """
-    Generalized minimum over time (Eq. 5): E at the argmin of E'.
+    Generalized minimum over time: E at the argmin of E'.
 
+    L = E(x_{t*}, G(c)) with t* = argmin_{t in T} E'(x_t, G(c)) (Eq. 5).
     The choice has no gradient; the outer error is not weighted by the preference.
 
     :param error: (B, T) errors E_t, or a function from steps (B,) to their errors (B,), which
@@ -136,7 +141,10 @@ def generalized_minimum_loss(error, selection_error, valid=None):
 
 def recursive_loss(losses, counts):
     """
-    Recursive loss (Eq. 3): the sum over levels r of the loss of the prediction from c(r).
+    Recursive loss: the sum over levels r of the loss of the prediction from c(r).
+
+    L = sum_r min_{t in T(r)} E(x_t, G(c(r))), where c(r) holds the prediction of level r - 1, and
+    T(r) the targets that its match leaves (Eq. 3).
 
     :param losses: for each level, the mean loss over the episodes that still have targets.
     :param counts: for each level, how many those are; level 0 has all of them.
@@ -163,7 +171,8 @@ def bell_preference(times, first, last, edge=2 / 3):
     """
     Prefer the middle: a Gaussian over the target times, 1 in the middle and `edge` at both ends.
 
-    The paper's edge, 2/3, makes the standard deviation 1.110 of half the range (section 4).
+    w(t) = exp(-(t - m)^2 / (2 sigma^2)), m the middle; the paper's edge, 2/3, makes sigma 1.110
+    of half the range (section 4).
 
     :param times: (B, T) times of the targets.
     :param first: (B, 1) or number, the earliest target time.

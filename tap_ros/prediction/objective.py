@@ -85,12 +85,19 @@ class Outcome:
 def predictor_loss(networks, batch, augmentation, config, draws=None,
                    autocast=contextlib.nullcontext, selection=selection_errors):
     """
-    Compute the predictor's training loss of a batch (Eq. 1, 2, 3, 5, 7, 9 or 10).
+    Compute the predictor's training loss of a batch.
 
-    The GAN's terms stand at the matched frame, as in Eq. 10, and are left out of the choice. With
-    an outer power below 1 the outer error is E_t ** power, which is not in the paper. The mean of
-    E_t is as low for a blend of two possible bottlenecks as for either of them; a concave function
-    of it is lowest at one of them, so that the network commits itself.
+    With E_t = E(x_t, G(c)) and t* chosen by the method (Eqs. 1, 2, 5; summed over levels: 3):
+
+        E_{t*}                                                               no GAN, no VAE
+        E_{t*} - log D_{t*}(c, G(c))                                         GAN (Eq. 7)
+        D_KL(q(z|X), p(z)) + E_{t*} at z ~ q                                 VAE (Eq. 9)
+        the same - log D_{t*}(c, G(c, z ~ p)) - log D'_{t*}(c, G(c, z ~ q))  both (Eq. 10)
+
+    each with its weight. The GAN's terms stand at the matched frame, as in Eq. 10, and are left
+    out of the choice. With an outer power below 1 the outer error is E_t ** power, which is not in
+    the paper. The mean of E_t is as low for a blend of two possible bottlenecks as for either of
+    them; a concave function of it is lowest at one of them, so that the network commits itself.
 
     :param networks: Networks.
     :param batch: batches.Batch.
@@ -202,6 +209,8 @@ def _recursive_loss(networks, prediction, targets, context, match, loss, config,
 def _frame_posterior_loss(networks, targets, context, config, draws, autocast, selection):
     """
     Compute the alternative of appendix B: the minimum over time of the whole CVAE loss.
+
+    L = min_{t in T} [D_KL(q(z | c, x_t), p(z)) + E(x_t, G(c, z ~ q(z | c, x_t)))].
 
     Recognition network and predictor run once for every target; num_targets keeps that small. With
     genmin the selection error is that of the whole loss instead of the l1 error.

@@ -62,7 +62,9 @@ def sample_latent(mean, log_variance, noise):
 
 def kl_divergence(mean, log_variance):
     """
-    Compute D_KL(q_phi(z | X), p(z)) to the prior N(0, I) (Eqs. 8 to 10).
+    Compute the divergence of the posterior from the prior N(0, I) (Eqs. 8 to 10).
+
+    D_KL(q_phi(z | X), p(z)) = 1/2 sum (mu^2 + sigma^2 - 1 - log sigma^2).
 
     :param mean: (B, latent_size).
     :param log_variance: (B, latent_size).

@@ -5,11 +5,12 @@
 from dataclasses import asdict
 from pathlib import Path
 import re
+from types import SimpleNamespace
 
 import cv2
 from made_runs import made_run, save_runs, scores
 import numpy as np
-from tap_ros.evaluation.paper.pictures import draw, write_grids
+from tap_ros.evaluation.paper.pictures import _contrast, draw, write_grids
 from tap_ros.evaluation.paper.results import write_results
 from tap_ros.evaluation.paper.runs import paper_runs
 from tap_ros.prediction.networks import Predictor, PredictorConfig
@@ -117,6 +118,14 @@ def test_grids_show_each_method_that_has_weights(tmp_path):
         'push2-bidirectional': 2 + 3 + 1, 'push2-bidirectional-masks': 2 + 2 * 4,
         'push2-bidirectional-recursion': 2 + 2 * 2, 'push2-bidirectional-samples': 2 + 6,
         'push2-forward': 1 + 1 + 1}
+
+
+def test_masks_show_a_form_of_ours_that_finds_bottlenecks():
+    names = ['fix', 'fix+root', 'genmin', 'genmin+changed', 'genmin+relative']
+    shown = [SimpleNamespace(method=name) for name in names]
+    assert [one.method for one in _contrast(shown)] == ['fix', 'genmin', 'genmin+relative']
+    assert [one.method for one in _contrast(shown[:4])] == ['fix', 'genmin', 'genmin+changed']
+    assert [one.method for one in _contrast(shown[1:3])] == ['genmin']
 
 
 def test_a_picture_that_shows_more_is_not_replaced(tmp_path):

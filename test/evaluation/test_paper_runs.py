@@ -15,7 +15,7 @@ EVERY = [run for scale in SCALES for run in paper_runs(scale, seeds=(0, 1))]
 
 def rows(task, mode, new_pixels):
     return {run.method for run in paper_runs('small') if run.recursion == 1 and (
-        run.task, run.mode, run.new_pixels) == (task, mode, new_pixels)}
+        run.task, run.mode, run.new_pixels, run.variant) == (task, mode, new_pixels, '')}
 
 
 @pytest.mark.parametrize('task', ['grasp', 'pick_place', 'push2'])

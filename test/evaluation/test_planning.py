@@ -19,7 +19,7 @@ from tap_ros.evaluation.planning.scenes import nearest_first, step_budget
 from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.images import to_float
 from tap_ros.planning.cem import CEMConfig
-from tap_ros.planning.mpc_config import PAPER, VisualMPCConfig
+from tap_ros.planning.mpc_config import LARGE, PAPER, VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.warp import one_hot_maps
@@ -27,7 +27,7 @@ from tap_ros.recording.episode import check_episode
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 import torch
 
-QUICK = VisualMPCConfig(search=CEMConfig(16, 1, 4), proposals=8, batch_size=16, threads=1)
+SMALL = VisualMPCConfig(search=CEMConfig(16, 1, 4), proposals=8, batch_size=16, threads=1)
 DIRECT, SHIPPED = parse_method('direct'), parse_method('shipped')
 
 
@@ -40,7 +40,7 @@ def simulator():
 
 @pytest.fixture(scope='module')
 def mpc():
-    return VisualMPC.load(FORWARD_MODEL, QUICK)
+    return VisualMPC.load(FORWARD_MODEL, SMALL)
 
 
 @pytest.fixture(scope='module')
@@ -154,14 +154,14 @@ def test_the_true_model_foresees_what_then_happens(simulator, mpc):
 
 def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):
     method = parse_method('true_model')
-    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(QUICK))
+    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(SMALL))
     runs = [run_episode(simulator, planner, method, 2, 5) for _ in range(2)]
     np.testing.assert_array_equal(runs[0].actions, runs[1].actions)
 
 
 def test_objects_can_be_followed_by_pictures_while_the_simulator_plans(simulator, mpc):
     method = parse_method('true_model:carried')
-    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(QUICK))
+    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(SMALL))
     run = run_episode(simulator, planner, method, 2, 5)
     assert len(run.actions) == 2 and run.tracking_error() < 2
 
@@ -193,11 +193,12 @@ def test_impossible_methods_are_named(text):
 
 
 def test_options_change_the_planner():
-    assert parse_method('direct:more_search').planner(QUICK).search.num_samples == 64
-    assert parse_method('fix:half:paper').planner(QUICK) == PAPER
-    assert parse_method('direct:every3').planner(QUICK).replan_every == 3
-    assert parse_method('direct:plain_cost').planner(QUICK) == replace(QUICK, unfinished=0)
-    assert parse_method('direct').planner(QUICK) == QUICK
+    more = parse_method('direct:more_search').planner(SMALL)
+    assert more == replace(SMALL, search=LARGE.search, proposals=80, batch_size=50)
+    assert parse_method('fix:half:paper').planner(SMALL) == PAPER
+    assert parse_method('direct:every3').planner(SMALL).replan_every == 3
+    assert parse_method('direct:plain_cost').planner(SMALL) == replace(SMALL, unfinished=0)
+    assert parse_method('direct').planner(SMALL) == SMALL
 
 
 def test_budgets_are_the_papers():
@@ -207,7 +208,7 @@ def test_budgets_are_the_papers():
 def test_replanning_less_often_carries_the_plan_out(simulator, mpc):
     seen = simulator.reset(5)
     goal = simulator.goal().object_pixels
-    planner = VisualMPC(mpc.model, replace(QUICK, replan_every=3))
+    planner = VisualMPC(mpc.model, replace(SMALL, replan_every=3))
     planner.reset(5)
     plans = []
     for _ in range(4):

@@ -21,11 +21,11 @@ from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
 SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
-QUICK = VisualMPCConfig(search=CEMConfig(8, 1, 4), proposals=4, batch_size=8, threads=1)
+SMALL = VisualMPCConfig(search=CEMConfig(8, 1, 4), proposals=4, batch_size=8, threads=1)
 
 
 def job(name, budget=1):
-    return Job('push2', parse_method(name), QUICK, str(FORWARD_MODEL), budget=budget)
+    return Job('push2', parse_method(name), SMALL, str(FORWARD_MODEL), budget=budget)
 
 
 def stored(name, finals, first=0):
@@ -51,7 +51,7 @@ def test_other_settings_are_refused_and_speed_is_none(tmp_path):
     with pytest.raises(ConfigError, match='step_budget'):
         ResultFile(tmp_path, job('direct', budget=2))
     faster = Job('push2', parse_method('direct'), VisualMPCConfig(
-        search=QUICK.search, proposals=4, batch_size=3, threads=2), str(FORWARD_MODEL), budget=1)
+        search=SMALL.search, proposals=4, batch_size=3, threads=2), str(FORWARD_MODEL), budget=1)
     assert ResultFile(tmp_path, faster).scenes
 
 
@@ -112,9 +112,9 @@ def test_methods_are_compared_in_the_same_planner():
 
 def test_results_of_other_settings_are_not_subtracted():
     results = dict([stored('direct', [9.0]), stored('genmin', [4.0])])
-    results['push2', 'direct'][0]['preset'] = 'quick'
+    results['push2', 'direct'][0]['preset'] = 'large'
     assert not any('against' in row for row in make_rows(results))
-    results['push2', 'direct'][0].update(preset='', planner={**asdict(QUICK), 'segments': 4})
+    results['push2', 'direct'][0].update(preset='', planner={**asdict(SMALL), 'segments': 4})
     assert not any('against' in row for row in make_rows(results))
     results = dict([stored('genmin', [9.0]), stored('genmin:true_maps', [4.0])])
     assert any('against' in row for row in make_rows(results))

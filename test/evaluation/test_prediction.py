@@ -14,11 +14,14 @@ from tap_ros.evaluation.bottleneck import (
     bottleneck_frequency,
     bottleneck_scores,
     expected_distances,
+    fixed_frame,
     MIN_MOTION,
+    target_bottlenecks,
 )
 from tap_ros.evaluation.prediction import add_arguments, evaluate, run, write_pictures
 from tap_ros.evaluation.samples import draw_latents, score_samples
 from tap_ros.images import to_float
+from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.prediction.weights import save_weights
@@ -121,6 +124,17 @@ def test_with_three_objects_one_or_two_may_have_moved_but_not_none_or_all():
         pixels = start + 4 * torch.tensor(moved)[None, :, None]
         score = bottleneck_scores(one_hot_maps(pixels[0], (16, 16))[None], start, goal)
         assert score.item() == pytest.approx(gap if sum(moved) in (0, 3) else 0, abs=1e-4)
+
+
+def test_true_frames_are_scored_at_the_frame_that_fixed_time_prediction_has():
+    for fraction in (0.0, 0.25, 0.5, 0.75, 1.0):
+        batch = make_batch(EPISODES, [0, 1, 2], fraction=fraction)
+        frames = [fixed_frame(episode, fraction) for episode in EPISODES]
+        assert frames == batch.times[:, 0].tolist()
+    at = {share: target_bottlenecks(EPISODES, share, 'last') for share in (0.25, 0.5, 0.75)}
+    assert (at[0.5] == 0).all() and (at[0.25] > 1).all() and (at[0.75] > 1).all()
+    still = replace(EPISODES[0], object_pixels=np.repeat(EPISODES[0].object_pixels[:1], 9, 0))
+    assert np.isnan(target_bottlenecks([still], 0.5, 'last')).all()
 
 
 def test_a_perfect_bottleneck_is_found_and_matched():

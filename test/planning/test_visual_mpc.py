@@ -79,7 +79,7 @@ def test_trained_weights_plan_the_same_in_any_batch(batch_size):
     image = IMAGE.repeat(2, 0).repeat(2, 1)
 
     def chosen(batch_size):
-        mpc = VisualMPC.load(FORWARD_MODEL, with_preset('quick', batch_size=batch_size))
+        mpc = VisualMPC.load(FORWARD_MODEL, with_preset('default', batch_size=batch_size))
         return mpc.act(image, GRIPPER, 2 * PIXELS, goal_pixels=2 * GOALS)
 
     assert same([chosen(64)], [chosen(batch_size)])
@@ -192,5 +192,5 @@ def test_paper_preset_has_the_papers_numbers():
     assert paper.segments * paper.repeat == 15 and paper.last_weight == 10
     assert not paper.warm_start and not paper.proposals
     assert not paper.free_phase and not paper.recheck
-    with pytest.raises(ConfigError, match='default, paper'):
+    with pytest.raises(ConfigError, match='default, large, paper'):
         with_preset('fast')

@@ -270,6 +270,19 @@ def test_eq_10_l1_and_one_judge_see_the_posterior_the_other_judge_the_prior():
     assert networks.recognition.scale.grad.equal(before)
 
 
+def test_eq_9_is_the_divergence_and_the_least_error_at_a_sample_of_the_posterior():
+    batch = replace(make_batch(B=4), video=make_batch(B=4, seed=7).targets)
+    config = replace(CONFIG, method='min-vae', kl_weight=0.01)
+    networks = Networks(Shade(), Brightness(6))
+    outcome = predictor_loss(networks, batch, None, config, still_draws(batch))
+    mean = to_float(batch.video).mean((1, 2, 3, 4))  # of z, which is the shade of the prediction
+    errors = (mean[:, None, None, None, None] - to_float(batch.targets).movedim(-1, 2)).abs()
+    least = (errors.mean((2, 3, 4)) / 2).amin(1)
+    assert set(outcome.parts) == {'kl', 'error'} and outcome.judged is None
+    assert outcome.loss.item() == pytest.approx(
+        (0.01 * mean ** 2 / 2 + least).mean().item(), rel=1e-4)
+
+
 def test_appendix_b_is_the_minimum_over_the_whole_loss():
     batch = make_batch(B=2, T=5)
     shades = torch.tensor([[250, 30, 128, 30, 250], [250, 140, 30, 250, 100]], dtype=torch.uint8)

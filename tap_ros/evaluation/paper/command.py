@@ -75,6 +75,11 @@ def run(args):
     hashes = data_hashes(runs, places)
     states = [find_state(run, places, hashes.get(run.task)) for run in runs]
     print(f"{sum(state.kind == 'done' for state in states)} of {len(runs)} runs are done")
+    elsewhere = [run for run in runs if run.task not in hashes]
+    if elsewhere and not ends:
+        print(f'{len(elsewhere)} of them elsewhere: their scores are in {places.results}, their '
+              'recordings are not here. To make them again beside these: '
+              "make paper ARGS='--runs runs/again --results runs/again/results'")
     for end in ends:
         if end.kind == 'busy':
             print(f'{end.name}: another sweep is at it')

@@ -99,6 +99,7 @@ def score(run, config, weights, places):
     :return: dict for a JSON file: what the run was, and a number for each held-out episode.
     :raises ConfigError: if no episode was held out.
     """
+    from tap_ros.evaluation.bottleneck import target_bottlenecks
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.evaluation.samples import score_samples
     from tap_ros.prediction.batches import split_episodes
@@ -114,6 +115,10 @@ def score(run, config, weights, places):
     began = time.perf_counter()
     scores = {method: _rounded(value) for method, value in
               evaluate(network, store, held_out).items()}
+    fraction = config.chosen.fraction
+    if fraction is not None and config.mode == 'bidirectional':
+        scores['target_bottleneck'] = _rounded_list(
+            target_bottlenecks([store[i] for i in held_out], fraction, 'last'))
     if network.config.latent_size:
         samples = _rounded(score_samples(network, store, held_out))
         for name in [name for name in samples if name.startswith('spread')]:
@@ -154,8 +159,12 @@ def main(argument):
 
 def _rounded(scores):
     """Turn a dataclass of arrays into lists of few digits, None for NaN."""
-    return {name: [None if np.isnan(x) else round(float(x), _DIGITS) if x % 1 else int(x)
-                   for x in values] for name, values in vars(scores).items()}
+    return {name: _rounded_list(values) for name, values in vars(scores).items()}
+
+
+def _rounded_list(values):
+    return [None if np.isnan(x) else round(float(x), _DIGITS) if x % 1 else int(x)
+            for x in values]
 
 
 if __name__ == '__main__':

@@ -225,9 +225,10 @@ def _bottleneck(rows, scale, pictures):
              'once' + (f': {counted["n"]} of {all_of["n"]} held-out episodes remain.'
                        if counted and all_of else '.') + '\n',
              'The maps are normalised as in the paper, so that an object that a prediction '
-             'leaves out is still somewhere by its map. On the right, and in the last column, '
-             'predictions count only if the maps of both objects keep at least half of their '
-             'mass.\n',
+             'leaves out is still somewhere by its map. On the right, and in the last column but '
+             'one, predictions count only if the maps of both objects keep at least half of their '
+             'mass. The last column says how often the true frame at the time of a '
+             'fixed-time method is a bottleneck itself.\n',
              *_plot('bottleneck_curve', scale, pictures,
                     'bottleneck frequency over the threshold'),
              *(f'{TITLES[task]}:\n\n{bottleneck_table(rows, task)}' for task in TITLES

@@ -198,8 +198,9 @@ def _preferred(shown, names):
 
 
 def _contrast(shown):
-    """Choose fix, genmin and the first form of ours, those that are at hand."""
-    ours = [one.method for one in shown if '+' in one.method]
+    """Choose fix, genmin and a form of ours that finds bottlenecks, those that are at hand."""
+    ours = [one.method for one in shown if re.match(r'genmin.*\+', one.method)]
+    ours = ['genmin+relative', 'genmin+changed', *ours]
     found = [_preferred(shown, names) for names in (
         ('fix', 'fix-wo-gan', 'fix0.50'), ('genmin', 'genmin-wo-gan', 'genmin4'), ours)]
     return [one for one in found if one is not None]

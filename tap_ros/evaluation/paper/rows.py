@@ -95,7 +95,7 @@ def _group(key, runs, part, of=''):
     scores = {name: np.array([part[name] for part in parts], float) for name in names}
     if not np.isfinite(scores.get('bottleneck', np.nan)).any():
         scores.pop('bottleneck', None)
-    for name in SPREADS if part == 'prediction' else ():
+    for name in (*SPREADS, 'target_bottleneck') if part == 'prediction' else ():
         if all(name in run['evaluation'] for run in runs):
             scores[name] = np.array([run['evaluation'][name] for run in runs], float)
     command = ' && '.join(run['command'] for run in runs)
@@ -118,7 +118,8 @@ def make_rows(groups):
         Bottlenecks are scored without new pixels only, which have no origin to follow (App. E).
         min_l1 is the per-pixel mean on [0, 1], match_step counts frames from the start picture
         (0), bottleneck_frequency and gains are shares, bottleneck_median_px is in pixels. In
-        visible_bottleneck_frequency no object may be left out, see bottleneck.VISIBLE.
+        visible_bottleneck_frequency no object may be left out, see bottleneck.VISIBLE;
+        target_bottleneck_frequency is that of the true frames at a fixed time.
     """
     rows = []
     for group in groups:
@@ -148,6 +149,11 @@ def make_rows(groups):
                 rows.append(_row(group, f'visible_bottleneck_frequency_{threshold}px',
                                  _over_seeds(_mean), (placed <= threshold) & visible))
             rows.append(_row(group, 'bottleneck_median_px', _over_seeds(_median), placed))
+        target = scores.get('target_bottleneck', np.full((1, 1), np.nan))
+        target = target[:, np.isfinite(target).all(0)]
+        if target.size and not group.key.get('new_pixels'):
+            rows.append(_row(group, 'target_bottleneck_frequency_2px', _over_seeds(_mean),
+                             target <= 2))
     return rows + _gain_rows(groups) + _equal_gain_rows(groups)
 
 

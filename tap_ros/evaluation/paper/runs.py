@@ -219,4 +219,6 @@ def paper_runs(scale, seeds=(0,), episodes=0, steps=0):
     add(['push2'], ['genmin+relative'], new_pixels=False, variant='+mixed')
     # The rest of Fig. 4.
     add(['grasp'], ['genmin2', 'genmin7', 'genmin30'], mode='forward', variant='+changed')
+    add(['grasp'], ['fix0.75', 'genmin0.5', 'genmin10', 'fix0.25', 'fix1.00', 'genmin2', 'genmin7',
+                    'genmin30'], mode='forward')
     return [replace(run, seed=seed) for seed in seeds for run in rows]

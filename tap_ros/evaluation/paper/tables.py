@@ -141,19 +141,20 @@ def bottleneck_table(rows, task):
         if BEST in method:
             continue
         if shares[0] is None:
-            lines.append([method, NOT_RUN, *['-'] * (len(THRESHOLDS) + 1)])
+            lines.append([method, NOT_RUN, *['-'] * (len(THRESHOLDS) + 2)])
             continue
         line = [method, *(plain(share['value'], 0, 100) for share in shares)]
         line[1 + 2] = f'**{line[1 + 2]}**'
         lines.append([
             *line, with_interval(find(rows, **about, metric='bottleneck_median_px'), 1),
-            with_interval(find(rows, **about, metric='visible_bottleneck_frequency_2px'), 0, 100)])
+            with_interval(find(rows, **about, metric='visible_bottleneck_frequency_2px'), 0, 100),
+            with_interval(find(rows, **about, metric='target_bottleneck_frequency_2px'), 0, 100)])
     if task == 'push2':
         for method, share in BOTTLENECK_2PX.items():
             lines.append([f'{method} in the paper', *('-' if n != 2 else plain(share, 0, 100)
-                                                            for n in THRESHOLDS), '-', '-'])
+                                                            for n in THRESHOLDS), '-', '-', '-'])
     return markdown(['method', *(f'{n} px' for n in THRESHOLDS), 'median, px',
-                     'no object left out, 2 px'], lines)
+                     'no object left out, 2 px', 'the true frame at that time, 2 px'], lines)
 
 
 def best_table(rows):

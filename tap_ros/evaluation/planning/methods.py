@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 import re
 
 from tap_ros.errors import ConfigError
-from tap_ros.planning.mpc_config import PAPER
+from tap_ros.planning.mpc_config import LARGE, PAPER
 
 BASES = ('nothing', 'direct', 'one_object', 'oracle_order', 'true_subgoal')
 BOUNDS = ('one_object', 'oracle_order', 'true_subgoal', 'true_model')
@@ -40,8 +40,8 @@ class Method:
     :param tracking: 'ground_truth': object pixels from the simulator at every step; 'carried':
         only in the first picture, then followed by planning.tracking.
     :param model: 'learned' or 'true', the simulator itself.
-    :param search: 'preset'; 'more': four times the samples, five iterations; 'paper': the paper's
-        planner, mpc_config.PAPER, whatever else is set.
+    :param search: 'preset'; 'more': samples and iterations of mpc_config.LARGE; 'paper': the
+        paper's planner, mpc_config.PAPER, whatever else is set.
     :param cost: 'preset'; 'plain': the sum of distances alone, as in the paper, nothing that
         prefers to bring one object home before the next (VisualMPCConfig.unfinished).
     :param replan_every: see VisualMPCConfig; 0: as the preset has it.
@@ -84,16 +84,15 @@ class Method:
         """Return a VisualMPCConfig changed as this method wants it."""
         if self.search == 'paper':
             config = PAPER
-        search = config.search
         if self.search == 'more':
-            search = replace(search, num_samples=4 * search.num_samples, num_iterations=5)
-            config = replace(config, search=search, proposals=4 * config.proposals)
+            config = replace(config, search=LARGE.search, proposals=LARGE.proposals,
+                             batch_size=LARGE.batch_size)
         if self.cost == 'plain':
             config = replace(config, unfinished=0.0)
         if self.replan_every:
             config = replace(config, replan_every=self.replan_every)
         if self.model == 'true':  # the simulator rolls out all samples by itself
-            config = replace(config, batch_size=search.num_samples, threads=1)
+            config = replace(config, batch_size=config.search.num_samples, threads=1)
         return config
 
 

@@ -34,8 +34,8 @@ What stands behind a colon replaces one part of the chain: `half` switches at ha
 the paper does, otherwise a subgoal is left when it is reached or half the budget is spent;
 `recursion2` takes two subgoals in a row; `samples8` chooses among 8 by the planner's own cost;
 `true_maps` takes the objects' positions from the true configuration that looks most like the
-predicted picture; `true_model` plans with the simulator; `more_search` searches with four times
-the samples and five iterations; `paper` searches as the paper does, with displacements drawn
+predicted picture; `true_model` plans with the simulator; `more_search` searches with 200 samples
+and 3 iterations; `paper` searches as the paper does, with displacements drawn
 from a Gaussian instead of whole pushes and no warm start; `plain_cost` minimises the plain sum of
 distances, as the paper does, without our preference for bringing one object home before the next;
 `every2` plans anew at every second action. Object pixels come from the simulator's ground truth at
