@@ -47,10 +47,14 @@ def bottleneck_scores(maps, start_pixels, goal_pixels):
     :param goal_pixels: (B, K, 2), in the goal picture.
     :return: (B,), in pixels.
     """
-    to_start = expected_distances(maps, start_pixels)  # B, K
-    to_goal = expected_distances(maps, goal_pixels)
-    halfway = list(product((False, True), repeat=maps.shape[1]))[1:-1]
-    scores = [torch.where(torch.tensor(moved, device=maps.device), to_goal, to_start).sum(1)
+    return _least_sum(*(expected_distances(maps, pixels) for pixels in (
+        start_pixels, goal_pixels)))
+
+
+def _least_sum(to_start, to_goal):
+    """Return (B,), the least sum of distances (B, K) with some objects moved, but not all."""
+    halfway = list(product((False, True), repeat=to_start.shape[1]))[1:-1]
+    scores = [torch.where(torch.tensor(moved, device=to_start.device), to_goal, to_start).sum(1)
               for moved in halfway]
     return torch.stack(scores).amin(0)
 
@@ -108,10 +112,9 @@ def target_bottlenecks(episodes, fraction, goal_picture):
     for n, episode in enumerate(episodes):
         pixels, target = context_pixels(episode, goal_picture), fixed_frame(episode, fraction)
         if can_be_bottleneck(pixels):
-            start, goal, now = torch.from_numpy(np.stack(
-                [*pixels, episode.object_pixels[target]]).astype(np.float32))
-            size = episode.frames.shape[1:3]
-            result[n] = bottleneck_scores(one_hot_maps(now[None], size), start[None], goal[None])
+            gaps = np.linalg.norm(episode.object_pixels[target] - pixels, axis=-1)
+            to_start, to_goal = torch.from_numpy(gaps)[:, None]
+            result[n] = _least_sum(to_start, to_goal).item()
     return result
 
 

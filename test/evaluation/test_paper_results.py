@@ -103,6 +103,8 @@ def test_every_row_of_the_data_has_a_place_of_its_own():
     painted = find(rows, method='genmin', metric='min_l1')
     assert painted['new_pixels'] and find(rows, method='genmin', metric='min_l1_warp_only')
     assert find(rows, method='genmin', metric='bottleneck_frequency_2px')
+    alone = told_apart(rows_of(made_run('fix', scores(0.01), new_pixels=False, task='push3')))
+    assert find(alone, method='fix', metric='min_l1')  # without the others it keeps its name
 
 
 def test_variants_of_a_method_have_names_of_their_own(tmp_path):

@@ -44,6 +44,11 @@ many episodes the match lies within a tenth of the episode from an input; and **
 is the error over those pixels of the same frame alone in which it differs from every input by more
 than 0.075: what neither copying nor leaving out gives. The paper's world, pictures and range of l1
 (which it does not state) are not ours: only how methods stand to each other can be compared.
+
+In [prediction.json](prediction.json) every number is a row. Metrics of models without new pixels
+(`new_pixels` false) end in `_warp_only` where models with new pixels have the same metric, too;
+bottlenecks are theirs only. `baseline` names what a gain compares with, `of` the method whose
+samples the best of 100 are.
 """
 
 
@@ -126,22 +131,24 @@ def _setting(runs):
     return ['## What was run\n',
             markdown(['task', 'frames', 'trained on', 'held out', 'data', 'steps', 'batch',
                       'base width', 'runs', 'minutes of training'], lines),
-            f'Machines: {"; ".join(machines)}.{_differences(runs)} The recordings were made by\n',
-            '```bash\n' + '\n'.join(collected) + '\n```\n']
+            f'Machines: {"; ".join(machines)}.\n', *_differences(runs),
+            'The recordings were made by\n', '```bash\n' + '\n'.join(collected) + '\n```\n']
 
 
 def _differences(runs):
-    """Say which settings, beside the method's own, are not the same in all runs."""
-    text = ''
+    """Tabulate the settings, beside the method's own, that are not the same in all runs."""
+    lines = []
     for setting in SETTINGS:
         methods = {}
         for run in runs:
             methods.setdefault(run['config'].get(setting), set()).add(run['method'])
         if len(methods) > 1:
-            values = (f'{value} ({", ".join(sorted(methods[value], key=method_order))})'
-                      for value in sorted(methods, key=str))
-            text += f' Not the same in all runs: `{setting}`, {"; ".join(values)}.'
-    return text
+            values = sorted(methods, key=lambda value: (-len(methods[value]), str(value)))
+            lines += [[f'`{setting}`', f'{values[0]}', 'all others'], *(
+                ['', f'{value}', ', '.join(sorted(methods[value], key=method_order))]
+                for value in values[1:])]
+    return ['Not the same in all runs:\n',
+            markdown(['setting', 'value', 'methods'], lines, left=3)] if lines else []
 
 
 def _range(values):
@@ -205,8 +212,9 @@ def _forward(rows, scale, pictures):
         above = sum(row['ci_high'] < 0 for row in gains)
         parts.append(
             f'Of {len(gains)} methods whose match-step lies between those of the fixed-time '
-            f'models, {below} have an error below theirs at the same match-step with the whole '
-            f'interval, {above} above, and for {len(gains) - below - above} it could be either. '
+            f'models of their kind ({", ".join(row["method"] for row in gains)}), {below} have an '
+            'error below theirs at the same match-step with the whole interval, '
+            f'{above} above, and for {len(gains) - below - above} it could be either. '
             'In between, fixed-time prediction counts as the line in the plot: what choosing at '
             'random between two of its models would score. In the paper every one lies below.\n')
     return parts

@@ -208,7 +208,7 @@ def _contrast(shown):
 
 @torch.inference_mode()
 def _parts(task, mode, shown, store, episodes, goal_picture):
-    """Show what pushing predictions are blended from (Fig. 10): masked warps and new pixels."""
+    """Show what pushing predictions are blended from (Figs. 9, 15): masked warps, new pixels."""
     chosen = _contrast(shown)
     if not task.startswith('push') or mode != 'bidirectional' or not chosen:
         return None
@@ -253,7 +253,7 @@ def _recursion(task, mode, shown, store, episodes, goal_picture):
 
 @torch.inference_mode()
 def _samples(task, mode, shown, store, episodes, goal_picture):
-    """Show samples of the VAE for one start and goal (Fig. 6, right)."""
+    """Show samples of the VAE for one start and goal (Figs. 9, 16)."""
     chosen = [one for one in shown if one.network.config.latent_size]
     chosen = _preferred(chosen, [one.method for one in reversed(chosen)])
     if chosen is None:

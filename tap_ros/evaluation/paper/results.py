@@ -101,15 +101,19 @@ def told_apart(rows):
     """
     Name metrics so that task, mode, method, metric and scale belong to one row.
 
-    The metrics of models without new pixels end in _warp_only, but for bottlenecks, which only
-    these have.
+    The metrics of models without new pixels end in _warp_only where the task has models with new
+    pixels, too; but for bottlenecks, which only the former have.
 
     :param rows: of make_rows.
     :return: list of dicts.
     """
+    def place(row):
+        return row['task'], row['mode'], row['scale']
+
+    both = {place(row) for row in rows if row.get('new_pixels')}
     return [{**row, 'metric': f'{row["metric"]}_warp_only'}
-            if row.get('new_pixels') is False and 'bottleneck' not in row['metric'] else row
-            for row in rows]
+            if row.get('new_pixels') is False and 'bottleneck' not in row['metric']
+            and place(row) in both else row for row in rows]
 
 
 def rows_as_json(rows):

@@ -21,7 +21,7 @@ import torch
 THRESHOLD = 2  # px, of the bottleneck frequency on the card
 _SETTINGS = ('method', 'mode', 'new_pixels', 'base_width', 'steps', 'batch_size', 'learning_rate',
              'margin', 'outer_power', 'changed_weight', 'goal_picture', 'recursion', 'gan_weight',
-             'kl_weight', 'latent_size', 'seed')
+             'kl_weight', 'latent_size', 'initial_weights', 'seed')
 
 
 def ship(run, file, places):
@@ -84,7 +84,8 @@ def make_card(file, result, scores):
     kind = ('Predicts a later picture from a start picture alone' if result['mode'] == 'forward'
             else 'Predicts a subgoal picture between a start and a goal picture')
     task = TITLES.get(result['task'], result['task'])
-    settings = ', '.join(f'{key} {config[key]}' for key in _SETTINGS if key in config)
+    settings = ', '.join(f'{key} {config[key]}' for key in _SETTINGS
+                         if config.get(key) not in (None, ''))
     lines = [
         f'# {file.name}\n',
         f'{kind}. Task: {task.lower()}; method: {name} (see docs/paper_map.md). Stored as '
@@ -101,20 +102,37 @@ def make_card(file, result, scores):
         '\nScores of this file on the held-out episodes, with 95% intervals over them; l1 is the '
         'per-pixel mean on [0, 1]. Copying an input is scored too: a low l1 alone says nothing. '
         'One training of one seed.\n',
-        markdown(['goal picture', 'method', 'min l1', 'match-step, share of the episode',
-                  f'bottlenecks at {THRESHOLD} px'],
+        markdown(['goal picture', 'method', 'min l1', 'of changed pixels',
+                  'match-step, share of the episode', f'bottlenecks at {THRESHOLD} px'],
                  [row for goal, methods in scores.items() for row in _rows(goal, methods)],
                  left=2),
+        *_samples(result['evaluation']),
+        '\nOf changed pixels: the error over those pixels alone in which the matched frame '
+        'differs from every input. What the picture shows and what it lacks: docs/results.\n',
         '\nTrained on pictures of this simulated world alone; other cameras, arms and objects '
         'need training of their own.']
     return '\n'.join(lines) + '\n'
+
+
+def _samples(evaluation):
+    """Say how good the best of 100 samples is and how much samples differ, if there are any."""
+    if 'best_of_100' not in evaluation:
+        return []
+    best = mean_interval(np.array(evaluation['best_of_100']['min_l1'], float))
+    near, elsewhere = (np.nanmean(np.array(evaluation[f'sample_spread_{where}'], float))
+                       for where in ('near', 'elsewhere'))
+    return [f'\nThe best of 100 samples, goal picture the last frame: min l1 {_text(best, 4)}. '
+            f'Samples differ by {near:.4f} on average around the objects and {elsewhere:.4f} '
+            'elsewhere (standard deviation on [0, 1]).']
 
 
 def _rows(goal, methods):
     """Write a line for each method."""
     for method, scores in methods.items():
         placed = scores.bottleneck[np.isfinite(scores.bottleneck)]
+        changed = scores.changed_l1[np.isfinite(scores.changed_l1)]
         yield [goal, method, _text(mean_interval(scores.min_l1), 4),
+               _text(mean_interval(changed), 3) if len(changed) else '-',
                _text(mean_interval(scores.match_fraction), 2),
                _text(mean_interval(placed <= THRESHOLD), 2) if len(placed) else '-']
 
