@@ -65,8 +65,9 @@ def make_page(rows, runs, left_out, scales, pictures, findings=''):
     :return: Markdown.
     """
     parts = ['# Prediction results\n',
-             'Made by `python -m tap_ros paper --results-only` from the scores in [runs](runs), '
-             'never typed; the same numbers as data: [prediction.json](prediction.json). '
+             'Tables and pictures are made by `python -m tap_ros paper --results-only` from the '
+             'scores in [runs](runs), never typed; the same numbers as data: '
+             '[prediction.json](prediction.json). '
              + ' '.join(_progress(runs, scale) for scale in scales) + '\n']
     if findings.strip():
         parts.append(findings.strip() + '\n')
