@@ -172,16 +172,17 @@ def _append(rows, images):
 
 @torch.inference_mode()
 def _methods(task, mode, shown, store, episodes, goal_picture):
-    """Show the inputs, the output of each method, and the match of genmin (Figs. 5, 6)."""
+    """Show inputs, the output of each method, and matches of genmin and ours (Figs. 5, 6)."""
     batch, context = _gather(store, episodes, mode, goal_picture)
     headings, rows = _inputs(batch)
     matched = _preferred(shown, ('genmin', 'genmin4', 'genmin-wo-gan'))
+    ours = next((one for one in _contrast(shown) if '+' in one.method), None)
     matches = []
     for one in shown:
         image = _predict(one, episodes, context).image
         _append(rows, to_uint8(image))
         headings.append(_coloured(one.method))
-        if one is matched or (one.method.startswith('genmin') and '+' in one.method):
+        if one is matched or one is ours:
             errors = l1_errors(image[:, None], batch.targets.movedim(-1, 2))[:, 0]
             match = match_step(errors, batch.valid)
             matches.append((one, batch.targets.numpy()[np.arange(len(match)), match]))
