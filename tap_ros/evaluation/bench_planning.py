@@ -73,7 +73,7 @@ def run(args):
     dtype = next(planner.model.push.parameters()).dtype
     if dtype == torch.bfloat16:
         rates['bfloat16'] = matrix_rate(args.device, dtype)
-    print(f'{"default, one sample, every frame":<34}{naive:>10.0f}'
+    print(f'{"large, one sample, every frame":<34}{naive:>10.0f}'
           f'   ({args.naive_samples} of {samples} samples timed)')
     print(f'naive / planned, while pushing: {naive / median:.1f}x')
     print(f'operations of a plan: {operations / 1e9:.2f} G (network {dtype})')

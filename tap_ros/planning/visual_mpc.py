@@ -163,7 +163,7 @@ class VisualMPC:
         best, best_cost, _ = cem(cost, mean, std, config.search, rng, clip, proposals,
                                  recheck if config.recheck else None)
         actions = shape.actions(best[None], gripper[2])
-        _, ends = self._cost(features, state, maps, distance, actions)
+        _, ends = self._cost(features, state, maps, distance, actions, pad=False)
         return best, actions[0], float(ends[0]), best_cost
 
     def _first_gaussian(self, shape):
@@ -186,7 +186,7 @@ class VisualMPC:
         model = self.model
         return (model.grid.flatten(0, 1) * model.config.table_half).cpu().numpy()
 
-    def _cost(self, features, gripper, maps, distance, actions):
+    def _cost(self, features, gripper, maps, distance, actions, pad=True):
         """
         Judge action sequences.
 
@@ -196,6 +196,7 @@ class VisualMPC:
         :param gripper: (N, 4), where each sequence begins, or (1, 4).
         :param distance: (K, n n) pixels, what each object costs in every table cell.
         :param actions: (N, horizon, 4).
+        :param pad: predict whole batches, so that costs are the same whatever N is.
         :return: costs (N,) numpy; expected distance at the horizon's end, px, mean over objects.
         """
         config, worst = self.config, distance.amax(1)
@@ -203,8 +204,8 @@ class VisualMPC:
         @torch.inference_mode()
         def judge(part, begin):
             count, total, seen = len(part), 0, 0
-            # a fixed batch keeps results the same whatever the number of samples
-            part, begin = (torch.cat([t, t[-1:].expand(config.batch_size - count, *t.shape[1:])])
+            missing = config.batch_size - count if pad else 0
+            part, begin = (torch.cat([t, t[-1:].expand(missing, *t.shape[1:])])
                            for t in (part, begin))
             for carried in self.model.carried_maps(
                     features, begin, maps, part, config.cost_every):
