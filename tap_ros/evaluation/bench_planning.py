@@ -66,7 +66,7 @@ def run(args):
         size = f'{mpc.config.search.num_samples} x {mpc.config.search.num_iterations}'
         print(f'{f"preset {name}, {size}":<34}' + ''.join(
             f'{np.median(part):>10.1f}{np.percentile(part, 90):>10.1f}' for part in times))
-    samples = search.num_samples * search.num_iterations
+    samples = search.num_samples * search.num_iterations + search.num_elites * large.recheck
     naive = time_naively(planner, seen, args.naive_samples) * samples
     operations = samples * count_operations(planner, seen)
     rates = {'float32': matrix_rate(args.device, torch.float32)}

@@ -58,7 +58,7 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None, recheck=None)
         num_samples, else the last count.
     :param recheck: cost that the best num_elites of all iterations are judged by once more, with
         the same convention; of many noisy costs the least is an illusion.
-    :return: best sample (D,), its cost, and the last mean (D,).
+    :return: best sample (D,), its cost (not the one by recheck), and the last mean (D,).
     """
     mean, std = np.array(mean, np.float64), np.array(std, np.float64)
     floor, kept = config.min_std * std, np.empty((0, len(mean)))

@@ -313,7 +313,8 @@ class ForwardModel(nn.Module):
         """
         Yield the maps (N, K, n, n) after every so many steps of N action sequences.
 
-        :param features: (1, C, n, n) from begin; gripper (1, 4); maps (K, n, n) on the table grid.
+        :param features: (1, C, n, n) from begin; maps (K, n, n) on the table grid.
+        :param gripper: (1, 4), or (N, 4) where each sequence begins.
         :param actions: (N, horizon, 4).
         """
         count = len(actions)

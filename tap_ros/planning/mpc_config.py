@@ -12,7 +12,7 @@ from tap_ros.planning.cem import CEMConfig
 @dataclass(frozen=True)
 class VisualMPCConfig:
     """
-    Settings of the planner. The default is what does best; PAPER is the paper's.
+    Settings of the planner. The default does as well as larger ones; PAPER is the paper's.
 
     :param search: settings of the search.
     :param segments: displacements of a sequence; repeat: control periods of each.
@@ -85,7 +85,7 @@ class VisualMPCConfig:
                               f'(num_samples), got {self.proposals}')
 
 
-# The paper's numbers of samples: three times as slow here, without a clear gain.
+# The paper's numbers of samples: more than twice as slow, without a clear gain.
 LARGE = VisualMPCConfig(search=CEMConfig(), proposals=80, batch_size=50)
 # 0.08 m std and 0.16 m clip in the paper are for actions of 1 s; ours last 0.25 s.
 PAPER = VisualMPCConfig(

@@ -40,7 +40,7 @@ class Method:
     :param tracking: 'ground_truth': object pixels from the simulator at every step; 'carried':
         only in the first picture, then followed by planning.tracking.
     :param model: 'learned' or 'true', the simulator itself.
-    :param search: 'preset'; 'more': samples and iterations of mpc_config.LARGE; 'paper': the
+    :param search: 'preset'; 'more': samples, iterations and proposals of LARGE; 'paper': the
         paper's planner, mpc_config.PAPER, whatever else is set.
     :param cost: 'preset'; 'plain': the sum of distances alone, as in the paper, nothing that
         prefers to bring one object home before the next (VisualMPCConfig.unfinished).

@@ -38,6 +38,7 @@ class TrueModel:
         Yield the maps (N, K, n, n) after every so many steps, as ForwardModel does.
 
         :param start: from begin; actions (N, horizon, 4).
+        :param gripper: is not looked at, all sequences begin where the simulator's gripper is.
         """
         model, state, target = start
         actions, same = torch.unique(actions, dim=0, return_inverse=True)
