@@ -9,7 +9,7 @@ Object positions are the recordings', that is, the simulator's ground truth; the
 from itertools import product
 
 import numpy as np
-from tap_ros.prediction.batches import uses_recorded_goal
+from tap_ros.prediction.batches import fixed_time, uses_recorded_goal
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps, WarpedMaps
 import torch
 
@@ -110,18 +110,13 @@ def target_bottlenecks(episodes, fraction, goal_picture):
     """
     result = np.full(len(episodes), np.nan, np.float32)
     for n, episode in enumerate(episodes):
-        pixels, target = context_pixels(episode, goal_picture), fixed_frame(episode, fraction)
+        pixels, end = context_pixels(episode, goal_picture), len(episode.frames) - 1
         if can_be_bottleneck(pixels):
+            target = fixed_time(fraction, end, 1, end - 1)
             gaps = np.linalg.norm(episode.object_pixels[target] - pixels, axis=-1)
             to_start, to_goal = torch.from_numpy(gaps)[:, None]
             result[n] = _least_sum(to_start, to_goal).item()
     return result
-
-
-def fixed_frame(episode, fraction):
-    """Return the index of the frame at a share of an episode, neither the first nor the last."""
-    end = len(episode.frames) - 1
-    return int(np.clip(int(fraction * end + 0.5), 1, end - 1))
 
 
 def can_be_bottleneck(pixels):

@@ -133,6 +133,11 @@ def uses_recorded_goal(episode, goal_picture, rng=None):
     return episode.outcome == 'success'
 
 
+def fixed_time(fraction, end, first, last):
+    """Return the time, first to last, at a share of an episode that ends at time `end`."""
+    return int(np.clip(int(fraction * end + 0.5), first, last))
+
+
 def make_batch(store, episodes, margin=0, num_targets=0, fraction=None, max_frames=0,
                min_crop=1.0, goal_picture='last', forward=False, num_others=0, video_frames=0,
                frames=None, rng=None):
@@ -168,7 +173,7 @@ def make_batch(store, episodes, margin=0, num_targets=0, fraction=None, max_fram
         first, last = target_times(end, margin, forward)
         times = np.arange(first, last + 1)
         if fraction is not None:
-            fixed = np.clip(int(fraction * end + 0.5), first, last)
+            fixed = fixed_time(fraction, end, first, last)
             others = rng.permutation(times[times != fixed])[:num_others]
             times = np.append(fixed, others if len(others) or not num_others else fixed)
         elif num_targets and len(times) > num_targets:

@@ -14,14 +14,13 @@ from tap_ros.evaluation.bottleneck import (
     bottleneck_frequency,
     bottleneck_scores,
     expected_distances,
-    fixed_frame,
     MIN_MOTION,
     target_bottlenecks,
 )
 from tap_ros.evaluation.prediction import add_arguments, evaluate, run, write_pictures
 from tap_ros.evaluation.samples import draw_latents, score_samples
 from tap_ros.images import to_float
-from tap_ros.prediction.batches import make_batch
+from tap_ros.prediction.batches import fixed_time, make_batch
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.prediction.weights import save_weights
@@ -129,7 +128,7 @@ def test_with_three_objects_one_or_two_may_have_moved_but_not_none_or_all():
 def test_true_frames_are_scored_at_the_frame_that_fixed_time_prediction_has():
     for fraction in (0.0, 0.25, 0.5, 0.75, 1.0):
         batch = make_batch(EPISODES, [0, 1, 2], fraction=fraction)
-        frames = [fixed_frame(episode, fraction) for episode in EPISODES]
+        frames = [fixed_time(fraction, 8, 1, 7) for _ in EPISODES]
         assert frames == batch.times[:, 0].tolist()
     at = {share: target_bottlenecks(EPISODES, share, 'last') for share in (0.25, 0.5, 0.75)}
     assert (at[0.5] == 0).all() and (at[0.25] > 1).all() and (at[0.75] > 1).all()

@@ -135,8 +135,7 @@ def make_rows(groups):
                 beside |= share > 1 - BESIDE
             rows.append(_row(group, 'match_beside_input', _over_seeds(_mean), beside))
         for metric in ('changed_l1', *SPREADS):  # not known of every episode
-            known = scores.get(metric, np.full((1, 1), np.nan))
-            known = known[:, np.isfinite(known).all(0)]
+            known = _known(scores, metric)
             if known.size:
                 rows.append(_row(group, metric, _over_seeds(_mean), known))
         if 'bottleneck' in scores and not group.key.get('new_pixels'):
@@ -149,12 +148,17 @@ def make_rows(groups):
                 rows.append(_row(group, f'visible_bottleneck_frequency_{threshold}px',
                                  _over_seeds(_mean), (placed <= threshold) & visible))
             rows.append(_row(group, 'bottleneck_median_px', _over_seeds(_median), placed))
-        target = scores.get('target_bottleneck', np.full((1, 1), np.nan))
-        target = target[:, np.isfinite(target).all(0)]
+        target = _known(scores, 'target_bottleneck')
         if target.size and not group.key.get('new_pixels'):
             rows.append(_row(group, 'target_bottleneck_frequency_2px', _over_seeds(_mean),
                              target <= 2))
     return rows + _gain_rows(groups) + _equal_gain_rows(groups)
+
+
+def _known(scores, name):
+    """Return the scores (S, N') of the episodes that have them; N' is 0 where there are none."""
+    values = scores.get(name, np.empty((1, 0)))
+    return values[:, np.isfinite(values).all(0)]
 
 
 def _mean(values):
