@@ -73,7 +73,8 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None, recheck=None)
         # judge
         costs = _finite(cost(samples))
         order = np.argsort(costs, kind='stable')
-        best, best_costs = np.concatenate([best, samples]), np.concatenate([best_costs, costs])
+        best = np.concatenate([best, samples[len(kept):]])  # kept ones were judged before
+        best_costs = np.concatenate([best_costs, costs[len(kept):]])
         first = np.argsort(best_costs, kind='stable')[:config.num_elites]
         best, best_costs = best[first], best_costs[first]
         # refit

@@ -8,7 +8,9 @@ subgoal is reached ('reached') wastes no steps; several subgoals share the budge
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import cv2
 import numpy as np
 from tap_ros.errors import ConfigError
 
@@ -30,9 +32,31 @@ class Target:
     free: np.ndarray | None = None
 
     def distance(self, pixels):
-        """Return the mean distance in pixels of the objects (K, 2) that are not free."""
-        gaps = np.linalg.norm(np.asarray(pixels) - self.pixels, axis=1)
-        return float(gaps.mean() if self.free is None else gaps[~self.free].mean())
+        """
+        Return how far the objects at pixels (K, 2) are, in pixels, mean over those not free.
+
+        To a map it is what the planner minimises, the expected distance, less the least that it
+        can be anywhere. An object whose map is undecided between two places is thus there in
+        either: waiting until it is half way would be waiting for nothing.
+        """
+        pixels = np.asarray(pixels, np.float32)
+        if self.maps is None:
+            gaps = np.linalg.norm(pixels - self.pixels, axis=1)
+        else:
+            gaps = [cv2.remap(table, *pixel[:, None, None], cv2.INTER_LINEAR,
+                              borderMode=cv2.BORDER_REPLICATE).item()
+                    for table, pixel in zip(self._excess, pixels)]
+        return float(np.mean(gaps) if self.free is None else np.asarray(gaps)[~self.free].mean())
+
+    @cached_property
+    def _excess(self):
+        """Return the expected distance (K, H, W) of each pixel to the maps, less the least."""
+        maps = np.asarray(self.maps, np.float32)
+        H, W = maps.shape[1:]
+        gaps = np.hypot(*np.mgrid[1 - H:H, 1 - W:W]).astype(np.float32)
+        tables = np.stack([cv2.filter2D(m / m.sum(), -1, gaps, borderType=cv2.BORDER_CONSTANT)
+                           for m in maps])
+        return tables - tables.min((1, 2), keepdims=True)
 
     def goal(self, pixels):
         """Return the keyword arguments of VisualMPC.act, for objects that are at pixels (K, 2)."""

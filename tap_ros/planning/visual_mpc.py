@@ -163,7 +163,7 @@ class VisualMPC:
         best, best_cost, _ = cem(cost, mean, std, config.search, rng, clip, proposals,
                                  recheck if config.recheck else None)
         actions = shape.actions(best[None], gripper[2])
-        _, ends = self._cost(features, state, maps, distance, actions, pad=False)
+        _, ends = self._cost(features, state, maps, distance, actions)
         return best, actions[0], float(ends[0]), best_cost
 
     def _first_gaussian(self, shape):
@@ -186,7 +186,7 @@ class VisualMPC:
         model = self.model
         return (model.grid.flatten(0, 1) * model.config.table_half).cpu().numpy()
 
-    def _cost(self, features, gripper, maps, distance, actions, pad=True):
+    def _cost(self, features, gripper, maps, distance, actions):
         """
         Judge action sequences.
 
@@ -196,15 +196,15 @@ class VisualMPC:
         :param gripper: (N, 4), where each sequence begins, or (1, 4).
         :param distance: (K, n n) pixels, what each object costs in every table cell.
         :param actions: (N, horizon, 4).
-        :param pad: predict whole batches, so that costs are the same whatever N is.
         :return: costs (N,) numpy; expected distance at the horizon's end, px, mean over objects.
         """
         config, worst = self.config, distance.amax(1)
+        size = -(-len(actions) // -(-len(actions) // config.batch_size))  # as even as can be
 
         @torch.inference_mode()
         def judge(part, begin):
             count, total, seen = len(part), 0, 0
-            missing = config.batch_size - count if pad else 0
+            missing = size - count  # the last part, filled up so that size moves no digit
             part, begin = (torch.cat([t, t[-1:].expand(missing, *t.shape[1:])])
                            for t in (part, begin))
             for carried in self.model.carried_maps(
@@ -221,7 +221,7 @@ class VisualMPC:
         order = np.argsort((actions[..., 2].cumsum(1) + gripper[0, 2].item() > LOW + 0.01).sum(1),
                            kind='stable')
         begins = gripper.expand(len(actions), -1)[torch.from_numpy(order).to(gripper.device)]
-        parts = [t.split(config.batch_size) for t in (
+        parts = [t.split(size) for t in (
             torch.from_numpy(actions[order]).to(distance.device), begins)]
         costs, ends = map(torch.cat, zip(*self._pool.map(judge, *parts)))
         back = np.argsort(order)

@@ -142,7 +142,7 @@ def running_loop(folder):
                 loop.start('recorder_node', folder=folder / 'bag')
                 loop.start('sim_node', lock_step='true')
                 loop.start('predictor_node')
-                loop.start('visual_mpc_node', image_timeout=4.0)
+                loop.start('visual_mpc_node', image_timeout=10.0)
                 for process in loop.processes.values():
                     process.wait_for('ready', 120)
                 assert loop.predict_client.wait_for_service(30)

@@ -68,6 +68,21 @@ def test_maps_go_before_their_means():
     assert Target(PLACES, maps).goal(PLACES) == {'goal_maps': maps}
 
 
+def test_a_map_is_reached_where_its_expected_distance_is_least():
+    maps = one_hot_maps(torch.tensor(PLACES), (32, 32)).numpy()
+    now = PLACES + [[3.0, 4.0], [0.0, 1.0]]
+    assert Target(PLACES, maps).distance(now) == pytest.approx(3, abs=0.05)  # of 5 and 1
+    undecided = (maps[:1] + maps[1:]) / 2  # one object, in either place
+    mean = PLACES.mean(0, keepdims=True)
+    target = Target(mean, undecided)
+    for place in (PLACES[:1], PLACES[1:], mean):
+        assert target.distance(place) == pytest.approx(0, abs=0.05)
+    away = mean + [[5.0, -5.0]]
+    expected = np.linalg.norm(PLACES - away, axis=1).mean() - np.hypot(6, 6)
+    assert target.distance(away) == pytest.approx(expected, abs=0.05)
+    assert target.distance([[99.0, 14.0]]) > 5  # outside the picture
+
+
 def test_unknown_switches_are_named():
     with pytest.raises(ConfigError, match='half'):
         Itinerary(targets(2), 12, 'sometimes')
