@@ -37,7 +37,7 @@ def test_every_run_can_be_trained_as_its_name_says():
         assert config.chosen.name == run.method and config.mode == run.mode
         assert config.seed == run.seed
         assert (config.goal_picture == 'last') == (run.variant != '+mixed')
-        assert run.task in TASKS and config.recordings == (f'bags/{run.task}',)
+        assert run.task in TASKS and config.recordings[-1] == f'bags/{run.task}'
         assert config.out == f'runs/paper/{run.scale}/{run.name}'
         if 'relative' not in run.method and not run.variant:
             assert (config.margin, config.outer_power) == (0, 1)
@@ -67,6 +67,14 @@ def test_the_command_of_three_objects_makes_what_it_begins_with():
     run = PaperRun('push3', 'bidirectional', 'fix', new_pixels=False)
     assert run.before in paper_runs('small')
     assert f'--only {run.before.name} {run.name}' in run.command
+
+
+def test_three_objects_are_trained_on_two_as_well_and_longer():
+    run = PaperRun('push3', 'bidirectional', 'fix', new_pixels=False)
+    assert run.config('bags', 'r').recordings == ('bags/push2', 'bags/push3')
+    assert run.num_steps == 3600 and replace(run, steps=7).num_steps == 7
+    full = replace(run, scale='full')
+    assert full.num_steps * 64 == 200 * 2 * 55000
 
 
 def test_full_has_the_papers_length():

@@ -85,7 +85,7 @@ def places(tmp_path):
 def test_a_run_leaves_a_number_for_every_held_out_episode(places):
     assert find_state(RUN, places).kind == 'missing'
     assert perform(RUN, places) == DONE
-    state = find_state(RUN, places, recording_hash(places.recording('push2')))
+    state = find_state(RUN, places, {'push2': recording_hash(places.recording('push2'))})
     assert state.kind == 'done'
     result = json.loads(places.result(RUN).read_text())
     assert result == state.result
@@ -123,15 +123,15 @@ def test_other_settings_or_recordings_are_not_done(places, tmp_path):
     perform(RUN, places)
     path, data_hash = places.result(RUN), recording_hash(places.recording('push2'))
     assert find_state(replace(RUN, steps=3), places).kind == 'other'
-    assert find_state(RUN, places, 'of other recordings').kind == 'other'
+    assert find_state(RUN, places, {'push2': 'of other recordings'}).kind == 'other'
     # Elsewhere, without the weights or the recordings, the result alone says that it is done.
     elsewhere = replace(places, runs=str(tmp_path / 'none'), recordings=str(tmp_path / 'none'))
     assert find_state(RUN, elsewhere).kind == 'done'
     path.unlink()
-    state = find_state(RUN, places, data_hash)
+    state = find_state(RUN, places, {'push2': data_hash})
     assert (state.kind, state.steps) == ('partial', 2)
     path.write_text('{"torn": ')
-    assert find_state(RUN, places, data_hash).kind == 'partial'
+    assert find_state(RUN, places, {'push2': data_hash}).kind == 'partial'
 
 
 def test_a_training_goes_on_where_it_stopped(places):
@@ -208,7 +208,19 @@ def test_three_objects_begin_with_the_weights_for_two(places):
     ends = sweep([run, run.before], places, jobs=2, progress=False)
     assert [(end.name, end.kind) for end in ends] == [
         (RUN.name, 'done'), (run.name, 'done')]
-    config = json.loads(places.result(run).read_text())['config']
+    result = json.loads(places.result(run).read_text())
+    config, data = result['config'], result['data']
+    # trained on both, scored on their own
+    assert config['recordings'] == [str(places.recording(task)) for task in ('push2', 'push3')]
+    hashes = {task: recording_hash(places.recording(task)) for task in ('push2', 'push3')}
+    assert data['hash'] == hashes['push3'] and data['episodes'] == 2 * (EPISODES - 2)
+    assert data['held_out'] == len(result['evaluation']['prediction']['min_l1']) == 2
+    about = json.loads((run.folder(places.runs) / 'run.json').read_text())
+    assert about['data_hash'] == recording_hash(
+        *(places.recording(task) for task in ('push2', 'push3')))
+    assert find_state(run, places, hashes).kind == 'done'
+    places.result(run).unlink()
+    assert find_state(run, places, hashes).kind == 'partial'  # trained, not scored
     assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
 
 

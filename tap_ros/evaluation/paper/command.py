@@ -73,7 +73,7 @@ def run(args):
     if not args.collect:
         _try_results(places, pictures=True)
     hashes = data_hashes(runs, places)
-    states = [find_state(run, places, hashes.get(run.task)) for run in runs]
+    states = [find_state(run, places, hashes) for run in runs]
     print(f"{sum(state.kind == 'done' for state in states)} of {len(runs)} runs are done")
     elsewhere = [run for run in runs if run.task not in hashes]
     if elsewhere and not ends:
@@ -122,7 +122,7 @@ def show(runs, places):
     width = max(len(run.name) for run in runs)
     print(f'{"run":{width}s}{"state":>16s}{"min l1":>9s}{"match (share)":>15s}{"2 px":>8s}')
     for run in runs:
-        state = find_state(run, places, hashes.get(run.task))
+        state = find_state(run, places, hashes)
         text = {'partial': f'{state.steps}/{run.num_steps} steps',
                 'other': 'other settings'}.get(state.kind, state.kind)
         print(f'{run.name:{width}s}{text:>16s}{_scores(state.result)}')

@@ -90,7 +90,7 @@ def _check_before(run, places):
 
 def score(run, config, weights, places):
     """
-    Score a trained run on the episodes that training held out.
+    Score a trained run on the episodes of its task that training held out.
 
     :param run: PaperRun.
     :param config: its TrainingConfig.
@@ -108,10 +108,10 @@ def score(run, config, weights, places):
     from tap_ros.recording.cache import open_recordings
 
     network, about = load_network(weights, pick_device(config.device))
-    store = open_recordings(list(config.recordings), progress=False)
+    store = open_recordings([str(places.recording(run.task))], progress=False)
     _, held_out = split_episodes(store, config.test_fraction)
     if not len(held_out):
-        raise ConfigError(f'{config.recordings[0]}: no episode of it is held out; collect more')
+        raise ConfigError(f'{config.recordings[-1]}: no episode of it is held out; collect more')
     began = time.perf_counter()
     scores = {method: _rounded(value) for method, value in
               evaluate(network, store, held_out).items()}
@@ -131,8 +131,8 @@ def score(run, config, weights, places):
         'recursion': run.recursion, 'variant': run.variant, 'command': run.command,
         'config': asdict(config),
         'data': {'hash': store.data_hash, 'episodes': about['episodes'],
-                 'held_out': about['held_out'],
-                 'command': collect_command(places.recording(run.task))},
+                 'held_out': len(held_out), 'command': '; '.join(
+                     collect_command(places.recording(task)) for task in run.training_tasks)},
         'training': {name: about[name]
                      for name in ('steps', 'seconds', 'machine', 'torch', 'python')},
         'evaluation': {'margin': 0, 'goal_picture': 'last', 'seconds': seconds, **scores}}

@@ -128,7 +128,8 @@ def _setting(runs):
                 f'{config.get("batch_size", "-")}', f'{config.get("base_width", "-")}',
                 f'{len(own)}', f'{sum(run["training"]["seconds"] for run in own) / 60:.0f}'])
     machines = sorted({run['training']['machine'] for run in runs})
-    collected = sorted({run['data']['command'] for run in runs})
+    collected = sorted({
+        command for run in runs for command in run['data']['command'].split('; ')})
     return ['## What was run\n',
             markdown(['task', 'frames', 'trained on', 'held out', 'data', 'steps', 'batch',
                       'base width', 'runs', 'minutes of training'], lines),

@@ -111,10 +111,10 @@ def collect_command(folder):
     return shlex.join(words + (['--seed', str(settings['seed'])] if settings['seed'] else []))
 
 
-def recording_hash(folder):
-    """Compute EpisodeStore.data_hash without decoding anything."""
+def recording_hash(*folders):
+    """Compute EpisodeStore.data_hash of recordings without decoding anything."""
     digests = []
-    for file in (file for bag in find_bags(folder) for file in bag):
+    for file in (file for folder in folders for bag in find_bags(folder) for file in bag):
         with open(file, 'rb') as stream:
             digests.append(hashlib.file_digest(stream, 'sha256').hexdigest())
     return hashlib.sha256(''.join(digests).encode()).hexdigest()

@@ -8,7 +8,7 @@ them.
 """
 
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 import json
 import math
 import os
@@ -78,28 +78,39 @@ class _Job:
     log: Path
 
 
-def find_state(run, places, data_hash=None):
+def find_state(run, places, hashes=None):
     """
     Find out how far a run is.
 
     :param run: PaperRun.
     :param places: Places.
-    :param data_hash: of the task's recording; None where it is not at hand: a run that was done
-        elsewhere is then taken as it is.
+    :param hashes: of data_hashes. Where the recording is not at hand a run that was done elsewhere
+        is taken as it is.
     :return: State.
     """
+    hashes = hashes or {}
+    scored = hashes.get(run.task)
     config, folder = run.config(places.recordings, places.runs), run.folder(places.runs)
     result = read_json(places.result(run))
     if (result is not None and _same(result['config'], config)
-            and data_hash in (None, result['data']['hash'])):
+            and scored in (None, result['data']['hash'])):
         return State('done', config.steps, result)
     about = read_json(folder / 'run.json')
     if about is not None:
         if (_same(read_json(folder / 'config.json') or {}, config)
-                and data_hash in (None, about['data_hash'])):
+                and _training_hash(run, places, hashes) in (None, about['data_hash'])):
             return State('partial', about['steps'])
         return State('other')
     return State('missing' if result is None else 'other')
+
+
+def _training_hash(run, places, hashes):
+    """Return the hash of what a run is trained on; None where not all of it is at hand."""
+    if any(task not in hashes for task in run.training_tasks):
+        return None
+    if len(run.training_tasks) == 1:
+        return hashes[run.task]
+    return recording_hash(*map(places.recording, run.training_tasks))
 
 
 def trained_steps(run, places):
@@ -139,7 +150,8 @@ def data_hashes(runs, places):
     """
     wanted = {}
     for run in runs:
-        wanted[run.task] = max(run.num_episodes, wanted.get(run.task, 0))
+        for task in run.training_tasks:
+            wanted[task] = max(replace(run, task=task).num_episodes, wanted.get(task, 0))
     return {task: recording_hash(places.recording(task)) for task, episodes in wanted.items()
             if is_collected(places.recording(task), episodes)}
 
@@ -161,7 +173,7 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
     """
     deadline = time.monotonic() + 60 * (minutes or math.inf)
     hashes = data_hashes(runs, places)
-    states = {run: find_state(run, places, hashes.get(run.task)) for run in runs}
+    states = {run: find_state(run, places, hashes) for run in runs}
     waiting = [run for run in runs if states[run].kind != 'done']
     if collect_only:
         waiting = list(runs)
@@ -174,18 +186,19 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
         """Start the first job that can be; return whether there was one."""
         collecting = {job.task for job in active if job.run is None}
         for run in list(waiting):
-            if run.task in failed or (collect_only and run.task in hashes):
+            missing = [task for task in run.training_tasks if task not in hashes]
+            if not failed.isdisjoint(run.training_tasks) or (collect_only and not missing):
                 waiting.remove(run)
             elif run.before in [*waiting, *(job.run for job in active if job.run)] and (
                     not collect_only):
                 continue
-            elif run.task in hashes:
+            elif not missing:
                 waiting.remove(run)
                 active.append(_start_run(
                     run, places, deadline, fresh and states[run].kind != 'partial'))
                 return True
-            elif run.task not in collecting:
-                active.append(_start_collecting(run, runs, places, jobs))
+            elif missing[0] not in collecting:
+                active.append(_start_collecting(missing[0], runs, places, jobs))
                 return True
         return False
 
@@ -231,13 +244,13 @@ def _start_run(run, places, deadline, fresh):
     return _Job(run.task, run, *_start(job, places, run.folder(places.runs) / 'log.txt'))
 
 
-def _start_collecting(run, runs, places, jobs):
-    """Start a process that collects the recording of a run's task, for all runs of it."""
-    episodes = max(other.num_episodes for other in runs if other.task == run.task)
-    job = {'collect': run.task, 'episodes': episodes,
+def _start_collecting(task, runs, places, jobs):
+    """Start a process that collects the recording of a task, for all runs that need it."""
+    episodes = max(replace(run, task=task).num_episodes
+                   for run in runs if task in run.training_tasks)
+    job = {'collect': task, 'episodes': episodes,
            'workers': max(1, len(os.sched_getaffinity(0)) // jobs)}
-    return _Job(run.task, None, *_start(
-        job, places, Path(places.runs) / f'collect-{run.task}.txt'))
+    return _Job(task, None, *_start(job, places, Path(places.runs) / f'collect-{task}.txt'))
 
 
 def _start(job, places, log):
