@@ -224,6 +224,16 @@ def test_three_objects_begin_with_the_weights_for_two(places):
     assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
 
 
+def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path):
+    bags = tmp_path / 'bags'
+    write_bag(bags / 'push2', [0])  # one episode: none can be held out
+    write_bag(bags / 'push3', SEEDS)
+    run = replace(RUN, task='push3')
+    ends = sweep([run, run.before], Places(str(bags), str(tmp_path / 'runs'), str(
+        tmp_path / 'results')), progress=False)
+    assert [(end.name, end.kind) for end in ends] == [(run.before.name, 'failed')]
+
+
 @pytest.mark.slow
 def test_missing_recordings_are_collected(places):
     run = replace(RUN, task='grasp', episodes=2)

@@ -177,7 +177,7 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
     waiting = [run for run in runs if states[run].kind != 'done']
     if collect_only:
         waiting = list(runs)
-    active, ends, failed = [], [], set()
+    active, ends, failed, undone = [], [], set(), set()
     bar = tqdm(desc='paper', unit='step', total=sum(run.num_steps for run in waiting),
                initial=sum(states[run].steps for run in waiting),
                disable=not progress or collect_only)
@@ -187,7 +187,8 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
         collecting = {job.task for job in active if job.run is None}
         for run in list(waiting):
             missing = [task for task in run.training_tasks if task not in hashes]
-            if not failed.isdisjoint(run.training_tasks) or (collect_only and not missing):
+            if (not failed.isdisjoint(run.training_tasks) or run.before in undone
+                    or (collect_only and not missing)):
                 waiting.remove(run)
             elif run.before in [*waiting, *(job.run for job in active if job.run)] and (
                     not collect_only):
@@ -214,7 +215,9 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
             hashes[job.task] = recording_hash(places.recording(job.task))
         elif job.run is None:
             failed.add(job.task)
-        elif kind == 'done' and on_done:
+        elif kind != 'done':
+            undone.add(job.run)  # what begins with its weights has to wait for another sweep
+        elif on_done:
             on_done()
 
     shown = -math.inf
