@@ -42,7 +42,8 @@ def declare_parameters(node):
              'the planner knows it, from the next goal on.'),
             ('max_step_z', 0.15, 0.02, 0.15, 'Largest |dz| of a command in metres; likewise.'),
             ('goal_tolerance', 1.0, 0.0, 64.0,
-             'A goal or subgoal is reached at this mean distance of the objects in pixels.')):
+             'A goal is reached at this mean distance of the objects in pixels, a subgoal where '
+             'the mean expected distance to its maps is so much above the least possible.')):
         parameters.declare(name, default, description, low=low, high=high, read_only=False)
     parameters.declare('switch', 'reached', 'When to go on from a subgoal: when it is reached, '
                        'or its share of the budget spent; or at its share (half), as the paper '

@@ -36,16 +36,17 @@ class Target:
         Return how far the objects at pixels (K, 2) are, in pixels, mean over those not free.
 
         To a map it is what the planner minimises, the expected distance, less the least that it
-        can be anywhere. An object whose map is undecided between two places is thus there in
-        either: waiting until it is half way would be waiting for nothing.
+        can be anywhere in the picture. An object whose map is evenly undecided between two places
+        is thus there in either: waiting until it is half way would be waiting for nothing.
         """
         pixels = np.asarray(pixels, np.float32)
         if self.maps is None:
             gaps = np.linalg.norm(pixels - self.pixels, axis=1)
         else:
-            gaps = [cv2.remap(table, *pixel[:, None, None], cv2.INTER_LINEAR,
-                              borderMode=cv2.BORDER_REPLICATE).item()
-                    for table, pixel in zip(self._excess, pixels)]
+            edges = np.clip(pixels, 0, np.array(self.maps.shape[:0:-1], np.float32) - 1)
+            gaps = np.linalg.norm(pixels - edges, axis=1)  # of those outside
+            gaps = [gap + cv2.remap(table, *edge[:, None, None], cv2.INTER_LINEAR).item()
+                    for gap, table, edge in zip(gaps, self._excess, edges, strict=True)]
         return float(np.mean(gaps) if self.free is None else np.asarray(gaps)[~self.free].mean())
 
     @cached_property
@@ -77,7 +78,7 @@ class Itinerary:
     :param step_budget: B.
     :param switch: 'half': a target gets its whole share of the budget; 'reached': goes on to the
         next one as soon as it is reached.
-    :param reached: px, mean over objects; nearer than this is there. 0: never.
+    :param reached: px of Target.distance; nearer than this is there. 0: never.
     :ivar switches: steps at which the second, third ... target began.
     """
 

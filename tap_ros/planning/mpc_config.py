@@ -37,7 +37,8 @@ class VisualMPCConfig:
     :param cost_every: the cost looks at every so many steps; 1: at all of them.
     :param replan_every: search anew at every so many actions, or when the goal changes; between
         these the last plan is carried out.
-    :param batch_size: samples predicted at once; threads: on the CPU. Both change the speed only.
+    :param batch_size: samples predicted at once, at most; threads: on the CPU. Both change the
+        speed only.
     """
 
     search: CEMConfig = CEMConfig(num_samples=64, num_iterations=2, num_elites=8)

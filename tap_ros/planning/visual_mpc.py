@@ -204,7 +204,7 @@ class VisualMPC:
         @torch.inference_mode()
         def judge(part, begin):
             count, total, seen = len(part), 0, 0
-            missing = size - count  # the last part, filled up so that size moves no digit
+            missing = size - count  # the last part is filled up: all go the same way
             part, begin = (torch.cat([t, t[-1:].expand(missing, *t.shape[1:])])
                            for t in (part, begin))
             for carried in self.model.carried_maps(

@@ -35,12 +35,13 @@ from tap_ros.recording.writer import EpisodeWriter, write_metadata
 
 ROOT = Path(__file__).parents[2]
 SEEDS = (122, 142, *range(6))  # the first two are held out
+SEEDS_3 = (12, 22, 32, *range(6, 9))  # of three objects the first three
 EPISODES = len(SEEDS)
 RUN = PaperRun('push2', 'bidirectional', 'genmin-wo-gan', new_pixels=False, episodes=EPISODES,
                steps=2)
 
 
-def make_episode(seed, length=7, size=16):
+def make_episode(seed, task='push2', length=7, size=16):
     """Two squares that move one after the other."""
     rng = np.random.default_rng(seed)
     start = rng.uniform(3, size - 9, (2, 2))
@@ -56,7 +57,7 @@ def make_episode(seed, length=7, size=16):
         frames=frames, stamps=np.arange(length) * 250_000_000 + (seed + 1) * 10 ** 11,
         actions=np.zeros((length, 4), np.float32), grippers=np.zeros((length, 4), np.float32),
         object_names=('object_0', 'object_1'), object_pixels=pixels, object_poses=poses,
-        goal_frame=frames[-1], goal_pixels=pixels[-1], goal_poses=poses[-1], task='push2',
+        goal_frame=frames[-1], goal_pixels=pixels[-1], goal_poses=poses[-1], task=task,
         seed=seed, outcome='success')
 
 
@@ -64,7 +65,7 @@ def write_bag(folder, seeds):
     folder.mkdir(parents=True, exist_ok=True)
     with EpisodeWriter(folder / f'{folder.name}_0.mcap') as writer:
         for seed in seeds:
-            writer.write(make_episode(seed))
+            writer.write(make_episode(seed, folder.name))
     write_metadata(folder)
 
 
@@ -92,8 +93,9 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places):
     store = open_recordings([str(places.recording('push2'))])
     held_out = len(split_episodes(store, 0.05)[1])
     assert held_out == 2
-    assert result['data'] == {'hash': store.data_hash, 'episodes': EPISODES - held_out,
-                              'held_out': held_out, 'command': ''}
+    assert result['data'] == {
+        'hash': store.data_hash, 'trained_on': store.data_hash, 'episodes': EPISODES - held_out,
+        'held_out': held_out, 'command': ''}
     scores = result['evaluation']
     assert (scores['margin'], scores['goal_picture']) == (0, 'last')
     for method in ('prediction', 'copy-start', 'copy-goal'):
@@ -201,7 +203,7 @@ def test_what_cannot_be_collected_fails_and_is_tried_once(places):
 
 
 def test_three_objects_begin_with_the_weights_for_two(places):
-    write_bag(Path(places.recordings) / 'push3', SEEDS)
+    write_bag(Path(places.recordings) / 'push3', SEEDS_3)
     run = replace(RUN, task='push3')
     assert [(end.name, end.kind) for end in sweep([run], places, progress=False)] == [
         (run.name, 'failed')]  # those are not trained
@@ -213,21 +215,26 @@ def test_three_objects_begin_with_the_weights_for_two(places):
     # trained on both, scored on their own
     assert config['recordings'] == [str(places.recording(task)) for task in ('push2', 'push3')]
     hashes = {task: recording_hash(places.recording(task)) for task in ('push2', 'push3')}
-    assert data['hash'] == hashes['push3'] and data['episodes'] == 2 * (EPISODES - 2)
-    assert data['held_out'] == len(result['evaluation']['prediction']['min_l1']) == 2
+    assert data['hash'] == hashes['push3'] and data['episodes'] == EPISODES - 2 + 3
+    assert data['held_out'] == len(result['evaluation']['prediction']['min_l1']) == 3
+    both = recording_hash(*(places.recording(task) for task in ('push2', 'push3')))
     about = json.loads((run.folder(places.runs) / 'run.json').read_text())
-    assert about['data_hash'] == recording_hash(
-        *(places.recording(task) for task in ('push2', 'push3')))
+    assert about['data_hash'] == data['trained_on'] == both
     assert find_state(run, places, hashes).kind == 'done'
+    assert find_state(run, places, {'push3': hashes['push3']}).kind == 'done'
+    kept = places.result(run).read_text()
     places.result(run).unlink()
     assert find_state(run, places, hashes).kind == 'partial'  # trained, not scored
+    places.result(run).write_text(kept)
+    write_bag(Path(places.recordings) / 'push2', SEEDS[1:])
+    assert find_state(run, places, hashes).kind == 'other'  # trained on another push2
     assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
 
 
 def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path):
     bags = tmp_path / 'bags'
     write_bag(bags / 'push2', [0])  # one episode: none can be held out
-    write_bag(bags / 'push3', SEEDS)
+    write_bag(bags / 'push3', SEEDS_3)
     run = replace(RUN, task='push3')
     ends = sweep([run, run.before], Places(str(bags), str(tmp_path / 'runs'), str(
         tmp_path / 'results')), progress=False)

@@ -77,7 +77,7 @@ def test_the_elites_are_judged_once_more():
     np.testing.assert_array_equal(best, samples[1])
     np.testing.assert_array_equal(samples[0], search(CEMConfig(num_elites=4))[0])
     assert cost == quadratic(best[None])[0]
-    search(CEMConfig(num_elites=4, keep_elites=4), recheck=recheck)
+    search(CEMConfig(num_samples=8, num_elites=4, keep_elites=4), recheck=recheck)
     assert len(np.unique(judged[-1], axis=0)) == 4  # those kept are not judged twice
 
 

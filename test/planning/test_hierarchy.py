@@ -69,18 +69,34 @@ def test_maps_go_before_their_means():
 
 
 def test_a_map_is_reached_where_its_expected_distance_is_least():
-    maps = one_hot_maps(torch.tensor(PLACES), (32, 32)).numpy()
-    now = PLACES + [[3.0, 4.0], [0.0, 1.0]]
-    assert Target(PLACES, maps).distance(now) == pytest.approx(3, abs=0.05)  # of 5 and 1
-    undecided = (maps[:1] + maps[1:]) / 2  # one object, in either place
-    mean = PLACES.mean(0, keepdims=True)
-    target = Target(mean, undecided)
-    for place in (PLACES[:1], PLACES[1:], mean):
-        assert target.distance(place) == pytest.approx(0, abs=0.05)
-    away = mean + [[5.0, -5.0]]
-    expected = np.linalg.norm(PLACES - away, axis=1).mean() - np.hypot(6, 6)
-    assert target.distance(away) == pytest.approx(expected, abs=0.05)
-    assert target.distance([[99.0, 14.0]]) > 5  # outside the picture
+    places, size = np.array([[8.0, 14.0], [20.0, 5.0]]), (24, 32)
+    maps = one_hot_maps(torch.tensor(places), size).numpy()
+    target = Target(places, maps)
+    assert target.distance(places) == pytest.approx(0, abs=0.05)
+    assert target.distance(places + [[3.0, 4.0], [0.0, 1.0]]) == pytest.approx(3, abs=0.05)
+    assert target.distance(places - [[5.0, 0.0], [0.0, 25.0]]) == pytest.approx(15, abs=0.05)
+    held = Target(places, maps, free=np.array([False, True]))
+    assert held.distance(places + [[3.0, 4.0], [9.0, 9.0]]) == pytest.approx(5, abs=0.05)
+    assert np.isnan(target.distance(places * np.nan))
+    with pytest.raises(ValueError):
+        target.distance(places[:1])
+
+
+def test_an_undecided_map_is_reached_in_either_place_an_uneven_one_in_the_likelier():
+    places = np.array([[8.0, 14.0], [20.0, 5.0]])
+    maps = one_hot_maps(torch.tensor(places), (24, 32)).numpy()
+    evenly = Target(places[:1], (maps[:1] + maps[1:]) / 2)  # one object
+    for place in (places[:1], places[1:], places.mean(0, keepdims=True)):
+        assert evenly.distance(place) == pytest.approx(0, abs=0.05)
+    uneven = Target(places[:1], 0.6 * maps[:1] + 0.4 * maps[1:])
+    assert uneven.distance(places[:1]) == pytest.approx(0, abs=0.05)
+    assert uneven.distance(places[1:]) == pytest.approx(0.2 * 15, abs=0.05)
+    away = np.array([[15.0, 20.0]])
+    expected = np.linalg.norm(places - away, axis=1).mean() - 7.5
+    assert evenly.distance(away) == pytest.approx(expected, abs=0.05)
+    way = Itinerary([evenly, Target(places[:1])], 12)
+    way.target(0, places[1:])
+    assert way.switches == [0]
 
 
 def test_unknown_switches_are_named():

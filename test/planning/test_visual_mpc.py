@@ -108,6 +108,23 @@ def test_an_object_that_the_flow_loses_is_dear(model):
     assert (costs >= 10 * DISTANCE.max(1).sum() - 0.1).all()
 
 
+@pytest.mark.parametrize('count, lengths', [(48, {24}), (64, {32}), (33, {17}), (1, {1})])
+def test_sequences_are_predicted_in_even_batches(model, monkeypatch, count, lengths):
+    seen, carried_maps = [], model.carried_maps
+
+    def spy(features, begin, maps, actions, *rest):
+        seen.append(len(actions))
+        return carried_maps(features, begin, maps, actions, *rest)
+
+    monkeypatch.setattr(model, 'carried_maps', spy)
+    mpc = VisualMPC(model, replace(SMALL, batch_size=32))
+    costs, _ = mpc._cost(
+        model.begin(to_float(IMAGE)[None], torch.zeros(1, 4)), torch.zeros(1, 4),
+        model.seed_maps(torch.tensor(PIXELS).float()), torch.from_numpy(DISTANCE).float(),
+        np.zeros((count, 15, 4), np.float32))
+    assert len(costs) == count and set(seen) == lengths
+
+
 def test_equal_sequences_cost_the_same_in_any_batch(model):
     costs, actions = {}, np.zeros((40, 15, 4), np.float32)
     actions[..., :2] = np.random.default_rng(0).normal(0, 0.05, (5, 15, 2)).repeat(8, 0)

@@ -75,7 +75,7 @@ def run(args):
     hashes = data_hashes(runs, places)
     states = [find_state(run, places, hashes) for run in runs]
     print(f"{sum(state.kind == 'done' for state in states)} of {len(runs)} runs are done")
-    elsewhere = [run for run in runs if run.task not in hashes]
+    elsewhere = [run for run in runs if not hashes.keys() >= set(run.training_tasks)]
     if elsewhere and not ends:
         print(f'{len(elsewhere)} of them elsewhere: their scores are in {places.results}, their '
               'recordings are not here. To make them again beside these: '

@@ -108,8 +108,10 @@ def score(run, config, weights, places):
     from tap_ros.recording.cache import open_recordings
 
     network, about = load_network(weights, pick_device(config.device))
-    store = open_recordings([str(places.recording(run.task))], progress=False)
+    store = open_recordings(list(config.recordings), progress=False)
+    own = open_recordings(list(config.recordings[-1:]), progress=False)
     _, held_out = split_episodes(store, config.test_fraction)
+    held_out = held_out[held_out >= len(store) - len(own)]
     if not len(held_out):
         raise ConfigError(f'{config.recordings[-1]}: no episode of it is held out; collect more')
     began = time.perf_counter()
@@ -130,9 +132,10 @@ def score(run, config, weights, places):
         'new_pixels': run.new_pixels, 'seed': run.seed, 'scale': run.scale,
         'recursion': run.recursion, 'variant': run.variant, 'command': run.command,
         'config': asdict(config),
-        'data': {'hash': store.data_hash, 'episodes': about['episodes'],
-                 'held_out': len(held_out), 'command': '; '.join(
-                     collect_command(places.recording(task)) for task in run.training_tasks)},
+        'data': {'hash': own.data_hash, 'trained_on': store.data_hash,
+                 'episodes': about['episodes'], 'held_out': len(held_out),
+                 'command': '; '.join(filter(None, (collect_command(
+                     places.recording(task)) for task in run.training_tasks)))},
         'training': {name: about[name]
                      for name in ('steps', 'seconds', 'machine', 'torch', 'python')},
         'evaluation': {'margin': 0, 'goal_picture': 'last', 'seconds': seconds, **scores}}

@@ -84,11 +84,12 @@ def write_grids(folder, runs, weights, recordings='bags'):
 
 def _held_out(run, recordings):
     """Return (store, indices of the first held-out episodes, goal picture), or None."""
-    paths = [path for path in run['config'].get('recordings', ()) if Path(path).exists()]
+    own = run['config'].get('recordings', ())[-1:]
+    paths = [path for path in own if Path(path).exists()]
     paths = paths or [Path(recordings) / run['task']]
-    if not Path(paths[-1]).exists():
+    if not Path(paths[0]).exists():
         return None
-    store = open_recordings(paths[-1:])  # the task's own
+    store = open_recordings(paths)
     _, held_out = split_episodes(store, run['config'].get('test_fraction', 0.05))
     # Of other recordings the pictures would not be those that the scores are of.
     if not len(held_out) or store.data_hash != run['data']['hash']:

@@ -27,7 +27,7 @@ class Scale:
     How large everything is.
 
     :param episodes: task to how many to collect.
-    :param steps: length of a training; 0: the paper's epochs.
+    :param steps: length of a training, but see LONGER; 0: the paper's epochs.
     :param settings: of every training, beside the method's own.
     """
 

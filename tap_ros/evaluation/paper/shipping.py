@@ -10,6 +10,7 @@ from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.paper.places import read_json
 from tap_ros.evaluation.paper.published import TITLES
 from tap_ros.evaluation.paper.runs import label
+from tap_ros.evaluation.paper.sweep import trained_on
 from tap_ros.evaluation.paper.tables import markdown
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.prediction.batches import split_episodes
@@ -55,7 +56,7 @@ def score(file, recording):
     Score weights on held-out episodes, as they are on disk.
 
     :param file: of a predictor.
-    :param recording: what it was trained on.
+    :param recording: of its task, among what it was trained on.
     :return: dict from a description of the goal picture to {method: EpisodeScores}.
     """
     network, about = load_network(file)
@@ -92,7 +93,7 @@ def make_card(file, result, scores):
         'float16.\n',
         markdown(['', ''], [
             ['data', f'`{data["command"]}`: {data["episodes"]} episodes to train on, '
-                     f'{data["held_out"]} held out; hash `{data["hash"][:12]}`'],
+                     f'{data["held_out"]} held out; hash `{trained_on(result)[:12]}`'],
             ['training', f'`{result["command"]}`'],
             ['settings', settings],
             ['time', f'{training["seconds"] / 60:.0f} min on {training["machine"]}; '

@@ -93,7 +93,8 @@ def find_state(run, places, hashes=None):
     config, folder = run.config(places.recordings, places.runs), run.folder(places.runs)
     result = read_json(places.result(run))
     if (result is not None and _same(result['config'], config)
-            and scored in (None, result['data']['hash'])):
+            and scored in (None, result['data']['hash'])
+            and _training_hash(run, places, hashes) in (None, trained_on(result))):
         return State('done', config.steps, result)
     about = read_json(folder / 'run.json')
     if about is not None:
@@ -102,6 +103,11 @@ def find_state(run, places, hashes=None):
             return State('partial', about['steps'])
         return State('other')
     return State('missing' if result is None else 'other')
+
+
+def trained_on(result):
+    """Return the hash of the recordings that the run of a result was trained on."""
+    return result['data'].get('trained_on', result['data']['hash'])
 
 
 def _training_hash(run, places, hashes):
@@ -198,8 +204,9 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
                 active.append(_start_run(
                     run, places, deadline, fresh and states[run].kind != 'partial'))
                 return True
-            elif missing[0] not in collecting:
-                active.append(_start_collecting(missing[0], runs, places, jobs))
+            elif not collecting.issuperset(missing):
+                task = next(task for task in missing if task not in collecting)
+                active.append(_start_collecting(task, runs, places, jobs))
                 return True
         return False
 

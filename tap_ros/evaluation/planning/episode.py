@@ -16,7 +16,7 @@ from tap_ros.planning.hierarchy import choose_sample, Itinerary, Target, targets
 from tap_ros.planning.tracking import ObjectTracker
 from tap_ros.recording.episode import Episode
 
-REACHED = 1.0  # px, mean over the objects, at which a goal or subgoal is reached
+REACHED = 1.0  # px of Target.distance at which a goal or subgoal is reached
 
 
 @dataclass
