@@ -87,6 +87,8 @@ def test_rows_are_means_with_intervals_and_paired_differences():
     paired = rows['genmin', 'final_distance_difference_cm', 'fix']
     assert paired['n'] == 2 and paired['value'] == pytest.approx((8 - 12 + 6 - 16) / 2)
     assert rows['genmin', 'success_5cm', None]['value'] == pytest.approx(1 / 3, abs=1e-4)
+    more = rows['genmin', 'success_5cm_difference', 'direct']
+    assert more['value'] == pytest.approx(1 / 3, abs=1e-4) and more['n'] == 3
     assert ('direct', 'final_distance_difference_cm', 'direct') not in rows
     assert ('nothing', 'plan_ms', None) not in rows
     assert all(row['tracking'] == 'ground_truth' for row in rows.values())

@@ -76,7 +76,8 @@ def make_page(rows, strips, maps=(), findings=''):
 def _table(task, rows):
     """Return the table of one task."""
     lines = ['| method | paper | final distance, cm | minus direct, cm | minus fix, cm '
-             '| all within 5 cm | steps | ms a plan | samples | scenes |', '|---' * 10 + '|']
+             '| all within 5 cm | minus direct, points | steps | ms a plan | samples | scenes |',
+             '|---' * 11 + '|']
     methods = list(dict.fromkeys(row['method'] for row in rows))
     for method in sorted(methods, key=_rank):
         own = {(r['metric'], r.get('compares')): r for r in rows if r['method'] == method}
@@ -88,6 +89,7 @@ def _table(task, rows):
             _value(own.get(('final_distance_difference_cm', 'direct')), '+.1f'),
             _value(own.get(('final_distance_difference_cm', 'fix')), '+.1f'),
             _share(own['success_5cm', None]),
+            _share(own.get(('success_5cm_difference', 'direct')), '+.0f', ''),
             f'{own["steps", None]["value"]:.0f}',
             f'{own["plan_ms", None]["value"]:.0f}' if ('plan_ms', None) in own else '',
             search if method != 'nothing' else '', str(final['n'])]) + ' |')
@@ -145,9 +147,11 @@ def _paper(task, method):
     return f'{value[0]} ± {value[1]}' if value else ''
 
 
-def _share(row):
-    return '{:.0f}% [{:.0f}, {:.0f}]'.format(
-        *(100 * row[name] for name in ('value', 'ci_low', 'ci_high')))
+def _share(row, form='.0f', unit='%'):
+    if row is None:
+        return ''
+    value, low, high = (f'{100 * row[name]:{form}}' for name in ('value', 'ci_low', 'ci_high'))
+    return f'{value}{unit} [{low}, {high}]'
 
 
 def _value(row, form='.1f'):

@@ -36,7 +36,8 @@ def make_rows(results):
     Turn results into the rows of planning.json.
 
     A difference is this method minus another, over the scenes that both were run on, so that less
-    than 0 is better; see partners. Intervals are of 95%, by bootstrap over scenes.
+    than 0 cm, or more than 0 of success, is better; see partners. Intervals are of 95%, by
+    bootstrap over scenes.
 
     :param results: of load_results.
     :return: list of dicts.
@@ -49,7 +50,7 @@ def make_rows(results):
         finals = [run['final_cm'] for run in runs]
         measured = [
             ('final_distance_cm', finals, {'standard_error': _short(standard_error(finals))}),
-            ('success_5cm', [max(run['objects_cm']) < SUCCESS_CM for run in runs], {}),
+            ('success_5cm', [_success(run) for run in runs], {}),
             ('steps', [run['steps'] for run in runs], {}),
             ('plan_ms', [run['plan_ms'] for run in runs], {}),
             ('tracking_error_px', [run.get('tracking_error_px') for run in runs], {})]
@@ -57,9 +58,11 @@ def make_rows(results):
             others, other = results[task, partner]
             both = sorted(set(scenes) & set(other))
             if both and comparable(compares, settings, others):
+                about = {'against': partner, 'compares': compares}
                 gaps = [scenes[seed]['final_cm'] - other[seed]['final_cm'] for seed in both]
-                measured.append(('final_distance_difference_cm', gaps,
-                                 {'against': partner, 'compares': compares}))
+                measured.append(('final_distance_difference_cm', gaps, about))
+                gaps = [_success(scenes[seed]) - _success(other[seed]) for seed in both]
+                measured.append(('success_5cm_difference', gaps, about))
         for metric, values, more in measured:
             values = np.array([value for value in values if value is not None], float)
             if len(values):
@@ -124,6 +127,11 @@ def _how(name, settings):
         'planner_iterations': planner['search']['num_iterations'],
         'replan_every': planner['replan_every'], 'preset': settings['preset'],
         'device': settings['device'], 'precision': settings['precision']}
+
+
+def _success(scene):
+    """Say whether every object ended within 5 cm of its goal, as 0 or 1."""
+    return int(max(scene['objects_cm']) < SUCCESS_CM)
 
 
 def standard_error(values):
