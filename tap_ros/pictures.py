@@ -8,6 +8,7 @@ import numpy as np
 OBJECT_COLOURS = (  # rgb, one per object; colour-blind readers tell them apart too
     (255, 176, 0), (100, 143, 255), (220, 38, 127), (0, 158, 115))
 GAP = 2  # white pixels between panels
+MARGIN = 8  # pixels outside a picture from where no mark reaches into it
 
 
 def enlarge(image, scale):
@@ -41,7 +42,10 @@ def overlay(image, object_maps, scale=1, start_pixels=None, goal_pixels=None):
     for pixels, draw in ((start_pixels, _circle), (goal_pixels, _cross)):
         for k, pixel in enumerate(() if pixels is None else pixels):
             if np.isfinite(pixel).all():
-                centre = tuple(int((x + 0.5) * scale) for x in pixel)
+                # Far outside, where no mark is seen, numbers may be too large to draw.
+                near = (min(max(x, -MARGIN), limit + MARGIN)
+                        for x, limit in zip(pixel, image.shape[1::-1]))
+                centre = tuple(int((x + 0.5) * scale) for x in near)
                 draw(canvas, centre, scale, OBJECT_COLOURS[k % len(OBJECT_COLOURS)])
     return canvas
 

@@ -9,12 +9,15 @@ import numpy as np
 from sensor_msgs.msg import Image
 from tap_ros.errors import ImageError
 from tap_ros.images import check_image
+from tap_ros.text import escaped
 import torch
 
 # Bytes per pixel, and which of them are red, green and blue.
 ENCODINGS = {
     'rgb8': (3, (0, 1, 2)), 'bgr8': (3, (2, 1, 0)),
     'rgba8': (4, (0, 1, 2)), 'bgra8': (4, (2, 1, 0)), 'mono8': (1, (0, 0, 0))}
+MAX_BYTES = 32 * 2**20  # of one picture: rgb8 of 3840x2160 pixels has 24 MiB
+MAX_FRAME_ID = 100  # characters; it comes back with every picture and map of an answer
 
 
 def is_empty(message):
@@ -56,12 +59,9 @@ def decode_image(message, name, size=None, resize=False):
     :param size: the (height, width) wanted, or None for any.
     :param resize: resize to `size` instead of refusing another size.
     :return: uint8 (H, W, 3) rgb.
-    :raises ImageError: for another encoding, size, step or length.
+    :raises ImageError: for another encoding, size, step or length, and for more than MAX_BYTES.
     """
-    if message.encoding not in ENCODINGS:
-        raise ImageError(
-            f'{name}: encoding {message.encoding!r} cannot be used; '
-            f'valid encodings: {", ".join(ENCODINGS)}')
+    _check_encoding(message, name, ENCODINGS)
     channels, order = ENCODINGS[message.encoding]
     rows = _rows(message, name, channels)
     image = rows.reshape(message.height, message.width, channels)[..., list(order)]
@@ -70,18 +70,20 @@ def decode_image(message, name, size=None, resize=False):
     return check_image(np.ascontiguousarray(image), name, size)
 
 
-def decode_map(message, name):
+def decode_map(message, name, size=None):
     """
     Turn a 32FC1 message into an object map.
 
     :param message: sensor_msgs/Image, 32FC1.
     :param name: how an error calls it.
+    :param size: the (height, width) wanted, or None for any.
     :return: float32 (H, W).
-    :raises ImageError: for another encoding, step or length, or values that are not finite.
+    :raises ImageError: for another encoding, size, step or length, or values that are not finite.
     """
-    if message.encoding != '32FC1':
-        raise ImageError(
-            f'{name}: encoding {message.encoding!r} cannot be used; valid encodings: 32FC1')
+    _check_encoding(message, name, ('32FC1',))
+    if size is not None and (message.height, message.width) != tuple(size):
+        raise ImageError(f'{name}: expected {size[1]}x{size[0]} pixels (width x height), '
+                         f'got {message.width}x{message.height}')
     rows = np.ascontiguousarray(_rows(message, name, 4))
     values = rows.view('>f4' if message.is_bigendian else '<f4').astype(np.float32)
     if not np.isfinite(values).all():
@@ -117,9 +119,22 @@ def resize_pixels(pixels, old_size, new_size):
     return ((np.asarray(pixels, np.float64) + 0.5) * scale - 0.5).astype(np.float32)
 
 
+def _check_encoding(message, name, valid):
+    """Refuse another encoding than the valid ones."""
+    if message.encoding not in valid:
+        raise ImageError(f"{name}: encoding '{escaped(message.encoding, 40)}' cannot be used; "
+                         f'valid encodings: {", ".join(valid)}')
+
+
 def _rows(message, name, bytes_per_pixel):
     """Check the layout and return uint8 (height, width * bytes_per_pixel) without padding."""
     height, width, step = message.height, message.width, message.step
+    if len(message.data) > MAX_BYTES:
+        raise ImageError(f'{name}: data has {len(message.data)} bytes; at most {MAX_BYTES} are '
+                         'taken, send a smaller picture')
+    if len(message.header.frame_id) > MAX_FRAME_ID:
+        raise ImageError(f'{name}: frame_id has {len(message.header.frame_id)} characters; '
+                         f'at most {MAX_FRAME_ID} are taken')
     if height == 0 or width == 0:
         raise ImageError(f'{name}: is empty ({width}x{height} pixels); send a whole image')
     row_bytes = width * bytes_per_pixel

@@ -7,8 +7,11 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import ObjectState, ObjectStates
 from tap_ros.errors import PlanningError
+from tap_ros.text import escaped, listing
 
 GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
+MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is predicted
+MAX_NAME = 100  # characters
 
 
 def encode_objects(names, pixels, poses, stamp, frame_id, source):
@@ -35,29 +38,51 @@ def encode_objects(names, pixels, poses, stamp, frame_id, source):
     return message
 
 
-def decode_objects(message, name):
+def decode_objects(message, name, size=None):
     """
     Turn a message into names and pixels.
 
     :param message: tap_msgs/ObjectStates.
     :param name: how an error calls it, for example 'goal_objects'.
+    :param size: (height, width) of the picture that the pixels must be in, or None for any.
     :return: names, a tuple of K strings, and pixels, float32 (K, 2) as (u, v).
-    :raises PlanningError: for names that are empty or used twice, and for unknown pixels.
+    :raises PlanningError: for too many objects, for names that are empty, too long or used twice,
+        and for pixels that are unknown or outside the picture.
     """
+    if len(message.objects) > MAX_OBJECTS:
+        raise PlanningError(
+            f'{name}: has {len(message.objects)} objects; at most {MAX_OBJECTS} are taken')
     names = tuple(state.name for state in message.objects)
-    pixels = np.array([(state.u, state.v) for state in message.objects], np.float32)
-    pixels = pixels.reshape(len(names), 2)
+    pixels = np.array([(state.u, state.v) for state in message.objects]).reshape(len(names), 2)
+    with np.errstate(over='ignore'):  # what float32 cannot hold becomes infinite, and is refused
+        pixels = pixels.astype(np.float32)
     for index, object_name in enumerate(names):
         if not object_name or object_name in names[:index]:
             raise PlanningError(
-                f'{name}: objects[{index}].name is {object_name!r}; '
+                f"{name}: objects[{index}].name is '{escaped(object_name, MAX_NAME)}'; "
                 'every object needs a name of its own')
-        if not np.isfinite(pixels[index]).all():
-            u, v = pixels[index]
+        if len(object_name) > MAX_NAME:
             raise PlanningError(
-                f'{name}: {object_name} has the pixel ({u}, {v}); expected finite numbers, '
-                'leave out objects that are not seen')
+                f'{name}: objects[{index}].name has {len(object_name)} characters; '
+                f'at most {MAX_NAME} are taken')
+        _check_pixel(f'{name}: {escaped(object_name)}', pixels[index], size)
     return names, pixels
+
+
+def _check_pixel(name, pixel, size):
+    """Refuse a pixel (u, v) that is unknown, or not in a picture of this (height, width)."""
+    u, v = pixel
+    if not np.isfinite(pixel).all():
+        raise PlanningError(f'{name} has the pixel ({u}, {v}); expected finite numbers, '
+                            'leave out objects that are not seen')
+    if size is None:
+        return
+    height, width = size
+    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+        raise PlanningError(
+            f'{name} has the pixel ({u}, {v}), which is outside the picture; expected u from -0.5 '
+            f'to {width - 0.5} and v from -0.5 to {height - 0.5}, leave out objects that are not '
+            'seen')
 
 
 def match_objects(names, other_names, other_pixels, name, other_name):
@@ -75,8 +100,8 @@ def match_objects(names, other_names, other_pixels, name, other_name):
     missing = [object_name for object_name in names if object_name not in other_names]
     if missing:
         raise PlanningError(
-            f'{other_name}: lacks {", ".join(missing)} of {name}; it has '
-            f'{", ".join(other_names) or "no objects"}')
+            f'{other_name}: lacks {listing(missing)} of {name}; it has '
+            f'{listing(other_names) or "no objects"}')
     return other_pixels[[other_names.index(object_name) for object_name in names]]
 
 
@@ -108,7 +133,7 @@ def decode_gripper(message, name='joint_states'):
     missing = [joint for joint in GRIPPER_JOINTS if joint not in positions]
     if missing:
         raise PlanningError(
-            f'{name}: lacks {", ".join(missing)}; it has {", ".join(positions) or "no joints"}')
+            f'{name}: lacks {", ".join(missing)}; it has {listing(positions) or "no joints"}')
     gripper = np.array([positions[joint] for joint in GRIPPER_JOINTS], np.float32)
     if not np.isfinite(gripper).all():
         raise PlanningError(f'{name}: the gripper is at {gripper}; expected finite numbers')

@@ -9,6 +9,7 @@ from tap_ros.errors import PlanningError
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image, encode_map
 from tap_ros.nodes.object_messages import match_objects
 from tap_ros.prediction.predictor import Subgoal
+from tap_ros.text import escaped
 
 
 def encode_subgoal(subgoal, names, stamp, frame_id):
@@ -60,9 +61,13 @@ def _decode(message, names, size, sample, level):
             f'expected_pixels for {len(found)} object_names; expected one for each')
     order = match_objects(names, found, np.arange(len(found)), 'objects', 'subgoal')
     points = [message.expected_pixels[i] for i in order]
+    pixels = np.array([(point.x, point.y) for point in points], np.float32).reshape(-1, 2)
+    if not np.isfinite(pixels).all():
+        raise PlanningError('subgoal: expected_pixels hold NaN or infinity; expected finite '
+                            'numbers')
+    maps = [decode_map(message.object_maps[i], f'object map of {escaped(found[i])}', size)
+            for i in order]
     return Subgoal(
         image=decode_image(message.image, 'image of the subgoal', size),
-        object_maps=np.stack([
-            decode_map(message.object_maps[i], f'object map of {found[i]}') for i in order]),
-        expected_pixels=np.array([(point.x, point.y) for point in points], np.float32),
+        object_maps=np.array(maps, np.float32).reshape(-1, *size), expected_pixels=pixels,
         mass=np.full(len(order), np.nan, np.float32), sample=sample, level=level)

@@ -1,0 +1,103 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Requests that wait, and the thread that answers what waits together."""
+
+from collections import deque
+import threading
+
+from tap_ros.errors import TapError
+
+
+class Busy(TapError):
+    """A request cannot wait: too many do already, or nobody answers any more."""
+
+
+class RequestQueue:
+    """
+    Answer requests in batches, in a thread of its own; every request is answered exactly once.
+
+    :param work: called in the thread with a list of requests that waited, oldest first; returns
+        their answers in the same order. Where it fails for several, each is tried alone, so that
+        an error reaches nobody but who caused it.
+    :param cost: called with a request; how much of a batch it takes.
+    :param max_waiting: most requests that wait; what comes beyond is refused at once.
+    :param max_together: most requests in one batch.
+    :param max_cost: most cost in one batch; a request that takes more goes alone.
+    """
+
+    def __init__(self, work, cost, max_waiting, max_together, max_cost):
+        self._work, self._cost = work, cost
+        self._max_waiting = max_waiting
+        self._max_together, self._max_cost = max_together, max_cost
+        self._waiting = deque()  # (request, answer)
+        self._changed = threading.Condition()
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, name='request queue', daemon=True)
+        self._thread.start()
+
+    def __len__(self):
+        """Return how many requests wait."""
+        return len(self._waiting)
+
+    def put(self, request, answer):
+        """
+        Let a request wait for its answer.
+
+        :param request: what `work` takes.
+        :param answer: called once, in another thread, with what `work` returned for the request,
+            or with the exception that it raised.
+        :raises Busy: when it cannot wait; `answer` is not called then.
+        """
+        with self._changed:
+            if self._ending:
+                raise Busy('busy: the node is ending; ask again when it is back')
+            if len(self._waiting) >= self._max_waiting:
+                raise Busy(f'busy: {len(self._waiting)} requests are waiting, which is the most '
+                           'that may; ask again')
+            self._waiting.append((request, answer))
+            self._changed.notify()
+
+    def close(self, timeout_s):
+        """
+        Answer what still waits with Busy, and end the thread after its batch.
+
+        :param timeout_s: most seconds to wait for that batch.
+        """
+        with self._changed:
+            self._ending = True
+            left = list(self._waiting)
+            self._waiting.clear()
+            self._changed.notify()
+        for _, answer in left:
+            answer(Busy('busy: the node is ending; ask again when it is back'))
+        self._thread.join(timeout_s)
+
+    def _run(self):
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._ending)
+                if self._ending:
+                    return
+                batch = self._take()
+            for (_, answer), found in zip(batch, self._answers([one for one, _ in batch])):
+                answer(found)
+
+    def _take(self):
+        """Take the oldest requests, as many as go together."""
+        batch, cost = [], 0
+        while self._waiting and len(batch) < self._max_together:
+            cost += self._cost(self._waiting[0][0])
+            if batch and cost > self._max_cost:
+                break
+            batch.append(self._waiting.popleft())
+        return batch
+
+    def _answers(self, requests):
+        """Yield the answers of a batch, in its order; an exception stands for one that failed."""
+        try:
+            found = self._work(requests)
+        except Exception as error:
+            if len(requests) == 1:
+                return [error]
+            return (answer for one in requests for answer in self._answers([one]))
+        return found

@@ -1,0 +1,141 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the queue of requests: each is answered once, whatever happens to the others."""
+
+from collections import Counter
+import threading
+
+import pytest
+from tap_ros.prediction.request_queue import Busy, RequestQueue
+
+TIMEOUT = 20.0
+
+
+class Rig:
+    """A queue whose work waits until it is let go, and what was answered."""
+
+    def __init__(self, work=lambda batch: [-one for one in batch], cost=lambda one: 1, **limits):
+        self.batches, self.answers = [], []
+        self.begun, self.go = threading.Semaphore(0), threading.Event()
+        self._answered = threading.Condition()
+
+        def slow(batch):
+            self.batches.append(list(batch))
+            self.begun.release()
+            assert self.go.wait(TIMEOUT)
+            return work(batch)
+
+        self.queue = RequestQueue(
+            slow, cost, **{'max_waiting': 100, 'max_together': 8, 'max_cost': 100, **limits})
+
+    def put(self, one):
+        self.queue.put(one, lambda found: self._note(one, found))
+
+    def _note(self, one, found):
+        with self._answered:
+            self.answers.append((one, found))
+            self._answered.notify()
+
+    def wait(self, count):
+        with self._answered:
+            assert self._answered.wait_for(lambda: len(self.answers) >= count, TIMEOUT)
+        return dict(self.answers)
+
+    def hold(self):
+        """Occupy the thread with a request of its own, so that all others wait."""
+        self.put(0)
+        assert self.begun.acquire(timeout=TIMEOUT)
+
+
+@pytest.fixture
+def made():
+    """Make rigs, and end them with the test."""
+    rigs = []
+
+    def make(*args, **limits):
+        rigs.append(Rig(*args, **limits))
+        return rigs[-1]
+
+    yield make
+    for rig in rigs:
+        rig.go.set()
+        rig.queue.close(TIMEOUT)
+
+
+def test_every_request_of_many_threads_is_answered_once_and_its_own_way(made):
+    rig = made(max_waiting=1000)
+    rig.go.set()
+    threads = [threading.Thread(target=lambda first=100 * i: [rig.put(n) for n in range(
+        first, first + 100)]) for i in range(1, 9)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    found = rig.wait(800)
+    assert found == {n: -n for n in range(100, 900)}
+    assert set(Counter(one for one, _ in rig.answers).values()) == {1}
+
+
+def test_what_waits_is_answered_together_oldest_first_and_within_the_limits(made):
+    rig = made(cost=lambda one: one, max_together=3, max_cost=10)
+    rig.hold()
+    for one in (1, 2, 3, 4, 5, 6, 50, 1):
+        rig.put(one)
+    rig.go.set()
+    rig.wait(9)
+    assert rig.batches == [[0], [1, 2, 3], [4, 5], [6], [50], [1]]
+
+
+def test_beyond_the_most_that_wait_one_is_told_how_many_do(made):
+    rig = made(max_waiting=5)
+    rig.hold()
+    for one in range(1, 6):
+        rig.put(one)
+    assert len(rig.queue) == 5
+    for one in (6, 7):
+        with pytest.raises(Busy, match='^busy: 5 requests are waiting'):
+            rig.put(one)
+    rig.go.set()
+    assert rig.wait(6) == {n: -n for n in range(6)}
+    rig.put(8)  # there is room again
+    assert rig.wait(7)[8] == -8
+
+
+@pytest.mark.parametrize('bad', [{3}, {1, 5}, {1, 2, 3, 4, 5}])
+def test_an_error_reaches_only_who_caused_it(made, bad):
+    def work(batch):
+        if bad & set(batch):
+            raise MemoryError(f'{bad & set(batch)}')
+        return [-one for one in batch]
+
+    rig = made(work)
+    rig.hold()
+    for one in range(1, 6):
+        rig.put(one)
+    rig.go.set()
+    found = rig.wait(6)
+    assert len(rig.answers) == 6
+    for one in range(1, 6):
+        if one in bad:
+            assert isinstance(found[one], MemoryError) and str(found[one]) == str({one})
+        else:
+            assert found[one] == -one
+    rig.put(9)
+    assert rig.wait(7)[9] == -9
+
+
+def test_at_the_end_all_that_wait_are_told_and_the_batch_is_finished(made):
+    rig = made()
+    rig.hold()
+    for one in range(1, 4):
+        rig.put(one)
+    ending = threading.Thread(target=rig.queue.close, args=(TIMEOUT,))
+    ending.start()
+    found = rig.wait(3)  # at once, while the batch is in progress
+    assert all(isinstance(found[one], Busy) for one in (1, 2, 3)) and 0 not in found
+    with pytest.raises(Busy, match='ending'):
+        rig.put(4)
+    rig.go.set()
+    ending.join(TIMEOUT)
+    assert not ending.is_alive()
+    assert rig.wait(4)[0] == 0 and len(rig.answers) == 4
