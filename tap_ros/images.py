@@ -9,21 +9,20 @@ A pixel position is (u, v) = (column, row) with (0, 0) at the centre of the top-
 
 import numpy as np
 from tap_ros.errors import ImageError
-import torch
 
 
-def to_float(images, dtype=torch.float32):
+def to_float(images):
     """
     Turn pictures into network inputs.
 
     :param images: uint8 (..., H, W, 3), numpy array or tensor.
-    :param dtype: the floating-point type of the answer.
-    :return: tensor (..., 3, H, W) in [-1, 1].
+    :return: float32 tensor (..., 3, H, W) in [-1, 1].
     """
     if isinstance(images, np.ndarray):
+        import torch  # here, since it takes seconds, and nodes without a network need no tensors
         # Recorded frames are read-only memory maps, which torch warns about unless copied.
         images = torch.from_numpy(np.require(images, requirements=['C', 'W']))
-    return images.movedim(-1, -3).to(dtype).div_(127.5).sub_(1.0)
+    return images.movedim(-1, -3).float().div_(127.5).sub_(1.0)
 
 
 def to_uint8(images):
@@ -34,7 +33,7 @@ def to_uint8(images):
     :return: uint8 numpy array (..., H, W, 3).
     """
     pixels = images.detach().float().add(1.0).mul(127.5).round_().clamp_(0, 255)
-    return pixels.to(torch.uint8).movedim(-3, -1).contiguous().cpu().numpy()
+    return pixels.byte().movedim(-3, -1).contiguous().cpu().numpy()
 
 
 def check_image(image, name, size=None):

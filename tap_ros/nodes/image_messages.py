@@ -10,7 +10,6 @@ from sensor_msgs.msg import Image
 from tap_ros.errors import ImageError
 from tap_ros.images import check_image
 from tap_ros.text import escaped
-import torch
 
 # Bytes per pixel, and which of them are red, green and blue.
 ENCODINGS = {
@@ -99,6 +98,7 @@ def resize_image(image, size):
     :param size: (height, width) of the answer.
     :return: uint8 (height, width, 3).
     """
+    import torch  # here, since it takes seconds, and not every node resizes
     planes = torch.from_numpy(np.ascontiguousarray(image)).movedim(-1, 0)[None].float()
     planes = torch.nn.functional.interpolate(
         planes, tuple(size), mode='bilinear', antialias=True, align_corners=False)

@@ -10,7 +10,6 @@ from rcl_interfaces.msg import (
 )
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from tap_ros.errors import ConfigError
-import torch
 
 
 class Parameters:
@@ -79,5 +78,6 @@ def check_device(device):
     :param device: 'cpu' or 'cuda'.
     :raises ConfigError: for cuda without a GPU that torch can use.
     """
+    import torch  # here, since it takes seconds, and not every node has a device
     if device == 'cuda' and not torch.cuda.is_available():
         raise ConfigError('parameter device: torch finds no GPU for cuda; valid here: cpu')

@@ -23,6 +23,20 @@ LAYERS = (
     ('tap_ros.nodes', 'sim_bridge.sim_node', 'tap_ros.cli', 'tap_ros.__main__'),
 )
 
+# What takes seconds to import: what each node does without, so that it is back soon after a crash.
+DONE_WITHOUT = {
+    ('sim_bridge.sim_node', 'tap_ros.nodes.recorder_node'):
+        ('torch', 'cv2', 'scipy', 'matplotlib', 'pandas', 'tensorboard'),
+    ('tap_ros.nodes.predictor_node', 'tap_ros.nodes.visual_mpc_node'):
+        ('scipy', 'matplotlib', 'pandas', 'tensorboard', 'mujoco'),
+}
+PRINT_LOADED = """
+import importlib, sys
+for name in sys.argv[1:]:
+    importlib.import_module(name)
+print(*sys.modules)
+"""
+
 IMPORT_ALL = """
 import importlib, sys
 
@@ -92,3 +106,13 @@ def test_the_block_would_be_noticed():
     run = subprocess.run([sys.executable, '-c', IMPORT_ALL, 'sensor_msgs.msg'], cwd=ROOT,
                          text=True, stderr=subprocess.PIPE)
     assert 'sensor_msgs is blocked' in run.stderr
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('nodes', DONE_WITHOUT)
+def test_nodes_load_nothing_slow_that_they_do_not_need(nodes):
+    run = subprocess.run([sys.executable, '-c', PRINT_LOADED, *nodes], cwd=ROOT, text=True,
+                         stdout=subprocess.PIPE, check=True)
+    loaded = run.stdout.split()
+    assert set(nodes) <= set(loaded)
+    assert not set(DONE_WITHOUT[nodes]) & set(loaded)
