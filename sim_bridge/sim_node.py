@@ -4,11 +4,11 @@
 
 import math
 import sys
+import time
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
@@ -16,13 +16,13 @@ from sim_bridge.simulator import ACTION_LIMIT, Simulator
 from sim_bridge.tasks import TASKS
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
-from tap_msgs.msg import Episode, ObjectStates
+from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
 from tap_ros.errors import TapError
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
 from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.run import run_node
+from tap_ros.nodes.run import answering, run_node
 from tap_ros.nodes.topics import (
     CAMERA_FRAME,
     LATCHED,
@@ -33,6 +33,8 @@ from tap_ros.nodes.topics import (
 )
 
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
+RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
+MAX_TIMEOUT = 60.0  # s
 MAX_PERIODS = 100  # of one sim/step call: about a second
 
 
@@ -41,8 +43,12 @@ class SimNode(Node):
     Steps and renders in the thread that spins, to which the OpenGL context belongs.
 
     Lock-step: a command stamped like the newest image, or unstamped, lets one control period pass.
+    Meanwhile the newest image, and what belongs to it, is sent again and again with the same
+    stamp, so that who waits for it, or comes late, has it.
     Real time: a timer does, with the command that came since the last period, else standing still.
-    A zero twist without a stamp means stop in both modes and lets no time pass.
+    A command is valid for command_timeout after it came; later the arm stands still.
+    A zero twist without a stamp means stop in both modes and lets no time pass. Whoever sends a
+    command that is not carried out learns it from arm/refused.
     """
 
     def __init__(self):
@@ -53,6 +59,8 @@ class SimNode(Node):
         self._hide_arm = False
         self._opening = 0.0  # the newest gripper command
         self._twist = None  # real time: the command for the next period
+        self._valid_until = 0.0  # monotonic time at which it runs out
+        self._timeout = self.params['command_timeout']  # s that a command is valid
         self._stamp_ns = FIRST_STAMP  # of the newest image; never goes back, unlike the physics
         self._answered_ns = 0  # stamp of the newest image that was answered by a command
         self._reset_ns = FIRST_STAMP
@@ -63,15 +71,19 @@ class SimNode(Node):
         # Subscribed before the twist, so that of two commands sent together it is taken first.
         self.create_subscription(Float64, 'gripper/command', self._on_gripper, STREAM)
         self.create_subscription(TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM)
+        self.create_subscription(Float64, 'arm/command_timeout', self._on_timeout, LATCHED)
         self._reset(task, self.params['seed'], False)
-        self.create_service(ResetScene, 'sim/reset', self._on_reset)
-        self.create_service(StepScene, 'sim/step', self._on_step)
-        self.create_service(SetBool, 'sim/pause', self._on_pause)
-        mode = 'lock-step'
-        if not self.params['lock_step']:
+        self.create_service(ResetScene, 'sim/reset', answering(self, self._on_reset))
+        self.create_service(StepScene, 'sim/step', answering(self, self._on_step))
+        self.create_service(SetBool, 'sim/pause', answering(self, self._on_pause))
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        if self.params['lock_step']:
+            mode = 'lock-step'
+            self.create_timer(RESEND_S, self._send_newest, clock=clock)
+        else:
             factor = self.params['real_time_factor']
-            self.create_timer(self._sim.control_period / factor, self._on_timer,
-                              clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self.create_timer(
+                self._sim.control_period / factor, self._on_timer, clock=clock)
             mode = f'{factor:g} x real time'
         self.get_logger().info(
             f'ready: task {task}, seed {self.params["seed"]}, {mode}')
@@ -83,26 +95,14 @@ class SimNode(Node):
 
     def _create_publishers(self):
         self._newest = {}  # topic -> the message sent last
-        self._streams = {topic: self._create_stream(kind, topic) for topic, kind in {
-            'clock': ClockMessage, 'joint_states': JointState, 'objects': ObjectStates,
-            'camera/camera_info': CameraInfo, 'camera/image_raw': Image}.items()}
+        self._streams = {
+            topic: self.create_publisher(kind, topic, STREAM) for topic, kind in {
+                'clock': ClockMessage, 'joint_states': JointState, 'objects': ObjectStates,
+                'camera/camera_info': CameraInfo, 'camera/image_raw': Image}.items()}
+        self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
         self._episode = self.create_publisher(Episode, 'episode', STREAM)
         self._goal_image = self.create_publisher(Image, 'goal/image', LATCHED)
         self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
-
-    def _create_stream(self, kind, topic):
-        """
-        Create a publisher for what is sent once per control period.
-
-        In lock-step nothing may be sent for long, so a subscriber that comes late gets the newest
-        message at once; the others get it again, with the same stamp.
-        """
-        def on_matched(info):
-            if info.current_count_change > 0 and self.params['lock_step'] and self._newest:
-                self._streams[topic].publish(self._newest[topic])
-
-        return self.create_publisher(
-            kind, topic, STREAM, event_callbacks=PublisherEventCallbacks(matched=on_matched))
 
     # Commands
 
@@ -117,12 +117,13 @@ class SimNode(Node):
     def _on_twist(self, message):
         stamp_ns = to_nanoseconds(message.header.stamp)
         move = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
+        if stamp_ns == 0 and not move.any():
+            self._twist = None
+            return
         reason = self._refuse_twist(message.twist, move, stamp_ns)
         if reason:
             self.get_logger().warning(f'arm/delta_twist_cmds ignored: {reason}')
-            return
-        if stamp_ns == 0 and not move.any():
-            self._twist = None
+            self._refused.publish(CommandRefused(header=message.header, message=reason))
             return
         if (np.abs(move) > ACTION_LIMIT).any():
             self.get_logger().warning(
@@ -132,7 +133,15 @@ class SimNode(Node):
         if self.params['lock_step']:
             self._step(move)
         else:
-            self._twist = move
+            self._twist, self._valid_until = move, time.monotonic() + self._timeout
+
+    def _on_timeout(self, message):
+        if not 0 < message.data <= MAX_TIMEOUT:
+            self.get_logger().warning(
+                f'arm/command_timeout ignored: data is {message.data}; expected seconds, more '
+                f'than 0 and at most {MAX_TIMEOUT:g}')
+            return
+        self._timeout = message.data
 
     def _refuse_twist(self, twist, move, stamp_ns):
         """Say why a command cannot be used; an empty string if it can."""
@@ -158,7 +167,9 @@ class SimNode(Node):
     def _on_timer(self):
         if not self._paused:
             move, self._twist = self._twist, None
-            self._step(np.zeros(3) if move is None else move)
+            if move is None or time.monotonic() > self._valid_until:
+                move = np.zeros(3)
+            self._step(move)
 
     # Services
 
@@ -247,6 +258,10 @@ class SimNode(Node):
             'camera/camera_info': encode_camera_info(
                 camera.K, (camera.height, camera.width), stamp, CAMERA_FRAME),
             'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME)}
+        self._send_newest()
+
+    def _send_newest(self):
+        """Send what the camera sees now, again if need be."""
         for topic, message in self._newest.items():
             self._streams[topic].publish(message)
 
@@ -276,6 +291,9 @@ def declare_parameters(node):
         'False: time passes by itself.')
     parameters.declare('real_time_factor', 1.0,
                        'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
+    parameters.declare('command_timeout', 1.0,
+                       'Seconds that a command is valid, unless its sender says otherwise on '
+                       'arm/command_timeout; then the arm stands still.', low=0.001, high=60.0)
     parameters.declare('hide_arm_in_goal', False,
                        'Leave the arm out of the goal picture, from the next reset on.',
                        read_only=False)

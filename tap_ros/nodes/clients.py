@@ -9,6 +9,8 @@ from action_msgs.msg import GoalStatus
 from rclpy.executors import MultiThreadedExecutor
 from tap_ros.errors import TapError
 
+NEWBORN_S = 1.0  # until others have heard of a node that has just started
+
 
 class CallError(TapError):
     """A service, action or topic did not answer in time, or refused."""
@@ -43,7 +45,7 @@ class Spinner:
             self._executor.spin_once(timeout_sec=0.1)
 
 
-def call(client, request, timeout_s, give_up=lambda: False):
+def call(client, request, timeout_s, give_up=lambda: False, server=None):
     """
     Call a service from a thread that does not spin the node.
 
@@ -51,23 +53,28 @@ def call(client, request, timeout_s, give_up=lambda: False):
     :param request: the service's request.
     :param timeout_s: most seconds to wait for the service and its answer together.
     :param give_up: asked several times a second whether to stop waiting.
+    :param server: heartbeat.Liveness of the node that offers it, by which its death is noticed
+        sooner; None: without.
     :return: the response.
     :raises CallError: when the service is not there, ends, or does not answer in time, or when
         the wait was given up.
     """
     deadline = time.monotonic() + timeout_s
     name = client.service_name
-    while not client.wait_for_service(timeout_sec=min(0.25, timeout_s)):
+    if server is not None and not server.wait_until_alive(min(NEWBORN_S, timeout_s)):
+        raise CallError(f'service {name}: its node, {server.name}, has ended; start it again')
+    while not client.wait_for_service(timeout_sec=min(0.1, timeout_s)):
         if time.monotonic() >= deadline or give_up():
             raise CallError(
                 f'service {name}: nobody offers it after {timeout_s:g} s; '
                 'start its node and wait until it says that it is ready')
+    deaths = server.deaths if server is not None else 0
     future = client.call_async(request)
     done = threading.Event()
     future.add_done_callback(lambda _: done.set())
     try:
-        while not done.wait(min(0.25, max(deadline - time.monotonic(), 0))):
-            if not client.service_is_ready():
+        while not done.wait(min(0.05, max(deadline - time.monotonic(), 0))):
+            if not client.service_is_ready() or (server and server.deaths > deaths):
                 raise CallError(f'service {name}: its node ended during the call')
             if time.monotonic() >= deadline or give_up():
                 raise CallError(
@@ -97,12 +104,16 @@ def send_goal(action_client, goal, timeout_s, on_feedback=None):
     :raises CallError: when no server answers in time, or it rejects the goal.
     """
     name = action_client._action_name
+    deadline = time.monotonic() + timeout_s
     if not action_client.wait_for_server(timeout_sec=timeout_s):
         raise CallError(f'action {name}: nobody offers it after {timeout_s:g} s')
     future = action_client.send_goal_async(
         goal, None if on_feedback is None else lambda message: on_feedback(message.feedback))
-    if not wait_for_future(future, timeout_s):
-        raise CallError(f'action {name}: no answer to the goal within {timeout_s:g} s')
+    while not wait_for_future(future, 0.1):
+        if not action_client.server_is_ready():
+            raise CallError(f'action {name}: its node ended before it answered the goal')
+        if time.monotonic() >= deadline:
+            raise CallError(f'action {name}: no answer to the goal within {timeout_s:g} s')
     handle = future.result()
     if not handle.accepted:
         raise CallError(
@@ -117,12 +128,20 @@ def wait_for_result(handle, timeout_s):
     :param handle: goal handle of send_goal.
     :param timeout_s: most seconds to wait.
     :return: status, one of the STATUS_ constants of action_msgs/GoalStatus, and the result.
-    :raises CallError: when it has not ended in time.
+    :raises CallError: when it has not ended in time, or the node that pursues it has.
     """
+    client = handle._action_client
     future = handle.get_result_async()
-    if not wait_for_future(future, timeout_s):
-        wait_for_future(handle.cancel_goal_async(), 1.0)
-        raise CallError(f'the goal has not ended within {timeout_s:g} s and was cancelled')
+    deadline = time.monotonic() + timeout_s
+    while not wait_for_future(future, 0.1):
+        if not client.server_is_ready():
+            raise CallError(f'action {client._action_name}: its node ended before the goal did; '
+                            'what the arm does now is up to its driver')
+        if time.monotonic() >= deadline:
+            cancelled = wait_for_future(handle.cancel_goal_async(), 1.0)
+            raise CallError(
+                f'the goal has not ended within {timeout_s:g} s and '
+                + ('was cancelled' if cancelled else 'its node does not answer the cancel'))
     answer = future.result()
     if answer.status == GoalStatus.STATUS_UNKNOWN:
         raise CallError('the action server does not know the goal; was it started anew?')

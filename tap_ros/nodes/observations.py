@@ -1,32 +1,56 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of several topics put together by their stamp."""
+"""Messages of several topics put together by their stamp, with the time of their reception."""
 
 from collections import OrderedDict
+from dataclasses import dataclass
+import math
 import threading
 import time
 
 from tap_ros.nodes.topics import to_nanoseconds
 
 DEPTH = 10  # stamps remembered
+JUMP_NS = 10 * 10**9  # a stamp so far ahead of all others is not believed at once
+PROOF = 3  # messages in a row that show that the clock of a topic has jumped
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Messages of one stamp."""
+
+    stamp_ns: int
+    messages: dict  # topic -> message
+    received: float  # s, monotonic: when the one that was received first came, or came again
 
 
 class Observations:
     """
     Collect messages that carry the same stamp; safe to use from several threads.
 
+    A stamp that goes back, or that is more than JUMP_NS ahead, is believed only when PROOF
+    messages in a row say the same: a single one is a stray publisher's, several are another
+    simulator or a bag that loops. Then all that came before is forgotten, and `jumps` counts it.
+
     :param topics: short names, for example 'image', 'objects'; the first is the one whose stamp
         counts, the others describe it.
+    :param latched: these come now and then and may have any stamp: the newest is what came last.
+    :ivar count: grows with every message and every call of wake.
+    :ivar jumps: how often the clock has jumped.
     """
 
-    def __init__(self, *topics):
+    def __init__(self, *topics, latched=False):
         self._topics = topics
+        self._latched = latched
         self._changed = threading.Condition()
-        self._by_stamp = OrderedDict()  # stamp in ns -> {topic: message}, oldest first
-        self._newest = dict.fromkeys(topics, 0)  # stamp in ns
-        self._seen = set()
+        self._by_stamp = OrderedDict()  # stamp in ns -> {topic: (message, received)}
+        self._newest = {}  # topic -> stamp in ns
+        self._received = {}  # topic -> monotonic time of its last message
+        self._renewed = {}  # topic -> monotonic time of its last message with a new stamp
+        self._suspects = {topic: [] for topic in topics}  # stamps in a row that are not believed
+        self.count, self.jumps = 0, 0
 
-    def subscribe(self, node, types, qos, callback_group=None):
+    def subscribe(self, node, types, qos, callback_group=None, on_message=None):
         """
         Subscribe to the topics.
 
@@ -34,36 +58,79 @@ class Observations:
         :param types: {short name: (message type, topic name)}.
         :param qos: QoSProfile of all of them.
         :param callback_group: callback group, None for the node's own.
+        :param on_message: called with the topic name after each message, or None.
         """
         for topic, (message_type, name) in types.items():
-            node.create_subscription(
-                message_type, name, lambda message, topic=topic: self.put(topic, message), qos,
-                callback_group=callback_group)
+            def receive(message, info, topic=topic, name=name):
+                self.put(topic, message, reception_time(info))
+                if on_message is not None:
+                    on_message(name)
 
-    def put(self, topic, message):
-        """Add a message with a header."""
+            node.create_subscription(
+                message_type, name, receive, qos, callback_group=callback_group)
+
+    def put(self, topic, message, received=None):
+        """
+        Add a message with a header.
+
+        :param received: monotonic time in seconds of its reception; None: now.
+        """
         stamp = to_nanoseconds(message.header.stamp)
+        received = time.monotonic() if received is None else received
         with self._changed:
-            if stamp < self._newest[topic]:  # time went back: another simulator, a looping bag
-                self._by_stamp.clear()
-                self._newest = dict.fromkeys(self._topics, 0)
+            if not self._latched and not self._believe(topic, stamp):
+                return
+            if stamp != self._newest.get(topic):
+                self._renewed[topic] = received
             self._newest[topic] = stamp
-            self._seen.add(topic)
-            self._by_stamp.setdefault(stamp, {})[topic] = message
+            self._received[topic] = received
+            self._by_stamp.setdefault(stamp, {})[topic] = message, received
+            self._by_stamp.move_to_end(stamp)
             while len(self._by_stamp) > DEPTH * len(self._topics):
                 self._by_stamp.popitem(last=False)
+            self.count += 1
             self._changed.notify_all()
 
-    def newest(self, *topics, after_ns=-1):
+    def _believe(self, topic, stamp):
+        """Tell whether a stamp is used; forget all others when the clock has jumped to it."""
+        clock = max(self._newest.values(), default=stamp)
+        if self._newest.get(topic, 0) <= stamp <= clock + JUMP_NS:
+            self._suspects[topic].clear()
+            return True
+        suspects = self._suspects[topic]
+        if suspects and not 0 <= stamp - suspects[-1] <= JUMP_NS:
+            suspects.clear()  # a stray of its own
+        suspects.append(stamp)
+        if len(suspects) < PROOF:
+            return False
+        self.jumps += 1
+        self._by_stamp.clear()
+        self._newest.clear()
+        for others in self._suspects.values():
+            others.clear()
+        return True
+
+    def newest(self, *topics, after_ns=-1, since=-math.inf):
         """
         Return the newest {topic: message} that has all of `topics`; None if there is none.
 
         :param after_ns: only what is stamped later than this.
+        :param since: only what was received at or after this monotonic time.
         """
+        moment = self.moment(topics, after_ns, since)
+        return None if moment is None else moment.messages
+
+    def moment(self, topics, after_ns=-1, since=-math.inf):
+        """Return the same with its stamp and time of reception, as a Moment."""
         with self._changed:
-            stamps = [stamp for stamp, found in self._by_stamp.items()
-                      if stamp > after_ns and all(topic in found for topic in topics)]
-            return dict(self._by_stamp[max(stamps)]) if stamps else None
+            found = [stamp for stamp, parts in self._by_stamp.items() if stamp > after_ns and all(
+                topic in parts and parts[topic][1] >= since for topic in topics)]
+            if not found:
+                return None
+            stamp = found[-1] if self._latched else max(found)
+            parts = self._by_stamp[stamp]
+            return Moment(stamp, {topic: message for topic, (message, _) in parts.items()},
+                          min(parts[topic][1] for topic in topics))
 
     def wait(self, topics, timeout_s, after_ns=-1, give_up=lambda: False):
         """
@@ -85,12 +152,42 @@ class Observations:
                 self._changed.wait(min(left, 0.1))
         return None
 
-    def wake(self):
-        """Make all that wait ask give_up again."""
+    def wait_for_change(self, timeout_s, count):
+        """Wait until something has come or wake was called since `count`, or the time is over."""
         with self._changed:
+            self._changed.wait_for(lambda: self.count != count, timeout_s)
+
+    def wake(self):
+        """Make all that wait look again."""
+        with self._changed:
+            self.count += 1
             self._changed.notify_all()
 
     def missing(self, topics):
         """Return those of `topics` of which nothing has come since the start."""
         with self._changed:
-            return [topic for topic in topics if topic not in self._seen]
+            return [topic for topic in topics if topic not in self._received]
+
+    def ages(self, topics, now, renewed=False):
+        """
+        Return how long ago each topic was heard, {topic: seconds}, infinity for never.
+
+        :param now: monotonic time.
+        :param renewed: messages that repeat the stamp of the one before do not count.
+        """
+        with self._changed:
+            times = self._renewed if renewed else self._received
+            return {topic: now - times.get(topic, -math.inf) for topic in topics}
+
+
+def reception_time(info):
+    """
+    Return the monotonic time at which the middleware received a message.
+
+    It may have waited in a queue since then; an executor that lags makes nothing look fresh.
+
+    :param info: what rclpy hands to a callback beside the message.
+    """
+    now = time.monotonic()
+    received_ns = info.get('received_timestamp', 0)
+    return now - max(0.0, (time.time_ns() - received_ns) / 1e9) if received_ns else now

@@ -8,6 +8,7 @@ from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.topics import WORLD_FRAME
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.reach import default_budget
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 
@@ -52,7 +53,18 @@ def declare_parameters(node):
                        'every picture (ground_truth), or there only at first, then carried by '
                        'the forward model and found again in the pictures.', choices=TRACKING,
                        read_only=False)
-    parameters.declare('image_timeout', 5.0, 'Seconds to wait for an image before giving up.',
+    parameters.declare('max_silence', 0.4,
+                       'The arm is stopped when the picture, the objects or the joints have been '
+                       'silent for so many seconds, or when the last command is so old.',
+                       low=0.05, high=60.0, read_only=False)
+    parameters.declare('command_timeout', 0.5,
+                       'Seconds that a command is valid after it came; told to the arm on '
+                       'arm/command_timeout.', low=0.01, high=60.0)
+    parameters.declare('max_age', 3.0,
+                       'Seconds; what was received longer ago is not acted upon, so a plan that '
+                       'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
+    parameters.declare('image_timeout', 5.0,
+                       'Seconds without a usable observation after which a goal is aborted.',
                        low=0.1, high=600.0, read_only=False)
     parameters.declare('predictor_timeout', 20.0, 'Seconds to wait for a subgoal.',
                        low=0.1, high=600.0, read_only=False)
@@ -92,8 +104,3 @@ def check_request(request):
         raise ConfigError(f'step_budget is {request.step_budget}; expected 1 to {MAX_BUDGET}, or '
                           f'0 for {default_budget(2)}, with three objects {default_budget(3)}')
     return mode
-
-
-def default_budget(num_objects):
-    """Return how many steps a goal may take, as in the paper's Table 2."""
-    return 40 if num_objects <= 2 else 75

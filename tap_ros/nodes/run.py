@@ -5,6 +5,7 @@
 import signal
 import sys
 import threading
+import traceback
 
 import rclpy
 from rclpy.executors import (
@@ -14,6 +15,8 @@ from rclpy.executors import (
 )
 from rclpy.signals import SignalHandlerOptions
 from tap_ros.errors import TapError
+from tap_ros.nodes.heartbeat import Heartbeat, use_short_leases
+from tap_ros.text import escaped
 
 
 def run_node(make_node, name, args=None, num_threads=1):
@@ -22,42 +25,89 @@ def run_node(make_node, name, args=None, num_threads=1):
 
     On a signal the callback in progress is finished and `node.close()` is called before ROS shuts
     down: rclpy's own signal handlers would end the context first, and neither a last command nor a
-    last episode mark could be sent.
+    last episode mark could be sent. `close` is called whatever ends the node. What a callback
+    raises is logged, and the node goes on.
 
     :param make_node: called without arguments after rclpy.init; a TapError from it is fatal.
     :param name: name for the log until the node has one.
     :param args: command-line arguments, None for those of the process.
     :param num_threads: threads for callbacks; with 1 all of them run in the calling thread.
-    :return: exit code, 1 when the node could not be started.
+    :return: exit code: 1 when the node could not be started, or close says so by returning 1.
     """
     stop = threading.Event()
-    node = executor = None
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    node = executor = None
+    code = 0
     try:
+        use_short_leases()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # what follows --ros-args cannot be parsed
-        print(f'{name}: {error}', file=sys.stderr)
-        return 1
-    try:
         node = make_node()
         executor = (SingleThreadedExecutor() if num_threads == 1
                     else MultiThreadedExecutor(num_threads))
         executor.add_node(node)
+        Heartbeat(node)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
         while rclpy.ok() and not stop.is_set():
-            executor.spin_once(timeout_sec=0.1)  # a signal is noticed after this time at most
-        node.close()
+            _spin_once(executor, node)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except TapError as error:
-        rclpy.logging.get_logger(name).fatal(str(error))
-        return 1
+        rclpy.logging.get_logger(name).fatal(escaped(error, 1000))
+        code = 1
+    except RuntimeError as error:  # what follows --ros-args cannot be parsed
+        if node is not None or rclpy.ok():
+            raise
+        print(f'{name}: {escaped(error, 1000)}', file=sys.stderr)
+        code = 1
     finally:
+        if node is not None:
+            code = _close(node) or code
         if executor is not None:
             executor.shutdown(timeout_sec=2.0)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+    return code
+
+
+def answering(node, callback):
+    """
+    Let a service answer whatever its callback raises.
+
+    :param node: rclpy Node, for its log.
+    :param callback: of a service whose response has the fields success and message.
+    :return: a callback that raises nothing.
+    """
+    def answer(request, response):
+        try:
+            return callback(request, response)
+        except Exception as error:
+            node.get_logger().error(traceback.format_exc())
+            return type(response)(
+                success=False,
+                message=f'internal error: {type(error).__name__}: {escaped(error)}')
+
+    return answer
+
+
+def _spin_once(executor, node):
+    """Run what is ready; a signal is noticed after 0.1 s at most."""
+    try:
+        executor.spin_once(timeout_sec=0.1)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        raise
+    except Exception as error:
+        node.get_logger().error(
+            f'a callback failed with {type(error).__name__}: {escaped(error)}; going on\n'
+            + traceback.format_exc())
+
+
+def _close(node):
+    """Let the node end what it does; return its exit code."""
+    try:
+        return node.close() or 0
+    except Exception:
+        node.get_logger().error(f'the node did not end cleanly:\n{traceback.format_exc()}')
+        return 1

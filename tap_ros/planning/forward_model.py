@@ -113,6 +113,11 @@ class ForwardModel(nn.Module):
         constant('limits', torch.stack([low, high]))
         constant('move_limit', torch.tensor(MOVE_LIMIT))
 
+    @property
+    def learned(self):
+        """Return the model that looks at pictures: this one. See evaluation's TrueModel."""
+        return self
+
     def _constant(self, name, value):
         self.register_buffer(name, value, persistent=False)
 

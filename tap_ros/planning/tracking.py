@@ -47,6 +47,16 @@ class ObjectTracker:
         inside = (self._cells.norm(dim=1) <= CELL * CELLS / 2).float()
         self._templates, self._weights = templates[:, :3], templates[:, 3] * inside
 
+    @property
+    def memory(self):
+        """Return where the objects are and how they are turned; it may be set back."""
+        return self.pixels, self._angles.copy()
+
+    @memory.setter
+    def memory(self, memory):
+        self.pixels, angles = memory
+        self._angles = angles.copy()
+
     @torch.inference_mode()
     def update(self, before, gripper_before, action, after, gripper):
         """

@@ -84,6 +84,15 @@ class VisualMPC:
             config.max_lift, config.push_limit, config.upright, config.climb_limit)
         self._last = self._plan = self._goal = None  # _last: parameters of what is left of _plan
 
+    @property
+    def memory(self):
+        """Return what one plan leaves to the next; it may be set back, and then gives the same."""
+        return self._count, self._age, self._shape, self._last, self._plan, self._goal
+
+    @memory.setter
+    def memory(self, memory):
+        self._count, self._age, self._shape, self._last, self._plan, self._goal = memory
+
     def limit(self, move, climb):
         """
         Plan within limits, from the next reset on.

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of putting messages together by their stamp."""
 
+from math import inf
 import threading
+import time
 
 import pytest
 from sensor_msgs.msg import Image, JointState
-from tap_ros.nodes.observations import DEPTH, Observations
+from tap_ros.nodes.observations import DEPTH, Observations, PROOF, reception_time
 from tap_ros.nodes.topics import to_nanoseconds, to_stamp
 
 pytestmark = pytest.mark.ros
@@ -49,14 +51,63 @@ def test_what_never_came_is_named():
     assert stamp_of(seen.newest('image')) == 0
 
 
-def test_when_time_goes_back_the_past_is_forgotten():
+def test_when_time_goes_back_for_good_the_past_is_forgotten():
     seen = Observations('image', 'joints')
     put(seen, 1000, 'image', 'joints')
-    put(seen, 5, 'image')
-    assert stamp_of(seen.newest('image')) == 5
+    for _ in range(PROOF):
+        assert stamp_of(seen.newest('image')) == 1000 and seen.jumps == 0
+        put(seen, 5, 'image')
+    assert stamp_of(seen.newest('image')) == 5 and seen.jumps == 1
     assert seen.newest('image', 'joints') is None
     put(seen, 5, 'joints')
     assert stamp_of(seen.newest('image', 'joints')) == 5
+
+
+@pytest.mark.parametrize('stray', [1, 10**17])
+@pytest.mark.parametrize('topic', ['image', 'joints'])
+def test_a_stray_stamp_now_and_then_is_not_believed(stray, topic):
+    seen = Observations('image', 'joints')
+    for stamp in range(10**9, 20 * 10**9, 10**9):
+        put(seen, stamp, 'image', 'joints')
+        put(seen, stray, topic)
+        put(seen, stray + 1, topic)
+        assert stamp_of(seen.newest('image', 'joints')) == stamp
+    assert seen.jumps == 0
+
+
+def test_a_stray_that_comes_first_is_found_out():
+    seen = Observations('image', 'joints')
+    put(seen, 10**17, 'image')
+    for stamp in range(10**9, (PROOF + 2) * 10**9, 10**9):
+        put(seen, stamp, 'image', 'joints')
+    assert stamp_of(seen.newest('image', 'joints')) == (PROOF + 1) * 10**9
+
+
+def test_what_comes_now_and_then_may_have_any_stamp():
+    seen = Observations('image', 'objects', latched=True)
+    for stamp in (5, 10**18, 0):
+        put(seen, stamp, 'image', 'objects')
+        assert stamp_of(seen.newest('image', 'objects')) == stamp
+
+
+def test_only_what_was_received_since_a_time_counts():
+    seen = Observations('image', 'joints')
+    for topic, received in (('image', 1.0), ('joints', 2.0)):
+        seen.put(topic, stamped(Image, 10), received)
+    assert seen.moment(('image', 'joints'), since=1.0).received == 1.0
+    assert seen.moment(('image', 'joints'), since=1.5) is None
+    seen.put('image', stamped(Image, 10), 3.0)  # sent again, as in lock-step
+    assert seen.moment(('image', 'joints'), since=1.5).received == 2.0
+    assert seen.ages(('image', 'joints'), 4.0) == {'image': 1.0, 'joints': 2.0}
+    assert seen.ages(('image', 'other'), 4.0, renewed=True) == {'image': 3.0, 'other': inf}
+
+
+def test_time_in_a_queue_makes_a_message_older():
+    now = time.monotonic()
+    late = reception_time({'received_timestamp': time.time_ns() - 3 * 10**9})
+    assert now - 3.5 < late <= time.monotonic() - 3
+    assert reception_time({}) >= now
+    assert reception_time({'received_timestamp': time.time_ns() + 10**12}) >= now
 
 
 def test_memory_does_not_grow():

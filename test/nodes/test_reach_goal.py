@@ -14,6 +14,7 @@ from sensor_msgs.msg import Image
 from sim_bridge.simulator import Simulator
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
+from tap_msgs.srv import ResetScene
 from tap_ros.nodes.clients import call, CallError, send_goal, wait_for_result
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.weights import save_weights
@@ -88,10 +89,9 @@ def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
     assert status == GoalStatus.STATUS_CANCELED
     assert 'cancelled' in result.message and 1 <= result.steps < 40
     assert loop.stopped()
-    sent = [t.twist.linear for t in list(loop.twists)]
-    still = [(v.x, v.y, v.z) == (0, 0, 0) for v in sent]
-    assert all(still[still.index(True):])  # no command follows the first stop
     count = len(loop.moves())
+    threading.Event().wait(1.0)
+    assert len(loop.moves()) == count == result.steps
     status, result = loop.reach(mode='direct', step_budget=1)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     assert len(loop.moves()) == count + 1
@@ -114,20 +114,73 @@ def test_a_bad_goal_is_aborted_with_the_reason_and_moves_nothing(loop, fields, w
     assert loop.stopped() and len(loop.moves()) == 0
 
 
-def test_when_images_stop_coming_the_arm_is_stopped(loop):
+@pytest.mark.parametrize('_', range(5))
+def test_a_goal_right_after_a_cancel_or_a_reset_is_served(loop, _):
+    loop.reset()
+    moving = threading.Event()
+    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
+                       lambda feedback: moving.set())
+    assert moving.wait(120)
+    handle.cancel_goal_async()
+    status, _ = wait_for_result(handle, 60)
+    assert status == GoalStatus.STATUS_CANCELED
+    status, result = loop.reach(mode='direct', step_budget=2)
+    assert status == GoalStatus.STATUS_SUCCEEDED and result.steps == 2, result.message
+    response = call(loop.reset_client, ResetScene.Request(task='push2', seed=SEED), 30)
+    assert response.success
+    status, result = loop.reach(mode='direct', step_budget=1)
+    assert status == GoalStatus.STATUS_SUCCEEDED and result.steps == 1, result.message
+
+
+def test_a_reset_during_a_goal_aborts_it(loop):
+    loop.reset()
+    moving = threading.Event()
+    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
+                       lambda feedback: moving.set())
+    assert moving.wait(120)
+    call(loop.reset_client, ResetScene.Request(task='push2', seed=SEED + 1), 30)
+    status, result = wait_for_result(handle, 60)
+    assert status == GoalStatus.STATUS_ABORTED and 'the scene has changed' in result.message
+    assert loop.stopped()
+
+
+def test_an_arm_that_refuses_is_waited_for_and_then_the_goal_ends(loop):
     loop.reset()
     call(loop.pause_client, SetBool.Request(data=True), 10)
-    acting = threading.Event()
-    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct', step_budget=10), 30,
-                       lambda feedback: acting.set())
-    assert acting.wait(60)
-    threading.Event().wait(2.5)
-    assert loop.stopped() and not handle.status == GoalStatus.STATUS_ABORTED  # it still waits
-    status, result = wait_for_result(handle, 60)
-    call(loop.pause_client, SetBool.Request(data=False), 10)
-    assert status == GoalStatus.STATUS_ABORTED and result.steps == 1
-    assert '/camera/image_raw' in result.message
+    try:
+        with loop.set('visual_mpc_node', image_timeout=2.0):
+            status, result = loop.reach(mode='direct', step_budget=10)
+    finally:
+        call(loop.pause_client, SetBool.Request(data=False), 10)
+    assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+    assert 'refused' in result.message and 'paused' in result.message
     assert loop.stopped()
+
+
+def test_when_images_stop_coming_the_arm_is_stopped_and_no_goal_begins(loop):
+    loop.reset()
+    simulator = loop.processes['sim_node'].process
+    acting = threading.Event()
+    with loop.set('visual_mpc_node', image_timeout=2.0):
+        handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct', step_budget=10), 30,
+                           lambda feedback: acting.set())
+        assert acting.wait(60)
+        simulator.send_signal(signal.SIGSTOP)
+        try:
+            status, result = wait_for_result(handle, 60)
+            assert status == GoalStatus.STATUS_ABORTED
+            assert '/camera/image_raw' in result.message
+            assert loop.stopped()
+            count = len(loop.moves())
+            status, result = loop.reach(mode='direct', step_budget=1)
+            assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+            assert '/camera/image_raw' in result.message
+            assert len(loop.moves()) == count
+        finally:
+            simulator.send_signal(signal.SIGCONT)
+    loop.reset()
+    status, result = loop.reach(mode='direct', step_budget=1)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
 
 
 def test_when_the_predictor_dies_the_arm_stays_and_the_planner_lives(loop):
@@ -154,7 +207,7 @@ def test_a_predictor_that_hangs_is_given_up(loop):
     finally:
         predictor.send_signal(signal.SIGCONT)
     assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
-    assert '/predict_subgoal' in result.message and '1 s' in result.message
+    assert '/predict_subgoal' in result.message
     assert loop.stopped() and len(loop.moves()) == 0
 
 

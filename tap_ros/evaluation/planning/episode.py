@@ -3,7 +3,8 @@
 """
 One scene, planned and pushed in one process.
 
-The loop, its seeds and its classes are those of visual_mpc_node, so that both act the same.
+The loop is that of visual_mpc_node, planning/reach.py, with the same seeds, so that both act the
+same.
 """
 
 from dataclasses import dataclass
@@ -12,8 +13,8 @@ from itertools import product
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.planning.scenes import nearest_first
-from tap_ros.planning.hierarchy import choose_sample, Itinerary, Target, targets_by
-from tap_ros.planning.tracking import ObjectTracker
+from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
+from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
 from tap_ros.recording.episode import Episode
 
 REACHED = 1.0  # px of Target.distance at which a goal or subgoal is reached
@@ -62,41 +63,39 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     """
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
-    seen = simulator.reset(seed)
+    start = seen = simulator.reset(seed)
     goal = simulator.goal()
-    K = len(goal.object_pixels)
-    chosen = np.arange(K) if objects is None else np.asarray(objects)
     targets, subgoals = make_targets(simulator, mpc, method, seen, goal, predictor, seed)
     if objects is not None:
-        targets = [Target(goal.object_pixels[chosen])]
-    tracker = None
-    if method.tracking == 'carried':
-        model = getattr(mpc.model, 'learned', mpc.model)
-        tracker = ObjectTracker(model, seen.image, seen.gripper, seen.object_pixels)
-    itinerary = Itinerary(targets, step_budget, method.switch, reached)
+        objects = tuple(objects)
+        targets = [Target(goal.object_pixels[list(objects)])]
+    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, method.tracking,
+                                   objects=objects), seed)
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
-    pixels = seen.object_pixels
-    tracked, limit = [pixels], np.array(seen.image.shape[1::-1]) - 1
-    mpc.reset(seed)
-    for step in range(step_budget if method.base != 'nothing' else 0):
-        if targets[-1].distance(pixels[chosen]) <= reached:
+    tracked = []
+    while method.base != 'nothing':
+        answer = reach.step(as_seen(seen))
+        if isinstance(answer, Aim):
+            reach.head_for(targets)
+            continue
+        tracked.append(reach.pixels)
+        if isinstance(answer, End):
             break
-        target = itinerary.target(step, pixels[chosen])
-        plan = mpc.act(seen.image, seen.gripper, pixels[chosen],
-                       **target.goal(np.clip(pixels[chosen], 0, limit)))
-        before, seen = seen, simulator.step(plan.action)
-        pixels = seen.object_pixels
-        if tracker is not None:
-            pixels = tracker.update(
-                before.image, before.gripper, plan.action, seen.image, seen.gripper)
+        seen = simulator.step(answer.plan.action)
+        reach.sent()
         observations.append(seen)
         distances.append(simulator.distances())
-        tracked.append(pixels)
-        actions.append(plan.action)
-        times.append(plan.planning_ms)
+        actions.append(answer.plan.action)
+        times.append(answer.plan.planning_ms)
     return PlannedEpisode(
         np.array(distances), observations, np.array(actions).reshape(-1, 4), np.array(times),
-        goal, targets, itinerary.switches, np.array(tracked), subgoals)
+        goal, targets, reach.switches, np.array(tracked or [start.object_pixels]), subgoals)
+
+
+def as_seen(observation):
+    """Return an Observation of the simulator as reach.Seen."""
+    return Seen(observation.image, observation.gripper, tuple(observation.object_names),
+                observation.object_pixels, observation.stamp_ns)
 
 
 def make_targets(simulator, mpc, method, seen, goal, predictor, seed):

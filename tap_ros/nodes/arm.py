@@ -1,0 +1,119 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What visual_mpc_node sends to the arm, and the watch that stops it."""
+
+import math
+import threading
+import time
+
+from geometry_msgs.msg import TwistStamped
+import numpy as np
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from std_msgs.msg import Float64
+from tap_ros.errors import PlanningError
+from tap_ros.nodes.topics import LATCHED, STREAM
+
+WATCH_S = 0.05  # how often it is checked whether the arm has to be stopped
+REPEAT_S = 0.2  # a stop is repeated after so long, while a goal is in progress
+
+
+class Arm:
+    """
+    Commands for one goal at a time; safe to use from several threads.
+
+    While a goal is in progress, the arm is sent zero unless a command is younger than max_silence
+    and so is all that is watched. A timer does this, in a thread of its own: it does not matter
+    what keeps the planner busy.
+
+    :param node: rclpy Node.
+    :param params: its Parameters.
+    :param sensors: Observations of what is watched.
+    """
+
+    def __init__(self, node, params, sensors):
+        self._node, self._params, self._sensors = node, params, sensors
+        self._lock = threading.Lock()  # no command may follow the end of a goal
+        self._goal, self._topics = None, ()
+        self._moved_at = self._stopped_at = -math.inf  # monotonic time
+        self._gripper = node.create_publisher(Float64, 'gripper/command', STREAM)
+        self._twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
+        self._timeout = node.create_publisher(Float64, 'arm/command_timeout', LATCHED)
+        self._timeout.publish(Float64(data=params['command_timeout']))
+        node.create_timer(WATCH_S, self._watch, MutuallyExclusiveCallbackGroup(),
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def begin(self, goal):
+        """Let a goal, any object, move the arm; nothing else may from now on."""
+        with self._lock:
+            self._goal, self._topics = goal, ()
+            self._moved_at = -math.inf
+            self._stop()
+
+    def end(self, goal=None):
+        """
+        Stop the arm; the goal may not move it any more.
+
+        :param goal: which one; None: any.
+        """
+        with self._lock:
+            if goal is None or self._goal is goal:
+                self._goal = None
+            self._stop()
+
+    def send(self, goal, action, stamp, topics):
+        """
+        Send one command within the limits.
+
+        :param goal: as given to begin.
+        :param action: (4,) metres moved in one control period, and gripper opening 0..1.
+        :param stamp: builtin_interfaces/Time of the image that it answers.
+        :param topics: sensors that the arm depends on until the next command.
+        :return: whether it was sent; not when the goal has ended or a sensor is silent.
+        :raises PlanningError: for numbers that are not finite.
+        """
+        if not np.isfinite(action).all():
+            raise PlanningError(f'the planner chose {action}; expected finite numbers')
+        params = self._params
+        # The planner keeps within them already.
+        limit = np.array([params['max_step_xy']] * 2 + [params['max_step_z']])
+        move = params['twist_scale'] * np.clip(np.asarray(action[:3], np.float64), -limit, limit)
+        message = TwistStamped()
+        message.header.stamp = (self._node.get_clock().now().to_msg()
+                                if params['stamp_with_now'] else stamp)
+        message.header.frame_id = params['command_frame']
+        linear = message.twist.linear
+        linear.x, linear.y, linear.z = move.tolist()
+        with self._lock:
+            now = time.monotonic()
+            if self._goal is not goal or self._silent(topics, now):
+                return False
+            self._topics, self._moved_at = tuple(topics), now
+            self._gripper.publish(Float64(data=float(np.clip(action[3], 0, 1))))
+            self._twist.publish(message)
+        return True
+
+    def wait_until_sent(self, seconds):
+        """Wait until all has left, the last stop above all."""
+        self._twist.wait_for_all_acked(Duration(seconds=seconds))
+
+    def _watch(self):
+        """Stop the arm when it is time to."""
+        with self._lock:
+            now = time.monotonic()
+            if self._goal is None or now - self._stopped_at < REPEAT_S:
+                return
+            if (now - self._moved_at > self._params['max_silence']
+                    or self._silent(self._topics, now, renewed=True)):
+                self._stop()
+
+    def _silent(self, topics, now, renewed=False):
+        """Tell whether one of the topics is silent."""
+        ages = self._sensors.ages(topics, now, renewed)
+        return any(age > self._params['max_silence'] for age in ages.values())
+
+    def _stop(self):
+        """Send a zero command; it has no stamp, since it answers no image."""
+        self._stopped_at = time.monotonic()
+        self._twist.publish(TwistStamped())

@@ -1,0 +1,286 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The control loop: from what is seen to the next command, without ROS and without an own clock.
+
+visual_mpc_node and the evaluation both drive it, so that they act alike:
+
+    reach = Reach(mpc, ReachConfig(step_budget=40), seed)
+    while not isinstance(answer := reach.step(seen), End):
+        if isinstance(answer, Aim):
+            reach.head_for(targets)          # decided from what is seen now
+        elif isinstance(answer, Command):
+            seen = carry_out(answer.plan.action)
+            reach.sent()
+        else:                                # Wait
+            seen = look_again()
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from tap_ros.planning.hierarchy import Itinerary
+from tap_ros.planning.tracking import ObjectTracker
+from tap_ros.text import listing
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was seen at one moment."""
+
+    image: np.ndarray  # (H, W, 3) uint8
+    gripper: np.ndarray  # (4,) metres and opening
+    names: tuple  # K object names
+    pixels: np.ndarray | None  # (K, 2) (u, v), in the order of the names; None: not looked for
+    stamp_ns: int  # of the picture
+    received: float = 0.0  # s, on the clock of `now`: when the oldest part of it was received
+    scene_ns: int = 0  # stamp at which the newest scene known of began; 0: nothing is known
+    jumps: int = 0  # how often the clock of the stamps has jumped so far
+
+
+@dataclass(frozen=True)
+class ReachConfig:
+    """
+    Settings of one goal.
+
+    :param step_budget: commands at most; 0: default_budget.
+    :param switch: when to go on from a subgoal, see hierarchy.Itinerary.
+    :param reached: px, mean distance of the objects; nearer than this is there. 0: never.
+    :param tracking: 'ground_truth': Seen.pixels at every step; 'carried': those of the first step,
+        then followed by tracking.ObjectTracker.
+    :param max_age: s; nothing is planned from what was received longer ago.
+    :param timeout: s without anything to plan from, after which the goal ends.
+    :param objects: indices of the objects that are planned for; None: all.
+    """
+
+    step_budget: int = 0
+    switch: str = 'reached'
+    reached: float = 1.0
+    tracking: str = 'ground_truth'
+    max_age: float = float('inf')
+    timeout: float = float('inf')
+    objects: tuple | None = None
+
+
+@dataclass(frozen=True)
+class Aim:
+    """Decide from `seen` what to go to, and say so by Reach.head_for."""
+
+    seen: Seen
+
+
+@dataclass(frozen=True)
+class Command:
+    """Carry out plan.action, and say so by Reach.sent; what is not carried out is planned anew."""
+
+    plan: object  # visual_mpc.Plan
+    stage: int  # index of the target; the last one is the goal
+    seen: Seen  # what it answers
+
+
+@dataclass(frozen=True)
+class Wait:
+    """Stand still and look again."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class End:
+    """The goal has ended: 'reached', 'spent' (the step budget) or 'aborted'."""
+
+    outcome: str
+    message: str
+
+
+class Reach:
+    """
+    Reach one goal.
+
+    The same things seen and the same seed give the same answers: what step changes counts only
+    once `sent` has been called, so it may be called any number of times in between. A picture is
+    planned from once.
+
+    :param mpc: VisualMPC; reset here.
+    :param config: ReachConfig.
+    :param seed: of the planner.
+    :param now: s, on any clock that does not go back; 0.0 throughout if time does not matter.
+    :ivar steps: commands carried out.
+    :ivar distance: px, from the objects to the goal when last seen; NaN before.
+    :ivar pixels: (K, 2), where the objects were then.
+    :ivar switches: steps at which the second, third ... target began.
+    """
+
+    def __init__(self, mpc, config, seed=0, now=0.0):
+        self._mpc, self._config, self._seed = mpc, config, seed
+        self._targets = self._itinerary = self._tracker = None
+        self._first = self._planned = self._answered = None  # Seen, Command, Command
+        self._after_ns = -1  # pictures count that are stamped later than this
+        self._kept = self._before = None  # memories: after the last command, and before it
+        self._refusal = ''
+        self._usable_at = now
+        self.steps, self.distance, self.pixels = 0, float('nan'), None
+
+    @property
+    def aimed(self):
+        """Tell whether head_for has been called."""
+        return self._targets is not None
+
+    @property
+    def switches(self):
+        """Return the steps at which the targets after the first one began."""
+        return self._itinerary.switches if self._itinerary else []
+
+    def step(self, seen, now=0.0, lacking=''):
+        """
+        Answer what is seen.
+
+        :param seen: Seen, or None when nothing is.
+        :param now: s, on the clock of Seen.received.
+        :param lacking: why nothing is seen, for the message.
+        :return: Aim, Command, Wait or End.
+        :raises PlanningError: for what cannot be planned with.
+        """
+        if seen is not None and self._first is not None:
+            change = scene_change(self._first, seen)
+            if change:
+                return End('aborted', f'the scene has changed: {change}')
+        reason = self._unusable(seen, now, lacking)
+        if reason:
+            silence = now - self._usable_at
+            if silence <= self._config.timeout:
+                return Wait(reason)
+            return End('aborted', f'no observation for {silence:.1f} s: {reason}')
+        self._usable_at = now
+        self._first = self._first or seen
+        if self._targets is None:
+            return Aim(seen)
+        if self._planned is None or self._planned.seen.stamp_ns != seen.stamp_ns:
+            return self._plan(seen)
+        return self._planned
+
+    def head_for(self, targets, now=0.0):
+        """
+        Say what to go to.
+
+        :param targets: list of hierarchy.Target, the last one is the goal.
+        :param now: deciding may have taken time, which does not count as silence.
+        """
+        config = self._config
+        self._targets = list(targets)
+        self._budget = config.step_budget or default_budget(len(targets[-1].pixels))
+        self._itinerary = Itinerary(targets, self._budget, config.switch, config.reached)
+        if config.tracking == 'carried':
+            first = self._first
+            self._tracker = ObjectTracker(
+                self._mpc.model.learned, first.image, first.gripper, first.pixels)
+        self._mpc.reset(self._seed)
+        self._kept, self._usable_at = self._memory(), now
+
+    def sent(self, after_ns=None):
+        """
+        Say that the last Command is carried out.
+
+        :param after_ns: pictures show its effect that are stamped later than this; None: than the
+            picture that it answers.
+        """
+        command, self._planned = self._planned, None
+        self._before = self._kept, self._answered, self._after_ns
+        self._kept, self._answered = self._memory(), command
+        self._after_ns = command.seen.stamp_ns if after_ns is None else after_ns
+        self.steps += 1
+        self._refusal = ''
+
+    def refused(self, stamp_ns, reason):
+        """
+        Say that a command was not carried out after all: a newer picture is to be answered.
+
+        :param stamp_ns: of the picture that it answered.
+        :param reason: why; told when no newer picture comes.
+        :return: whether it was the last one of this goal.
+        """
+        if self._before is None or self._answered.seen.stamp_ns != stamp_ns:
+            return False
+        refused = self._answered
+        (self._kept, self._answered, _), self._before = self._before, None
+        self._after_ns, self._planned = refused.seen.stamp_ns, None
+        self.steps -= 1
+        self._refusal = reason
+        return True
+
+    def _unusable(self, seen, now, lacking):
+        """Say why there is nothing to plan from; an empty string if there is."""
+        if seen is None:
+            return lacking or 'nothing is seen'
+        if seen.stamp_ns <= self._after_ns:
+            return (f'the last command was refused: {self._refusal}' if self._refusal
+                    else 'no new picture since the last command')
+        if seen.stamp_ns < seen.scene_ns:
+            return 'the picture is of an old scene'
+        age = now - seen.received
+        if age > self._config.max_age:
+            return f'what was seen is {age:.1f} s old'
+        return ''
+
+    def _plan(self, seen):
+        """Plan the next command from a new picture."""
+        config = self._config
+        self._recall(self._kept)
+        self.pixels = self._find_objects(seen)
+        chosen = self.pixels if config.objects is None else self.pixels[list(config.objects)]
+        self.distance = self._targets[-1].distance(chosen)
+        if self.distance <= config.reached:
+            return End('reached', f'{self.distance:.1f} px from the goal, reached')
+        if self.steps >= self._budget:
+            return End('spent', f'{self.distance:.1f} px from the goal, '
+                                f'step budget of {self._budget} spent')
+        target = self._itinerary.target(self.steps, chosen)
+        limit = np.array(seen.image.shape[1::-1]) - 1
+        plan = self._mpc.act(seen.image, seen.gripper, chosen,
+                             **target.goal(np.clip(chosen, 0, limit)))
+        self._planned = Command(plan, len(self._itinerary.switches), seen)
+        return self._planned
+
+    def _find_objects(self, seen):
+        """Return where the objects are, (K, 2)."""
+        if self._tracker is None:
+            return seen.pixels
+        if self._answered is None:
+            return self._tracker.pixels
+        before = self._answered
+        return self._tracker.update(
+            before.seen.image, before.seen.gripper, before.plan.action, seen.image, seen.gripper)
+
+    def _memory(self):
+        """Return all that a plan changes."""
+        return (self._mpc.memory, list(self._itinerary.switches),
+                None if self._tracker is None else self._tracker.memory)
+
+    def _recall(self, memory):
+        self._mpc.memory, switches, tracked = memory
+        self._itinerary.switches = list(switches)
+        if self._tracker is not None:
+            self._tracker.memory = tracked
+
+
+def default_budget(num_objects):
+    """Return how many steps a goal may take, as in the paper's Table 2."""
+    return 40 if num_objects <= 2 else 75
+
+
+def scene_change(first, seen):
+    """
+    Say in what way the scene is another one; an empty string if it is not.
+
+    :param first: Seen at the start of a goal; seen: Seen now.
+    """
+    if seen.jumps != first.jumps:
+        return 'the clock of its stamps has jumped: another simulator, or a recording that loops'
+    if seen.scene_ns > first.stamp_ns:
+        return 'a new episode has begun'
+    if seen.pixels is not None and set(seen.names) != set(first.names):
+        gone = [name for name in first.names if name not in seen.names]
+        come = [name for name in seen.names if name not in first.names]
+        return '; '.join(f'{listing(names)} {what}' for names, what in (
+            (come, 'appeared'), (gone, 'vanished')) if names)
+    return ''

@@ -1,0 +1,149 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the control loop, with an untrained planner in the toy world."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tap_ros.planning.cem import CEMConfig
+from tap_ros.planning.hierarchy import Target
+from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig, Seen, Wait
+from tap_ros.planning.visual_mpc import VisualMPC
+from toy_world import SIZE
+
+SECOND = 10**9
+START = np.array([[8.0, 8.0], [20.0, 20.0]], np.float32)
+GOAL = Target(np.array([[12.0, 8.0], [20.0, 24.0]], np.float32))
+SMALL = VisualMPCConfig(search=CEMConfig(8, 1, 2), proposals=4, batch_size=8, threads=1)
+
+
+@pytest.fixture
+def mpc(model):
+    return VisualMPC(model, SMALL)
+
+
+def look(t, pixels=START, **changes):
+    """Return what is seen t seconds after the start; the picture differs from second to second."""
+    image = np.random.default_rng(t).integers(0, 256, (SIZE, SIZE, 3), np.uint8)
+    seen = Seen(image, np.array([0, 0, 0.1, 0], np.float32), ('a', 'b'), pixels,
+                (t + 1) * SECOND, received=float(t))
+    return replace(seen, **changes)
+
+
+def begun(mpc, config=None, seed=3):
+    """Return a loop that knows where to go from what is seen at 0."""
+    reach = Reach(mpc, config or ReachConfig(10, max_age=5.0, timeout=5.0), seed)
+    assert isinstance(reach.step(look(0)), Aim)
+    reach.head_for([GOAL])
+    return reach
+
+
+def act(reach, t):
+    answer = reach.step(look(t), float(t))
+    assert isinstance(answer, Command)
+    reach.sent()
+    return answer.plan.action
+
+
+def test_one_command_a_picture_until_the_budget_is_spent(mpc):
+    reach = begun(mpc, ReachConfig(3))
+    for t in range(3):
+        act(reach, t)
+        assert isinstance(reach.step(look(t)), Wait)  # the same picture again
+    end = reach.step(look(3))
+    assert isinstance(end, End) and end.outcome == 'spent' and reach.steps == 3
+    assert '4.0 px' in end.message and '3 spent' in end.message
+
+
+def test_a_goal_that_is_reached_ends_at_once(mpc):
+    reach = begun(mpc)
+    end = reach.step(look(1, GOAL.pixels))
+    assert isinstance(end, End) and end.outcome == 'reached' and reach.steps == 0
+
+
+def test_the_default_budget_is_the_papers():
+    pixels = np.zeros((3, 2), np.float32)
+    for count, budget in ((2, 40), (3, 75)):
+        reach = Reach(None, ReachConfig(reached=0.0))
+        reach._mpc = type('Counts', (), {'reset': lambda *_: None, 'memory': None})()
+        reach.step(look(0))
+        reach.head_for([Target(pixels[:count])])
+        assert reach._budget == budget
+
+
+def test_what_is_not_sent_leaves_no_trace(mpc):
+    straight, hesitant = begun(mpc), None
+    expected = [act(straight, t) for t in range(3)]
+    hesitant = begun(mpc)
+    found = []
+    for t in range(3):
+        hesitant.step(look(40 + t, stamp_ns=1 + t + t * SECOND))  # planned, and never sent
+        found.append(act(hesitant, t))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_a_picture_is_planned_from_once(mpc):
+    reach = begun(mpc)
+    first = reach.step(look(0))
+    assert reach.step(look(0)) is first
+    assert reach.step(look(1)) is not first
+
+
+def test_a_refused_command_does_not_count_and_the_newer_picture_is_answered(mpc):
+    other = begun(mpc)
+    act(other, 0)
+    reach = begun(mpc)
+    act(reach, 0)
+    reach.step(look(4))
+    reach.sent(after_ns=10 * SECOND)  # a newer picture had come before
+    assert isinstance(reach.step(look(5)), Wait)
+    assert not reach.refused(3 * SECOND, 'not this one')
+    assert reach.refused(5 * SECOND, 'it answers an old image') and reach.steps == 1
+    assert not reach.refused(5 * SECOND, 'told twice')
+    waiting = reach.step(look(4))  # the refused picture itself is not answered again
+    assert isinstance(waiting, Wait) and 'it answers an old image' in waiting.reason
+    np.testing.assert_array_equal(act(reach, 5), act(other, 5))
+    assert reach.steps == 2
+
+
+def test_old_and_missing_sights_are_waited_for_and_then_end_the_goal(mpc):
+    reach = begun(mpc)
+    for seen, words in ((None, 'nothing on the table'), (look(1, received=-9.0), '10.0 s old')):
+        answer = reach.step(seen, now=1.0, lacking='nothing on the table')
+        assert isinstance(answer, Wait) and words in answer.reason
+    end = reach.step(None, now=5.1, lacking='nothing on the table')
+    assert isinstance(end, End) and end.outcome == 'aborted'
+    assert '5.1 s' in end.message and 'nothing on the table' in end.message
+
+
+def test_time_begins_anew_with_every_picture_that_is_used(mpc):
+    reach = begun(mpc)
+    act(reach, 4)
+    assert isinstance(reach.step(None, now=8.9), Wait)
+    assert isinstance(reach.step(None, now=9.1), End)
+
+
+def test_pictures_of_an_old_scene_are_not_used(mpc):
+    reach = Reach(mpc, ReachConfig(10))
+    answer = reach.step(look(0, scene_ns=2 * SECOND))
+    assert isinstance(answer, Wait) and 'old scene' in answer.reason
+    assert isinstance(reach.step(look(1, scene_ns=2 * SECOND)), Aim)
+
+
+@pytest.mark.parametrize('changes, words', [
+    ({'scene_ns': 3 * SECOND}, 'a new episode'), ({'jumps': 1}, 'clock'),
+    ({'names': ('a', 'b', 'c\n')}, 'c\\n appeared'), ({'names': ('a',)}, 'b vanished'),
+    ({'names': ('a', 'c')}, 'c appeared; b vanished')])
+def test_another_scene_ends_the_goal_even_if_nothing_else_is_new(mpc, changes, words):
+    reach = begun(mpc)
+    act(reach, 0)
+    end = reach.step(look(0, **changes))
+    assert isinstance(end, End) and end.outcome == 'aborted' and words in end.message
+    assert isinstance(reach.step(look(1)), Command)
+
+
+def test_names_in_another_order_are_the_same_scene(mpc):
+    reach = begun(mpc)
+    assert isinstance(reach.step(look(1, names=('b', 'a'))), Command)
