@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What came of late, in bounded memory."""
 
-from collections import deque
-
 import numpy as np
 
 
@@ -17,17 +15,21 @@ class Window:
 
     def __init__(self, seconds, limit):
         self._seconds = seconds
-        self._items = deque(maxlen=limit)
+        self._times, self._values = np.empty(limit), np.empty(limit)  # rings: fast to summarise
+        self._count = 0
 
     def add(self, now, value=0.0):
         """Add a number that came at `now`, in seconds of a clock that never goes back."""
-        self._items.append((now, value))
+        place = self._count % len(self._times)
+        self._times[place], self._values[place] = now, value
+        self._count += 1
 
     def newest(self, now):
         """Return times and values, each float64 (N,), oldest first."""
-        while self._items and now - self._items[0][0] > self._seconds:
-            self._items.popleft()
-        return np.array(self._items, np.float64).reshape(-1, 2).T
+        limit = len(self._times)
+        places = np.arange(max(self._count - limit, 0), self._count) % limit
+        places = places[np.searchsorted(self._times[places], now - self._seconds):]
+        return self._times[places], self._values[places]
 
 
 def rate(times):
