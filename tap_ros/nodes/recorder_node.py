@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 from importlib import import_module
+import math
 from pathlib import Path
 import sys
 import time
@@ -16,6 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.recording import topics
@@ -28,6 +30,8 @@ TYPES = {
     'subgoal/image': 'sensor_msgs/msg/Image',
     'subgoal/overlay': 'sensor_msgs/msg/Image'}
 LATCHED = ('goal/image', 'goal/objects', 'subgoal', 'subgoal/image', 'subgoal/overlay')
+PERIODIC = ('camera/image_raw', 'camera/camera_info', 'objects', 'joint_states')
+MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls it stale
 WRITE_ERRORS = (OSError, McapError, RecordingError)
 
 
@@ -58,6 +62,8 @@ class RecorderNode(Node):
         self._wanted = list(self.params['topics'])
         if not self._wanted:
             raise ConfigError('parameter topics: is empty; name at least one topic')
+        self._diagnostics = Diagnostics(self, {
+            name: MAX_AGE if name.lstrip('/') in PERIODIC else math.inf for name in self._wanted})
         if self.params['record_on_start']:
             self._start()
         self._subscribe_known()
@@ -96,6 +102,7 @@ class RecorderNode(Node):
         except WRITE_ERRORS as error:
             text = f'{writer.folder}: the bag could not be finished: {error}'
             self.get_logger().error(text)
+            self._diagnostics.error(text)
             return text
         text = f'{self._count} messages in {writer.folder}'
         self.get_logger().info(f'recorded {text}')
@@ -113,6 +120,7 @@ class RecorderNode(Node):
     def _give_up(self, error):
         """Stop recording after a failed write."""
         folder, self._writer = self._writer.folder, None
+        self._diagnostics.error(f'{folder}: {error}')
         self.get_logger().error(
             f'{folder}: cannot be written ({error}); recording has stopped after {self._count} '
             'messages, those flushed before stay readable. Make room, then call recorder/record '
@@ -164,6 +172,7 @@ class RecorderNode(Node):
         self._sources[topic] = Source(type_name, qos, subscription)
 
     def _on_message(self, topic, data, info):
+        self._diagnostics.received(topic)
         source = self._sources[topic]
         latched = source.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         qos = topics.Qos(

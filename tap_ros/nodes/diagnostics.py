@@ -1,0 +1,148 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How a node is, once a second on /diagnostics, where rqt and Foxglove look for it."""
+
+from dataclasses import dataclass, field
+import math
+import threading
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from tap_ros.nodes.windows import percentiles, rate, Window
+from tap_ros.text import escaped
+
+PERIOD = 1.0  # s
+RATE_SECONDS = 10.0  # over which rates are taken, of RATE_LIMIT messages at most
+RATE_LIMIT = 100
+WORK_SECONDS = 60.0  # over which percentiles are taken, of WORK_LIMIT durations at most
+WORK_LIMIT = 10_000
+ERROR_SECONDS = 10.0  # that the level is ERROR after an error
+
+
+@dataclass
+class Input:
+    """What is known of a topic; times in seconds of the monotonic clock."""
+
+    max_age_s: float
+    count: int = 0
+    newest: float = -math.inf
+    arrivals: Window = field(default_factory=lambda: Window(RATE_SECONDS, RATE_LIMIT))
+
+
+@dataclass
+class Work:
+    """What is known of one kind of work."""
+
+    count: int = 0
+    durations: Window = field(default_factory=lambda: Window(WORK_SECONDS, WORK_LIMIT))
+
+
+class Diagnostics:
+    """
+    Publishes the state of a node's work and inputs; its methods may be called from any thread.
+
+    Of the work: WARN never, ERROR for some seconds after an error, else OK. Of each input:
+    NotReceived (WARN), Stale (STALE) when its newest message is older than its `max_age_s`, or OK.
+
+    :param node: rclpy Node.
+    :param inputs: {topic: max_age_s}; names as the node subscribes to them; math.inf for topics
+        on which nothing may come for long.
+    :param queue: called without arguments, returns how many requests wait; None for no queue.
+    """
+
+    def __init__(self, node, inputs, queue=None):
+        self._node = node
+        self._queue = queue
+        self._lock = threading.Lock()
+        self._inputs = {node.resolve_topic_name(topic): Input(max_age_s)
+                        for topic, max_age_s in inputs.items()}
+        self._by_name = self._inputs | {
+            topic: self._inputs[node.resolve_topic_name(topic)] for topic in inputs}
+        self._work = {}  # what -> Work
+        self._errors, self._last_error, self._error_time = 0, '', -math.inf
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        # Its own group: it goes on while the node works, where there are threads enough.
+        node.create_timer(PERIOD, self._publish, MutuallyExclusiveCallbackGroup(),
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def received(self, topic):
+        """
+        Note a message.
+
+        :param topic: one of the inputs, by the name given or by the resolved one.
+        """
+        now = time.monotonic()
+        with self._lock:
+            source = self._by_name[topic]
+            source.count += 1
+            source.newest = now
+            source.arrivals.add(now)
+
+    def took(self, ms, what):
+        """
+        Note how long a piece of work took.
+
+        :param ms: milliseconds.
+        :param what: name of this kind of work, for example 'predict_subgoal'.
+        """
+        now = time.monotonic()
+        with self._lock:
+            work = self._work.setdefault(what, Work())
+            work.count += 1
+            work.durations.add(now, ms)
+
+    def error(self, text):
+        """
+        Note what went wrong.
+
+        :param text: the error or its text; shown in one line.
+        """
+        with self._lock:
+            self._errors += 1
+            self._last_error, self._error_time = escaped(text), time.monotonic()
+
+    def _publish(self):
+        queue = None if self._queue is None else self._queue()  # it may take locks of its own
+        now = time.monotonic()
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        with self._lock:
+            message.status.append(self._describe_work(queue, now))
+            for topic, source in self._inputs.items():
+                message.status.append(self._describe_input(topic, source, now))
+        self._publisher.publish(message)
+
+    def _describe_work(self, queue, now):
+        values = {} if queue is None else {'queue': queue}
+        for what, work in self._work.items():
+            p50, p99 = percentiles(work.durations.newest(now)[1])
+            values |= {f'{what} calls': work.count,
+                       f'{what} p50_ms': f'{p50:.2f}', f'{what} p99_ms': f'{p99:.2f}'}
+        values['errors'] = self._errors
+        if self._errors:
+            age = now - self._error_time
+            values |= {'last_error': self._last_error, 'last_error_age_s': f'{age:.1f}'}
+            if age < ERROR_SECONDS:
+                return self._status(
+                    'service', DiagnosticStatus.ERROR, self._last_error, values)
+        return self._status('service', DiagnosticStatus.OK, 'OK', values)
+
+    def _describe_input(self, topic, source, now):
+        age = now - source.newest
+        if not source.count:
+            level, status, age = DiagnosticStatus.WARN, 'NotReceived', math.nan
+        elif age > source.max_age_s:
+            level, status = DiagnosticStatus.STALE, 'Stale'
+        else:
+            level, status = DiagnosticStatus.OK, 'OK'
+        return self._status(topic, level, status, {
+            'status': status, 'age_s': f'{age:.3f}', 'max_age_s': f'{source.max_age_s:g}',
+            'rate_hz': f'{rate(source.arrivals.newest(now)[0]):.2f}', 'count': source.count})
+
+    def _status(self, name, level, text, values):
+        return DiagnosticStatus(
+            name=f'{self._node.get_name()}: {name}', level=level, message=text,
+            hardware_id=self._node.get_fully_qualified_name(),
+            values=[KeyValue(key=key, value=str(value)) for key, value in values.items()])
