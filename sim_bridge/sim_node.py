@@ -19,6 +19,7 @@ from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
 from tap_ros.errors import TapError
+from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
 from tap_ros.nodes.parameters import Parameters
@@ -67,6 +68,8 @@ class SimNode(Node):
         self._num_steps = 0
         self._in_episode = False
         self._paused = False
+        self._diagnostics = Diagnostics(
+            self, {'arm/delta_twist_cmds': math.inf, 'gripper/command': math.inf})
         self._create_publishers()
         # Subscribed before the twist, so that of two commands sent together it is taken first.
         self.create_subscription(Float64, 'gripper/command', self._on_gripper, STREAM)
@@ -107,6 +110,7 @@ class SimNode(Node):
     # Commands
 
     def _on_gripper(self, message):
+        self._diagnostics.received('gripper/command')
         if not math.isfinite(message.data):
             self.get_logger().warning(
                 f'gripper/command ignored: data is {message.data}; expected a number from '
@@ -115,6 +119,7 @@ class SimNode(Node):
         self._opening = min(max(message.data, 0.0), 1.0)
 
     def _on_twist(self, message):
+        self._diagnostics.received('arm/delta_twist_cmds')
         stamp_ns = to_nanoseconds(message.header.stamp)
         move = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
         if stamp_ns == 0 and not move.any():
@@ -123,6 +128,7 @@ class SimNode(Node):
         reason = self._refuse_twist(message.twist, move, stamp_ns)
         if reason:
             self.get_logger().warning(f'arm/delta_twist_cmds ignored: {reason}')
+            self._diagnostics.error(f'arm/delta_twist_cmds ignored: {reason}')
             self._refused.publish(CommandRefused(header=message.header, message=reason))
             return
         if (np.abs(move) > ACTION_LIMIT).any():
@@ -133,7 +139,8 @@ class SimNode(Node):
         if self.params['lock_step']:
             self._step(move)
         else:
-            self._twist, self._valid_until = move, time.monotonic() + self._timeout
+            self._twist = move
+            self._valid_until = time.monotonic() + self._timeout / self.params['real_time_factor']
 
     def _on_timeout(self, message):
         if not 0 < message.data <= MAX_TIMEOUT:
@@ -230,7 +237,9 @@ class SimNode(Node):
 
     def _step(self, move):
         """Let one control period pass and publish what the camera then sees."""
+        begin = time.perf_counter()
         observation = self._sim.step(np.append(move, self._opening))
+        self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'step')
         self._stamp_ns += self._period_ns()
         self._num_steps += 1
         self._publish(observation)
@@ -292,8 +301,9 @@ def declare_parameters(node):
     parameters.declare('real_time_factor', 1.0,
                        'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
     parameters.declare('command_timeout', 1.0,
-                       'Seconds that a command is valid, unless its sender says otherwise on '
-                       'arm/command_timeout; then the arm stands still.', low=0.001, high=60.0)
+                       'Simulated seconds that a command is valid after it came; then the arm '
+                       'stands still. Its sender may say otherwise on arm/command_timeout.',
+                       low=0.001, high=60.0)
     parameters.declare('hide_arm_in_goal', False,
                        'Leave the arm out of the goal picture, from the next reset on.',
                        read_only=False)

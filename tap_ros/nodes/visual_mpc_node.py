@@ -3,7 +3,7 @@
 """Serves reach_goal: drives planning.reach by what is seen, and sends its commands."""
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+import math
 import sys
 import threading
 import time
@@ -12,50 +12,36 @@ import traceback
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from sensor_msgs.msg import Image, JointState
 from tap_msgs.action import ReachGoal
-from tap_msgs.msg import CommandRefused, Episode, ObjectStates
+from tap_msgs.msg import CommandRefused
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import PlanningError, TapError
 from tap_ros.nodes.arm import Arm
 from tap_ros.nodes.clients import call, CallError
+from tap_ros.nodes.diagnostics import Diagnostics
+from tap_ros.nodes.goal_source import GoalSource, needed_topics
+from tap_ros.nodes.goal_source import TOPICS as GOAL
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.image_messages import decode_image, is_empty
-from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
-from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.planner_setup import (
     check_request,
     declare_parameters,
     load_planner,
 )
 from tap_ros.nodes.run import run_node
+from tap_ros.nodes.sight import Sight
+from tap_ros.nodes.sight import TOPICS as SENSORS
 from tap_ros.nodes.subgoal_messages import decode_subgoals
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import STREAM, to_nanoseconds
 from tap_ros.planning.hierarchy import choose_sample, targets_by
-from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig, Seen
+from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig
 from tap_ros.text import escaped
 
-SENSORS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
-           'joints': (JointState, 'joint_states')}
-GOAL = {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}
+STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
 
 
 class Cancelled(TapError):
     """The goal was cancelled, or the node is ending."""
-
-
-@dataclass
-class Task:
-    """A goal in progress, and what it was begun with."""
-
-    handle: object
-    accepted: float  # monotonic time
-    mode: str = ''
-    goal: dict = field(default_factory=dict)  # messages: image, objects
-    goal_stamp: int | None = None  # of the goal that came by topic, in ns
-    num_subgoals: int = 0
-    seen: Seen | None = None  # the newest that was decoded
-    messages: dict = field(default_factory=dict)  # that it was decoded from
 
 
 class VisualMpcNode(Node):
@@ -73,15 +59,16 @@ class VisualMpcNode(Node):
         self._cancelled = None  # the goal that was cancelled last
         self._busy = threading.Lock()  # held from the acceptance of a goal to its end
         self._accepted = 0.0
-        self._scene_ns = 0  # stamp of the newest mark that an episode begins
         self._refusals = deque(maxlen=10)
-        self._goal = Observations(*GOAL, latched=True)
-        self._goal.subscribe(self, GOAL, LATCHED)
-        self._sensors = Observations(*SENSORS)
-        self.create_subscription(Episode, 'episode', self._on_episode, STREAM)
-        self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM)
-        self._sensors.subscribe(self, SENSORS, STREAM)
+        self._diagnostics = Diagnostics(self, {
+            **dict.fromkeys((name for _, name in SENSORS.values()), STALE_S),
+            **dict.fromkeys((name for _, name in GOAL.values()), math.inf)})
+        heard = self._diagnostics.received
+        self._goal = GoalSource(self, heard)
+        self._sight = Sight(self, self.params, self._mpc.image_size, heard)
+        self._sensors = self._sight.sensors
         self._arm = Arm(self, self.params, self._sensors)
+        self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM)
         group = ReentrantCallbackGroup()  # answers and cancels arrive while a goal is executed
         self._predict = self.create_client(
             PredictSubgoal, 'predict_subgoal', callback_group=group)
@@ -116,11 +103,6 @@ class VisualMpcNode(Node):
         self._sensors.wake()
         return CancelResponse.ACCEPT
 
-    def _on_episode(self, message):
-        if message.event == Episode.START:
-            self._scene_ns = to_nanoseconds(message.header.stamp)
-            self._sensors.wake()
-
     def _on_refused(self, message):
         self._refusals.append((to_nanoseconds(message.header.stamp), escaped(message.message)))
         self._sensors.wake()
@@ -128,10 +110,9 @@ class VisualMpcNode(Node):
     def _execute(self, handle):
         """Run a goal to its end; runs in a thread of the executor."""
         result = ReachGoal.Result()
-        task = Task(handle, self._accepted)
         self._arm.begin(handle)
         try:
-            self._reach(task, result)
+            self._reach(handle, result)
             handle.succeed()
         except Cancelled as error:
             result.message = str(error)
@@ -141,8 +122,10 @@ class VisualMpcNode(Node):
                 handle.abort()
         except TapError as error:
             result.message = str(error)
+            self._diagnostics.error(error)
             handle.abort()
         except Exception as error:
+            self._diagnostics.error(error)
             result.message = f'internal error: {type(error).__name__}: {escaped(error)}'
             self.get_logger().error(traceback.format_exc())
             handle.abort()
@@ -155,50 +138,51 @@ class VisualMpcNode(Node):
 
     # One goal
 
-    def _reach(self, task, result):
+    def _reach(self, handle, result):
         """Show the loop what is seen, and do what it answers, filling the result."""
-        request, handle = task.handle.request, task.handle
-        task.mode = check_request(request)
+        request, accepted = handle.request, self._accepted
+        mode = check_request(request)
+        self._goal.begin(needed_topics(request, mode))
+        self._sight.begin(accepted)
         self._mpc.limit(self.params['max_step_xy'], self.params['max_step_z'])
         self._refusals.clear()
-        reach = None
+        config, num_subgoals = self._config(request), 0
+        reach = Reach(self._mpc, config, request.seed, accepted)
         while True:
             self._go_on(handle)
             count = self._sensors.count
             while self._refusals:
-                if reach is not None and reach.refused(*self._refusals.popleft()):
-                    result.steps = reach.steps
-            topics = self._topics(reach)
-            seen, lacking = self._look(task, topics)
-            if reach is None:
-                if seen is not None and not seen.names:
-                    raise PlanningError('objects: none are seen, so there is nothing to push; '
-                                        'publish their pixels')
-                reach = Reach(self._mpc, self._reach_config(request), request.seed, task.accepted)
-            if self._goal_changed(task, reach):
-                reach = None
-                continue
+                reach.refused(*self._refusals.popleft())
+            # Objects that are carried need to be seen once only.
+            topics = (('image', 'joints') if config.tracking == 'carried' and reach.aimed
+                      else tuple(SENSORS))
+            seen, lacking = self._sight.look(topics)
+            if self._goal.changed(accepted):
+                reach = Reach(self._mpc, config, request.seed, accepted)
             answer = reach.step(seen, time.monotonic(), lacking)
-            result.expected_distance = reach.distance
+            result.steps, result.expected_distance = reach.steps, reach.distance
             if isinstance(answer, End):
-                result.success = answer.outcome == 'reached'
-                result.message = answer.message
                 if answer.outcome == 'aborted':
                     raise PlanningError(answer.message)
+                result.success, result.message = answer.outcome == 'reached', answer.message
                 return
             if isinstance(answer, Aim):
-                reach.head_for(self._aim(task, seen), time.monotonic())
-            elif isinstance(answer, Command) and self._send(task, answer, topics):
-                reach.sent(self._effect_after(task))
+                targets = self._aim(handle, mode, seen)
+                num_subgoals = len(targets) - 1
+                reach.head_for(targets, time.monotonic())
+            elif isinstance(answer, Command) and self._send(handle, answer, topics):
+                reach.sent(self._sight.newest_stamp()
+                           + int(0.9e9 * self.params['control_period']))
                 result.steps = reach.steps
+                self._diagnostics.took(answer.plan.planning_ms, 'plan')
                 handle.publish_feedback(ReachGoal.Feedback(
-                    step=reach.steps, stage=stage_name(answer.stage, task.num_subgoals),
+                    step=reach.steps, stage=stage_name(answer.stage, num_subgoals),
                     expected_distance=float(answer.plan.expected_distance),
                     planning_ms=float(answer.plan.planning_ms)))
             else:
                 self._sensors.wait_for_change(0.1, count)
 
-    def _reach_config(self, request):
+    def _config(self, request):
         """Return the settings of a goal."""
         params = self.params
         return ReachConfig(request.step_budget, params['switch'], params['goal_tolerance'],
@@ -211,154 +195,53 @@ class VisualMpcNode(Node):
         if self._cancelled_or_ending(handle):
             raise Cancelled('cancelled' if self._cancelled is handle else 'the node is ending')
 
-    # What is seen
-
-    def _topics(self, reach):
-        """Return the sensors that are needed now: carried objects need to be seen once only."""
-        if reach is not None and self.params['tracking'] == 'carried' and reach.aimed:
-            return 'image', 'joints'
-        return tuple(SENSORS)
-
-    def _look(self, task, topics):
-        """
-        Return what was seen last since the goal was accepted, as Seen, or None and why.
-
-        :raises TapError: for messages that cannot be used.
-        """
-        moment = self._sensors.moment(topics, since=task.accepted)
-        if moment is None:
-            return None, self._lacking(topics, task.accepted)
-        times = {'received': moment.received, 'scene_ns': self._scene_ns,
-                 'jumps': self._sensors.jumps}
-        if task.seen is not None and (task.seen.stamp_ns, task.seen.jumps) == (
-                moment.stamp_ns, self._sensors.jumps):
-            task.seen = replace(task.seen, **times)
-            return task.seen, ''
-        size = self._mpc.image_size
-        names, pixels = task.seen.names if task.seen else (), None
-        if 'objects' in topics:
-            names, pixels = decode_objects(moment.messages['objects'], 'objects', size)
-            if task.seen is not None and set(names) == set(task.seen.names):
-                pixels = match_objects(
-                    task.seen.names, names, pixels, 'the first objects', 'objects')
-                names = task.seen.names
-        image = decode_image(moment.messages['image'], 'camera/image_raw', size)
-        gripper = decode_gripper(moment.messages['joints'])
-        task.seen = Seen(image, gripper, names, pixels, moment.stamp_ns, **times)
-        task.messages = moment.messages
-        return task.seen, ''
-
-    def _lacking(self, topics, since):
-        """Say why nothing can be seen."""
-        missing = self._sensors.missing(topics)
-        if missing:
-            return f'nothing has come on {self._names(missing)}'
-        now = time.monotonic()
-        ages = self._sensors.ages(topics, now)
-        silent = [topic for topic in topics if ages[topic] > min(
-            now - since, self.params['max_silence'])]
-        if silent:
-            return f'nothing new has come on {self._names(silent)}'
-        return f'no new messages of the same stamp on {self._names(topics)}'
-
-    def _names(self, topics):
-        return ', '.join(self.resolve_topic_name(SENSORS[topic][1]) for topic in topics)
-
     # Where to go
 
-    def _aim(self, task, seen):
+    def _aim(self, handle, mode, seen):
         """Return the Targets of a goal, asking for subgoals if it is to go by any."""
-        request = task.handle.request
-        self._find_goal(task)
-        names, pixels = decode_objects(task.goal['objects'], 'goal_objects', self._mpc.image_size)
+        if not seen.names:
+            raise PlanningError('objects: none are seen, so there is nothing to push; publish '
+                                'their pixels')
+        request = handle.request
+        goal = self._goal.take(request, self.params['image_timeout'],
+                               lambda: self._cancelled_or_ending(handle))
+        self._go_on(handle)
+        names, pixels = decode_objects(goal['objects'], 'goal_objects', self._mpc.image_size)
         goal_pixels = match_objects(seen.names, names, pixels, 'objects', 'goal_objects')
         subgoals = []
-        if task.mode == 'subgoal':
+        if mode == 'subgoal':
+            found = self._ask_for_subgoals(handle, goal, seen.names)
             subgoals = choose_sample(
-                self._mpc, seen.image, seen.gripper, seen.pixels, goal_pixels,
-                self._ask_for_subgoals(task, seen), request.seed,
-                lambda: self._go_on(task.handle))
-        task.num_subgoals = len(subgoals)
+                self._mpc, seen.image, seen.gripper, seen.pixels, goal_pixels, found,
+                request.seed, lambda: self._go_on(handle))
         return targets_by(subgoals, goal_pixels)
 
-    def _needed(self, task):
-        """Return what of the goal has to come by topic."""
-        request = task.handle.request
-        return [topic for topic, empty in (
-            ('image', task.mode == 'subgoal' and is_empty(request.goal_image)),
-            ('objects', not request.goal_objects.objects)) if empty]
-
-    def _find_goal(self, task):
-        """Take the goal's picture and objects from the request, or from their topics."""
-        request, needed = task.handle.request, self._needed(task)
-        task.goal = {'image': request.goal_image, 'objects': request.goal_objects}
-        if not needed:
-            return
-        found = self._goal.wait(needed, self.params['image_timeout'],
-                                give_up=lambda: self._cancelled_or_ending(task.handle))
-        self._go_on(task.handle)
-        if found is None:
-            missing = self._goal.missing(needed) or needed
-            names = [self.resolve_topic_name(GOAL[topic][1]) for topic in missing]
-            raise PlanningError(
-                f'goal: nothing has come on {", ".join(names)}; publish there (the simulator does '
-                'at sim/reset), or send goal_image and goal_objects along')
-        task.goal.update({topic: found[topic] for topic in needed})
-        task.goal_stamp = to_nanoseconds(found[needed[0]].header.stamp)
-
-    def _goal_changed(self, task, reach):
-        """
-        Tell whether to aim again, at a goal that had come when this one was accepted.
-
-        :raises PlanningError: if another one has come since then.
-        """
-        if task.goal_stamp is None:
-            return False
-        needed = self._needed(task)
-        newest = self._goal.moment(needed)
-        if newest is None or newest.stamp_ns == task.goal_stamp:
-            return False
-        if newest.received > task.accepted or reach.steps:
-            names = ', '.join(self.resolve_topic_name(GOAL[topic][1]) for topic in needed)
-            raise PlanningError(f'the scene has changed: a new goal has come on {names}')
-        task.goal_stamp = None
-        return True
-
-    def _ask_for_subgoals(self, task, seen):
-        """Return the Subgoals of all samples, their objects in the order of those seen."""
-        wanted = task.handle.request
+    def _ask_for_subgoals(self, handle, goal, names):
+        """Return the Subgoals of all samples, their objects in the order of `names`."""
+        wanted, seen = handle.request, self._sight.messages
         request = PredictSubgoal.Request(
-            start=task.messages['image'], goal=task.goal['image'],
-            start_objects=task.messages['objects'], goal_objects=task.goal['objects'],
+            start=seen['image'], goal=goal['image'],
+            start_objects=seen['objects'], goal_objects=goal['objects'],
             num_samples=wanted.num_samples, recursion_depth=wanted.recursion_depth,
             seed=wanted.seed)
+        begin = time.perf_counter()
         try:
             response = call(
                 self._predict, request, self.params['predictor_timeout'],
-                lambda: self._cancelled_or_ending(task.handle), self._predictor)
+                lambda: self._cancelled_or_ending(handle), self._predictor)
         except CallError:
-            self._go_on(task.handle)
+            self._go_on(handle)
             raise
+        self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         if not response.success:
             raise PlanningError(f'service {self._predict.service_name}: {response.message}')
-        return decode_subgoals(response, seen.names, self._mpc.image_size)
+        return decode_subgoals(response, names, self._mpc.image_size)
 
-    # Commands
-
-    def _send(self, task, command, topics):
+    def _send(self, handle, command, topics):
         """Send a command, unless the goal has ended or the sensors are silent; tell whether."""
-        self._go_on(task.handle)
-        return self._arm.send(task.handle, command.plan.action,
-                              task.messages['image'].header.stamp, topics)
-
-    def _effect_after(self, task):
-        """
-        Return from which stamp on pictures show what was just sent, in ns.
-
-        Later than the newest image that had already come, and with one control period between.
-        """
-        newest = (self._sensors.newest('image') or task.messages)['image']
-        return to_nanoseconds(newest.header.stamp) + int(0.9e9 * self.params['control_period'])
+        self._go_on(handle)
+        stamp = self._sight.messages['image'].header.stamp
+        return self._arm.send(handle, command.plan.action, stamp, topics)
 
 
 def cancel_is_known(handle, seconds=1.0):

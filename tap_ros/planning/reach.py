@@ -137,7 +137,7 @@ class Reach:
 
         :param seen: Seen, or None when nothing is.
         :param now: s, on the clock of Seen.received.
-        :param lacking: why nothing is seen, for the message.
+        :param lacking: why nothing is seen, or nothing new, for the message.
         :return: Aim, Command, Wait or End.
         :raises PlanningError: for what cannot be planned with.
         """
@@ -151,13 +151,11 @@ class Reach:
             if silence <= self._config.timeout:
                 return Wait(reason)
             return End('aborted', f'no observation for {silence:.1f} s: {reason}')
+        if self._planned is not None and self._planned.seen.stamp_ns == seen.stamp_ns:
+            return self._planned
         self._usable_at = now
         self._first = self._first or seen
-        if self._targets is None:
-            return Aim(seen)
-        if self._planned is None or self._planned.seen.stamp_ns != seen.stamp_ns:
-            return self._plan(seen)
-        return self._planned
+        return Aim(seen) if self._targets is None else self._plan(seen)
 
     def head_for(self, targets, now=0.0):
         """
@@ -214,12 +212,12 @@ class Reach:
             return lacking or 'nothing is seen'
         if seen.stamp_ns <= self._after_ns:
             return (f'the last command was refused: {self._refusal}' if self._refusal
-                    else 'no new picture since the last command')
+                    else lacking or 'no new picture since the last command')
         if seen.stamp_ns < seen.scene_ns:
             return 'the picture is of an old scene'
         age = now - seen.received
         if age > self._config.max_age:
-            return f'what was seen is {age:.1f} s old'
+            return f'what was seen is {age:.1f} s old' + (f': {lacking}' if lacking else '')
         return ''
 
     def _plan(self, seen):

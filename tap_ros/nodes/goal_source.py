@@ -1,0 +1,76 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The goal of a reach_goal request: what it sends along, else what came by topic."""
+
+from sensor_msgs.msg import Image
+from tap_msgs.msg import ObjectStates
+from tap_ros.errors import PlanningError
+from tap_ros.nodes.image_messages import is_empty
+from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.topics import LATCHED, to_nanoseconds
+
+TOPICS = {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}
+
+
+class GoalSource:
+    """
+    Goal picture and goal objects, for one request at a time.
+
+    :param node: rclpy Node.
+    :param on_message: called with the topic name after each message.
+    """
+
+    def __init__(self, node, on_message):
+        self._node = node
+        self._newest = Observations(*TOPICS, latched=True)
+        self._newest.subscribe(node, TOPICS, LATCHED, on_message=on_message)
+        self.begin(())
+
+    def begin(self, needed):
+        """Begin a request that takes these of TOPICS from their topics."""
+        self._needed, self._stamp = tuple(needed), None
+
+    def take(self, request, timeout_s, give_up):
+        """
+        Return the goal as {'image': message, 'objects': message}.
+
+        :param request: ReachGoal goal.
+        :param timeout_s: most seconds to wait; give_up: asked whether to stop waiting.
+        :raises PlanningError: when nothing comes.
+        """
+        goal = {'image': request.goal_image, 'objects': request.goal_objects}
+        if not self._needed:
+            return goal
+        found = self._newest.wait(self._needed, timeout_s, give_up=give_up)
+        if found is None:
+            missing = self._newest.missing(self._needed) or self._needed
+            raise PlanningError(
+                f'goal: nothing has come on {self._names(missing)}; publish there (the simulator '
+                'does at sim/reset), or send goal_image and goal_objects along')
+        self._stamp = to_nanoseconds(found[self._needed[0]].header.stamp)
+        return goal | {topic: found[topic] for topic in self._needed}
+
+    def changed(self, since):
+        """
+        Tell whether take would return another goal now, which had come before.
+
+        :param since: monotonic time at which the request was accepted.
+        :raises PlanningError: if the other goal has come since then.
+        """
+        newest = self._newest.moment(self._needed) if self._stamp is not None else None
+        if newest is None or newest.stamp_ns == self._stamp:
+            return False
+        if newest.received > since:
+            raise PlanningError('the scene has changed: a new goal has come on '
+                                f'{self._names(self._needed)}')
+        return True
+
+    def _names(self, topics):
+        return ', '.join(self._node.resolve_topic_name(TOPICS[topic][1]) for topic in topics)
+
+
+def needed_topics(request, mode):
+    """Return those of TOPICS that a request leaves to them."""
+    return [topic for topic, empty in (
+        ('image', mode == 'subgoal' and is_empty(request.goal_image)),
+        ('objects', not request.goal_objects.objects)) if empty]
