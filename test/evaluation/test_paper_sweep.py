@@ -20,13 +20,13 @@ from tap_ros.evaluation.paper.job import BUSY, DONE, perform, UNFINISHED
 from tap_ros.evaluation.paper.places import (
     collect_command,
     is_collected,
-    locked,
     Places,
     recording_hash,
 )
 from tap_ros.evaluation.paper.runs import paper_runs, PaperRun
 from tap_ros.evaluation.paper.shipping import ship
 from tap_ros.evaluation.paper.sweep import find_state, sweep
+from tap_ros.files import locked
 from tap_ros.prediction.batches import split_episodes
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
@@ -149,7 +149,7 @@ def test_a_training_goes_on_where_it_stopped(places):
 
 def test_nobody_trains_what_another_process_is_at(places):
     holder = subprocess.Popen(
-        [sys.executable, '-c', 'import sys; from tap_ros.evaluation.paper.places import locked\n'
+        [sys.executable, '-c', 'import sys; from tap_ros.files import locked\n'
          f'with locked({str(RUN.folder(places.runs) / "lock")!r}) as mine:\n'
          '    print(mine, flush=True); sys.stdin.read()'],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of weights files, and what is said about files that are none."""
 
-from dataclasses import asdict
 import json
 import os
 from pathlib import Path
@@ -246,7 +245,7 @@ def test_a_file_without_sha_256_is_refused_with_the_remedy(path):
     tensors, about = load_tensors(path)
     metadata = {'format': 'tap_ros 1', 'about': json.dumps(about)}
     save_file(tensors, path, metadata)
-    assert "format tap_ros 1, not by tap_ros 2" in (text := refusal(load_network, path))
+    assert 'format tap_ros 1, not by tap_ros 2' in (text := refusal(load_network, path))
     assert 'train again' in text
     save_file(tensors, path, metadata | {'format': 'tap_ros 2'})
     refusal(load_network, path)
