@@ -166,15 +166,15 @@ def test_the_hash_is_that_of_the_opened_recording(places):
     assert recording_hash(places.recording('push2')) == store.data_hash
 
 
-def test_a_recording_is_complete_when_all_its_files_are_there(places):
+def test_a_recording_is_complete_when_all_its_episodes_are_there(places):
     folder = places.recording('push2')
     assert is_collected(folder, 10 ** 6)  # not made by collect: taken as it is
-    settings = {'task': 'push2', 'episodes': 50, 'episodes_per_file': 50, 'seed': 3}
+    settings = {'task': 'push2', 'episodes': EPISODES, 'episodes_per_file': 50, 'seed': 3}
     (folder / 'collection.json').write_text(json.dumps(settings))
-    assert is_collected(folder, 50) and not is_collected(folder, 51)
-    assert collect_command(folder).endswith(f'--out {folder} --episodes 50 --seed 3')
-    (folder / 'collection.json').write_text(json.dumps(settings | {'episodes': 51}))
-    assert not is_collected(folder, 50)
+    assert is_collected(folder, EPISODES) and not is_collected(folder, EPISODES + 1)
+    assert collect_command(folder).endswith(f'--out {folder} --episodes {EPISODES} --seed 3')
+    (folder / 'collection.json').write_text(json.dumps(settings | {'episodes': EPISODES + 1}))
+    assert not is_collected(folder, EPISODES)
     assert not is_collected(places.recording('grasp'), 1)
 
 
