@@ -9,11 +9,14 @@ collection goes on with the files that are not there yet.
 """
 
 from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 import json
 import multiprocessing
+from multiprocessing import connection
 import os
 from pathlib import Path
+import threading
 import time
 
 import numpy as np
@@ -21,9 +24,11 @@ from sim_bridge.expert import ExpertConfig, run_episode
 from sim_bridge.grasp_expert import GraspConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task, TASKS
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.writer import EpisodeWriter, write_metadata
+from tap_ros.recording.writer import count_episodes, EpisodeWriter, write_metadata
+from tap_ros.text import escaped
 from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
@@ -53,16 +58,28 @@ def collect(folder, config, workers=None, progress=True):
     :return: dict of episodes, frames, seconds (wall and by part, summed over workers), success
         rate and mean final distance in metres, of the episodes collected by this call.
     :raises ConfigError: when the folder holds a recording made with other settings.
+    :raises RecordingError: when a worker process was killed.
+    :raises StorageError: when the disk is full, or another process is collecting there. Files
+        that are finished stay.
     """
     default = GraspConfig() if get_task(config.task).gripping else ExpertConfig()
     config = replace(config, expert=config.expert or default)
     if min(config.episodes, config.episodes_per_file, workers or 1) < 1:
         raise ConfigError('episodes, episodes_per_file and workers must be at least 1')
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    _check_settings(folder, config)
+    with only_writer(folder), storage_errors(folder):
+        _check_settings(folder, config)
+        for left in folder.glob('*.part'):  # by a process that was killed
+            left.unlink()
+        result = _collect_missing(folder, config, workers, progress)
+        write_metadata(folder)
+    return result
+
+
+def _collect_missing(folder, config, workers, progress):
+    """Collect the files that are not there yet; see collect."""
     shards = -(-config.episodes // config.episodes_per_file)
-    missing = [i for i in range(shards) if not _shard_path(folder, i).exists()]
+    missing = [i for i in range(shards) if not _is_whole(folder, config, i)]
     workers = min(workers or len(os.sched_getaffinity(0)), max(len(missing), 1))
     context = multiprocessing.get_context('spawn')
     done = context.Value('i', 0)
@@ -77,10 +94,13 @@ def collect(folder, config, workers=None, progress=True):
                 finished, waiting = wait(waiting, timeout=0.5)
                 bar.update(done.value - bar.n)
                 stats += [future.result() for future in finished]
+        except BrokenProcessPool as error:
+            raise RecordingError(
+                f'{escaped(folder)}: a worker process was killed, perhaps for want of memory; '
+                'start again, with fewer --workers: finished files are kept') from error
         except BaseException:
             pool.shutdown(cancel_futures=True)  # finish the files in progress, begin no others
             raise
-    write_metadata(folder)
     return _summary(stats, time.perf_counter() - start)
 
 
@@ -102,7 +122,7 @@ def _check_settings(folder, config):
     path = folder / SETTINGS_FILE
     settings = json.loads(json.dumps(asdict(config)))
     if path.exists():
-        before = json.loads(path.read_text())
+        before = _read_settings(path)
         changed = [k for k in settings if k != 'episodes' and before.get(k) != settings[k]]
         if changed:
             raise ConfigError(
@@ -112,11 +132,28 @@ def _check_settings(folder, config):
             raise ConfigError(
                 f"{folder} is a recording of {before['episodes']} episodes; ask for at least as "
                 'many, or choose another folder')
-        if before['episodes'] % config.episodes_per_file and settings != before:
-            # The last file was not full: it is made anew with its missing episodes.
-            _shard_path(folder, before['episodes'] // config.episodes_per_file).unlink(
-                missing_ok=True)
-    path.write_text(json.dumps(settings, indent=2) + '\n')
+    write_atomically(path, json.dumps(settings, indent=2) + '\n')
+
+
+def _read_settings(path):
+    """Return the settings that a recording was made with."""
+    try:
+        before = json.loads(path.read_text())
+        int(before['episodes'])
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise ConfigError(
+            f'{escaped(path)}: damaged ({escaped(error)}); remove it and give the same settings '
+            'as before, or choose another folder') from error
+    return before
+
+
+def _is_whole(folder, config, shard):
+    """Say whether a file is there with all its episodes; the last may have been of fewer."""
+    path = _shard_path(folder, shard)
+    try:
+        return path.exists() and count_episodes(path) == len(_episodes(config, shard))
+    except RecordingError:  # it is made anew
+        return False
 
 
 def _shard_path(folder, shard):
@@ -131,9 +168,16 @@ def _episodes(config, shard):
 
 
 def _start_worker(done):
-    """Give a worker process the counter of finished episodes."""
+    """Give a worker process the counter of finished episodes; it ends when its parent does."""
     global _done
     _done = done
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent():
+    """Write nothing any more once the process that holds the folder's lock is gone."""
+    connection.wait([multiprocessing.parent_process().sentinel])
+    os._exit(1)
 
 
 def _collect_shard(folder, config, shard):

@@ -10,9 +10,11 @@ no simulator.
 
 import argparse
 import importlib
+import os
 import sys
 
 from tap_ros.errors import TapError
+from tap_ros.text import escaped
 
 COMMANDS = {  # command: (one line of help, module or {what: module})
     'collect': ('simulate the expert and record it', 'sim_bridge.collect'),
@@ -50,6 +52,14 @@ def main(arguments=None):
         return args.run(args) or 0
     except TapError as error:
         print(f'error: {error}', file=sys.stderr)
+        return 1
+    except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush
+        return 1
+    except OSError as error:
+        place = f'{escaped(error.filename)}: ' if error.filename else ''
+        print(f'error: {place}{escaped(error.strerror or error)}; see whether the place is there, '
+              'yours and not full', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print('interrupted', file=sys.stderr)

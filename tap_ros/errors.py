@@ -23,6 +23,10 @@ class RecordingError(TapError):
     """A recording is missing, empty, damaged, or lacks a topic."""
 
 
+class StorageError(TapError):
+    """A file cannot be written: the disk is full or gone, or another process is writing there."""
+
+
 class WeightsError(TapError):
     """A weights file is missing, damaged, or made for something else."""
 

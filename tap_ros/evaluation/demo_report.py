@@ -6,10 +6,10 @@ import base64
 from dataclasses import dataclass
 import html
 import io
-from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
+from tap_ros.files import write_atomically
 from tap_ros.pictures import enlarge, film_strip, grid, overlay, png_bytes
 
 SCALE = 4
@@ -95,7 +95,7 @@ of where every object should then be. Doing nothing ends 20 cm from the goals.</
 <p>{html.escape(note)}</p>
 {body}</html>
 """
-    Path(path).write_text(page, encoding='utf-8')
+    write_atomically(path, page)
 
 
 def write_overview(path, scenes):
@@ -106,7 +106,7 @@ def write_overview(path, scenes):
     :param scenes: list of SceneRuns.
     """
     rows = [[picture for _, picture in _prediction(scene)] for scene in scenes]
-    Path(path).write_bytes(png_bytes(grid(rows)))
+    write_atomically(path, png_bytes(grid(rows)))
 
 
 def _prediction(scene):

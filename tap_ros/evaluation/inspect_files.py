@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from tap_ros.files import write_atomically
 from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.prediction.weights import load_tensors
 from tap_ros.recording.cache import open_recordings
@@ -41,5 +42,5 @@ def run(args):
     print(f'data hash   {store.data_hash}')
     if args.picture:
         strips = [film_strip(e.frames) for e in episodes[:args.episodes]]
-        Path(args.picture).write_bytes(png_bytes(grid(strips, scale=2)))
+        write_atomically(args.picture, png_bytes(grid(strips, scale=2)))
         print(f'picture     {args.picture}')

@@ -24,6 +24,7 @@ from tap_ros.evaluation.bottleneck import (
 )
 from tap_ros.evaluation.intervals import bootstrap, gain_interval, mean_interval
 from tap_ros.evaluation.samples import draw_latents, SAMPLES, score_samples
+from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
 from tap_ros.pictures import grid, overlay
 from tap_ros.prediction.batches import make_batch, split_episodes
@@ -234,10 +235,9 @@ def run(args):
             network, store, episodes, args.margin, args.goal_picture, args.samples), args.samples)
     if args.out:
         folder = Path(args.out)
-        folder.mkdir(parents=True, exist_ok=True)
         about = {'weights': str(args.weights), 'data_hash': store.data_hash,
                  'goal_picture': args.goal_picture, 'margin': args.margin, 'scores': about}
-        (folder / 'scores.json').write_text(json.dumps(about, indent=2) + '\n')
+        write_atomically(folder / 'scores.json', json.dumps(about, indent=2) + '\n')
         write_pictures(folder / 'pictures.png', network, store, episodes[:12], args.goal_picture)
 
 

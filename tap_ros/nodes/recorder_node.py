@@ -9,7 +9,6 @@ from pathlib import Path
 import sys
 import time
 
-from mcap.exceptions import McapError
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -22,6 +21,7 @@ from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.recording import topics
 from tap_ros.recording.writer import BagWriter
+from tap_ros.text import escaped
 
 DEPTH = 100  # messages that may wait while the disk is slow
 TYPES = {
@@ -32,7 +32,7 @@ TYPES = {
 LATCHED = ('goal/image', 'goal/objects', 'subgoal', 'subgoal/image', 'subgoal/overlay')
 PERIODIC = ('camera/image_raw', 'camera/camera_info', 'objects', 'joint_states')
 MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls it stale
-WRITE_ERRORS = (OSError, McapError, RecordingError)
+LONG = 1000  # characters of an answer
 
 
 @dataclass
@@ -55,6 +55,7 @@ class RecorderNode(Node):
         super().__init__('recorder_node')
         self.params = declare_parameters(self)
         self._writer = None
+        self._failure = None  # why what was asked for last is not recorded, or not whole
         self._count = self._unflushed = 0
         self._sources = {}  # resolved topic -> Source
         self._last = {}  # latched topic -> what write_raw takes, for bags that start later
@@ -70,12 +71,13 @@ class RecorderNode(Node):
         self.create_service(SetBool, 'recorder/record', self._on_record)
         self.create_timer(0.5, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(
-            f'ready: recording to {self._writer.folder}' if self._writer
+            f'ready: recording to {escaped(self._writer.folder)}' if self._writer
             else 'ready: call recorder/record with data true to start')
 
     def close(self):
-        """Finish the bag."""
+        """Finish the bag; return the exit code, 1 when the last one is not whole."""
         self._finish()
+        return int(self._failure is not None)
 
     # Bags
 
@@ -83,35 +85,43 @@ class RecorderNode(Node):
         """
         Begin a new bag.
 
-        :raises RecordingError: when it cannot be made.
+        :raises TapError: when it cannot be made, or written to.
         """
+        self._failure = None
         self._writer = BagWriter(
             free_folder(self.params['folder']), compression=self.params['compression'])
         self._count = self._unflushed = 0
         now = time.time_ns()
         for topic, (type_name, data, qos) in self._last.items():
             self._write(topic, type_name, data, now, now, qos)
+        if self._failure is not None:
+            raise RecordingError(self._failure)
 
     def _finish(self):
-        """End the bag; tell what became of it."""
+        """End the bag; return what became of it, for people."""
         if self._writer is None:
-            return 'nothing was being recorded'
+            return self._failure or 'nothing was being recorded'
         writer, self._writer = self._writer, None
         try:
             writer.close()
-        except WRITE_ERRORS as error:
-            text = f'{writer.folder}: the bag could not be finished: {error}'
-            self.get_logger().error(text)
-            self._diagnostics.error(text)
-            return text
-        text = f'{self._count} messages in {writer.folder}'
+        except Exception as error:
+            self._failure = (
+                f'{escaped(writer.folder)}: the bag could not be finished: {escaped(error)}; what '
+                'was flushed before stays readable')
+            self.get_logger().error(self._failure)
+            self._diagnostics.error(self._failure)
+            return self._failure
+        text = f'{self._count} messages in {escaped(writer.folder)}'
         self.get_logger().info(f'recorded {text}')
         return text
 
     def _write(self, topic, type_name, data, log_time_ns, publish_time_ns, qos):
         try:
             self._writer.write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
-        except WRITE_ERRORS as error:
+        except RecordingError as error:  # of this topic alone
+            self._tell(f'{escaped(topic)}: a message was not recorded', error)
+            return
+        except Exception as error:
             self._give_up(error)
             return
         self._count += 1
@@ -119,24 +129,30 @@ class RecorderNode(Node):
 
     def _give_up(self, error):
         """Stop recording after a failed write."""
-        folder, self._writer = self._writer.folder, None
-        self._diagnostics.error(f'{folder}: {error}')
-        self.get_logger().error(
-            f'{folder}: cannot be written ({error}); recording has stopped after {self._count} '
-            'messages, those flushed before stay readable. Make room, then call recorder/record '
-            'with data true: it starts a new folder')
+        if self._writer is None:
+            return
+        writer, self._writer = self._writer, None
+        writer.abandon()
+        self._failure = (
+            f'{escaped(writer.folder)}: cannot be written ({escaped(error)}); recording has '
+            f'stopped after {self._count} messages, those flushed before stay readable. Make '
+            'room, then call recorder/record with data true: it starts a new folder')
+        self.get_logger().error(self._failure)
+        self._diagnostics.error(self._failure)
 
     def _on_record(self, request, response):
         try:
             if not request.data:
                 response.message = self._finish()
-            elif self._writer is None:
-                self._start()
-            if request.data:
-                response.message = f'recording to {self._writer.folder}'
-            response.success = True
-        except WRITE_ERRORS as error:
-            response.message = str(error)
+            else:
+                if self._writer is None:
+                    self._start()
+                response.message = f'recording to {escaped(self._writer.folder)}'
+            response.success = self._failure is None
+        except Exception as error:  # whatever it is, the caller gets an answer
+            self._failure = response.message = escaped(error, LONG)
+            response.success = False
+            self.get_logger().error(f'recorder/record: {self._failure}')
         return response
 
     # Topics
@@ -156,11 +172,14 @@ class RecorderNode(Node):
                     durability=DurabilityPolicy.TRANSIENT_LOCAL
                     if name.lstrip('/') in LATCHED else DurabilityPolicy.VOLATILE))
             except ConfigError as error:
-                self.get_logger().error(f'{topic} is not recorded: {error}')
+                self.get_logger().error(f'{escaped(topic)} is not recorded: {escaped(error)}')
 
     def _subscribe(self, topic, type_name, qos):
         def on_message(data, info):
-            self._on_message(topic, data, info)
+            try:
+                self._on_message(topic, data, info)
+            except Exception as error:  # no message ends the node
+                self._tell(f'{escaped(topic)}: a message was not recorded', error)
 
         def on_mismatch(info):
             self._mismatched.append((topic, info.last_policy_kind))
@@ -188,12 +207,23 @@ class RecorderNode(Node):
                         info['source_timestamp'] or received, qos)
 
     def _on_timer(self):
+        try:
+            self._look_after()
+        except Exception as error:
+            self._tell('the topics could not be looked after', error)
+
+    def _tell(self, what, error):
+        """Log what a callback raised; not each time, for it may come with every message."""
+        self.get_logger().error(
+            f'{what}: {type(error).__name__}: {escaped(error)}', throttle_duration_sec=1.0)
+
+    def _look_after(self):
         """Bring what was written to the disk, and look after topics."""
         if self._writer is not None and self._unflushed:
             self._unflushed = 0
             try:
                 self._writer.flush()
-            except WRITE_ERRORS as error:
+            except Exception as error:
                 self._give_up(error)
         while self._mismatched:  # a publisher offers less than was asked for: ask for less
             topic, policy = self._mismatched.pop()
@@ -203,9 +233,11 @@ class RecorderNode(Node):
             elif policy == QoSPolicyKind.DURABILITY:
                 source.qos.durability, offered = DurabilityPolicy.VOLATILE, 'volatile'
             else:
-                self.get_logger().error(f'{topic}: its publisher offers an unfit {policy.name}')
+                self.get_logger().error(
+                    f'{escaped(topic)}: its publisher offers an unfit {escaped(policy)}')
                 continue
-            self.get_logger().info(f'{topic}: recorded as {offered}, like it is published')
+            self.get_logger().info(
+                f'{escaped(topic)}: recorded as {offered}, like it is published')
             self.destroy_subscription(source.subscription)
             self._subscribe(topic, source.type_name, source.qos)
         if self._wanted:
@@ -241,12 +273,12 @@ def message_class(type_name):
     :param type_name: for example 'sensor_msgs/msg/Image'.
     :raises ConfigError: when its package is not installed.
     """
-    package, _, name = type_name.split('/')
     try:
+        package, _, name = type_name.split('/')
         return getattr(import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(
-            f'message type {type_name} is not installed; source the workspace that has it'
+            f'message type {escaped(type_name)} is not installed; source the workspace that has it'
         ) from error
 
 

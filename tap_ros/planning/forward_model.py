@@ -33,7 +33,7 @@ from tap_ros.planning.table import (
     sample_picture,
     splat_on_table,
 )
-from tap_ros.prediction.weights import load_into, load_weights, make_config
+from tap_ros.prediction.weights import load_weights, make_network
 import torch
 from torch import nn
 
@@ -72,6 +72,18 @@ class ForwardModelConfig:
             raise ConfigError(
                 f'forward model: image_size {self.image_size} must be a multiple of 4 and '
                 f'crop_cells {self.crop_cells} even')
+        for name in ('image_size', 'table_cells', 'window_cells', 'features', 'width', 'blocks',
+                     'encoder_width', 'sprite_size'):
+            if not 1 <= getattr(self, name) <= 1024:
+                raise ConfigError(
+                    f'forward model: {name}: expected 1..1024, got {getattr(self, name)}')
+        if len(self.crop_cells) != 2 or not all(
+                isinstance(n, int) and 2 <= n <= 1024 for n in self.crop_cells):
+            raise ConfigError('forward model: crop_cells: expected 2 whole numbers of 2..1024, '
+                              f'got {self.crop_cells}')
+        if not 2 <= self.window_cells <= self.table_cells:
+            raise ConfigError(f'forward model: window_cells: expected 2..{self.table_cells} '
+                              f'(table_cells), got {self.window_cells}')
 
 
 @dataclass
@@ -351,9 +363,7 @@ def load_forward_model(path, device='cpu', precision='auto'):
     :raises WeightsError: for a missing or damaged file, or one of another kind.
     """
     values, state, _ = load_weights(path, 'forward_model')
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    model = ForwardModel(make_config(ForwardModelConfig, values, path))
-    load_into(model, state, path)
+    model = make_network(ForwardModel, ForwardModelConfig, values, state, path)
     model = model.to(device).eval().requires_grad_(False)
     if precision == 'bfloat16' or (precision == 'auto' and has_bfloat16(device)):
         fields = model.push.fields  # geometry stays exact

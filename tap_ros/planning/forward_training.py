@@ -8,7 +8,6 @@ same result.
 """
 
 from dataclasses import asdict, dataclass
-import json
 import os
 from pathlib import Path
 import platform
@@ -26,6 +25,7 @@ from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.prediction.batches import split_episodes
 from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
 from tap_ros.prediction.pictures import grey_panels
+from tap_ros.prediction.run_folder import describe_run, run_folder
 from tap_ros.prediction.training import learning_rate, pick_device
 from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings
@@ -103,10 +103,20 @@ def train(config, stop_at=None, progress=True):
     :return: path of the weights file.
     :raises ConfigError: if the folder holds a run with other settings or recordings.
     :raises RecordingError: if the recordings cannot be trained on.
+    :raises WeightsError: if the checkpoint is damaged.
+    :raises StorageError: if the disk is full, or another process trains there. What was saved
+        stays; the run goes on from there.
     """
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
     store = open_recordings(list(config.recordings), progress=progress)
+    with run_folder(config.out):
+        _train(config, device, store, stop_at, progress)
+    return str(Path(config.out) / 'forward_model.safetensors')
+
+
+def _train(config, device, store, stop_at, progress):
+    """Train as the only process in the folder; see train."""
     training, held_out = split_episodes(store, config.test_fraction, config.horizon + 1)
     torch.manual_seed(config.seed)
     state = start(
@@ -139,9 +149,9 @@ def train(config, stop_at=None, progress=True):
                 bar.set_postfix(picture=f'{parts["picture"]:.4f}', horizon=len(batch.actions[0]))
             if state.step % config.save_every == 0 or state.step == last:
                 state.seconds = time.monotonic() - began
-                save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+                # The report first: a run that is stopped in between reports again.
                 _report(state, curves, config, store, training, held_out)
-    return str(Path(config.out) / 'forward_model.safetensors')
+                save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
 
 
 def model_config(config, store, training):
@@ -195,9 +205,7 @@ def _report(state, curves, config, store, training, held_out):
         'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
         'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device}',
         'torch': torch.__version__, 'python': platform.python_version()}
-    for name, values in (('config', asdict(config)), ('run', about), ('scores', scores)):
-        path = Path(config.out) / f'{name}.json'
-        path.write_text(json.dumps(values, indent=2) + '\n')
+    describe_run(config.out, config=asdict(config), run=about, scores=scores)
     save_weights(
         Path(config.out) / 'forward_model.safetensors', state.average, 'forward_model',
         state.network.config, about | {'settings': asdict(config), 'scores': scores})

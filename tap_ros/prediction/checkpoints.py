@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, WeightsError
 from tap_ros.prediction.weights import load_tensors, save_tensors
+from tap_ros.text import escaped
 import torch
 
 # Settings that change where a run happens and what it shows, not what it learns.
 FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
+_REMEDY = 'remove it to begin anew, or choose another --out folder'
 
 
 @dataclass
@@ -87,6 +89,7 @@ def save_checkpoint(path, state, settings, data_hash):
     :param state: TrainingState.
     :param settings: dict of the run's settings.
     :param data_hash: of the recordings.
+    :raises StorageError: if the disk is full; the checkpoint before stays.
     """
     tensors = {f'network.{name}': value for name, value in state.network.state_dict().items()}
     tensors |= {f'average.{name}': value for name, value in state.average.state_dict().items()}
@@ -109,20 +112,34 @@ def load_checkpoint(path, state, settings, data_hash, defaults=MappingProxyType(
     :param data_hash: of the recordings.
     :param defaults: dict of what settings were before they existed.
     :raises ConfigError: if the checkpoint is of other settings or other recordings.
-    :raises WeightsError: if it is damaged.
+    :raises WeightsError: if it is damaged, or no checkpoint of such a network.
     """
     if not Path(path).exists():
         return
     tensors, about = load_tensors(path)
+    if (about.get('kind') != 'checkpoint' or not isinstance(about.get('settings'), dict)
+            or not isinstance(about.get('step'), int)
+            or not isinstance(about.get('seconds'), (int, float))):
+        raise WeightsError(f'{escaped(path)}: is no checkpoint; {_REMEDY}')
     for name, value in settings.items():
         before = about['settings'].get(name, defaults.get(name))
         if name not in FREE and before != value:
             raise ConfigError(
-                f'{path}: made with {name}={before!r}, not {value!r}; to go on with it give the '
-                'same settings, else choose another --out folder')
-    if about['data_hash'] != data_hash:
-        raise ConfigError(f'{path}: made from other recordings; to go on with it give the same '
-                          'ones in the same order, else choose another --out folder')
+                f'{escaped(path)}: made with {name}={escaped(repr(before))}, not {value!r}; to go '
+                'on with it give the same settings, else choose another --out folder')
+    if about.get('data_hash') != data_hash:
+        raise ConfigError(f'{escaped(path)}: made from other recordings; to go on with it give '
+                          'the same ones in the same order, else choose another --out folder')
+    try:
+        _put_back(state, tensors)
+    except (LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise WeightsError(f'{escaped(path)}: is a checkpoint of something else '
+                           f'({escaped(error)}); {_REMEDY}') from error
+    state.step, state.seconds = about['step'], about['seconds']
+
+
+def _put_back(state, tensors):
+    """Put tensors of a checkpoint back into networks and optimizers."""
     for prefix, module in (('network.', state.network), ('average.', state.average),
                            ('helpers.', state.helpers)):
         module.load_state_dict({name[len(prefix):]: value for name, value in tensors.items()
@@ -134,4 +151,3 @@ def load_checkpoint(path, state, settings, data_hash, defaults=MappingProxyType(
                 if value.shape == weight.shape:  # the fused Adam wants the weight's own strides
                     value = torch.empty_like(weight).copy_(value)
                 optimizer.state[weight][name.rsplit('.', 1)[1]] = value
-    state.step, state.seconds = about['step'], about['seconds']

@@ -51,6 +51,13 @@ class PredictorConfig:
                 raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
         if self.latent_size < 0:
             raise ConfigError(f'latent_size: expected 0 or more, got {self.latent_size}')
+        # Beyond this a network takes many gigabytes; it is a wrong number rather than a wish.
+        if self.image_size * self.base_width > 2 ** 15:
+            raise ConfigError(f'image_size times base_width: expected at most {2 ** 15}, got '
+                              f'{self.image_size} times {self.base_width}')
+        for name, most in (('num_context', 64), ('code_size', 2 ** 13), ('latent_size', 2 ** 13)):
+            if getattr(self, name) > most:
+                raise ConfigError(f'{name}: expected at most {most}, got {getattr(self, name)}')
 
     @property
     def widths(self):

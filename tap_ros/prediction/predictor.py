@@ -9,7 +9,7 @@ from tap_ros.errors import ConfigError, ImageError
 from tap_ros.images import check_image, to_float, to_uint8
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
-from tap_ros.prediction.weights import load_into, load_weights, make_config
+from tap_ros.prediction.weights import load_weights, make_network
 from tap_ros.weights import find_predictor
 import torch
 
@@ -221,8 +221,7 @@ def load_network(path, device='cpu'):
     """
     path = find_predictor(path)
     values, state, training = load_weights(path, 'predictor')
-    network = Predictor(make_config(PredictorConfig, values, path))
-    load_into(network, state, path)
+    network = make_network(Predictor, PredictorConfig, values, state, path)
     network.eval().requires_grad_(False)
     return network.to(device, memory_format=torch.channels_last), training
 

@@ -5,7 +5,6 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import partial
-import json
 import math
 import os
 from pathlib import Path
@@ -31,6 +30,7 @@ from tap_ros.prediction.pictures import sample_grid
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.pretraining import pretrain_decoders
 from tap_ros.prediction.recognition import Recognition
+from tap_ros.prediction.run_folder import describe_run, run_folder
 from tap_ros.prediction.training_config import DEFAULTS
 from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings
@@ -56,12 +56,21 @@ def train(config, stop_at=None, minutes=None, progress=True):
     :return: path of the weights file.
     :raises ConfigError: if the folder holds a run with other settings or recordings.
     :raises RecordingError: if the recordings cannot be trained on.
-    :raises WeightsError: if the initial weights cannot be used.
+    :raises WeightsError: if the initial weights cannot be used, or the checkpoint is damaged.
+    :raises StorageError: if the disk is full, or another process trains there. What was saved
+        stays; the run goes on from there.
     """
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
     deadline = time.monotonic() + 60 * (minutes or math.inf)
     store = open_recordings(list(config.recordings), progress=progress)
+    with run_folder(config.out):
+        _train(config, device, store, stop_at, deadline, progress)
+    return str(Path(config.out) / 'predictor.safetensors')
+
+
+def _train(config, device, store, stop_at, deadline, progress):
+    """Train as the only process in the folder; see train."""
     training, held_out = split_episodes(store, config.test_fraction)
     torch.manual_seed(config.seed)
     network = Predictor(network_config(config, store.image_size))
@@ -113,7 +122,6 @@ def train(config, stop_at=None, minutes=None, progress=True):
                 save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
             if late:
                 break
-    return str(Path(config.out) / 'predictor.safetensors')
 
 
 def network_config(config, image_size):
@@ -311,10 +319,6 @@ def _report(state, curves, config, store, frames, training, held_out, autocast):
         'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
         'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {_name(device)}',
         'torch': torch.__version__, 'python': platform.python_version()}
-    for name, values in (('config', asdict(config)), ('run', about), ('scores', scores)):
-        path = Path(config.out) / f'{name}.json'
-        part = path.with_suffix('.part')
-        part.write_text(json.dumps(values, indent=2) + '\n')
-        part.replace(path)  # in one step: whoever reads it finds it whole
+    describe_run(config.out, config=asdict(config), run=about, scores=scores)
     save_weights(Path(config.out) / 'predictor.safetensors', state.average, 'predictor',
                  state.network.config, about | {'settings': asdict(config), 'scores': scores})

@@ -1,22 +1,29 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Weights files: safetensors with the network's configuration as JSON inside.
+Weights files: safetensors with the network's configuration as JSON inside, and a SHA-256 of both.
 
-No pickle is ever read or written. A file appears under its name only when it is complete.
+No pickle is ever read or written. A file appears under its name only when it is complete, and what
+is read from it is what was written: anything else is refused with a WeightsError of one line.
 """
 
 from dataclasses import asdict, fields, is_dataclass
+import hashlib
 import json
+import math
 import os
-from pathlib import Path
-import tempfile
+import stat
 
-from safetensors import safe_open, SafetensorError
-from safetensors.torch import save_file
-from tap_ros.errors import WeightsError
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from tap_ros.errors import TapError, WeightsError
+from tap_ros.files import write_atomically
+from tap_ros.text import escaped, listing
+import torch
 
-_FORMAT = 'tap_ros 1'
+_FORMAT = 'tap_ros 2'  # 1 had no SHA-256
+_MAX_HEADER = 2 ** 22  # bytes; names, shapes and description of the largest networks need 1%
+_AGAIN = 'copy it again, or train again'
 
 
 def save_weights(path, module, kind, config, training):
@@ -45,51 +52,112 @@ def load_weights(path, kind):
     """
     state, about = load_tensors(path)
     if about.get('kind') != kind:
-        raise WeightsError(f'{path}: holds weights of a {about.get("kind")}, not of a {kind}; '
-                           f'give the file that was trained with --model {kind}')
+        raise WeightsError(
+            f'{escaped(path)}: holds weights of a {escaped(about.get("kind"))}, not of a {kind}; '
+            f'give the file that was trained with --model {kind}')
+    for part in ('config', 'training'):
+        if not isinstance(about.get(part), dict):
+            raise WeightsError(f'{escaped(path)}: does not say its {part}; train again')
+    for name, tensor in state.items():
+        if not torch.isfinite(tensor).all():
+            raise WeightsError(f'{escaped(path)}: {escaped(name)} holds numbers that are not '
+                               'finite; the training has failed, train again')
+    if not any(tensor.any() for tensor in state.values() if tensor.dim() > 1):
+        raise WeightsError(f'{escaped(path)}: all weights are zero; train again')
     return about['config'], state, about['training']
+
+
+def make_network(network_class, config_class, values, state, path):
+    """
+    Make the network of a file, with its weights.
+
+    :param network_class: takes the configuration.
+    :param config_class: dataclass of the configuration.
+    :param values: configuration dict of load_weights; state: its state dict.
+    :param path: the file, for messages.
+    :return: the network, in float32, on the CPU.
+    :raises WeightsError: if the configuration cannot be used, or the weights do not fit it.
+    """
+    config = make_config(config_class, values, path)
+    try:
+        network = network_class(config)
+    except (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError,
+            ValueError) as error:
+        raise WeightsError(f'{escaped(path)}: no network has its configuration '
+                           f'({escaped(error)}); {_AGAIN}') from error
+    check_fit(network.state_dict(), state, path)
+    network.load_state_dict(state)
+    return network
 
 
 def make_config(config_class, values, path):
     """
     Turn the configuration found in a file back into its dataclass.
 
-    :param config_class: the dataclass.
+    :param config_class: the dataclass, of fields that are bool, int, float or tuple of numbers.
     :param values: the dict of load_weights.
     :param path: the file, for the message.
     :return: the dataclass.
-    :raises WeightsError: for a key that this version does not know.
+    :raises WeightsError: for a key that this version does not know or that is missing, and for
+        a value of another type, that is not finite, or that cannot be used.
     """
-    known = {field.name for field in fields(config_class)}
-    unknown = sorted(set(values) - known)
-    if unknown:
-        raise WeightsError(f'{path}: unknown configuration {", ".join(unknown)}; known are '
-                           f'{", ".join(sorted(known))}. Use the tap_ros version that wrote it, '
-                           'or train again')
-    return config_class(**values)
+    known = {field.name: field.type for field in fields(config_class)}
+    unknown, missing = sorted(set(values) - set(known)), sorted(set(known) - set(values))
+    if unknown or missing:
+        what = f'unknown configuration {listing(unknown)}' if unknown else (
+            f'lacks the configuration {listing(missing)}')
+        raise WeightsError(f'{escaped(path)}: {what}; known are {", ".join(sorted(known))}. Use '
+                           'the tap_ros version that wrote it, or train again')
+    for name, value in values.items():
+        if not _is_a(value, known[name]):
+            raise WeightsError(
+                f'{escaped(path)}: configuration {name} is {escaped(repr(value), 60)}; expected '
+                f'{_EXPECTED[known[name]]}. {_AGAIN.capitalize()}')
+    try:
+        return config_class(**{name: tuple(value) if isinstance(value, list) else value
+                               for name, value in values.items()})
+    except TapError as error:
+        raise WeightsError(f'{escaped(path)}: {error}') from error
 
 
-def load_into(module, state, path):
+_EXPECTED = {bool: 'true or false', int: 'a whole number', float: 'a finite number',
+             tuple: 'a list of finite numbers'}
+
+
+def _is_a(value, kind):
+    """Say whether a value from JSON is of a field's type."""
+    if kind is tuple:
+        return isinstance(value, list) and all(_is_a(each, float) for each in value)
+    if isinstance(value, bool) or kind is bool:
+        return isinstance(value, bool) and kind is bool
+    if isinstance(value, int):
+        return abs(value) < 2 ** 31
+    return kind is float and isinstance(value, float) and math.isfinite(value)
+
+
+def check_fit(wanted, state, path):
     """
-    Put weights into a network.
+    Compare weights with what a network has.
 
-    :param module: the network.
-    :param state: the state dict of load_weights.
+    :param wanted: state dict of the network; state: of load_weights.
     :param path: the file, for the message.
-    :raises WeightsError: if names or sizes do not fit.
+    :raises WeightsError: if names, sizes or types do not fit.
     """
-    wanted = module.state_dict()
     missing = sorted(set(wanted) - set(state))
     unknown = sorted(set(state) - set(wanted))
     if missing or unknown:
-        raise WeightsError(f'{path}: does not fit its own configuration; '
-                           f'missing {missing[:3]}, unknown {unknown[:3]}. Train again')
+        raise WeightsError(
+            f'{escaped(path)}: does not fit its own configuration; missing '
+            f'{listing(missing, 3) or "nothing"}, unknown {listing(unknown, 3) or "nothing"}. '
+            'Train again')
     for name, tensor in wanted.items():
         if tensor.shape != state[name].shape:
             raise WeightsError(
-                f'{path}: {name} has size {tuple(state[name].shape)}, the configuration wants '
-                f'{tuple(tensor.shape)}. Use weights made for this image size and width')
-    module.load_state_dict(state)
+                f'{escaped(path)}: {name} has size {tuple(state[name].shape)}, the configuration '
+                f'wants {tuple(tensor.shape)}. Use weights made for this image size and width')
+        if tensor.is_floating_point() != state[name].is_floating_point():
+            raise WeightsError(f'{escaped(path)}: {name} is {state[name].dtype}, the network '
+                               f'wants {tensor.dtype}. Train again')
 
 
 def save_tensors(path, tensors, about):
@@ -99,22 +167,12 @@ def save_tensors(path, tensors, about):
     :param path: where to.
     :param tensors: dict of name to tensor.
     :param about: dict that JSON can hold.
+    :raises StorageError: when it cannot be written; an existing file is then what it was.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    metadata = {'format': _FORMAT, 'about': json.dumps(about, sort_keys=True)}
-    handle, part = tempfile.mkstemp(prefix=f'{path.name}.', suffix='.part', dir=path.parent)
-    os.close(handle)
-    try:
-        save_file(tensors, part, metadata)
-        os.chmod(part, 0o644)
-        with open(part, 'rb') as written:
-            os.fsync(written.fileno())
-        os.replace(part, path)
-    except BaseException:
-        Path(part).unlink(missing_ok=True)
-        raise
+    text = json.dumps(about, sort_keys=True)
+    write_atomically(path, save(tensors, {
+        'format': _FORMAT, 'about': text, 'sha256': _digest(tensors, text)}))
 
 
 def load_tensors(path):
@@ -123,19 +181,83 @@ def load_tensors(path):
 
     :param path: the file.
     :return: (dict of name to CPU tensor, description dict).
-    :raises WeightsError: if it is missing, damaged, or not written by this package.
+    :raises WeightsError: if it is missing, damaged, changed, or not written by this package.
     """
-    if not Path(path).is_file():
-        raise WeightsError(f'{path}: no such weights file; train one with '
-                           '`python -m tap_ros train`, or correct the path')
+    tensors, about, _ = _load(path)
+    return tensors, about
+
+
+def stored_digest(path):
+    """
+    Return the SHA-256 of what a file holds, once it is found to be right.
+
+    :param path: written by save_tensors.
+    :return: 64 hexadecimal digits, of tensors and description; the file's own bytes may differ.
+    :raises WeightsError: as load_tensors.
+    """
+    return _load(path)[2]
+
+
+def _load(path):
+    """Return tensors, description and SHA-256 of a file."""
+    name = escaped(path)
+    data = _read(path, name)
     try:
-        with safe_open(path, 'pt', device='cpu') as stored:
-            metadata = stored.metadata() or {}
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}
-    except SafetensorError as error:
-        raise WeightsError(f'{path}: damaged, truncated, or no safetensors file ({error}); '
-                           'copy it again, or train again') from error
-    if metadata.get('format') != _FORMAT or 'about' not in metadata:
-        raise WeightsError(f'{path}: written by format {metadata.get("format")!r}, not by '
-                           f'{_FORMAT!r}; train again with this version')
-    return tensors, json.loads(metadata['about'])
+        header = json.loads(data[8:8 + _header_length(data)])
+        metadata = header.get('__metadata__') or {}
+        if metadata.get('format') != _FORMAT or not {'about', 'sha256'} <= set(metadata):
+            raise WeightsError(
+                f'{name}: written by format {escaped(metadata.get("format"), 40)}, not by '
+                f'{_FORMAT}, which holds a SHA-256; train again with this version')
+        tensors = load(data)
+        digest = _digest(tensors, metadata['about'])
+        about = json.loads(metadata['about'])
+    except (SafetensorError, ArithmeticError, AssertionError, AttributeError, LookupError,
+            MemoryError, RecursionError, RuntimeError, TypeError, ValueError) as error:
+        raise WeightsError(f'{name}: damaged, truncated, or no safetensors file '
+                           f'({escaped(error)}); {_AGAIN}') from error
+    if digest != metadata['sha256']:
+        raise WeightsError(f'{name}: damaged: its content has another SHA-256 than was written '
+                           f'with it; {_AGAIN}')
+    if not isinstance(about, dict):
+        raise WeightsError(f'{name}: does not describe what it holds; train again')
+    return tensors, about, digest
+
+
+def _read(path, name):
+    """Return the bytes of a file whose header is not longer than can be."""
+    try:
+        # without O_NONBLOCK a pipe would wait for somebody to write to it
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb') as stream:
+            status = os.fstat(stream.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise WeightsError(f'{name}: is no file; give a .safetensors file')
+            length = _header_length(stream.read(8))
+            if length > min(_MAX_HEADER, status.st_size):
+                raise WeightsError(f'{name}: damaged, truncated, or no safetensors file (a header '
+                                   f'of {length} bytes); {_AGAIN}')
+            stream.seek(0)
+            return stream.read()
+    except FileNotFoundError:
+        raise WeightsError(f'{name}: no such weights file; train one with '
+                           '`python -m tap_ros train`, or correct the path') from None
+    except (OSError, ValueError, MemoryError) as error:
+        raise WeightsError(f'{name}: cannot be read: '
+                           f'{escaped(getattr(error, "strerror", None) or error)}') from error
+
+
+def _header_length(data):
+    """Return the length that a file's first bytes give its header."""
+    return int.from_bytes(data[:8], 'little')
+
+
+def _digest(tensors, about):
+    """Return the SHA-256 of tensors, in the order of their names, and of a description."""
+    found = hashlib.sha256()
+    for part in (_FORMAT, about):
+        found.update(f'{len(part.encode())}:{part}'.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        found.update(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy())
+    return found.hexdigest()

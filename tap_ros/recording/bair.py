@@ -18,13 +18,15 @@ and no goal pictures. What the records do not say, and how the recordings fill i
 - The gripper's opening. It is NaN in /joint_states.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 import re
 
 import cv2
 import numpy as np
-from tap_ros.errors import RecordingError
+from tap_ros.errors import RecordingError, TapError
+from tap_ros.files import only_writer, storage_errors
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.tfrecord import parse_example, read_records
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
@@ -88,21 +90,34 @@ def import_bair(paths, folder, progress=True):
     :return: number of episodes imported by this call.
     :raises RecordingError: at the first file that cannot be read or lacks something. What was
         imported before it stays, as complete bags.
+    :raises StorageError: when the disk is full, or another process is importing there.
     """
     shards = find_shards(paths)
-    missing = [shard for shard in shards if not shard.target(folder).exists()]
-    total = sum(len(shard.numbers) for shard in missing)
+    bags = sorted({shard.target(folder).parent for shard in shards})
     done = 0
-    with tqdm(total=total, unit='episode', disable=not progress) as bar:
-        try:
-            for shard in missing:
-                _import_shard(shard, shard.target(folder), bar)
-                done += len(shard.numbers)
-        finally:
-            for bag in sorted({shard.target(folder).parent for shard in shards}):
-                if any(bag.glob('*.mcap')):
-                    write_metadata(bag)
+    with only_writer(folder), storage_errors(folder):
+        for left in (part for bag in bags for part in bag.glob('*.part')):
+            left.unlink()  # by a process that was killed
+        missing = [shard for shard in shards if not shard.target(folder).exists()]
+        total = sum(len(shard.numbers) for shard in missing)
+        with tqdm(total=total, unit='episode', disable=not progress) as bar:
+            try:
+                for shard in missing:
+                    _import_shard(shard, shard.target(folder), bar)
+                    done += len(shard.numbers)
+            except BaseException:
+                with suppress(TapError):  # the first error is the one to tell
+                    _describe(bags)
+                raise
+        _describe(bags)
     return done
+
+
+def _describe(bags):
+    """Write metadata.yaml of the bags that have files."""
+    for bag in bags:
+        if any(bag.glob('*.mcap')):
+            write_metadata(bag)
 
 
 def read_episode(data, seed):

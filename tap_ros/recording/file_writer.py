@@ -6,11 +6,14 @@ Write one MCAP file as rosbag2 would.
 Equal input gives equal bytes: no clock is read into the file.
 """
 
+from contextlib import suppress
 from functools import cache
+import os
 from pathlib import Path
 
 from mcap.writer import CompressionType, IndexType, Writer
 from tap_ros.errors import RecordingError
+from tap_ros.files import storage_errors
 from tap_ros.recording import metadata, topics
 from tap_ros.recording.schemas import schema_text, type_hash
 
@@ -63,6 +66,7 @@ class FileWriter:
         :param publish_time_ns: when it was published; by default the same.
         :param qos: topics.Qos offered by the publisher; used at the topic's first message.
         :raises RecordingError: for a type without definition, or another one than before.
+        :raises StorageError: when it cannot be written.
         """
         channel = self._channels.get(topic)
         if channel is None:
@@ -72,7 +76,8 @@ class FileWriter:
             raise RecordingError(
                 f'{self.path}: topic {topic} has the type {info["type"]}, not {type_name}')
         publish = log_time_ns if publish_time_ns is None else publish_time_ns
-        self._writer.add_message(channel, int(log_time_ns), data, int(publish), info['count'])
+        with storage_errors(self.path):
+            self._writer.add_message(channel, int(log_time_ns), data, int(publish), info['count'])
         info['count'] += 1
         total = self._info
         first = total['message_count'] == 0
@@ -82,24 +87,32 @@ class FileWriter:
 
     def flush(self):
         """Finish the chunk in progress, so that what was written so far can be read."""
-        self._writer.flush()
+        with storage_errors(self.path):
+            self._writer.flush()
 
     def close(self):
         """
         Finish the file.
 
         :return: dict that describes it, as metadata.bag_information takes it.
+        :raises StorageError: when it cannot be written; what was flushed before is readable.
         """
         if not self._stream.closed:
             text = metadata.to_yaml(metadata.bag_information([self._info]))
-            self._writer.add_metadata('rosbag2', {'serialized_metadata': text})
-            self._writer.finish()
-            self._stream.close()
+            try:
+                with storage_errors(self.path):
+                    self._writer.add_metadata('rosbag2', {'serialized_metadata': text})
+                    self._writer.finish()
+                    self._stream.flush()
+                    os.fsync(self._stream.fileno())
+            finally:
+                self.abandon()
         return self._info
 
     def abandon(self):
         """Close without finishing the file; what was flushed is readable."""
-        self._stream.close()
+        with suppress(OSError):  # what a full disk refuses again
+            self._stream.close()
 
     def _open_topic(self, topic, type_name, qos):
         """Register a topic, and its type when it is new."""

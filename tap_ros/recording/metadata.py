@@ -3,11 +3,11 @@
 """The metadata.yaml of a bag: written as by rosbag2 of Jazzy (version 9), read in any version."""
 
 from functools import cache
-import os
 from pathlib import Path
 import re
 
 from tap_ros.errors import RecordingError
+from tap_ros.files import write_atomically
 import yaml
 
 FILE_NAME = 'metadata.yaml'
@@ -81,10 +81,12 @@ def save(folder, files):
     :param folder: of the bag.
     :param files: as in bag_information.
     """
-    path = Path(folder, FILE_NAME)
-    part = path.with_name(FILE_NAME + '.part')
-    part.write_text(to_yaml({_KEY: bag_information(files)}))
-    os.replace(part, path)
+    write_atomically(Path(folder, FILE_NAME), to_yaml({_KEY: bag_information(files)}))
+
+
+def files_by_number(folder):
+    """Return the .mcap files of a folder in the order of the numbers in their names."""
+    return sorted(Path(folder).glob('*.mcap'), key=_natural)
 
 
 def bag_files(folder):
@@ -100,7 +102,7 @@ def bag_files(folder):
     folder = Path(folder)
     path = folder / FILE_NAME
     if not path.exists():
-        return sorted(folder.glob('*.mcap'), key=_natural)
+        return files_by_number(folder)
     try:
         information = _from_yaml(path.read_text())[_KEY]
         storage = information['storage_identifier']

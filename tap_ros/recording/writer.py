@@ -6,18 +6,22 @@ Write recordings: MCAP files and bags as rosbag2 would write them with `ros2 bag
 `BagWriter` writes the messages of a running system, `EpisodeWriter` finished episodes.
 """
 
+from contextlib import suppress
 import os
 from pathlib import Path
+import struct
 import time
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
 from tap_ros.errors import RecordingError
+from tap_ros.files import storage_errors
 from tap_ros.recording import metadata, topics
 from tap_ros.recording.codec import encode
 from tap_ros.recording.episode import check_episode
 from tap_ros.recording.file_writer import FileWriter
+from tap_ros.text import escaped
 
 EPISODE_GAP_NS = 10**9  # between episodes whose stamps do not follow each other
 
@@ -53,7 +57,8 @@ class BagWriter:
         if time.monotonic() - self._flushed > self._flush_seconds:
             self.flush()
             if self._split_bytes and self._file.path.stat().st_size >= self._split_bytes:
-                self._finished.append(self._file.close())
+                file, self._file = self._file, None
+                self._finished.append(file.close())
                 self._file = self._open()
         self._file.write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
 
@@ -63,11 +68,21 @@ class BagWriter:
         self._flushed = time.monotonic()
 
     def close(self):
-        """Finish the bag: its last file and metadata.yaml."""
+        """
+        Finish the bag: its last file and metadata.yaml.
+
+        :raises StorageError: when it cannot be; what was flushed before is readable.
+        """
         if self._file is not None:
-            self._finished.append(self._file.close())
-            self._file = None
+            file, self._file = self._file, None
+            self._finished.append(file.close())
             metadata.save(self.folder, self._finished)
+
+    def abandon(self):
+        """Write no more, after an error; what was flushed before is readable."""
+        if self._file is not None:
+            self._file.abandon()
+            self._file = None
 
     def __enter__(self):
         return self
@@ -97,7 +112,8 @@ class EpisodeWriter:
     def __init__(self, path, compression='zstd', camera_matrix=None):
         self.path = Path(path)
         self._part = self.path.with_name(self.path.name + '.part')
-        self._part.unlink(missing_ok=True)
+        with storage_errors(self.path):
+            self._part.unlink(missing_ok=True)
         self._file = FileWriter(self._part, self.path.name, compression)
         K = np.zeros((3, 3)) if camera_matrix is None else np.asarray(camera_matrix, float)
         self._camera = {
@@ -110,12 +126,15 @@ class EpisodeWriter:
         return self
 
     def __exit__(self, kind, *_):
-        if kind is None:
-            self._file.close()
-            os.replace(self._part, self.path)
-        else:
+        try:
+            if kind is None:
+                self._file.close()
+                with storage_errors(self.path):
+                    os.replace(self._part, self.path)
+        finally:
             self._file.abandon()
-            self._part.unlink(missing_ok=True)
+            with suppress(OSError):  # on a disk that is gone
+                self._part.unlink(missing_ok=True)
 
     def write(self, episode):
         """
@@ -187,12 +206,20 @@ def write_metadata(folder):
     :param folder: of the bag; the files play in the order of the numbers in their names.
     :raises RecordingError: when there is no .mcap file, or one is not finished.
     """
-    folder = Path(folder)
-    Path(folder, metadata.FILE_NAME).unlink(missing_ok=True)
-    files = metadata.bag_files(folder)
+    files = metadata.files_by_number(folder)
     if not files:
         raise RecordingError(f'{folder}: holds no .mcap file')
     metadata.save(folder, [_describe(path) for path in files])
+
+
+def count_episodes(path):
+    """
+    Count the episodes in a finished file, by the marks of their starts and ends.
+
+    :raises RecordingError: when the file is not finished.
+    """
+    marks = _describe(path)['topics'].get(topics.EPISODE, {'count': 0})
+    return marks['count'] // 2
 
 
 def _describe(path):
@@ -200,8 +227,10 @@ def _describe(path):
     try:
         with open(path, 'rb') as stream:
             summary = make_reader(stream).get_summary()
-    except (OSError, McapError) as error:
-        raise RecordingError(f'{path}: not a finished MCAP file: {error}') from error
+    except (OSError, McapError, ValueError, LookupError, ArithmeticError, MemoryError,
+            struct.error) as error:
+        raise RecordingError(
+            f'{path}: not a finished MCAP file: {escaped(error)}') from error
     if summary is None or summary.statistics is None:
         raise RecordingError(f'{path}: not a finished MCAP file: it has no summary')
     counts = summary.statistics.channel_message_counts

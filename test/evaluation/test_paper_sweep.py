@@ -20,13 +20,13 @@ from tap_ros.evaluation.paper.job import BUSY, DONE, perform, UNFINISHED
 from tap_ros.evaluation.paper.places import (
     collect_command,
     is_collected,
-    locked,
     Places,
     recording_hash,
 )
 from tap_ros.evaluation.paper.runs import paper_runs, PaperRun
 from tap_ros.evaluation.paper.shipping import ship
 from tap_ros.evaluation.paper.sweep import find_state, sweep
+from tap_ros.files import locked
 from tap_ros.prediction.batches import split_episodes
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
@@ -149,7 +149,7 @@ def test_a_training_goes_on_where_it_stopped(places):
 
 def test_nobody_trains_what_another_process_is_at(places):
     holder = subprocess.Popen(
-        [sys.executable, '-c', 'import sys; from tap_ros.evaluation.paper.places import locked\n'
+        [sys.executable, '-c', 'import sys; from tap_ros.files import locked\n'
          f'with locked({str(RUN.folder(places.runs) / "lock")!r}) as mine:\n'
          '    print(mine, flush=True); sys.stdin.read()'],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -166,15 +166,15 @@ def test_the_hash_is_that_of_the_opened_recording(places):
     assert recording_hash(places.recording('push2')) == store.data_hash
 
 
-def test_a_recording_is_complete_when_all_its_files_are_there(places):
+def test_a_recording_is_complete_when_all_its_episodes_are_there(places):
     folder = places.recording('push2')
     assert is_collected(folder, 10 ** 6)  # not made by collect: taken as it is
-    settings = {'task': 'push2', 'episodes': 50, 'episodes_per_file': 50, 'seed': 3}
+    settings = {'task': 'push2', 'episodes': EPISODES, 'episodes_per_file': 50, 'seed': 3}
     (folder / 'collection.json').write_text(json.dumps(settings))
-    assert is_collected(folder, 50) and not is_collected(folder, 51)
-    assert collect_command(folder).endswith(f'--out {folder} --episodes 50 --seed 3')
-    (folder / 'collection.json').write_text(json.dumps(settings | {'episodes': 51}))
-    assert not is_collected(folder, 50)
+    assert is_collected(folder, EPISODES) and not is_collected(folder, EPISODES + 1)
+    assert collect_command(folder).endswith(f'--out {folder} --episodes {EPISODES} --seed 3')
+    (folder / 'collection.json').write_text(json.dumps(settings | {'episodes': EPISODES + 1}))
+    assert not is_collected(folder, EPISODES)
     assert not is_collected(places.recording('grasp'), 1)
 
 

@@ -18,7 +18,10 @@ from std_srvs.srv import SetBool
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
+from tap_ros.recording.bags import find_topics
 from tap_ros.recording.codec import decode
+from tap_ros.recording.columns import decode_file
+from tap_ros.recording.container import McapFile
 
 sys.path.insert(0, str(Path(__file__).parent))
 from processes import Client, NodeProcess  # noqa: E402
@@ -71,10 +74,12 @@ def arrived(publisher):
     assert publisher.wait_for_all_acked(Duration(seconds=20))
 
 
-def finish(client):
+def finish(client, success=True):
     """End the bag; what has arrived before is written first."""
     service = client.create_client(SetBool, 'recorder/record')
-    return call(service, SetBool.Request(data=False), 20).message
+    answer = call(service, SetBool.Request(data=False), 20)
+    assert answer.success == success, answer.message
+    return answer.message
 
 
 def random_image(stamp):
@@ -151,6 +156,7 @@ def test_a_full_disk_is_told_and_the_node_stays_up(client, record, tmp_path):
         sleep(0.01)
     process.wait_for('recording has stopped after')
     assert str(tmp_path / 'bag') in process.text
+    assert 'recording has stopped after' in finish(client, success=False)
     resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (200_000, 200_000))
     assert 'bag-2' in call(service, SetBool.Request(data=True), 20).message
     images.publish(random_image(1))
@@ -158,6 +164,37 @@ def test_a_full_disk_is_told_and_the_node_stays_up(client, record, tmp_path):
     assert '1 messages' in finish(client)
     assert process.end() == 0, process.text
     assert len(read(tmp_path / 'bag-2')) == 1
+
+
+def test_a_bag_that_cannot_be_finished_is_a_failure(client, record, tmp_path):
+    images = client.create_publisher(Image, 'camera/image_raw', STREAM)
+    process = record().wait_for('ready')
+    wait_for_subscriber(images)
+    for stamp in range(1, 20):
+        images.publish(random_image(stamp))
+    arrived(images)
+    sleep(1.5)  # it is flushed every half second
+    path, = (tmp_path / 'bag').glob('*.mcap')
+    room = path.stat().st_size + 100
+    resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (room, 2 * room))
+    assert 'could not be finished' in finish(client, success=False)
+    assert len(read_what_is_there(tmp_path / 'bag')) == 19
+    resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (room, room))
+    service = client.create_client(SetBool, 'recorder/record')
+    assert call(service, SetBool.Request(data=True), 20).success, 'it stays up'
+    for stamp in range(1, 20):
+        images.publish(random_image(stamp))
+    arrived(images)
+    sleep(1.5)
+    assert process.end() == 1, process.text
+    assert 'Traceback' not in process.text
+
+
+def read_what_is_there(folder):
+    """Return the camera's pictures in a bag that was not finished."""
+    path, = Path(folder).glob('*.mcap')
+    columns = decode_file(McapFile(path), find_topics([path]), lambda buffers: None)
+    return columns.arrays['frame_log']
 
 
 @pytest.mark.parametrize('parameters, words', [

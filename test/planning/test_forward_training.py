@@ -95,6 +95,22 @@ def test_resumed_training_equals_uninterrupted_training(bag, tmp_path):
     assert run['steps'] == 4 and run['episodes'] + run['held_out'] == 60
 
 
+@pytest.mark.parametrize('where', ['save_weights', 'save_checkpoint'])
+def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(
+        bag, tmp_path, monkeypatch, where):
+    def killed(*_):
+        raise KeyboardInterrupt
+    config = config_for(bag, tmp_path / 'a')
+    train(config, stop_at=2, progress=False)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(f'tap_ros.planning.forward_training.{where}', killed)
+        train(config, progress=False)
+    resumed = load_file(train(config, progress=False))
+    whole = load_file(train(config_for(bag, tmp_path / 'b'), progress=False))
+    for name, value in whole.items():
+        assert torch.equal(value, resumed[name]), name
+
+
 def test_a_run_with_other_settings_is_not_resumed(bag, tmp_path):
     train(config_for(bag, tmp_path), stop_at=2, progress=False)
     with pytest.raises(ConfigError, match='learning_rate'):

@@ -6,16 +6,18 @@ import argparse
 from dataclasses import replace
 import json
 from pathlib import Path
+import resource
 
 import pytest
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, StorageError, WeightsError
+from tap_ros.files import only_writer
 from tap_ros.images import to_float
 from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.train_command import add_arguments, run
 from tap_ros.prediction.training import learning_rate, train
 from tap_ros.prediction.training_config import TrainingConfig
-from tap_ros.prediction.weights import load_tensors, load_weights
+from tap_ros.prediction.weights import load_tensors, load_weights, save_tensors
 from tap_ros.recording.cache import open_recordings
 import torch
 
@@ -143,6 +145,46 @@ def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(config, monke
     for name, tensor in served.items():
         assert weights(config)[f'average.{name}'].equal(tensor), name
     assert not list(out.glob('*.part'))
+
+
+@pytest.mark.parametrize('change', [
+    lambda path: path.write_bytes(path.read_bytes()[:-9]),
+    lambda path: path.write_bytes(path.with_name('predictor.safetensors').read_bytes()),
+    lambda path: save_tensors(path, {}, load_tensors(path)[1]),
+    lambda path: save_tensors(path, load_tensors(path)[0], {'kind': 'checkpoint'})],
+    ids=['cut', 'other', 'empty', 'undescribed'])
+def test_a_damaged_or_foreign_checkpoint_is_one_line(config, change):
+    train(config, stop_at=2, progress=False)
+    path = Path(config.out, 'checkpoint.safetensors')
+    change(path)
+    with pytest.raises(WeightsError, match=str(path)) as error:
+        train(config, progress=False)
+    assert str(error.value).isprintable()
+
+
+def test_a_full_disk_is_one_line_and_the_run_goes_on_later(config):
+    train(config, stop_at=2, progress=False)
+    before = Path(config.out, 'checkpoint.safetensors').read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(StorageError, match=config.out) as error:
+            train(config, progress=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(error.value).isprintable()
+    assert Path(config.out, 'checkpoint.safetensors').read_bytes() == before
+    assert not list(Path(config.out).glob('*.part'))
+    train(config, progress=False)
+    resumed = weights(config)
+    whole = replace(config, out=f'{config.out}-whole')
+    train(whole, progress=False)
+    assert all(resumed[name].equal(value) for name, value in weights(whole).items())
+
+
+def test_a_second_training_in_the_same_folder_is_refused(config):
+    with only_writer(config.out), pytest.raises(StorageError, match='another process'):
+        train(config, progress=False)
 
 
 def test_a_network_in_use_predicts_as_in_training(config):

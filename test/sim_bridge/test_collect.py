@@ -2,12 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the expert and of collecting: progress, variety, reproducibility, resuming."""
 
+import json
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
 import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.expert import run_episode
 from sim_bridge.simulator import Simulator
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, StorageError
+from tap_ros.evaluation.paper.places import is_collected
+from tap_ros.files import only_writer
 from tap_ros.recording.reader import iter_episodes
 
 
@@ -74,3 +83,67 @@ def test_a_folder_is_never_mixed_with_other_settings(tmp_path):
     with pytest.raises(ConfigError, match='seed'):
         collect(folder, CollectConfig(episodes=1, seed=2), progress=False)
     assert (folder / 'push_0.mcap').read_bytes() == before
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_a_killed_collection_goes_on_to_the_same_files(tmp_path):
+    config = CollectConfig(episodes=4, episodes_per_file=1, seed=5)
+    collect(tmp_path / 'whole' / 'push', config, progress=False)
+    folder = tmp_path / 'killed' / 'push'
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'tap_ros', 'collect', '--out', str(folder), '--episodes', '4',
+         '--episodes-per-file', '1', '--seed', '5'], stderr=subprocess.DEVNULL)
+    while not list(folder.glob('*.mcap')) and process.poll() is None:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    collect(folder, config, progress=False)
+    assert contents(folder) == contents(tmp_path / 'whole' / 'push')
+
+
+def test_a_full_disk_is_one_line_and_what_was_there_stays(tmp_path):
+    folder = tmp_path / 'push'
+    collect(folder, CollectConfig(episodes=1, episodes_per_file=4, seed=5), progress=False)
+    before = contents(folder)
+    # no file may grow larger than the one that is there
+    limit = (f'import resource, sys; from tap_ros.cli import main; '
+             f'resource.setrlimit(resource.RLIMIT_FSIZE, ({len(before["push_0.mcap"])},) * 2); '
+             'sys.exit(main(sys.argv[1:]))')
+    ended = subprocess.run(
+        [sys.executable, '-c', limit, 'collect', '--out', str(folder), '--episodes', '4',
+         '--episodes-per-file', '4', '--seed', '5'], capture_output=True, text=True)
+    assert ended.returncode == 1 and 'Traceback' not in ended.stderr, ended.stderr
+    assert ended.stderr.splitlines()[-1].startswith(f'error: {folder}')
+    assert contents(folder) | {'collection.json': b''} == before | {'collection.json': b''}
+    assert [e.seed for e in iter_episodes(folder)] == [5]
+    assert not is_collected(folder, 4)
+    collect(folder, CollectConfig(episodes=4, episodes_per_file=4, seed=5), progress=False)
+    assert [e.seed for e in iter_episodes(folder)] == [5, 6, 7, 8] and is_collected(folder, 4)
+
+
+def test_a_second_collection_into_the_same_folder_is_refused(tmp_path):
+    with only_writer(tmp_path), pytest.raises(StorageError, match='another process'):
+        collect(tmp_path, CollectConfig(episodes=1), progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('text', ['', '{"task": ', '[]', '3', '{"episodes": null}', '[' * 10 ** 5])
+def test_damaged_settings_are_named_with_the_remedy(tmp_path, text):
+    Path(tmp_path, 'collection.json').write_text(text)
+    with pytest.raises(ConfigError, match='collection.json: damaged.*remove it') as error:
+        collect(tmp_path, CollectConfig(episodes=1), progress=False)
+    assert str(error.value).isprintable()
+    assert Path(tmp_path, 'collection.json').read_text() == text
+
+
+def test_a_damaged_file_is_made_anew(tmp_path):
+    folder, config = tmp_path / 'push', CollectConfig(episodes=2, episodes_per_file=1, seed=5)
+    collect(folder, config, progress=False)
+    before = contents(folder)
+    (folder / 'push_1.mcap').write_bytes(before['push_1.mcap'][:-1000])
+    assert collect(folder, config, progress=False)['episodes'] == 1
+    assert contents(folder) == before
+    assert json.loads(before['collection.json'])['episodes'] == 2

@@ -18,12 +18,11 @@ from tap_ros.errors import ConfigError, TapError
 from tap_ros.evaluation.paper.places import (
     collect_command,
     collected_episodes,
-    locked,
     Places,
     read_json,
-    write_json,
 )
 from tap_ros.evaluation.paper.runs import PaperRun
+from tap_ros.files import locked, write_atomically
 
 DONE, FAILED, BUSY, UNFINISHED = 0, 1, 73, 75  # exit statuses
 _DIGITS = 5
@@ -72,7 +71,8 @@ def perform(run, places, minutes=None, fresh=False):
         weights = train(config, minutes=minutes, progress=False)
         if read_json(folder / 'run.json')['steps'] < config.steps:
             return UNFINISHED
-        write_json(places.result(run), score(run, config, weights, places))
+        write_atomically(places.result(run),
+                         json.dumps(score(run, config, weights, places)) + '\n')
     return DONE
 
 

@@ -18,6 +18,7 @@ from tap_ros.evaluation.paper.figures import COLOURS, family, file_name
 from tap_ros.evaluation.paper.published import TITLES
 from tap_ros.evaluation.paper.rows import method_order
 from tap_ros.evaluation.samples import draw_latents
+from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
 from tap_ros.pictures import GAP, grid, png_bytes
 from tap_ros.prediction.batches import make_batch, split_episodes
@@ -79,7 +80,7 @@ def write_grids(folder, runs, weights, recordings='bags'):
             path = Path(folder) / file_name(f'{task}-{mode}{variant}{name}', chosen[
                 at_hand[0]]['scale'])
             if sheet is not None and (len(at_hand) == len(paths) or not path.exists()):
-                path.write_bytes(png_bytes(draw(title, *sheet)))
+                write_atomically(path, png_bytes(draw(title, *sheet)))
 
 
 def _held_out(run, recordings):

@@ -2,17 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where recordings, runs and results are, and who may write to them."""
 
-from contextlib import contextmanager
 from dataclasses import dataclass
-import fcntl
 import hashlib
 import json
-import os
 from pathlib import Path
 import shlex
 
 from tap_ros.errors import RecordingError
 from tap_ros.recording.bags import find_bags
+from tap_ros.recording.writer import count_episodes
 
 _SETTINGS = 'collection.json'  # as sim_bridge.collect leaves it
 
@@ -40,34 +38,6 @@ class Places:
         return Path(self.results) / 'runs' / run.scale / f'{run.name}.json'
 
 
-@contextmanager
-def locked(path, wait=False):
-    """
-    Hold a lock as long as the context lasts; it ends with the process, however that ends.
-
-    :param path: of a file to lock, made if it is not there.
-    :param wait: whether to wait until it is free.
-    :return: context manager of a bool: whether this process has it.
-    """
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with open(path, 'a') as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError:
-            yield False
-            return
-        yield True
-
-
-def write_json(path, value):
-    """Write a JSON file that appears complete or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f'{path.name}.{os.getpid()}.part')
-    part.write_text(json.dumps(value) + '\n')
-    os.replace(part, path)
-
-
 def read_json(path):
     """Read a JSON file; None where there is none that can be read."""
     try:
@@ -91,9 +61,13 @@ def is_collected(folder, episodes):
             return bool(find_bags(folder))
         except RecordingError:
             return False
-    files = -(-settings['episodes'] // settings['episodes_per_file'])
-    return (settings['episodes'] >= episodes and (Path(folder) / 'metadata.yaml').exists()
-            and len(list(Path(folder).glob('*.mcap'))) >= files)
+    if settings['episodes'] < episodes or not (Path(folder) / 'metadata.yaml').exists():
+        return False
+    try:
+        found = sum(map(count_episodes, Path(folder).glob('*.mcap')))
+    except RecordingError:
+        return False
+    return found >= settings['episodes']
 
 
 def collected_episodes(folder):

@@ -12,6 +12,7 @@ from tap_ros.evaluation.paper.page import make_page
 from tap_ros.evaluation.paper.pictures import write_grids
 from tap_ros.evaluation.paper.rows import group_runs, make_rows
 from tap_ros.evaluation.paper.runs import label
+from tap_ros.files import write_atomically
 
 SCALES = ('full', 'small')  # the order on the page
 _KEYS = {'name', 'task', 'mode', 'method', 'new_pixels', 'seed', 'scale', 'command', 'config',
@@ -83,7 +84,7 @@ def write_results(folder='docs/results', runs='runs/paper', recordings='bags', p
     kept, left_out = on_same_recordings(loaded)
     groups = group_runs(kept)
     rows = make_rows(groups)
-    (folder / 'prediction.json').write_text(rows_as_json(told_apart(rows)))
+    write_atomically(folder / 'prediction.json', rows_as_json(told_apart(rows)))
     scales = [scale for scale in SCALES if any(run['scale'] == scale for run in kept)]
     for scale in scales:
         _write_plots(folder, scale, rows, groups)
@@ -93,7 +94,7 @@ def write_results(folder='docs/results', runs='runs/paper', recordings='bags', p
     findings = folder / 'findings.md'
     page = make_page(rows, kept, left_out, scales, sorted(p.name for p in folder.glob('*.png')),
                      findings.read_text() if findings.exists() else '')
-    (folder / 'README.md').write_text(page)
+    write_atomically(folder / 'README.md', page)
     return rows
 
 
@@ -133,6 +134,6 @@ def _write_plots(folder, scale, rows, groups):
     for name, png in plots.items():
         path = folder / figures.file_name(name, scale)
         if png is not None:
-            path.write_bytes(png)
+            write_atomically(path, png)
         else:
             path.unlink(missing_ok=True)

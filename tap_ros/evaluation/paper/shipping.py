@@ -13,6 +13,7 @@ from tap_ros.evaluation.paper.runs import label
 from tap_ros.evaluation.paper.sweep import trained_on
 from tap_ros.evaluation.paper.tables import markdown
 from tap_ros.evaluation.prediction import evaluate
+from tap_ros.files import write_atomically
 from tap_ros.prediction.batches import split_episodes
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.weights import load_weights, save_weights
@@ -47,7 +48,7 @@ def ship(run, file, places):
              for name, value in state.items()}
     save_weights(file, state, 'predictor', config, about)
     card = file.with_suffix('.md')
-    card.write_text(make_card(file, result, score(file, places.recording(run.task))))
+    write_atomically(card, make_card(file, result, score(file, places.recording(run.task))))
     return card
 
 

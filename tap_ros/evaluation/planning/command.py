@@ -16,6 +16,7 @@ from tap_ros.evaluation.planning.page import make_page
 from tap_ros.evaluation.planning.results import load_results, make_rows, write_rows
 from tap_ros.evaluation.planning.runs import Job, run_jobs
 from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS
+from tap_ros.files import write_atomically
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.weights import find_predictor, FORWARD_MODEL
@@ -106,7 +107,7 @@ def _write_results(out, films):
         raise ConfigError(f'{out / "planning"}: holds no results; run without --results-only')
     write_rows(out / 'planning.json', rows)
     maps, findings = out / forward.FILE, out / 'planning_findings.md'
-    (out / 'planning.md').write_text(make_page(
+    write_atomically(out / 'planning.md', make_page(
         rows, _all_films(out, rows, films),
         json.loads(maps.read_text()) if maps.exists() else (),
         findings.read_text() if findings.exists() else ''))

@@ -8,6 +8,7 @@ import numpy as np
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.evaluation.planning.episode import as_recording
 from tap_ros.evaluation.planning.runs import plan_scene
+from tap_ros.files import write_atomically
 from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import EpisodeWriter
@@ -56,7 +57,7 @@ def write_films(job, scenes, picture, recording):
             writer.write(as_recording(run, job.task, seed, outcome))
             rows.append([*film_strip(run.frames, PICTURES),
                          *(subgoal.image for subgoal in run.subgoals), run.goal.image])
-    Path(picture).write_bytes(png_bytes(np.ascontiguousarray(grid(rows, scale=2))))
+    write_atomically(picture, png_bytes(np.ascontiguousarray(grid(rows, scale=2))))
     return caption
 
 

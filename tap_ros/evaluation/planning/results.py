@@ -10,6 +10,7 @@ import numpy as np
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.planning.methods import BASES, DEFAULTS, parse_method, SUBGOALS_ONLY
 from tap_ros.evaluation.planning.runs import read_results
+from tap_ros.files import write_atomically
 
 # Results are compared where these settings agree; what an option changes is not among them.
 SAME = ('step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
@@ -142,8 +143,7 @@ def standard_error(values):
 
 def write_rows(path, rows):
     """Write planning.json, a row a line."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text('[\n' + ',\n'.join(json.dumps(row) for row in rows) + '\n]\n')
+    write_atomically(path, '[\n' + ',\n'.join(json.dumps(row) for row in rows) + '\n]\n')
 
 
 def _short(value):

@@ -5,10 +5,8 @@
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-import hashlib
 import json
 import multiprocessing
-import os
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +16,12 @@ from tap_ros.evaluation.planning.episode import REACHED, run_episode
 from tap_ros.evaluation.planning.methods import Method
 from tap_ros.evaluation.planning.scenes import step_budget
 from tap_ros.evaluation.planning.true_model import TrueModel
+from tap_ros.files import write_atomically
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.weights import stored_digest
 import torch
 from tqdm import tqdm
 
@@ -64,14 +64,11 @@ class Job:
 @lru_cache
 def digest(path):
     """
-    Return the first digits of a file's SHA-256.
+    Return the first digits of the SHA-256 of what a weights file holds.
 
-    :raises ConfigError: when it cannot be read.
+    :raises WeightsError: when it cannot be read, or is damaged.
     """
-    try:
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
-    except OSError as error:
-        raise ConfigError(f'{path}: cannot be read: {error.strerror}') from error
+    return stored_digest(path)[:16]
 
 
 class ResultFile:
@@ -99,10 +96,7 @@ class ResultFile:
         lines = [json.dumps(self.scenes[seed]) for seed in sorted(self.scenes)]
         settings = self.settings | {'command': self._command}
         text = json.dumps(settings) + ',\n"scenes": [\n ' + ',\n '.join(lines)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        part = self.path.with_suffix('.json.part')
-        part.write_text('{"settings": ' + text + '\n]}\n')
-        os.replace(part, self.path)
+        write_atomically(self.path, '{"settings": ' + text + '\n]}\n')
 
 
 def read_results(path):

@@ -1,0 +1,131 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Files that appear complete or not at all, folders that one process writes to at a time.
+
+A kill or a full disk leaves what was there before: the old file stays until the new one is whole.
+"""
+
+from contextlib import contextmanager, suppress
+import fcntl
+import os
+from pathlib import Path
+
+from tap_ros.errors import StorageError
+from tap_ros.text import escaped
+
+
+def write_atomically(path, data):
+    """
+    Write a file in one step; an existing one is replaced.
+
+    :param path: of the file; its folder is made.
+    :param data: bytes, or str that is written as UTF-8.
+    :raises StorageError: when it cannot be written. An existing file is then what it was.
+    """
+    path = Path(path)
+    part = path.with_name(f'{path.name}.part')
+    rest = memoryview(data.encode() if isinstance(data, str) else data)
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with _open_alone(part) as stream:
+            try:
+                while rest:
+                    rest = rest[stream.write(rest):]
+                os.fsync(stream.fileno())
+                os.replace(part, path)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
+        _sync_folder(path.parent)
+
+
+@contextmanager
+def storage_errors(path):
+    """
+    Turn what the system says about storage into one line.
+
+    :param path: the file or folder that is named.
+    :raises StorageError: for an OSError from the block.
+    """
+    try:
+        yield
+    except BrokenPipeError:  # nobody reads the output any more
+        raise
+    except OSError as error:
+        raise StorageError(
+            f'{escaped(path)}: cannot be written: {escaped(error.strerror or error)}; make room '
+            'or choose another place, then start again') from error
+
+
+@contextmanager
+def only_writer(folder):
+    """
+    Be the only process that writes to a folder, as long as the context lasts.
+
+    :param folder: made if it is not there.
+    :raises StorageError: when another process is writing there, or the folder cannot be made.
+    """
+    with storage_errors(folder):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        if not _lock(handle, wait=False):
+            raise StorageError(
+                f'{escaped(folder)}: another process is writing there; wait until it has ended, '
+                'or choose another folder')
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def locked(path, wait=False):
+    """
+    Hold a lock as long as the context lasts; it ends with the process, however that ends.
+
+    :param path: of a file to lock, made if it is not there.
+    :param wait: whether to wait until it is free.
+    :return: context manager of a bool: whether this process has it.
+    """
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with open(path, 'a') as file:
+        yield _lock(file.fileno(), wait)
+
+
+def _lock(handle, wait):
+    """Lock an open file or folder; say whether it could be."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except OSError:  # some network file systems have no locks
+        pass
+    return True
+
+
+def _open_alone(part):
+    """Open a file, empty, that no other process writes at once; one left by a kill serves."""
+    while True:
+        stream = open(part, 'ab', buffering=0)
+        _lock(stream.fileno(), wait=True)
+        try:
+            if os.path.samestat(os.fstat(stream.fileno()), os.stat(part)):
+                stream.truncate(0)
+                return stream
+        except FileNotFoundError:  # another process has given it its name in the meantime
+            pass
+        except BaseException:
+            stream.close()
+            raise
+        stream.close()
+
+
+def _sync_folder(folder):
+    """Bring the name of a new file to the disk, where the file system can."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,42 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a training run: one process writes to it, and a full disk is told in one line."""
+
+from contextlib import contextmanager
+import json
+from pathlib import Path
+import threading
+
+from tap_ros.files import only_writer, storage_errors, write_atomically
+
+
+@contextmanager
+def run_folder(folder):
+    """
+    Write to the folder of a training run, as the only process.
+
+    :param folder: made if it is not there.
+    :raises StorageError: when another process trains there, or it cannot be written.
+    """
+    def tell(failed):
+        # The thread that writes the curves; its error is raised where the next point is added.
+        if not isinstance(failed.exc_value, OSError):
+            before(failed)
+
+    with only_writer(folder), storage_errors(folder):
+        before, threading.excepthook = threading.excepthook, tell
+        try:
+            yield
+        finally:
+            threading.excepthook = before
+
+
+def describe_run(folder, **files):
+    """
+    Write what a run was.
+
+    :param folder: of the run.
+    :param files: name without .json to what stands in the file.
+    """
+    for name, values in files.items():
+        write_atomically(Path(folder, f'{name}.json'), json.dumps(values, indent=2) + '\n')
