@@ -1,0 +1,29 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A service whose answers are sent when they are ready, by any thread."""
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+# Requests that wait to be taken, and answers that wait to be received. With the default of 10, DDS
+# drops what comes beyond without a word.
+SERVICE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+
+
+def create_late_service(node, service_type, name, take):
+    """
+    Offer a service that keeps no thread of the executor waiting.
+
+    :param node: rclpy Node.
+    :param service_type: type of the service.
+    :param name: its name.
+    :param take: called with each request and a function that sends a response; it may call that
+        later, from another thread, and must see that it is called once.
+    :return: the rclpy Service.
+    """
+    # An executor hands what the callback returns to send_response, together with whom it is for.
+    service = node.create_service(
+        service_type, name, lambda request, response: request, qos_profile=SERVICE)
+    send = service.send_response
+    service.send_response = lambda request, header: take(
+        request, lambda response: send(response, header))
+    return service
