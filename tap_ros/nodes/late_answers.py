@@ -4,9 +4,10 @@
 
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-# Requests that wait to be taken, and answers that wait to be received. With the default of 10, DDS
-# drops what comes beyond without a word.
-SERVICE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+# Of servers: requests that wait to be taken, answers that wait to be received. Of clients: answers
+# that wait to be taken, those to all other clients among them, since every client receives all.
+# With the default depth of 10, DDS drops what comes beyond without a word.
+SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def create_late_service(node, service_type, name, take):
@@ -22,7 +23,7 @@ def create_late_service(node, service_type, name, take):
     """
     # An executor hands what the callback returns to send_response, together with whom it is for.
     service = node.create_service(
-        service_type, name, lambda request, response: request, qos_profile=SERVICE)
+        service_type, name, lambda request, response: request, qos_profile=SERVICE_QOS)
     send = service.send_response
     service.send_response = lambda request, header: take(
         request, lambda response: send(response, header))

@@ -87,8 +87,8 @@ class PredictorNode(Node):
     def __init__(self):
         super().__init__('predictor_node')
         self.params = declare_parameters(self)
-        self._predictors = load_predictors(
-            self.params['weights'], self.params['forward_weights'], self.params['device'])
+        self._queue = RequestQueue(
+            self._load, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
         self._newest = {'start': PulledObservations(self, TOPICS['start'], STREAM),
                         'goal': PulledObservations(self, TOPICS['goal'], LATCHED)}
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
@@ -97,8 +97,6 @@ class PredictorNode(Node):
         self._unshown = None  # the newest (Task, prediction, message), until it is published
         # Apart from the answers, which need not wait for it.
         self.create_timer(SHOW_PERIOD, self._show)
-        self._queue = RequestQueue(
-            self._predict, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
         create_late_service(self, PredictSubgoal, 'predict_subgoal', self._on_request)
         sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
                  for mode, predictor in self._predictors.items()]
@@ -157,6 +155,13 @@ class PredictorNode(Node):
         self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
 
     # In the thread of the queue
+
+    def _load(self):
+        """Load the weights; return what predicts."""
+        # Here, since OpenMP is slow where two threads have begun parallel work on few cores.
+        self._predictors = load_predictors(
+            self.params['weights'], self.params['forward_weights'], self.params['device'])
+        return self._predict
 
     def _predict(self, tasks):
         """Predict Tasks together; return (subgoals, ms that the network took) for each."""
