@@ -28,3 +28,17 @@ def create_late_service(node, service_type, name, take):
     service.send_response = lambda request, header: take(
         request, lambda response: send(response, header))
     return service
+
+
+def take_waiting(service):
+    """
+    Take the requests that wait in DDS where no executor does so any more.
+
+    :param service: what create_late_service returned.
+    """
+    with service.handle:
+        while True:
+            request, header = service.handle.service_take_request(service.srv_type.Request)
+            if header is None:
+                return
+            service.send_response(request, header)

@@ -13,7 +13,7 @@ from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import TapError
 from tap_ros.nodes.image_messages import encode_image
-from tap_ros.nodes.late_answers import create_late_service
+from tap_ros.nodes.late_answers import create_late_service, take_waiting
 from tap_ros.nodes.predictor_requests import encode_answer, RequestReader
 from tap_ros.nodes.predictor_setup import (
     declare_parameters,
@@ -53,7 +53,8 @@ class PredictorNode(Node):
         self._unshown = deque(maxlen=1)  # (Task, prediction, message) until it is published
         # Apart from the answers, which need not wait for it.
         self.create_timer(SHOW_PERIOD, self._show)
-        create_late_service(self, PredictSubgoal, 'predict_subgoal', self._on_request)
+        self._service = create_late_service(
+            self, PredictSubgoal, 'predict_subgoal', self._on_request)
         sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
                  for mode, predictor in self._predictors.items()]
         files = [path for path in (self.params['weights'], self.params['forward_weights']) if path]
@@ -63,6 +64,7 @@ class PredictorNode(Node):
     def close(self):
         """Answer all that wait, and let the batch in progress end."""
         self._queue.close(CLOSE_TIMEOUT)
+        take_waiting(self._service)  # they are told that the node is ending
         self._show()
 
     # In the executor: what comes, and what people see
