@@ -32,7 +32,8 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
         'collect': 'tap_ros.evaluation.bench_collect',
         'recording': 'tap_ros.evaluation.bench_recording',
         'training': 'tap_ros.evaluation.bench_training',
-        'planning': 'tap_ros.evaluation.bench_planning'}),
+        'planning': 'tap_ros.evaluation.bench_planning',
+        'service': 'tap_ros.nodes.bench_service'}),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }

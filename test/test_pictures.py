@@ -3,6 +3,7 @@
 """Laws of the pictures for people."""
 
 import numpy as np
+import pytest
 from tap_ros.pictures import film_strip, grid, overlay
 
 SCALE = 4
@@ -18,6 +19,17 @@ def test_the_overlay_shows_each_map_where_it_is():
     assert set(zip(*np.nonzero(changed))) == {(3, 12), (12, 3)}
     marked = overlay(start, maps, SCALE, np.array([[8, 8], [2, 2]]), np.array([[4, 4], [9, 9]]))
     assert (marked != shown).any()
+
+
+@pytest.mark.parametrize('far', [20, -20, 5.4e8, -5.4e8, 3e38])
+def test_marks_outside_the_picture_are_not_seen_however_far(far):
+    start, maps = np.full((16, 16, 3), 128, np.uint8), np.zeros((0, 16, 16))
+    for pixel in ((far, 5), (5, far), (far, far)):
+        shown = overlay(start, maps, SCALE, np.array([pixel], np.float32),
+                        np.array([pixel], np.float64))
+        assert (shown == 128).all()
+    for pixel in ((-0.5, 5), (5, 15.5)):  # at the border half of a mark is
+        assert (overlay(start, maps, SCALE, [pixel]) != 128).any()
 
 
 def test_a_strip_begins_and_ends_with_the_episode():

@@ -63,7 +63,9 @@ def decode_image(message, name, size=None, resize=False):
     _check_encoding(message, name, ENCODINGS)
     channels, order = ENCODINGS[message.encoding]
     rows = _rows(message, name, channels)
-    image = rows.reshape(message.height, message.width, channels)[..., list(order)]
+    image = rows.reshape(message.height, message.width, channels)
+    if order != tuple(range(channels)):
+        image = image[..., list(order)]
     if resize and size is not None and image.shape[:2] != tuple(size):
         return resize_image(image, size)
     return check_image(np.ascontiguousarray(image), name, size)

@@ -1,71 +1,60 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Serves predict_subgoal: decode, call SubgoalPredictor, encode."""
+"""Serves predict_subgoal: decode, predict what waits together, encode."""
 
-from dataclasses import dataclass
+from collections import deque
 import sys
 import time
+import traceback
 
-from builtin_interfaces.msg import Time
-import numpy as np
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
 from sensor_msgs.msg import Image
-from tap_msgs.msg import ObjectStates, Subgoal
+from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.errors import ImageError, TapError
-from tap_ros.nodes.image_messages import decode_image, encode_image, is_empty, resize_pixels
-from tap_ros.nodes.object_messages import decode_objects, match_objects
-from tap_ros.nodes.observations import Observations
+from tap_ros.errors import TapError
+from tap_ros.nodes.image_messages import encode_image
+from tap_ros.nodes.late_answers import create_late_service, take_waiting
+from tap_ros.nodes.predictor_requests import encode_answer, RequestReader
 from tap_ros.nodes.predictor_setup import (
-    check_count,
-    choose_mode,
     declare_parameters,
     load_predictors,
-    MAX_DEPTH,
-    MAX_SAMPLES,
+    MAX_ROWS,
+    MAX_TOGETHER,
+    MAX_WAITING,
 )
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.subgoal_messages import encode_subgoal
-from tap_ros.nodes.topics import CAMERA_FRAME, LATCHED, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import LATCHED
 from tap_ros.pictures import overlay
+from tap_ros.prediction.request_queue import Busy, RequestQueue
+from tap_ros.text import escaped
 
-TOPICS = {  # what stands in for the fields that a request leaves empty
-    'start': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
-    'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
-OBJECTS_TIMEOUT = 0.1  # s that the objects of the newest picture may come after it
-
-
-@dataclass(frozen=True)
-class View:
-    """A picture that came with a request or from a topic, ready for the predictor."""
-
-    image: np.ndarray  # (H, W, 3) uint8
-    names: tuple  # K object names
-    pixels: np.ndarray  # (K, 2) float32 (u, v)
-    lacking: str  # why there are no objects; empty if there are
-    stamp: Time
-    frame_id: str
+SHOW_PERIOD = 0.1  # s between two looks for a subgoal to publish
+CLOSE_TIMEOUT = 5.0  # s; longer than any batch takes
 
 
 class PredictorNode(Node):
-    """Offers the service only once the weights are loaded, checked and warmed up."""
+    """
+    Offers the service only once the weights are loaded, checked and warmed up.
+
+    The executor takes and checks the requests; one thread predicts what waits together, and sends
+    the answers.
+    """
 
     def __init__(self):
         super().__init__('predictor_node')
         self.params = declare_parameters(self)
-        self._predictors = load_predictors(
-            self.params['weights'], self.params['forward_weights'], self.params['device'])
-        self._newest = {name: Observations(*topics) for name, topics in TOPICS.items()}
-        self._newest['start'].subscribe(self, TOPICS['start'], STREAM)
-        self._newest['goal'].subscribe(self, TOPICS['goal'], LATCHED)
+        self._queue = RequestQueue(
+            self._load, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
+        self._reader = RequestReader(self, self.params, self._predictors)
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
-        # Its own group: images keep coming in while the network works.
-        self.create_service(PredictSubgoal, 'predict_subgoal', self._on_request,
-                            callback_group=MutuallyExclusiveCallbackGroup())
+        self._unshown = deque(maxlen=1)  # (Task, prediction, message) until it is published
+        # Apart from the answers, which need not wait for it.
+        self.create_timer(SHOW_PERIOD, self._show)
+        self._service = create_late_service(
+            self, PredictSubgoal, 'predict_subgoal', self._on_request)
         sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
                  for mode, predictor in self._predictors.items()]
         files = [path for path in (self.params['weights'], self.params['forward_weights']) if path]
@@ -73,108 +62,102 @@ class PredictorNode(Node):
             f'ready: {", ".join(sizes)}, {self.params["device"]}, {", ".join(files)}')
 
     def close(self):
-        """Do nothing: there is nothing to end."""
+        """Answer all that wait, and let the batch in progress end."""
+        self._queue.close(CLOSE_TIMEOUT)
+        take_waiting(self._service)  # they are told that the node is ending
+        self._show()
 
-    def _on_request(self, request, response):
+    # In the executor: what comes, and what people see
+
+    def _on_request(self, request, send):
+        """Check a request, and let it wait or refuse it."""
         try:
-            self._predict(request, response)
-        except TapError as error:
+            task = self._reader.read(request)
+            self._queue.put(task, lambda found: self._answer(task, found, send))
+        except Exception as error:
+            self._send(send, self._refusal(error))
+
+    def _show(self):
+        """Publish the newest subgoal for planners and people, if there is one that is not yet."""
+        if not self._unshown:
+            return
+        task, subgoal, message = self._unshown.pop()
+        question = task.question
+        try:
+            self._subgoal.publish(message)
+            self._picture.publish(message.image)
+            picture = overlay(question.start, subgoal.object_maps, OVERLAY_SCALE,
+                              question.start_pixels, question.goal_pixels)
+            self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
+        except Exception as error:
+            self._log_unexpected(error, 'subgoal')
+
+    # In the thread of the queue
+
+    def _load(self):
+        """Load the weights; return what predicts."""
+        # Here, since OpenMP is slow where two threads have begun parallel work on few cores.
+        self._predictors = load_predictors(
+            self.params['weights'], self.params['forward_weights'], self.params['device'])
+        return self._predict
+
+    def _predict(self, tasks):
+        """Predict Tasks together; return (subgoals, ms that the network took) for each."""
+        answers = [None] * len(tasks)
+        for mode, predictor in self._predictors.items():
+            chosen = [index for index, task in enumerate(tasks) if task.mode == mode]
+            if not chosen:
+                continue
+            begin = time.perf_counter()
+            found = predictor.predict_together([tasks[index].question for index in chosen])
+            elapsed_ms = (time.perf_counter() - begin) * 1e3
+            for index, subgoals in zip(chosen, found):
+                answers[index] = subgoals, elapsed_ms
+        return answers
+
+    def _answer(self, task, found, send):
+        """Send the answer to one task, found by _predict or an exception."""
+        try:
+            if isinstance(found, Exception):
+                raise found
+            response = encode_answer(task, *found)
+        except Exception as error:
+            self._send(send, self._refusal(error))
+            return
+        self._send(send, response)
+        # Where to go first: the earliest subgoal of the first sample.
+        self._unshown.append((task, found[0][0], response.subgoals[0]))
+
+    # In either
+
+    def _refusal(self, error):
+        """Return the response that says what was wrong, and log it."""
+        if isinstance(error, Busy):
+            self.get_logger().warning(f'predict_subgoal: {error}', throttle_duration_sec=1.0)
+        elif isinstance(error, TapError):
             self.get_logger().warning(f'predict_subgoal refused: {error}')
-            response = PredictSubgoal.Response(success=False, message=str(error))
-        return response
+        else:
+            self._log_unexpected(error, 'predict_subgoal')
+            error = f'internal error: {type(error).__name__}: {escaped(error)}'
+        return PredictSubgoal.Response(success=False, message=str(error))
 
-    def _predict(self, request, response):
-        num_samples = check_count(request.num_samples, 'num_samples', MAX_SAMPLES)
-        depth = check_count(request.recursion_depth, 'recursion_depth', MAX_DEPTH)
-        mode = choose_mode(request, self._predictors)
-        predictor = self._predictors[mode]
-        start = self._view('start', request.start, request.start_objects, predictor.image_size)
-        goal = None
-        if mode == 'bidirectional':
-            goal = self._view('goal', request.goal, request.goal_objects, predictor.image_size)
-        views = [view for view in (start, goal) if view]
-        lacking = '; '.join(view.lacking for view in views if view.lacking)
-        names = () if lacking else start.names
-        start_pixels = start.pixels if names else None
-        goal_pixels = match_objects(
-            names, goal.names, goal.pixels, 'start_objects', 'goal_objects'
-        ) if names and goal else None
-        begin = time.perf_counter()
-        subgoals = predictor.predict(
-            start.image, goal and goal.image, start_pixels, goal_pixels, num_samples=num_samples,
-            recursion_depth=depth, seed=request.seed)
-        response.model_time_ms = (time.perf_counter() - begin) * 1e3
-        response.subgoals = [
-            encode_subgoal(subgoal, names, start.stamp, start.frame_id) for subgoal in subgoals]
-        response.sample = [subgoal.sample for subgoal in subgoals]
-        response.level = [subgoal.level for subgoal in subgoals]
-        response.success = True
-        response.message = (
-            f'{mode}, {len(subgoals)} subgoal{"s" * (len(subgoals) > 1)}, '
-            + (f'no object maps: {lacking}' if lacking else f'maps of {", ".join(names)}'))
-        if len(subgoals) < num_samples * depth:
-            response.message += (f'; one sample instead of {num_samples}, as these weights have '
-                                 'no latent variable and all samples would be the same')
-        # For planners and people: where to go first, the earliest subgoal of the first sample.
-        self._subgoal.publish(response.subgoals[0])
-        self._picture.publish(response.subgoals[0].image)
-        picture = overlay(start.image, subgoals[0].object_maps, OVERLAY_SCALE, start_pixels,
-                          goal_pixels)
-        self._overlay.publish(encode_image(picture, start.stamp, start.frame_id))
+    def _log_unexpected(self, error, what):
+        """Log an error that is none of ours, with where it came from."""
+        for line in ''.join(traceback.format_exception(error)).splitlines():
+            self.get_logger().error(f'{what}: {escaped(line)}')
 
-    def _view(self, name, image, objects, size):
-        """Decode a picture and its objects; take the newest ones if it was left empty."""
-        lacking = '' if objects.objects else f'{name}_objects are empty'
-        if is_empty(image):
-            found = self._find(name)
-            image = found['image']
-            if not objects.objects:
-                objects = found.get('objects', objects)
-                lacking = '' if objects.objects else self._explain(name, found)
-        picture = decode_image(image, name, size, resize=self.params['resize_images'])
-        names, pixels = decode_objects(objects, f'{name}_objects')
-        pixels = resize_pixels(pixels, (image.height, image.width), size)
-        return View(picture, names, pixels, lacking, image.header.stamp,
-                    image.header.frame_id or CAMERA_FRAME)
-
-    def _find(self, name):
-        """Return the newest picture, and its objects if there are any with its stamp."""
-        newest = self._newest[name]
-        found = newest.newest('image')
-        if found is None:
-            advice = ''
-            if name == 'goal' and 'forward' in self._predictors:
-                advice = '; or ask for mode forward, which needs no goal'
-            raise ImageError(
-                f'{name}: the request has none and nothing has come on '
-                f'{self._topic(name, "image")}; publish one there (the simulator does at '
-                f'sim/reset), or send it along{advice}')
-        if 'objects' not in found and not newest.missing(['objects']):
-            stamp = to_nanoseconds(found['image'].header.stamp)
-            found = newest.wait(
-                ('image', 'objects'), OBJECTS_TIMEOUT, after_ns=stamp - 1) or found
-        return found
-
-    def _explain(self, name, found):
-        """Say why what was found has no objects."""
-        topic, newest = self._topic(name, 'objects'), self._newest[name].newest('objects')
-        if 'objects' in found:
-            return f'the list on {topic} is empty'
-        if newest is None:
-            return f'nothing has come on {topic}'
-        stamps = [f'{to_nanoseconds(message.header.stamp) / 1e9:.9f} s'
-                  for message in (newest['objects'], found['image'])]
-        return (f'the newest on {topic} has the stamp {stamps[0]}, the picture on '
-                f'{self._topic(name, "image")} {stamps[1]}; publish both with the same')
-
-    def _topic(self, name, what):
-        """Return the full name of a topic, for messages."""
-        return self.resolve_topic_name(TOPICS[name][what][1])
+    def _send(self, send, response):
+        """Send a response; its client may have gone."""
+        try:
+            send(response)
+        except Exception as error:
+            self.get_logger().error(
+                f'predict_subgoal: an answer cannot be sent: {escaped(error)}')
 
 
 def main(args=None):
     """Run the node; the answer is the exit code of the process."""
-    return run_node(PredictorNode, 'predictor_node', args, num_threads=3)
+    return run_node(PredictorNode, 'predictor_node', args)
 
 
 if __name__ == '__main__':

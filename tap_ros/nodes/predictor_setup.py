@@ -8,10 +8,17 @@ from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.text import escaped
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
+MAX_SUBGOALS = 200  # of one answer: samples x depth
+MAX_MAPS = 2000  # of one answer: samples x depth x objects; of 64x64 pixels these are 31 MiB
+MAX_WAITING = 64  # requests
+# Fewer than a client's queue of 10: every client receives the answers of all, and takes its own.
+MAX_TOGETHER = 8  # requests in one batch
+MAX_ROWS = 64  # samples x objects in one batch, unless one request alone has more
 HOW_TO_GET = {  # weights for each mode
     'bidirectional': 'start it with -p weights:=FILE, trained for start and goal',
     'forward': 'start it with -p forward_weights:=FILE, trained for the start alone'}
@@ -95,8 +102,9 @@ def choose_mode(request, modes):
     """
     if request.mode:
         if request.mode not in MODES:
-            raise ConfigError(f'mode {request.mode!r} is unknown; valid: {", ".join(MODES)}, '
-                              'or empty for what the weights are for')
+            raise ConfigError(
+                f"mode '{escaped(request.mode, 40)}' is unknown; valid: {', '.join(MODES)}, "
+                'or empty for what the weights are for')
         if request.mode not in modes:
             raise ConfigError(f'mode {request.mode}: this node has no weights for it; '
                               f'{HOW_TO_GET[request.mode]}')
@@ -115,3 +123,16 @@ def check_count(value, name, highest):
     if value > highest:
         raise ConfigError(f'{name} is {value}; expected 1 to {highest}, or 0 for 1')
     return value or 1
+
+
+def check_work(num_samples, depth, num_objects):
+    """Raise ConfigError when one answer would take too long or be too large."""
+    if num_samples * depth > MAX_SUBGOALS:
+        raise ConfigError(
+            f'num_samples x recursion_depth is {num_samples} x {depth} = {num_samples * depth}; '
+            f'at most {MAX_SUBGOALS} subgoals are predicted for one request')
+    maps = num_samples * depth * num_objects
+    if maps > MAX_MAPS:
+        raise ConfigError(
+            f'num_samples x recursion_depth x objects is {num_samples} x {depth} x {num_objects} '
+            f'= {maps}; at most {MAX_MAPS} maps are predicted for one request')

@@ -3,6 +3,7 @@
 """Requests that wait, and the thread that answers what waits together."""
 
 from collections import deque
+from concurrent.futures import Future
 import threading
 
 from tap_ros.errors import TapError
@@ -16,24 +17,29 @@ class RequestQueue:
     """
     Answer requests in batches, in a thread of its own; every request is answered exactly once.
 
-    :param work: called in the thread with a list of requests that waited, oldest first; returns
-        their answers in the same order. Where it fails for several, each is tried alone, so that
-        an error reaches nobody but who caused it.
+    :param prepare: called first, in the thread, and waited for. It returns the work: a function
+        that is called in the same thread with a list of requests that waited, oldest first, and
+        returns their answers in the same order. Where it fails for several, each is tried alone,
+        so that an error reaches nobody but who caused it.
     :param cost: called with a request; how much of a batch it takes.
     :param max_waiting: most requests that wait; what comes beyond is refused at once.
     :param max_together: most requests in one batch.
     :param max_cost: most cost in one batch; a request that takes more goes alone.
+    :raises Exception: what `prepare` raises.
     """
 
-    def __init__(self, work, cost, max_waiting, max_together, max_cost):
-        self._work, self._cost = work, cost
+    def __init__(self, prepare, cost, max_waiting, max_together, max_cost):
+        self._cost = cost
         self._max_waiting = max_waiting
         self._max_together, self._max_cost = max_together, max_cost
         self._waiting = deque()  # (request, answer)
         self._changed = threading.Condition()
         self._ending = False
-        self._thread = threading.Thread(target=self._run, name='request queue', daemon=True)
+        prepared = Future()
+        self._thread = threading.Thread(
+            target=self._run, args=(prepare, prepared), name='request queue', daemon=True)
         self._thread.start()
+        prepared.result()
 
     def __len__(self):
         """Return how many requests wait."""
@@ -72,7 +78,13 @@ class RequestQueue:
             answer(Busy('busy: the node is ending; ask again when it is back'))
         self._thread.join(timeout_s)
 
-    def _run(self):
+    def _run(self, prepare, prepared):
+        try:
+            self._work = prepare()
+        except BaseException as error:
+            prepared.set_exception(error)
+            return
+        prepared.set_result(None)
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._ending)

@@ -61,6 +61,8 @@ def test_grey_becomes_three_equal_channels():
     ({'width': 8}, ['step', '21', '24']),
     ({'height': 0}, ['empty', '7x0']),
     ({'data': array.array('B', bytes(104))}, ['data', '104', '105']),
+    ({'encoding': 'x\n\x1b' + 1000 * 'y'}, ["'x\\n\\x1byyy", 'rgb8']),
+    ({'height': 2**22, 'data': array.array('B', bytes(2**25 + 1))}, ['33554433', '33554432']),
 ])
 def test_a_bad_picture_is_refused_with_the_reason(change, words):
     message = image_messages.encode_image(picture(), STAMP, 'camera')
@@ -70,6 +72,13 @@ def test_a_bad_picture_is_refused_with_the_reason(change, words):
         image_messages.decode_image(message, 'goal')
     for word in ['goal', *words]:
         assert word in str(error.value)
+    assert str(error.value).isprintable() and len(str(error.value)) < 300
+
+
+def test_a_frame_id_without_end_is_refused():
+    message = image_messages.encode_image(picture(), STAMP, 101 * 'x')
+    with pytest.raises(ImageError, match='goal: frame_id has 101 characters; at most 100'):
+        image_messages.decode_image(message, 'goal')
 
 
 def test_another_size_is_refused_unless_resizing_is_allowed():
@@ -137,12 +146,31 @@ def test_objects_survive_the_round_trip_and_are_matched_by_name():
     ([[np.inf, 2], [1, 3]], ('red', 'blue'), ['red', 'inf']),
     ([[1, 2], [1, 3]], ('red', 'red'), ['objects[1].name', 'red']),
     ([[1, 2], [1, 3]], ('', 'red'), ['objects[0].name']),
+    ([[1, 2], [1e39, 3]], ('red', 'blue'), ['blue', 'inf']),
+    ([[1, 2], [np.nan, 3]], ('red', 'a\n\x1b[2J'), ['a\\n\\x1b[2J', 'nan']),
+    ([[1, 2], [1, 3]], ('red', 101 * 'x'), ['objects[1].name', '101', '100']),
+    (33 * [[1, 2]], [f'cup {n}' for n in range(33)], ['33 objects', '32']),
+    (10_000 * [[1, 2]], 10_000 * ['cup'], ['10000 objects', '32']),
 ])
 def test_unusable_objects_are_refused_with_the_reason(pixels, names, words):
     with pytest.raises(PlanningError) as error:
         object_messages.decode_objects(objects(pixels, names), 'goal_objects')
     for word in ['goal_objects', *words]:
         assert word in str(error.value)
+    assert str(error.value).isprintable()
+
+
+@pytest.mark.parametrize('pixel', [
+    (63.6, 5), (-0.6, 5), (5, 47.6), (5, -0.6), (5.4e8, 5), (5000, -7000)])
+def test_pixels_outside_the_picture_are_refused_with_the_bounds(pixel):
+    message = objects([[1, 2], pixel])
+    object_messages.decode_objects(message, 'objects')  # of no known picture
+    with pytest.raises(PlanningError) as error:
+        object_messages.decode_objects(message, 'objects', (48, 64))
+    for word in ('objects: blue', f'{np.float32(pixel[0])}', '-0.5 to 63.5', '-0.5 to 47.5'):
+        assert word in str(error.value)
+    border = objects([[-0.5, 47.5], [63.5, -0.5]])
+    assert len(object_messages.decode_objects(border, 'objects', (48, 64))[0]) == 2
 
 
 def test_the_gripper_is_found_among_other_joints():

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.nodes.clients import call, Newest
+from tap_ros.nodes.clients import call, Newest, wait_for_future
 from tap_ros.nodes.image_messages import decode_image, encode_image
+from tap_ros.nodes.late_answers import SERVICE_QOS
 from tap_ros.nodes.object_messages import encode_objects
 from tap_ros.nodes.topics import LATCHED, to_stamp
 from tap_ros.prediction.weights import save_weights
@@ -205,6 +206,68 @@ def test_why_there_are_no_maps_is_said_of_each_picture(services):
     publishers += [plain.publish('goal/objects', GOAL_OBJECTS)]
     response = reason('maps of cup, box')
     assert response.subgoals == plain.answer(**WITH_GOAL).subgoals
+
+
+def test_many_requests_at_once_all_get_their_own_answer(services):
+    both = services['both']
+    client = both.node.create_client(
+        PredictSubgoal, '/both/predict_subgoal', qos_profile=SERVICE_QOS)
+    assert client.wait_for_service(30)
+    modes = ('bidirectional', 'forward')
+    alone = [pictures(both.answer(mode=mode, seed=seed, **WITH_GOAL))
+             for seed in range(8) for mode in modes]
+    futures = [client.call_async(PredictSubgoal.Request(mode=mode, seed=seed, **WITH_GOAL))
+               for seed in range(8) for mode in modes]
+    for future, expected in zip(futures, alone, strict=True):
+        assert wait_for_future(future, 60)
+        assert future.result().success, future.result().message
+        assert differ(pictures(future.result()), expected) < 0.1
+
+
+def test_beyond_the_queue_requests_are_told_that_the_node_is_busy(services):
+    both = services['both']
+    client = both.node.create_client(
+        PredictSubgoal, '/both/predict_subgoal', qos_profile=SERVICE_QOS)
+    assert client.wait_for_service(30)
+    request = PredictSubgoal.Request(
+        mode='forward', num_samples=25, recursion_depth=8, **WITH_GOAL)
+    futures = [client.call_async(request) for _ in range(150)]
+    assert all(wait_for_future(future, 120) for future in futures)
+    refused = [f.result().message for f in futures if not f.result().success]
+    assert 0 < len(refused) <= 150 - 64
+    assert set(refused) == {
+        'busy: 64 requests are waiting, which is the most that may; ask again'}
+    both.answer(**WITH_GOAL)
+
+
+def test_each_bound_is_named_and_what_is_refused_touches_nothing(services):
+    both = services['both']
+    before = both.answer(**WITH_GOAL).subgoals
+    crowd = [f'cup {n}' for n in range(10_000)]
+    thirty = objects(30 * [(8, 9)], crowd[:30])
+    forged = 'cup\n[INFO] [0.0] [predictor_node]: all is well\x1b[2J'
+    large = encode_image(np.zeros((1, 12 * 2**20, 3), np.uint8), STAMP, 'eye')
+    for fields, words in (
+            ({'start_objects': objects(10_000 * [(8, 9)], crowd), 'recursion_depth': 8},
+             ['start_objects', '10000 objects', '32']),
+            ({'num_samples': 51, 'recursion_depth': 4},
+             ['num_samples x recursion_depth', '51 x 4 = 204', '200']),
+            ({'num_samples': 50, 'recursion_depth': 4, 'start_objects': thirty,
+              'goal_objects': thirty}, ['x objects', '50 x 4 x 30 = 6000', '2000']),
+            ({'start': large}, ['start', '37748736 bytes', '33554432']),
+            ({'start_objects': objects([(8, 9), (5.4e8, 21)])},
+             ['start_objects: box', '(540000000.0, 21.0)', 'outside', '-0.5 to 31.5']),
+            ({'goal_objects': objects([(8, 9), (20, -7)])},
+             ['goal_objects: box', '(20.0, -7.0)', 'outside', '-0.5 to 31.5']),
+            ({'start_objects': objects([(8, 9), (8, 9)], [forged, forged])}, ['cup\\n[INFO]']),
+            ({'start_objects': objects([(8, 9)], [forged])}, ['lacks cup\\n[INFO]']),
+            ({'mode': forged}, ['cup\\n[INFO]'])):
+        message = both.refusal(**{**WITH_GOAL, **fields})
+        for word in words:
+            assert word in message
+        assert message.isprintable()
+        assert both.answer(**WITH_GOAL).subgoals == before
+    assert '\n[INFO] [0.0]' not in both.process.text and '\x1b[2J' not in both.process.text
 
 
 @pytest.mark.parametrize('swapped', [False, True])

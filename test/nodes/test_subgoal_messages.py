@@ -54,6 +54,14 @@ def test_answers_that_lack_something_are_refused_with_what():
         decode_subgoals(answer(good), ('cup', 'jug'), SIZE)
     with pytest.raises(ImageError, match='16x16.*8x8'):
         decode_subgoals(answer(good), NAMES, (16, 16))
+    response = answer(good)
+    response.subgoals[0].object_maps[1].height = 4
+    with pytest.raises(ImageError, match='object map of box: expected 8x8 .* got 8x4'):
+        decode_subgoals(response, NAMES, SIZE)
+    response = answer(good)
+    response.subgoals[0].expected_pixels[0].x = float('nan')
+    with pytest.raises(PlanningError, match='expected_pixels hold NaN'):
+        decode_subgoals(response, NAMES, SIZE)
 
 
 def test_pixels_of_the_same_size_stay_the_same():

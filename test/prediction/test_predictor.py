@@ -10,7 +10,7 @@ import pytest
 from tap_ros.errors import ConfigError, ImageError, WeightsError
 from tap_ros.images import to_float, to_uint8
 from tap_ros.prediction.networks import Predictor, PredictorConfig
-from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.predictor import Question, SubgoalPredictor
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
 from tap_ros.prediction.weights import save_weights
 import torch
@@ -149,6 +149,30 @@ def test_samples_differ_by_z_and_repeat_by_seed():
     assert len(first) == 6
     assert all(np.array_equal(a.image, b.image) for a, b in zip(first, second))
     assert not np.array_equal(first[1].image, first[3].image)
+
+
+@pytest.mark.parametrize('num_context', [1, 2])
+@pytest.mark.parametrize('latent_size', [0, 8])
+def test_questions_answered_together_are_answered_as_alone(num_context, latent_size):
+    predictor = SubgoalPredictor(lively_network(num_context=num_context, latent_size=latent_size))
+    rng = np.random.default_rng(2)
+    asked = []
+    for K, samples, depth in ((2, 1, 1), (2, 3, 2), (0, 2, 1), (2, 1, 3), (1, 1, 1), (2, 2, 1)):
+        start, goal = rng.integers(0, 256, (2, 32, 32, 3), np.uint8)
+        start_pixels, goal_pixels = rng.uniform(4, 28, (2, K, 2))
+        if num_context == 1:
+            goal = goal_pixels = None
+        asked.append(Question(start, goal, start_pixels, goal_pixels, samples, depth, len(asked)))
+    for question, together in zip(asked, predictor.predict_together(asked), strict=True):
+        alone = predictor.predict(
+            question.start, question.goal, question.start_pixels, question.goal_pixels,
+            question.num_samples, question.recursion_depth, question.seed)
+        for one, other in zip(alone, together, strict=True):
+            assert (one.sample, one.level) == (other.sample, other.level)
+            assert differ(one.image, other.image) < 0.1
+            assert np.allclose(one.object_maps, other.object_maps, atol=1e-4)
+            assert np.allclose(one.expected_pixels, other.expected_pixels, atol=1e-2)
+            assert np.allclose(one.mass, other.mass, atol=1e-4)
 
 
 def test_without_z_all_samples_would_be_the_same(predictor):

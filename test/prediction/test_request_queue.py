@@ -26,7 +26,8 @@ class Rig:
             return work(batch)
 
         self.queue = RequestQueue(
-            slow, cost, **{'max_waiting': 100, 'max_together': 8, 'max_cost': 100, **limits})
+            lambda: slow, cost,
+            **{'max_waiting': 100, 'max_together': 8, 'max_cost': 100, **limits})
 
     def put(self, one):
         self.queue.put(one, lambda found: self._note(one, found))
@@ -139,3 +140,24 @@ def test_at_the_end_all_that_wait_are_told_and_the_batch_is_finished(made):
     ending.join(TIMEOUT)
     assert not ending.is_alive()
     assert rig.wait(4)[0] == 0 and len(rig.answers) == 4
+
+
+def test_what_is_prepared_is_prepared_in_the_thread_that_works():
+    threads = []
+
+    def prepare():
+        threads.append(threading.current_thread())
+        return lambda batch: threads.append(threading.current_thread()) or batch
+
+    queue, answered = RequestQueue(prepare, len, 1, 1, 1), threading.Event()
+    assert len(threads) == 1
+    queue.put('one', lambda found: answered.set())
+    assert answered.wait(TIMEOUT)
+    queue.close(TIMEOUT)
+    assert threads[0] is threads[1] is not threading.current_thread()
+
+    def fail():
+        raise OSError('no such file')
+
+    with pytest.raises(OSError, match='no such file'):
+        RequestQueue(fail, len, 1, 1, 1)

@@ -1,0 +1,89 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Observations that are taken only when somebody asks for them."""
+
+import threading
+import time
+
+from rclpy.callback_groups import CallbackGroup
+from tap_ros.nodes.observations import Observations
+
+MOST = 100  # messages of a topic that are taken at once; more come with the next question
+PAUSE = 0.005  # s between two looks while waiting
+
+
+class Unwatched(CallbackGroup):
+    """Subscriptions of this group wake no executor; their messages wait to be taken."""
+
+    def can_execute(self, entity):
+        """Tell that no callback is ever due."""
+        return False
+
+    def beginning_execution(self, entity):
+        """Refuse to begin a callback."""
+        return False
+
+    def ending_execution(self, entity):
+        """Do nothing: none has begun."""
+
+
+class PulledObservations:
+    """
+    Observations of topics that stream in and are seldom asked for.
+
+    With a callback for each message, every one would stop a network at work for a while.
+
+    :param node: rclpy Node.
+    :param types: {short name: (message type, topic name)}, the one whose stamp counts first.
+    :param qos: QoSProfile of all of them; its depth is how many messages wait to be taken.
+    """
+
+    def __init__(self, node, types, qos):
+        self._taking = threading.Lock()
+        self._observations = Observations(*types)
+        group = Unwatched()
+        self._subscriptions = {
+            topic: node.create_subscription(
+                message_type, name, lambda message: None, qos, callback_group=group)
+            for topic, (message_type, name) in types.items()}
+
+    def newest(self, *topics):
+        """Return the newest {topic: message} that has all of `topics`; None if there is none."""
+        self._pull()
+        return self._observations.newest(*topics)
+
+    def wait(self, topics, timeout_s, after_ns):
+        """
+        Wait for an observation.
+
+        :param topics: what it must have.
+        :param timeout_s: most seconds to wait.
+        :param after_ns: only what is stamped later than this.
+        :return: {topic: message}, or None when none came in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._pull()
+            found = self._observations.newest(*topics, after_ns=after_ns)
+            if found is not None or time.monotonic() >= deadline:
+                return found
+            time.sleep(PAUSE)
+
+    def missing(self, topics):
+        """Return those of `topics` of which nothing has come since the start."""
+        self._pull()
+        return self._observations.missing(topics)
+
+    def _pull(self):
+        """Take what has come, all topics together in the order in which it came."""
+        with self._taking:
+            come = []
+            for topic, subscription in self._subscriptions.items():
+                with subscription.handle:
+                    for _ in range(MOST):
+                        taken = subscription.handle.take_message(subscription.msg_type, False)
+                        if taken is None:
+                            break
+                        come.append((taken[1]['received_timestamp'], topic, taken[0]))
+            for _, topic, message in sorted(come, key=lambda one: one[0]):
+                self._observations.put(topic, message)
