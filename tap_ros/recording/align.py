@@ -69,12 +69,15 @@ class EpisodeTable:
         rows, K = slice(self.starts[i], self.starts[i + 1]), len(self.names[i])
         objects, goal_objects = self.objects[rows, :K], self.goal_objects[i, :K]
         goal, span = self.goals[i], self.spans[i]
+        with np.errstate(over='ignore'):  # absurd pixels become infinite
+            pixels, goal_pixels = (
+                a[..., :2].astype(np.float32) for a in (objects, goal_objects))
         return Episode(
             frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
             grippers=self.grippers[rows], object_names=self.names[i],
-            object_pixels=objects[..., :2].astype(np.float32), object_poses=objects[..., 2:],
+            object_pixels=pixels, object_poses=objects[..., 2:],
             goal_frame=None if goal is None else self.parts[goal[0]].goal_frames[goal[1]],
-            goal_pixels=goal_objects[:, :2].astype(np.float32), goal_poses=goal_objects[:, 2:],
+            goal_pixels=goal_pixels, goal_poses=goal_objects[:, 2:],
             task=span.task, seed=span.seed, outcome=span.outcome)
 
 

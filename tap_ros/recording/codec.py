@@ -155,7 +155,8 @@ class Layout:
                 self._visit_one(base, here)
             else:
                 if n > MAX_ELEMENTS:
-                    raise ValueError(f'{here} claims {n} elements; at most {MAX_ELEMENTS} are read')
+                    raise ValueError(
+                        f'{here} claims {n} elements; at most {MAX_ELEMENTS} are read')
                 for i in range(n):
                     self._visit_one(base, f'{here}[{i}]')
 

@@ -210,6 +210,7 @@ class _Decoder:
                 (numbers[own], rows[own, 0], data))
             self.kept_bytes += data.size
 
+    @np.errstate(over='ignore')  # absurd numbers become infinite
     def _decode_kept(self):
         for name, by_size in self.kept.items():
             for parts in by_size.values():

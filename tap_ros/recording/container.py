@@ -20,7 +20,16 @@ from tap_ros.errors import RecordingError
 from tap_ros.recording.chunks import claimed_size, unpack
 from tap_ros.recording.losses import FAR, Loss, NOTHING
 from tap_ros.recording.records import Records
-from tap_ros.recording.summary import CHANNEL, CHUNK, MAGIC, MESSAGE, read_summary, RECORD, SCHEMA
+from tap_ros.recording.summary import (
+    CHANNEL,
+    CHUNK,
+    DAMAGED,
+    MAGIC,
+    MESSAGE,
+    read_summary,
+    RECORD,
+    SCHEMA,
+)
 from tap_ros.text import escaped
 
 # Bounds on what a file may unpack to, far above what recordings of its size hold.
@@ -84,8 +93,12 @@ class McapFile:
                 f'{path}: not an MCAP file: it starts with {self.data[:8].hex(" ")}, '
                 f'not {MAGIC.hex(" ")}')
         self._summary, self._complaint = read_summary(self.data)
-        for kind, record in self._summary.topics if self._summary else ():
-            self._define(kind, record)
+        try:
+            for kind, record in self._summary.topics if self._summary else ():
+                self._define(kind, record)
+        except RecordingError:
+            self._summary, self._complaint = None, DAMAGED
+            self.channels, self._schemas = {}, {}
         if not all(channel.type_name for channel in self.channels.values()):
             self.channels = {}  # the summary has channels without their types
         size = len(self.data)
@@ -211,7 +224,12 @@ class McapFile:
         for number, count in Counter(heads['channel'].tolist()).items():
             self._counts[number] += count
             channel = self.channels.get(number)
-            if channel is not None and channel.topic in wanted:
+            if channel is None:
+                own = logs[heads['channel'] == number]
+                self.losses.append(Loss(
+                    f'messages of channel {number}, which nothing describes', 'block', None,
+                    int(own.min()), int(own.max())))
+            elif channel.topic in wanted:
                 found.setdefault(channel.topic, []).append(
                     np.flatnonzero(heads['channel'] == number))
         return Block(buffer, {

@@ -139,7 +139,8 @@ def bag_files(folder):
     if compression:
         raise RecordingError(
             f'{path}: the bag is compressed by rosbag2 ({escaped(compression, 40)}); use the '
-            'compression inside mcap instead (--storage-preset-profile zstd_fast, or ros2 bag convert)')
+            'compression inside mcap instead (--storage-preset-profile zstd_fast, or ros2 '
+            'bag convert)')
     files = [folder / Path(name).name for name in names]
     missing = [file.name for file in files if not _is_file(file)]
     if missing:

@@ -41,6 +41,8 @@ class Picture:
     def rgb(self, buffer, start):
         """Return a buffer of H * W * 3 bytes from the pixels that start somewhere in another."""
         height, width = self.size
+        if 0 in self.size:
+            return buffer[:0]
         data = buffer[start:start + height * self.step]
         channels = _CHANNELS.get(self.encoding)
         if self.encoding == 'rgb8' and self.step == 3 * width:

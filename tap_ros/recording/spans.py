@@ -68,15 +68,16 @@ def in_gaps(gaps, log):
 
 def _marked(data, marks, gaps):
     """Return the spans between marks; where marks may be lost nothing is known until the next."""
+    # At the same time starts come before gaps and ends behind: what cannot be told is left out.
     events = [
-        (log, 0, stamp, event, about) for log, stamp, event, about in zip(
+        (log, 2 * (event != 0), stamp, event, about) for log, stamp, event, about in zip(
             data['mark_log'].tolist(), data['mark_stamp'].tolist(), data['mark_event'].tolist(),
             marks, strict=True)]
     events += [(start, 1, end, 0, None) for start, end, cuts in gaps if cuts == EVERYTHING]
     spans, current, last_end = [], None, -FAR
-    for log, lost, stamp, event, about in sorted(events, key=lambda e: e[:2]):
+    for log, order, stamp, event, about in sorted(events, key=lambda e: e[:2]):
         unsure = current is not None and current.outcome is None
-        if lost:
+        if order == 1:
             if current is not None:
                 current.end_log = log - 1
             last_end = max(last_end, stamp + 1, log)

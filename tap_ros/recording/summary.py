@@ -13,7 +13,7 @@ RECORD = struct.Struct('<BQ')  # opcode, length of what follows
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15
 _FOOTER, _CHUNK_INDEX, _STATISTICS = 2, 8, 11
 _FOOTER_RECORD = struct.Struct('<BQQQI')  # header, summary start, summary offsets start, crc
-_DAMAGED = 'its summary is damaged, so that nothing tells whether all messages are there'
+DAMAGED = 'its summary is damaged, so that nothing tells whether all messages are there'
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ def read_summary(data):
     if not placed:  # bytes were lost or put in before it, or the end is damaged or missing
         start = _data_end(data)
         if start is None:
-            return None, _DAMAGED if sound else ''
+            return None, DAMAGED if sound else ''
         if not sound or not _holds(data, start, footer, crc):
-            return None, _DAMAGED
+            return None, DAMAGED
     try:
         return _parse(data, start, footer, placed), ''
     except struct.error:
-        return None, _DAMAGED
+        return None, DAMAGED
 
 
 def _holds(data, start, footer, crc):
