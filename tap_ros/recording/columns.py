@@ -24,7 +24,8 @@ _ENDINGS = ('_log', '_stamp', '_names', '_event', '_index')  # of column names
 _KEPT_BYTES = 2**26  # of messages that wait to be decoded together
 _GROUP_ROWS = 4096  # messages whose structures are compared together
 _RECENT = 8  # structures that are tried first
-_MOST_FIELDS = 2**21  # read one by one in a file, to find out where the fields of messages lie
+# Fields read one by one to find out where they lie: so many in any file, and one in so many bytes.
+_FREE_FIELDS, _BYTES_PER_FIELD = 2**18, 64
 _FIELD_BYTES, _MESSAGE_FIELDS = 8, 16  # bytes of a field at least; fields of an image at most
 _PADDED_BYTES, _PADDING = 2**28, 16  # objects may be padded to so much, or so many times theirs
 _CUTS = {topics.IMAGE: FRAMES, topics.TWIST: FRAMES, topics.GRIPPER_COMMAND: FRAMES,
@@ -266,9 +267,10 @@ class _Decoder:
     def _charge(self, kind, count):
         """Refuse files in which nearly every message, or a huge one, has its own structure."""
         self.fields += count
-        if self.fields > _MOST_FIELDS:
+        most = _FREE_FIELDS + len(self.file.data) // _BYTES_PER_FIELD
+        if self.fields > most:
             raise RecordingError(
-                f'messages of type {kind} have more than {_MOST_FIELDS} fields in all whose '
+                f'messages of type {kind} have more than {most} fields in all whose '
                 'places differ from one to the next; no recording has so many')
 
     def _add(self, name, numbers, logs, **values):

@@ -142,10 +142,9 @@ class McapFile:
                     data = np.frombuffer(self.data, np.uint8, end - start, start)
                 block = self._block(data, index, wanted)
             except RecordingError as error:
-                if kind == CHUNK:
-                    self._lose(str(error), 'chunk', start - RECORD.size, entry)
-                else:
-                    self._lose(str(error), 'record', start)
+                listed = entry is not None or not (self._summary and self._summary.chunks)
+                what = 'chunk' if kind == CHUNK and listed else 'record'
+                self._lose(str(error), what, start - RECORD.size * (kind == CHUNK), entry)
                 continue
             yield block
         for loss in self._pending:

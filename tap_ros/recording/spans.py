@@ -13,7 +13,7 @@ next to each other. Where marks may be lost too, frames after the gap belong to 
 end follows; without such an end they are left out.
 """
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,7 +106,7 @@ def _cut(span, gaps):
     """Yield the parts of a span between gaps."""
     interrupted = 'interrupted' if span.task or span.outcome else span.outcome
     first = bisect_right(gaps, span.start_log, key=lambda gap: gap[0])
-    for start, end, cuts in gaps[first:bisect_left(gaps, span.end_log, key=lambda gap: gap[0])]:
+    for start, end, cuts in gaps[first:bisect_right(gaps, span.end_log, key=lambda gap: gap[0])]:
         yield replace(span, end_log=start - 1, outcome=interrupted)
         first_cut = start if span.first_cut is None else span.first_cut
         span = replace(span, start_log=max(end + 1, start),
