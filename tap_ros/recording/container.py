@@ -17,7 +17,7 @@ import struct
 
 import numpy as np
 from tap_ros.errors import RecordingError
-from tap_ros.recording.chunks import claimed_size, unpack
+from tap_ros.recording.chunks import claimed_size, MAX_CHUNK_BYTES, unpack
 from tap_ros.recording.losses import FAR, Loss, NOTHING
 from tap_ros.recording.records import Records
 from tap_ros.recording.summary import (
@@ -154,7 +154,7 @@ class McapFile:
 
     def _charge(self, size):
         """Refuse to unpack more than any recording of this size holds."""
-        self._unpacked += size
+        self._unpacked += size if size <= MAX_CHUNK_BYTES else 0  # else it is refused anyway
         if self._unpacked > self._most_bytes:
             raise RecordingError(
                 f'it is not unpacked: more than {self._most_bytes} bytes in all, from a file of '

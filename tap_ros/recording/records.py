@@ -93,7 +93,7 @@ class Records:
         Return (opcode, end) of the record at a place.
 
         The opcode is None where there is none, end then the next place known to hold one. Message
-        indices and ends of data that cannot be are given the opcode 0.
+        indices, messages and ends of data that cannot be are given the opcode 0.
         """
         later = bisect_right(self._offsets, position)
         bound = self._offsets[later] if later < len(self._offsets) else self.limit
@@ -104,6 +104,8 @@ class Records:
         if end > bound or kind == 0:  # zeros: what was never written
             return None, bound
         if kind == _MESSAGE_INDEX and not self._is_index(position + RECORD.size, length):
+            return 0, end
+        if kind == MESSAGE and self._known:  # all lie in chunks
             return 0, end
         if kind == DATA_END and (length != 4 or (self.summary and end < self.limit)):
             return 0, end
