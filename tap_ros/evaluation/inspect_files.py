@@ -11,6 +11,7 @@ from tap_ros.files import write_atomically
 from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.prediction.weights import load_tensors
 from tap_ros.recording.cache import open_recordings
+from tap_ros.text import escaped, listing
 
 
 def add_arguments(parser):
@@ -37,7 +38,8 @@ def run(args):
     print(f'objects     {", ".join(map(str, objects))}')
     for name, values in (('task', [e.task for e in episodes]),
                          ('outcome', [e.outcome for e in episodes])):
-        counts = ', '.join(f'{k or "unknown"} {v}' for k, v in Counter(values).most_common())
+        counts = Counter(values).most_common()
+        counts = listing(f'{escaped(k, 40) or "unknown"} {v}' for k, v in counts)
         print(f'{name:<11} {counts}')
     print(f'data hash   {store.data_hash}')
     if args.picture:

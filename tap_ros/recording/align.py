@@ -8,13 +8,16 @@ not: a frame belongs to an episode whose marks enclose its stamp, and that is ne
 """
 
 from dataclasses import dataclass
+import warnings
 
 import numpy as np
 from tap_ros.recording.columns import pad_objects
-from tap_ros.recording.episode import Episode
-from tap_ros.recording.spans import assign, MAX_JITTER_NS, read_spans
+from tap_ros.recording.episode import Episode, RecordingWarning
+from tap_ros.recording.losses import EVERYTHING, FAR, seconds
+from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
+_LOOKED_AT = 4096  # messages looked at together
 _EMPTY = {
     'frame_log': ((0,), np.int64), 'frame_stamp': ((0,), np.int64),
     'goal_log': ((0,), np.int64), 'goal_stamp': ((0,), np.int64), 'goal_index': ((0,), np.int64),
@@ -27,6 +30,7 @@ _EMPTY = {
     'object': ((0, 0, 9), np.float64), 'object_names': ((0,), np.int64),
     'goal_object_log': ((0,), np.int64), 'goal_object_stamp': ((0,), np.int64),
     'goal_object': ((0, 0, 9), np.float64), 'goal_object_names': ((0,), np.int64),
+    'gap': ((0, 3), np.int64),
     'mark_log': ((0,), np.int64), 'mark_stamp': ((0,), np.int64), 'mark_event': ((0,), np.int64)}
 
 
@@ -65,12 +69,15 @@ class EpisodeTable:
         rows, K = slice(self.starts[i], self.starts[i + 1]), len(self.names[i])
         objects, goal_objects = self.objects[rows, :K], self.goal_objects[i, :K]
         goal, span = self.goals[i], self.spans[i]
+        with np.errstate(over='ignore'):  # absurd pixels become infinite
+            pixels, goal_pixels = (
+                a[..., :2].astype(np.float32) for a in (objects, goal_objects))
         return Episode(
             frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
             grippers=self.grippers[rows], object_names=self.names[i],
-            object_pixels=objects[..., :2].astype(np.float32), object_poses=objects[..., 2:],
+            object_pixels=pixels, object_poses=objects[..., 2:],
             goal_frame=None if goal is None else self.parts[goal[0]].goal_frames[goal[1]],
-            goal_pixels=goal_objects[:, :2].astype(np.float32), goal_poses=goal_objects[:, 2:],
+            goal_pixels=goal_pixels, goal_poses=goal_objects[:, 2:],
             task=span.task, seed=span.seed, outcome=span.outcome)
 
 
@@ -101,7 +108,7 @@ def assemble(parts):
     for name in ('twist', 'joint', 'object'):
         _stamp_unstamped(data, name)
     spans = read_spans(data, marks)
-    owner = assign(spans, data['frame_log'], data['frame_stamp'])
+    owner = _owner(spans, data, parts)
     order = np.lexsort((data['frame_stamp'], owner))
     order = order[owner[order] >= 0]
     owner, stamps = owner[order], data['frame_stamp'][order]
@@ -112,8 +119,7 @@ def assemble(parts):
     starts = np.concatenate([[0], np.cumsum(counts)])
     clock = _Clock(spans, starts, stamps)
     picked, goal_picked = _pick_names(data, clock)
-    goals = [
-        _newest(data['goal_log'], data['goal_stamp'], span) for span in spans]
+    goals = [_newest(data, 'goal', span) for span in spans]
     return EpisodeTable(
         parts=parts, starts=starts, spans=spans,
         file=data['frame_file'][order], row=data['frame_row'][order], stamps=stamps,
@@ -179,7 +185,7 @@ class _Clock:
 def _join(parts):
     """Put the columns of several files one behind the other."""
     data = {key: [] for key in (*_EMPTY, 'frame_file', 'frame_row', 'goal_file')}
-    numbers, marks = {}, []
+    numbers, marks, newest = {}, [], -FAR
     for index, part in enumerate(parts):
         arrays = {k: part.arrays.get(k, np.empty(s, d)) for k, (s, d) in _EMPTY.items()}
         local = np.array(
@@ -187,6 +193,10 @@ def _join(parts):
         for key in ('object_names', 'goal_object_names'):
             arrays[key] = local[arrays[key]]
         arrays['frame_file'] = np.full(len(arrays['frame_log']), index)
+        unplaced = arrays['gap'][:, :1] <= -FAR  # of files of which nothing could be read
+        arrays['gap'] = np.where(unplaced & [[True, True, False]], newest, arrays['gap'])
+        newest = max([newest, *(int(log.max()) for key, log in part.arrays.items()
+                                if key.endswith('_log') and len(log))])
         arrays['frame_row'] = np.arange(len(arrays['frame_log']))
         arrays['goal_file'] = np.full(len(arrays['goal_log']), index)
         marks += part.marks
@@ -195,6 +205,21 @@ def _join(parts):
     objects = pad_objects(data['object'] + data['goal_object'])
     data['object'], data['goal_object'] = objects[:len(parts)], objects[len(parts):]
     return {key: np.concatenate(value) for key, value in data.items()}, list(numbers), marks
+
+
+def _owner(spans, data, parts):
+    """Return (F,) int64: the episode of each frame, -1 for none; count those nobody knows."""
+    owner = assign(spans, data['frame_log'], data['frame_stamp'])
+    unsure = np.array([span.outcome is None for span in spans])[owner]
+    unsure = (owner >= 0) & (unsure | in_gaps(data['gap'], data['frame_log']))
+    for index in np.unique(data['frame_file'][unsure]).tolist():
+        logs = data['frame_log'][unsure & (data['frame_file'] == index)]
+        warnings.warn(
+            f'{parts[index].source}: {len(logs)} frames beside what is lost are left out, as '
+            'nothing tells which episode they belong to (log time '
+            f'{seconds(int(logs.min()))} to {seconds(int(logs.max()))} s)',
+            RecordingWarning, stacklevel=4)
+    return np.where(unsure, -1, owner)
 
 
 def _drop_stops(data):
@@ -233,19 +258,42 @@ def _actions(data, clock, frame_log):
         newest = np.full(len(frame_log), -1)
         newest[by_log[step[step >= 0]]] = np.flatnonzero(step >= 0)
         newest = np.maximum.accumulate(newest)
-        earliest = np.searchsorted(data['command_log'], frame_log[clock.starts[:-1]])
+        earliest = np.searchsorted(data['command_log'], _begins(clock, frame_log))
         known = newest >= earliest[clock.owner]
         actions[known, 3] = data['command'][newest[known]]
     actions[clock.starts[1:] - 1] = 0
     return actions
 
 
-def _newest(log, stamps, span):
-    """Return the row of the last message up to the end of an episode, -1 for none."""
-    row = int(np.searchsorted(log, span.end_log, 'right')) - 1
-    while row >= 0 and stamps[row] > span.end_stamp:
-        row -= 1
-    return row
+def _begins(clock, frame_log):
+    """Return (E,) log times from which commands count: of the first frame, cut off or not."""
+    begins = frame_log[clock.starts[:-1]]
+    for i, span in enumerate(clock.spans):
+        cut, before = span.first_cut, clock.spans[i - 1] if i else None
+        if cut is not None:
+            begins[i] = min(begins[i], cut)
+            if before is not None and (before.first_cut == cut or before.end_log == cut - 1):
+                begins[i] = min(begins[i], begins[i - 1])
+    return begins
+
+
+def _newest(data, name, span):
+    """
+    Return the row of the last message up to the end of an episode, -1 for none.
+
+    What was said before messages were lost does not hold after it.
+    """
+    log, stamps = data[f'{name}_log'], data[f'{name}_stamp']
+    lost = data['gap'][(data['gap'][:, 2] == EVERYTHING) & (data['gap'][:, 0] <= span.end_log), 1]
+    first = int(np.searchsorted(log, lost.max())) if len(lost) else 0
+    end = int(np.searchsorted(log, span.end_log, 'right'))
+    while end > first:
+        start = max(end - _LOOKED_AT, first)
+        known = np.flatnonzero(stamps[start:end] <= span.end_stamp)
+        if len(known):
+            return start + int(known[-1])
+        end = start
+    return -1
 
 
 def _pick_names(data, clock):
@@ -253,8 +301,7 @@ def _pick_names(data, clock):
     rows, found = clock.nearest_rows(data['object_log'], data['object_stamp'])
     seen = np.where(found, data['object_names'][rows] if len(data['object_names']) else -1, -1)
     goal_rows = np.array([
-        _newest(data['goal_object_log'], data['goal_object_stamp'], span)
-        for span in clock.spans], np.int64)
+        _newest(data, 'goal_object', span) for span in clock.spans], np.int64)
     picked = np.full(len(goal_rows), -1)
     for i, goal in enumerate(goal_rows.tolist()):
         known = seen[clock.starts[i]:clock.starts[i + 1]]
@@ -276,10 +323,14 @@ def _by_name(rows, found, values, numbers, names, wanted):
     """
     out = np.full((len(rows), *values.shape[1:]), np.nan)
     out[found] = values[rows[found]]
+    orders = {}  # (number, wanted) -> for each wanted name its place, and those that have one
     for i in np.flatnonzero(found)[numbers[rows[found]] != wanted[found]].tolist():
-        given = names[numbers[rows[i]]]
+        key = int(numbers[rows[i]]), int(wanted[i])
+        if key not in orders:
+            place = {name: k for k, name in reversed(list(enumerate(names[key[0]])))}
+            pairs = [(k, place[n]) for k, n in enumerate(names[key[1]]) if n in place]
+            orders[key] = np.array(pairs, np.int64).reshape(-1, 2).T
+        to, of = orders[key]
         out[i] = np.nan
-        for k, name in enumerate(names[wanted[i]]):
-            if name in given:
-                out[i, k] = values[rows[i], given.index(name)]
+        out[i, to] = values[rows[i], of]
     return out

@@ -9,8 +9,10 @@ from tap_ros.errors import RecordingError
 from tap_ros.recording import topics
 from tap_ros.recording.container import McapFile
 from tap_ros.recording.episode import RecordingWarning
+from tap_ros.recording.losses import describe
 from tap_ros.recording.metadata import bag_files, FILE_NAME
 from tap_ros.recording.schemas import check_schema
+from tap_ros.text import escaped
 
 
 def find_bags(path):
@@ -21,11 +23,16 @@ def find_bags(path):
     :raises RecordingError: when there is none.
     """
     path = Path(path)
-    if path.is_file():
-        return [[path]]
-    if not path.is_dir():
-        raise RecordingError(f'{path}: there is no such file or folder')
-    folders = [path] if _is_bag(path) else sorted(f for f in path.iterdir() if _is_bag(f))
+    try:
+        if path.is_file():
+            return [[path]]
+        if not path.is_dir():
+            raise RecordingError(
+                f'{path}: there is no such file or folder' if not path.exists() else
+                f'{path}: neither a regular file nor a folder')
+        folders = [path] if _is_bag(path) else sorted(f for f in path.iterdir() if _is_bag(f))
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     bags = [files for folder in folders if (files := bag_files(folder))]
     if not bags:
         raise RecordingError(
@@ -42,17 +49,26 @@ def find_topics(files, image_topic=None):
     :param image_topic: as in open_recordings.
     :return: as topics.resolve.
     """
-    channels = {}
-    for file in files:
-        channels |= McapFile(file).topics()
+    channels, damage = {}, []
+    for path in files:
+        file = McapFile(path)
+        channels |= file.topics()
+        if not file.channels and file.losses:
+            damage.append(f'{path}: {describe(file.losses)[0]}')
+    if not channels and damage:
+        raise RecordingError(damage[0])
     available = {topic: channel.type_name for topic, channel in channels.items()}
     found = topics.resolve(available, list_paths(files), image_topic)
     for topic in found.values():
-        if channels[topic].schema_encoding == 'ros2msg':
+        channel, source = channels[topic], f'{list_paths(files)}: topic {escaped(topic)}'
+        if channel.encoding != 'cdr':
+            raise RecordingError(
+                f'{source}: encoded as {channel.encoding[:40]!r}; only cdr can be read')
+        if channel.schema_encoding == 'ros2msg':
             try:
-                check_schema(available[topic], channels[topic].schema)
+                check_schema(available[topic], channel.schema)
             except RecordingError as error:
-                raise RecordingError(f'{list_paths(files)}: topic {topic}: {error}') from error
+                raise RecordingError(f'{source}: {error}') from error
     return found
 
 
@@ -63,8 +79,10 @@ def check_sizes(parts):
         if part.image_size is not None:
             sizes.setdefault(tuple(part.image_size), part.source)
     if not sizes:
+        why = next((f'{part.source}: {part.damage[0]}' for part in parts if part.damage), '')
         raise RecordingError(
-            f'{list_paths([part.source for part in parts])}: the image topic holds no image')
+            f'{list_paths([part.source for part in parts])}: the image topic holds no image'
+            + (f' that can be used; {why}' if why else ''))
     if len(sizes) > 1:
         listing = ', '.join(f'{s} ({w}x{h})' for (h, w), s in sizes.items())
         raise RecordingError(
@@ -72,9 +90,9 @@ def check_sizes(parts):
 
 
 def warn_of_damage(part):
-    """Say what could not be read of a file."""
-    if part.damage:
-        warnings.warn(f'{part.source}: {part.damage}', RecordingWarning, stacklevel=3)
+    """Say what could not be used of a file, in one warning a cause."""
+    for line in part.damage:
+        warnings.warn(f'{part.source}: {line}', RecordingWarning, stacklevel=3)
 
 
 def _is_bag(path):

@@ -26,7 +26,7 @@ from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.container import McapFile
 from tqdm import tqdm
 
-FORMAT = 1  # of a cache folder; another number makes all files be decoded again
+FORMAT = 2  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _MAX_BUFFERS = 1024  # of one writev
 _NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
@@ -145,9 +145,10 @@ def _build(path, found, folder):
             'to a folder that can') from error
     try:
         with open(part / 'frames.npy', 'wb', buffering=0) as stream:
-            stream.write(bytes(_NPY_HEADER))
+            _empty(stream)
             columns = decode_file(
-                McapFile(path), found, lambda buffers: _write_all(stream, buffers))
+                path, found, lambda buffers: _write_all(stream, buffers),
+                lambda: _empty(stream))
             _write_header(stream, columns)
         _sort_frames(part / 'frames.npy', columns.arrays)
         arrays = {k: np.ascontiguousarray(a) for k, a in columns.arrays.items()}
@@ -175,6 +176,13 @@ def _put(part, folder, path):
     except OSError:
         if _load(folder, path) is None:  # else another process was faster
             raise
+
+
+def _empty(stream):
+    """Keep but the room for the header."""
+    stream.seek(0)
+    stream.truncate()
+    stream.write(bytes(_NPY_HEADER))
 
 
 def _write_all(stream, buffers):

@@ -15,6 +15,8 @@ from tap_ros.errors import RecordingError
 from tap_ros.recording.schemas import fields, PRIMITIVES
 
 HEADER = b'\x00\x01\x00\x00'  # encapsulation: plain CDR, little endian
+MAX_ELEMENTS = 4096  # of a sequence of texts or of messages
+MAX_TEXT = 65536  # bytes
 _SCALAR = {'u1': 'B', 'i1': 'b', 'u2': 'H', 'i2': 'h', 'u4': 'I', 'i4': 'i', 'u8': 'Q', 'i8': 'q',
            'f4': 'f', 'f8': 'd'}
 
@@ -152,14 +154,17 @@ class Layout:
             elif n is None:
                 self._visit_one(base, here)
             else:
-                if n > len(self.example):
-                    raise ValueError(f'{here} claims {n} elements')
+                if n > MAX_ELEMENTS:
+                    raise ValueError(
+                        f'{here} claims {n} elements; at most {MAX_ELEMENTS} are read')
                 for i in range(n):
                     self._visit_one(base, f'{here}[{i}]')
 
     def _visit_one(self, base, here):
         if base == 'string':
             start = self._end_of_length(size := self._length(here))
+            if size > MAX_TEXT:
+                raise ValueError(f'{here} has {size} bytes; at most {MAX_TEXT} are read')
             self._static[start:start + size] = True
             self.strings[here] = self.example[start:start + max(size - 1, 0)].decode()
         else:

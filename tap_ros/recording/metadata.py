@@ -8,9 +8,14 @@ import re
 
 from tap_ros.errors import RecordingError
 from tap_ros.files import write_atomically
+from tap_ros.text import escaped, listing
 import yaml
 
 FILE_NAME = 'metadata.yaml'
+MAX_BYTES = 2**23
+MAX_DEPTH = 32
+_UNUSABLE = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
+_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _KEY = 'rosbag2_bagfile_information'
 
 
@@ -64,7 +69,18 @@ def to_yaml(value):
 
 
 def _from_yaml(text):
-    return yaml.load(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+    """Parse YAML; raise ValueError or another of _UNUSABLE when it is not, or is a bomb."""
+    if len(text) > MAX_BYTES:
+        raise ValueError(f'it has more than {MAX_BYTES} bytes')
+    depth = 0
+    for event in yaml.parse(text, Loader=_LOADER):  # the loader itself recurses, in C
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH:
+            raise ValueError(f'it is nested more than {MAX_DEPTH} deep')
+        if isinstance(event, yaml.ScalarEvent) and event.value == '<<':
+            raise ValueError('it merges mappings (<<)')
+    return yaml.load(text, Loader=_LOADER)
 
 
 class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):
@@ -97,36 +113,61 @@ def bag_files(folder):
 
     :param folder: of the bag.
     :return: list of paths; empty when there is no .mcap file.
-    :raises RecordingError: for a bag of another storage or compressed by rosbag2 as a whole.
+    :raises RecordingError: for a bag of another storage or compressed by rosbag2 as a whole, and
+        for a metadata.yaml that cannot be used.
     """
     folder = Path(folder)
     path = folder / FILE_NAME
     if not path.exists():
         return files_by_number(folder)
     try:
-        information = _from_yaml(path.read_text())[_KEY]
+        information = _from_yaml(_read(path))[_KEY]
         storage = information['storage_identifier']
         names = information['relative_file_paths']
         compression = information.get('compression_format') or ''
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError('relative_file_paths is no list of names')
+        if len(set(names)) < len(names):
+            raise ValueError('relative_file_paths names a file twice')
+    except _UNUSABLE as error:
         raise RecordingError(
-            f'{path}: not the metadata of a rosbag2 bag ({error}); remove it to read the .mcap '
-            'files without it, or make it anew (ros2 bag reindex)') from error
+            f'{path}: not the metadata of a rosbag2 bag ({escaped(" ".join(str(error).split()))});'
+            ' remove it to read the .mcap files without it, or make it anew (ros2 bag reindex)'
+        ) from error
     if storage != 'mcap':
         raise RecordingError(
-            f'{path}: the bag is stored as {storage}; only mcap is read '
+            f'{path}: the bag is stored as {escaped(storage, 40)}; only mcap is read '
             '(record with -s mcap, or ros2 bag convert)')
     if compression:
         raise RecordingError(
-            f'{path}: the bag is compressed by rosbag2 ({compression}); use the compression '
-            'inside mcap instead (--storage-preset-profile zstd_fast, or ros2 bag convert)')
+            f'{path}: the bag is compressed by rosbag2 ({escaped(compression, 40)}); use the '
+            'compression inside mcap instead (--storage-preset-profile zstd_fast, or ros2 '
+            'bag convert)')
     files = [folder / Path(name).name for name in names]
-    missing = [file.name for file in files if not file.is_file()]
+    missing = [file.name for file in files if not _is_file(file)]
     if missing:
         raise RecordingError(
-            f'{path} names files that are not there: {", ".join(missing)}; bring them back, or '
+            f'{path} names files that are not there: {listing(missing)}; bring them back, or '
             'make metadata.yaml anew (ros2 bag reindex)')
     return files
+
+
+def _read(path):
+    """Return the text of a file, a character too much when it is too long."""
+    if not _is_file(path):  # opening a FIFO would wait for its writer
+        raise RecordingError(f'{path}: not a regular file')
+    try:
+        with open(path, 'rb') as stream:
+            return stream.read(MAX_BYTES + 1).decode()
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
+
+
+def _is_file(path):
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
 
 
 @cache
@@ -134,7 +175,7 @@ def qos_from_text(text):
     """Return the offered QoS profiles that stand in a channel's metadata; [] when unknown."""
     try:
         profiles = _from_yaml(text) if text else []
-    except yaml.YAMLError:
+    except _UNUSABLE:
         return []
     return profiles if isinstance(profiles, list) else []
 

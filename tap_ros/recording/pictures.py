@@ -30,7 +30,7 @@ class Picture:
             return cls((0, 0), encoding, 0)
         if channels is None:
             raise RecordingError(
-                f'encoding {encoding!r} cannot be read; choose one of {", ".join(_CHANNELS)}')
+                f'encoding {encoding[:40]!r} cannot be read; choose one of {", ".join(_CHANNELS)}')
         if height * width == 0 or step < width * channels or length != height * step:
             raise RecordingError(
                 f'a {encoding} image of {width}x{height} pixels with step {step} and {length} '
@@ -41,6 +41,8 @@ class Picture:
     def rgb(self, buffer, start):
         """Return a buffer of H * W * 3 bytes from the pixels that start somewhere in another."""
         height, width = self.size
+        if 0 in self.size:
+            return buffer[:0]
         data = buffer[start:start + height * self.step]
         channels = _CHANNELS.get(self.encoding)
         if self.encoding == 'rgb8' and self.step == 3 * width:
@@ -50,11 +52,3 @@ class Picture:
             return np.repeat(pixels, 3, 2)
         return np.ascontiguousarray(
             pixels[..., :3] if self.encoding.startswith('rgb') else pixels[..., 2::-1])
-
-
-def check_size(size, expected, what):
-    """Refuse a size (H, W, ...) that is not the expected one."""
-    if tuple(size[:2]) != tuple(expected[:2]):
-        raise RecordingError(
-            f'{what} of different sizes: {expected[1]}x{expected[0]} and {size[1]}x{size[0]} '
-            'pixels (width x height); one recording has one size')

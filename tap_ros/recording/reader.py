@@ -8,7 +8,9 @@ import numpy as np
 from tap_ros.recording.align import assemble, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
-from tap_ros.recording.container import McapFile
+from tap_ros.recording.losses import EVERYTHING
+
+_NO_GAP = np.empty((0, 3), np.int64)
 
 
 def iter_episodes(path, image_topic=None):
@@ -25,7 +27,7 @@ def iter_episodes(path, image_topic=None):
         waiting, checked = [], []
         for file in files:
             part = _decode(file, found)
-            checked.append(Columns(part.source, part.image_size))
+            checked.append(Columns(part.source, part.image_size, damage=part.damage))
             if part.image_size is not None:
                 check_sizes(checked)
             if waiting and not follows(waiting[-1], part):
@@ -42,7 +44,8 @@ def iter_episodes(path, image_topic=None):
 def _decode(file, found):
     """Return the Columns of a file, frames in memory."""
     pieces = []
-    part = decode_file(McapFile(file), found, lambda buffers: pieces.append(b''.join(buffers)))
+    part = decode_file(
+        file, found, lambda buffers: pieces.append(b''.join(buffers)), pieces.clear)
     order = part.arrays.pop('frame_order', None)
     if pieces:
         frames = np.frombuffer(b''.join(pieces), np.uint8).reshape(-1, *part.image_size, 3)
@@ -58,15 +61,16 @@ def _episodes(parts):
 
 
 def _closed(part):
-    """Tell whether the last mark in a file is the end of an episode."""
-    events = part.arrays.get('mark_event', ())
-    return len(events) > 0 and events[-1] == 1
+    """Tell whether the last mark in a file is the end of an episode, and nothing is lost later."""
+    events, gap = part.arrays.get('mark_event', ()), part.arrays.get('gap', _NO_GAP)
+    return len(events) > 0 and events[-1] == 1 and not (
+        gap[gap[:, 2] == EVERYTHING, 1] >= part.arrays['mark_log'][-1]).any()
 
 
 def _kept(parts):
-    """Return what later files need to know of those before: their marks and the goal in force."""
+    """Return what later files need to know of those before: their marks, goals and gaps."""
     kept = parts[-1:]
-    for key in ('goal_log', 'goal_object_log'):
+    for key in ('goal_log', 'goal_object_log', 'gap'):
         last = next((part for part in reversed(parts) if key in part.arrays), None)
         if last is not None and not any(last is part for part in kept):
             kept.insert(0, last)
@@ -74,5 +78,5 @@ def _kept(parts):
     return [
         replace(part, frames=None, arrays={
             key: value for key, value in part.arrays.items()
-            if key.startswith(('goal_', 'mark_'))})
+            if key.startswith(('goal_', 'mark_', 'gap'))})
         for part in kept]

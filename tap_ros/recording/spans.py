@@ -6,52 +6,112 @@ Where episodes begin and end in a log, by the marks on /episode.
 By header stamps and by log time: a message belongs to an episode whose marks enclose its stamp,
 and that is nearest in the log. So neither marks and images that overtake each other on their way
 to the recorder, nor a simulated clock that starts anew, mix up episodes.
+
+Where something was lost an episode is cut in two: the frames before end as 'interrupted', those
+after are an episode of their own with the outcome of the whole. Frames on both sides never stand
+next to each other. Where marks may be lost too, frames after the gap belong to the episode whose
+end follows; without such an end they are left out.
 """
 
-from dataclasses import dataclass
+from bisect import bisect_right
+from dataclasses import dataclass, replace
 
 import numpy as np
+from tap_ros.recording.losses import EVERYTHING, FAR
 
 MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
-_FAR = 2**62
 
 
 @dataclass
 class Span:
     """The part of the log and of the stamps that belongs to one episode."""
 
-    start_log: int = -_FAR
-    end_log: int = _FAR
-    start_stamp: int = -_FAR
-    end_stamp: int = _FAR
+    start_log: int = -FAR
+    end_log: int = FAR
+    start_stamp: int = -FAR
+    end_stamp: int = FAR
     task: str = ''
     seed: int = 0
-    outcome: str = ''
+    outcome: str | None = ''  # None: of frames that may belong to no episode
+    first_cut: int | None = None  # log time of the gap where the first part of this one ends
 
 
 def read_spans(data, marks):
-    """Read the marks: a list of spans in the order of the log."""
-    if not marks:
-        return [Span()]
-    spans, current, last_end = [], None, -_FAR
-    for log, stamp, event, (task, seed, outcome) in zip(
-            data['mark_log'].tolist(), data['mark_stamp'].tolist(),
-            data['mark_event'].tolist(), marks, strict=True):
-        if event == 0:
+    """
+    Read the marks: a list of spans in the order of the log.
+
+    :param data: dict with mark_log, mark_stamp, mark_event (N,), and gap (G, 3) as losses.gaps.
+    :param marks: N triples (task, seed, outcome).
+    """
+    gaps = data['gap'][np.argsort(data['gap'][:, 0], kind='stable')].tolist()
+    spans = _marked(data, marks, gaps) if marks else [Span()]
+    if gaps:
+        spans = [part for span in spans for part in _cut(span, gaps)]
+        spans = sorted((s for s in spans if s.start_log <= s.end_log), key=lambda s: s.start_log)
+    return spans or [Span(outcome=None)]
+
+
+def in_gaps(gaps, log):
+    """
+    Tell which times lie where messages of any topic may be missing, ends included.
+
+    :param gaps: (G, 3) int64, as losses.gaps gives it.
+    :param log: (N,) int64, ns.
+    :return: (N,) bool.
+    """
+    gaps = gaps[gaps[:, 2] == EVERYTHING]
+    gaps = gaps[np.argsort(gaps[:, 0], kind='stable')]
+    before = np.searchsorted(gaps[:, 0], log, 'right')
+    ends = np.append(-FAR - 1, np.maximum.accumulate(gaps[:, 1]))
+    return log <= ends[before]
+
+
+def _marked(data, marks, gaps):
+    """Return the spans between marks; where marks may be lost nothing is known until the next."""
+    # At the same time starts come before gaps and ends behind: what cannot be told is left out.
+    events = [
+        (log, 2 * (event != 0), stamp, event, about) for log, stamp, event, about in zip(
+            data['mark_log'].tolist(), data['mark_stamp'].tolist(), data['mark_event'].tolist(),
+            marks, strict=True)]
+    events += [(start, 1, end, 0, None) for start, end, cuts in gaps if cuts == EVERYTHING]
+    spans, current, last_end = [], None, -FAR
+    for log, order, stamp, event, about in sorted(events, key=lambda e: e[:2]):
+        unsure = current is not None and current.outcome is None
+        if order == 1:
+            if current is not None:
+                current.end_log = log - 1
+            last_end = max(last_end, stamp + 1, log)
+            current = Span(last_end, outcome=None)
+            spans.append(current)
+        elif event == 0:
             if current is not None:
                 current.end_log = log - 1
                 if stamp > current.start_stamp:
                     current.end_stamp = stamp - 1
-            current = Span(log, _FAR, stamp, _FAR, task, seed, 'interrupted')
+            current = Span(log, FAR, stamp, FAR, about[0], about[1], 'interrupted')
             spans.append(current)
         else:
-            if current is None:  # recording began after the start of the episode
-                current = Span(last_end, task=task, seed=seed)
+            if current is None or unsure:  # the start of the episode was not recorded, or is lost
+                if unsure:
+                    spans.pop()
+                current = Span(last_end, task=about[0], seed=about[1])
                 spans.append(current)
-            current.end_log, current.outcome = log, outcome
-            current.end_stamp = stamp or _FAR
+            current.end_log, current.outcome = log, about[2]
+            current.end_stamp = stamp or FAR
             current, last_end = None, log + 1
     return spans
+
+
+def _cut(span, gaps):
+    """Yield the parts of a span between gaps."""
+    interrupted = 'interrupted' if span.task or span.outcome else span.outcome
+    first = bisect_right(gaps, span.start_log, key=lambda gap: gap[0])
+    for start, end, cuts in gaps[first:bisect_right(gaps, span.end_log, key=lambda gap: gap[0])]:
+        yield replace(span, end_log=start - 1, outcome=interrupted)
+        first_cut = start if span.first_cut is None else span.first_cut
+        span = replace(span, start_log=max(end + 1, start),
+                       first_cut=None if cuts == EVERYTHING else first_cut)
+    yield span
 
 
 def assign(spans, log, stamps):

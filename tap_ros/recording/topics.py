@@ -5,6 +5,7 @@
 from dataclasses import dataclass
 
 from tap_ros.errors import RecordingError
+from tap_ros.text import listing
 
 IMAGE = '/camera/image_raw'
 CAMERA_INFO = '/camera/camera_info'
@@ -68,10 +69,10 @@ def resolve(available, source, image_topic=None):
     :return: dict from the names above to topics of the recording; what it lacks is left out.
     :raises RecordingError: without an image topic, or when several would do.
     """
-    listing = ', '.join(f'{t} ({k})' for t, k in sorted(available.items())) or 'none'
+    known = listing((f'{t} ({k})' for t, k in sorted(available.items())), 20) or 'none'
     if image_topic is not None and available.get(image_topic) != TYPES[IMAGE]:
         raise RecordingError(
-            f'{source}: no topic {image_topic} of type {TYPES[IMAGE]}; topics found: {listing}')
+            f'{source}: no topic {image_topic} of type {TYPES[IMAGE]}; topics found: {known}')
     found = {IMAGE: image_topic} if image_topic else {}
     for name, kind in TYPES.items():
         if name in found or name in (CAMERA_INFO, CLOCK):
@@ -86,12 +87,12 @@ def resolve(available, source, image_topic=None):
             candidates = [space + name]
         if len(candidates) > 1:
             raise RecordingError(
-                f'{source}: several topics could be {name}: {", ".join(sorted(candidates))}; '
+                f'{source}: several topics could be {name}: {listing(sorted(candidates))}; '
                 'name the camera topic (image_topic) whose namespace is wanted')
         if candidates:
             found[name] = candidates[0]
     if IMAGE not in found:
         raise RecordingError(
             f'{source}: no topic ends in {IMAGE} with type {TYPES[IMAGE]}; name the camera topic '
-            f'(image_topic) if it is called otherwise; topics found: {listing}')
+            f'(image_topic) if it is called otherwise; topics found: {known}')
     return found

@@ -101,11 +101,11 @@ def test_many_processes_may_build_at_once(bag, cache):
 
 
 def test_a_failed_build_leaves_nothing(tmp_path, bag, cache):
-    path = bag / 'push2_0.mcap'
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xff
-    path.write_bytes(data)
-    with pytest.raises(RecordingError, match='push2_0.mcap'):
+    path = bag / 'both.mcap'
+    with EpisodeWriter(path) as writer:  # of two sizes, refused when all is decoded
+        writer.write(make_episode(size=(8, 8)))
+        writer.write(make_episode(size=(4, 16)))
+    with pytest.raises(RecordingError, match='both.mcap'):
         open_recordings(path)
     assert list(cache.glob('*')) == []
 

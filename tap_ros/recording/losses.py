@@ -1,0 +1,89 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What of a file could not be used: counted, placed in the log, and put in words."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from tap_ros.text import escaped
+
+FAR = 2**62  # ns; log times are held within +-FAR
+EXAMPLES = 3  # places named of one cause
+CAUSES = 8  # causes named of one file
+
+EVERYTHING, FRAMES, NOTHING = 2, 1, 0  # what may be missing from an episode; see Loss.cuts
+
+
+@dataclass(frozen=True)
+class Loss:
+    """
+    A part of a file that could not be used.
+
+    cuts: EVERYTHING when messages of any topic may be missing, FRAMES when frames or actions are,
+        NOTHING when all that is missing is unknown in the episode too (NaN, no goal).
+    """
+
+    why: str
+    what: str = ''  # 'chunk', 'record' or 'topic NAME'; '': why says it all
+    byte: int | None = None
+    start: int | None = None  # log times of what is missing (ns), from one end to the other
+    end: int | None = None
+    cuts: int = EVERYTHING
+
+    def place(self):
+        """Return where it is, in words."""
+        words = [] if self.byte is None else [f'at byte {self.byte}']
+        if self.start is not None and self.start > -FAR:
+            end = '' if self.end == self.start else f' to {seconds(self.end)}'
+            words.append(f'log time {seconds(self.start)}{end} s')
+        return ', '.join(words)
+
+
+def seconds(time):
+    """Return a time in nanoseconds as seconds, all digits."""
+    sign, time = ('-', -time) if time < 0 else ('', time)
+    return f'{sign}{time // 10**9}.{time % 10**9:09d}'
+
+
+def describe(losses):
+    """
+    Put losses in words.
+
+    :param losses: list of Loss.
+    :return: list of lines, one a cause, with the number of its losses and the first places.
+    """
+    groups = {}
+    for loss in losses:
+        groups.setdefault((loss.what, loss.why), []).append(loss)
+    lines = [_line(*key, group) for key, group in list(groups.items())[:CAUSES]]
+    if len(groups) > CAUSES:
+        rest = sum(len(group) for group in list(groups.values())[CAUSES:])
+        lines.append(f'{rest} more losses, of {len(groups) - CAUSES} other causes')
+    return lines
+
+
+def gaps(losses):
+    """
+    Return where episodes are cut.
+
+    :param losses: list of Loss.
+    :return: (G, 3) int64: first and last log time (ns), and EVERYTHING or FRAMES; the times are
+        -FAR where nothing of the file could be read.
+    """
+    rows = [(-FAR if loss.start is None else loss.start, -FAR if loss.end is None else loss.end,
+             loss.cuts) for loss in losses if loss.cuts != NOTHING]
+    return np.array(rows, np.int64).reshape(-1, 3)
+
+
+def _line(what, why, group):
+    places = [place for loss in group if (place := loss.place())]
+    more = f' and {len(places) - EXAMPLES} more' if len(places) > EXAMPLES else ''
+    where = '; '.join(places[:EXAMPLES]) + more
+    if not what:
+        return why
+    if what.startswith('topic '):
+        count = f'{len(group)} message{"s" * (len(group) > 1)} cannot be used'
+        return f'{escaped(what)}: {count}: {why}' + (f' ({where})' if where else '')
+    if len(group) == 1:
+        return f'{what} {where}: {why}'
+    return f'{len(group)} {what}s: {why} ({where})'
