@@ -61,6 +61,7 @@ class Job:
         self.count = max(1, round(fault.count * share))
         self.random = np.random.default_rng(0)
         self.tried = self.held = 0
+        self.note = ''  # for the row, beside the figure
         self.figures = []
         self.reasons, self._examples = Counter(), {}
         self._bar = tqdm(total=self.count, desc=fault.name, unit='', disable=not progress)

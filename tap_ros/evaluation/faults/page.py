@@ -12,8 +12,8 @@ INTRODUCTION = f"""\
 
 Made by `{COMMAND}` (`make faults`), never typed; as data: [{FILE}]({FILE}).
 
-Each row is a fault that was injected into real nodes, processes of their own that talk over DDS, or
-into real files. *Held* counts the trials in which the promise was kept. A row that falls short
+Each row is a fault that was injected into real nodes, processes of their own that talk over DDS,
+or into real files. *Held* counts the trials in which the promise was kept. A row that falls short
 stands here as it is, with the reason below the table.
 """
 
@@ -60,6 +60,7 @@ def _table(faults, rows):
         held = f'{row["held"]}' if row['held'] == row['tried'] else f'**{row["held"]}**'
         figure = '' if row['figure'] is None else f'{row["figure"]} {row["unit"]}'
         words = f'{fault.figure}, {fault.summary}' if figure else ''
+        words += f'; {row["note"]}' if row.get('note') else ''
         lines.append(f'| {fault.title} | {row["tried"]} | {held} | {figure} | {words} |')
     return '\n'.join(lines) + '\n'
 

@@ -5,8 +5,8 @@ The process that reads damaged files, so that a crash, a hang or a bomb ends it 
 
     python -m tap_ros.evaluation.faults.reading
 
-A line of standard input is a JSON list: what to read, and the file. The line that answers says what
-came of it. Whatever the files hold, nothing but such lines is printed.
+A line of standard input is a JSON list: what to read, and the file. The line that answers says
+what came of it. Whatever the files hold, nothing but such lines is printed.
 """
 
 import hashlib

@@ -260,8 +260,8 @@ FAULTS = [
           f'{NAMED} One flip does not cost the whole file.', 20_000, 0.012, flips,
           'pictures still read', '%', 'mean'),
     Fault('recording-opcodes', 'a chunk with another record type', 'The same, where the flip hits '
-          'the byte that says what follows: readers skip what they do not know.', NAMED, 200,
-          0.012, opcodes, 'pictures still read', '%', 'mean'),
+          'the byte that says what follows: readers skip what they do not know.', NAMED,
+          200, 0.012, opcodes, 'pictures still read', '%', 'mean'),
     Fault('recording-missing-chunks', 'a chunk of a recording gone', 'Part of a file was lost and '
           'the rest joined.', NAMED, 100, 0.012, missing_chunks, 'pictures still read', '%',
           'mean'),
@@ -271,9 +271,9 @@ FAULTS = [
           'pictures still read', '%', 'mean'),
     Fault('recording-metadata', 'nonsense in metadata.yaml', 'The file that lists the parts of a '
           'bag was edited by hand, or damaged.', NAMED, 72, 0.1, metadata, 'to read it', 's'),
-    Fault('recording-pipes', 'a pipe instead of a file', 'Something that is no file bears the name '
-          'of a recording.', 'Refused in one line instead of waiting for ever.', 10, 0.1, fifos,
+    Fault('recording-pipes', 'a pipe instead of a file', 'Something that is no file bears the '
+          'name of a recording.', 'Refused in one line instead of waiting for ever.', 10, 0.1, fifos,
           'to refuse it', 's'),
-    Fault('recording-bombs', 'kilobytes that unpack to gigabytes', 'A file from elsewhere was made '
-          'to exhaust the memory.', f'Refused in one line within {SLOW_S:g} s and {BOMB_MB} MB.',
-          20, 3.0, bombs, 'to refuse it', 's')]
+    Fault('recording-bombs', 'kilobytes that unpack to gigabytes', 'A file from elsewhere was '
+          'made to exhaust the memory.', f'Refused in one line within {SLOW_S:g} s and '
+          f'{BOMB_MB} MB.', 20, 3.0, bombs, 'to refuse it', 's')]

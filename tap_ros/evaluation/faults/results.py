@@ -63,12 +63,12 @@ def make_row(job, seconds, about):
     return {
         'fault': job.fault.name, 'tried': job.tried, 'held': job.held,
         'figure': None if figure is None else round_figure(figure), 'unit': job.fault.unit,
-        'command': command(job), 'why_not': job.why_not(), 'share': job.share,
-        'seconds': round(seconds, 1), **about}
+        'command': command(job), 'why_not': job.why_not(), 'note': job.note,
+        'share': job.share, 'seconds': round(seconds, 1), **about}
 
 
 def failed_row(job, seconds, about, error):
-    """Return the row of a Job that an exception ended: what was tried before counts for nothing."""
+    """Return the row of a Job that an exception ended; what was tried before is lost."""
     return {**make_row(job, seconds, about), 'tried': job.count, 'held': 0, 'error': True,
             'why_not': f'the trials could not be made: {error}'}
 
@@ -85,7 +85,7 @@ def command(job):
 
 
 def describe_machine():
-    """Return what every row says of where and of what it was made."""
+    """Return what every row says of the machine and the code."""
     return {'machine': f'{cpu_model()}, {os.cpu_count()} cores',
             'date': time.strftime('%Y-%m-%d'), 'commit': commit()}
 

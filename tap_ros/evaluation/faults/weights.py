@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of weights files: other numbers are never computed with, and every refusal is one line."""
+"""Faults of weights files: other numbers are never computed with; each refusal is one line."""
 
 import json
 import struct
@@ -117,6 +117,6 @@ FAULTS = [
           'the weights. A planner or predictor that computes with them would push objects to '
           'wrong places.', 'Refused in one line, or what is computed with is the same to the bit.',
           5000, 0.03, flips, 'to load it', 's'),
-    Fault('weights-nonsense', 'nonsense in a weights file', 'A file of another program or version, '
-          'an edited one, or one whose training went wrong.', 'Refused in one line that names the '
-          'file.', 160, 0.15, nonsense, 'to refuse it', 's')]
+    Fault('weights-nonsense', 'nonsense in a weights file', 'A file of another program or '
+          'version, an edited one, or one whose training went wrong.', 'Refused in one line '
+          'that names the file.', 160, 0.15, nonsense, 'to refuse it', 's')]
