@@ -272,8 +272,8 @@ FAULTS = [
     Fault('recording-metadata', 'nonsense in metadata.yaml', 'The file that lists the parts of a '
           'bag was edited by hand, or damaged.', NAMED, 72, 0.1, metadata, 'to read it', 's'),
     Fault('recording-pipes', 'a pipe instead of a file', 'Something that is no file bears the '
-          'name of a recording.', 'Refused in one line instead of waiting for ever.', 10, 0.1, fifos,
-          'to refuse it', 's'),
+          'name of a recording.', 'Refused in one line instead of waiting for ever.', 10, 0.1,
+          fifos, 'to refuse it', 's'),
     Fault('recording-bombs', 'kilobytes that unpack to gigabytes', 'A file from elsewhere was '
           'made to exhaust the memory.', f'Refused in one line within {SLOW_S:g} s and '
           f'{BOMB_MB} MB.', 20, 3.0, bombs, 'to refuse it', 's')]

@@ -16,6 +16,7 @@ from tap_ros.nodes.faults.attacked import Attacked
 END_S = 10.0
 USUAL_S = 4.0  # that a start takes
 SIDE_BY_SIDE = 2
+EARLY = 'ended by Python itself, while it imported'
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -30,8 +31,11 @@ def start_stop(job, name):
     trials = [(trial, random.uniform(0, USUAL_S), random.uniform(0, 0.5) * (trial % 3 > 0))
               for trial in job.trials()]
     with ThreadPoolExecutor(SIDE_BY_SIDE) as pool:
+        early = 0
         for why, seconds in pool.map(lambda trial: _one(job.folder, name, *trial), trials):
-            job.record(not why, why, seconds)
+            early += why == EARLY
+            job.record(why in ('', EARLY), why, seconds)
+    job.note = f'{early} times {EARLY}'
 
 
 def _one(folder, name, trial, early_s, late_s):
@@ -52,6 +56,9 @@ def _one(folder, name, trial, early_s, late_s):
     shutil.rmtree(bag, ignore_errors=True)
     if code is None:
         return f'did not end within {END_S:g} s of {number.name}', seconds
+    if not began and 'run_node' not in node.text and code is not None and (
+            code < 0 or 'KeyboardInterrupt' in node.text):
+        return EARLY, seconds
     if 'Traceback' in node.text:
         return f'a traceback after {number.name}: {node.last_line()}', seconds
     if code != 0 and (began or code > 0):
@@ -62,8 +69,8 @@ def _one(folder, name, trial, early_s, late_s):
 FAULTS = [
     Fault(f'start-stop-{name.removesuffix("_node").replace("visual_mpc", "planner")}',
           f'{name} is started and ended at any moment', 'A launch file is interrupted, or a '
-          'supervisor restarts a node.', f'It ends within {END_S:g} s, with exit code 0 once it '
-          'has said a word, and without a traceback.', 200, seconds,
-          partial(start_stop, name=name), 'until it had ended', 's')
+          'supervisor restarts a node.', f'It ends within {END_S:g} s, with exit code 0 and '
+          'without a traceback; while Python still imports, the signal may end Python itself.', 200,
+          seconds, partial(start_stop, name=name), 'until it had ended', 's')
     for name, seconds in (('sim_node', 2.0), ('predictor_node', 2.0), ('visual_mpc_node', 2.2),
                           ('recorder_node', 1.5))]
