@@ -22,7 +22,7 @@ $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 # Two processes share two cores best when each takes one.
 paper: export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test paper build lint bench clean
+.PHONY: help demo test paper faults build lint bench clean
 
 help:
 	@echo 'make demo    push two objects to where a goal picture shows them, three scenes'
@@ -30,6 +30,8 @@ help:
 	@echo 'make test    all tests; ARGS="-k warp" chooses'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
+	@echo 'make faults  inject every fault into real nodes and files, in docs/results: three hours;'
+	@echo '             goes on where it was interrupted; ARGS=--list, ARGS="--only NAME"'
 	@echo 'make bench   measure the speed of each part; ARGS=...'
 	@echo 'make lint    check the style of the code'
 	@echo 'make build   only the set-up: .venv, install/; then, to work in it:'
@@ -46,6 +48,9 @@ test: build
 
 paper: build
 	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(if $(SCALE),--scale $(SCALE)) $(ARGS)
+
+faults: build
+	@$(ENTER); $(DOMAIN); python -m tap_ros evaluate faults $(ARGS)
 
 bench: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros bench $(ARGS)

@@ -25,7 +25,8 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
     'evaluate': ('score trained weights', {
         'prediction': 'tap_ros.evaluation.prediction',
         'forward': 'tap_ros.evaluation.forward',
-        'planning': 'tap_ros.evaluation.planning.command'}),
+        'planning': 'tap_ros.evaluation.planning.command',
+        'faults': 'tap_ros.nodes.faults.command'}),
     'paper': ("make the paper's prediction results again", 'tap_ros.evaluation.paper.command'),
     'demo': ('push objects by way of a subgoal, with real nodes', 'tap_ros.nodes.demo'),
     'bench': ('measure speed; without a name, all of it', {

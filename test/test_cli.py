@@ -15,8 +15,8 @@ SAMPLE = ROOT / 'bags' / 'sample_push2'
 
 @pytest.mark.parametrize('command', [
     ['collect'], ['train'], ['train', '--model', 'forward'], ['evaluate', 'prediction'],
-    ['evaluate', 'planning'], ['bench', 'collect'], ['bench', 'recording'], ['bench', 'planning'],
-    ['bench', 'training'],
+    ['evaluate', 'planning'], ['evaluate', 'faults'],
+    ['bench', 'collect'], ['bench', 'recording'], ['bench', 'planning'], ['bench', 'training'],
     ['import-bair'], ['paper'], ['inspect'], []], ids=' '.join)
 def test_every_command_explains_itself(command, capsys):
     with pytest.raises(SystemExit) as end:
