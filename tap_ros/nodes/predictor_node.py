@@ -3,18 +3,21 @@
 """Serves predict_subgoal: decode, predict what waits together, encode."""
 
 from collections import deque
+import math
 import sys
 import time
 import traceback
 
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import TapError
+from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.late_answers import create_late_service, take_waiting
-from tap_ros.nodes.predictor_requests import encode_answer, RequestReader
+from tap_ros.nodes.predictor_requests import encode_answer, RequestReader, TOPICS
 from tap_ros.nodes.predictor_setup import (
     declare_parameters,
     load_predictors,
@@ -30,6 +33,7 @@ from tap_ros.text import escaped
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 SHOW_PERIOD = 0.1  # s between two looks for a subgoal to publish
+STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
 CLOSE_TIMEOUT = 5.0  # s; longer than any batch takes
 
 
@@ -46,13 +50,19 @@ class PredictorNode(Node):
         self.params = declare_parameters(self)
         self._queue = RequestQueue(
             self._load, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
-        self._reader = RequestReader(self, self.params, self._predictors)
+        self._diagnostics = Diagnostics(self, {
+            **dict.fromkeys((name for _, name in TOPICS['start'].values()), STALE_S),
+            **dict.fromkeys((name for _, name in TOPICS['goal'].values()), math.inf)},
+            queue=lambda: len(self._queue))
+        self._reader = RequestReader(
+            self, self.params, self._predictors, self._diagnostics.received)
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
         self._unshown = deque(maxlen=1)  # (Task, prediction, message) until it is published
         # Apart from the answers, which need not wait for it.
-        self.create_timer(SHOW_PERIOD, self._show)
+        self.create_timer(SHOW_PERIOD, self._look_around,
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._service = create_late_service(
             self, PredictSubgoal, 'predict_subgoal', self._on_request)
         sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
@@ -71,11 +81,17 @@ class PredictorNode(Node):
 
     def _on_request(self, request, send):
         """Check a request, and let it wait or refuse it."""
+        begin = time.perf_counter()
         try:
             task = self._reader.read(request)
-            self._queue.put(task, lambda found: self._answer(task, found, send))
+            self._queue.put(task, lambda found: self._answer(task, found, send, begin))
         except Exception as error:
             self._send(send, self._refusal(error))
+
+    def _look_around(self):
+        """Show what is new, and take what has come, whose age and rate diagnostics tell."""
+        self._show()
+        self._reader.pull()
 
     def _show(self):
         """Publish the newest subgoal for planners and people, if there is one that is not yet."""
@@ -115,8 +131,8 @@ class PredictorNode(Node):
                 answers[index] = subgoals, elapsed_ms
         return answers
 
-    def _answer(self, task, found, send):
-        """Send the answer to one task, found by _predict or an exception."""
+    def _answer(self, task, found, send, begin):
+        """Send the answer to a task that came at `begin`: found by _predict, or an exception."""
         try:
             if isinstance(found, Exception):
                 raise found
@@ -125,6 +141,7 @@ class PredictorNode(Node):
             self._send(send, self._refusal(error))
             return
         self._send(send, response)
+        self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         # Where to go first: the earliest subgoal of the first sample.
         self._unshown.append((task, found[0][0], response.subgoals[0]))
 
@@ -143,6 +160,7 @@ class PredictorNode(Node):
 
     def _log_unexpected(self, error, what):
         """Log an error that is none of ours, with where it came from."""
+        self._diagnostics.error(error)
         for line in ''.join(traceback.format_exception(error)).splitlines():
             self.get_logger().error(f'{what}: {escaped(line)}')
 

@@ -67,12 +67,19 @@ class RequestReader:
     :param node: rclpy Node; the topics that stand in for empty fields are subscribed to.
     :param params: its Parameters.
     :param predictors: {mode: SubgoalPredictor}.
+    :param on_message: called with the topic name for each message that has come.
     """
 
-    def __init__(self, node, params, predictors):
+    def __init__(self, node, params, predictors, on_message):
         self._node, self._params, self._predictors = node, params, predictors
-        self._newest = {'start': PulledObservations(node, TOPICS['start'], STREAM),
-                        'goal': PulledObservations(node, TOPICS['goal'], LATCHED)}
+        self._newest = {
+            'start': PulledObservations(node, TOPICS['start'], STREAM, on_message=on_message),
+            'goal': PulledObservations(node, TOPICS['goal'], LATCHED, True, on_message)}
+
+    def pull(self):
+        """Take what has come on the topics."""
+        for observations in self._newest.values():
+            observations.pull()
 
     def read(self, request):
         """

@@ -6,7 +6,7 @@ import threading
 import time
 
 from rclpy.callback_groups import CallbackGroup
-from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.observations import Observations, reception_time
 
 MOST = 100  # messages of a topic that are taken at once; more come with the next question
 PAUSE = 0.005  # s between two looks while waiting
@@ -36,11 +36,15 @@ class PulledObservations:
     :param node: rclpy Node.
     :param types: {short name: (message type, topic name)}, the one whose stamp counts first.
     :param qos: QoSProfile of all of them; its depth is how many messages wait to be taken.
+    :param latched: as in Observations.
+    :param on_message: called with the topic name for each message that is taken, or None.
     """
 
-    def __init__(self, node, types, qos):
+    def __init__(self, node, types, qos, latched=False, on_message=None):
         self._taking = threading.Lock()
-        self._observations = Observations(*types)
+        self._observations = Observations(*types, latched=latched)
+        self._on_message = on_message
+        self._names = {topic: name for topic, (_, name) in types.items()}
         group = Unwatched()
         self._subscriptions = {
             topic: node.create_subscription(
@@ -49,7 +53,7 @@ class PulledObservations:
 
     def newest(self, *topics):
         """Return the newest {topic: message} that has all of `topics`; None if there is none."""
-        self._pull()
+        self.pull()
         return self._observations.newest(*topics)
 
     def wait(self, topics, timeout_s, after_ns):
@@ -63,7 +67,7 @@ class PulledObservations:
         """
         deadline = time.monotonic() + timeout_s
         while True:
-            self._pull()
+            self.pull()
             found = self._observations.newest(*topics, after_ns=after_ns)
             if found is not None or time.monotonic() >= deadline:
                 return found
@@ -71,10 +75,10 @@ class PulledObservations:
 
     def missing(self, topics):
         """Return those of `topics` of which nothing has come since the start."""
-        self._pull()
+        self.pull()
         return self._observations.missing(topics)
 
-    def _pull(self):
+    def pull(self):
         """Take what has come, all topics together in the order in which it came."""
         with self._taking:
             come = []
@@ -84,6 +88,8 @@ class PulledObservations:
                         taken = subscription.handle.take_message(subscription.msg_type, False)
                         if taken is None:
                             break
-                        come.append((taken[1]['received_timestamp'], topic, taken[0]))
-            for _, topic, message in sorted(come, key=lambda one: one[0]):
-                self._observations.put(topic, message)
+                        come.append((reception_time(taken[1]), topic, taken[0]))
+            for received, topic, message in sorted(come, key=lambda one: one[0]):
+                self._observations.put(topic, message, received)
+                if self._on_message is not None:
+                    self._on_message(self._names[topic])
