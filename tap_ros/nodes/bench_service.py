@@ -86,7 +86,8 @@ def run(args):
                   f'{"busy":>7}{"lost":>7}')
             for count in args.clients:
                 load = measure_load(count, args.seconds)
-                p50, p99 = 1e3 * np.percentile(load.latencies, (50, 99))
+                p50, p99 = 1e3 * np.percentile(load.latencies, (50, 99)) if len(
+                    load.latencies) else (np.nan, np.nan)
                 print(f'{load.clients:>8}{load.per_second:>11.1f}{p50:>10.1f}{p99:>10.1f}'
                       f'{load.busy:>7}{load.lost:>7}', flush=True)
         nodes.check()
