@@ -3,6 +3,7 @@
 """The command that injects faults: `python -m tap_ros evaluate faults`."""
 
 import os
+import signal
 
 from tap_ros.evaluation.faults.runner import choose, run_faults
 from tap_ros.nodes.faults.groups import GROUPS
@@ -37,6 +38,7 @@ def run(args):
         return
     # Nodes of others on this machine must neither hear this nor be attacked.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # the nodes end with the run
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with Rig() as rig:
         print(f'logs of the nodes: {rig.folder}', flush=True)

@@ -70,7 +70,7 @@ FAULTS = [
     Fault(f'start-stop-{name.removesuffix("_node").replace("visual_mpc", "planner")}',
           f'{name} is started and ended at any moment', 'A launch file is interrupted, or a '
           'supervisor restarts a node.', f'It ends within {END_S:g} s, with exit code 0 and '
-          'without a traceback; while Python still imports, the signal may end Python itself.', 200,
+          'without a traceback; while Python imports, the signal may end Python itself.', 200,
           seconds, partial(start_stop, name=name), 'until it had ended', 's')
     for name, seconds in (('sim_node', 2.0), ('predictor_node', 2.0), ('visual_mpc_node', 2.2),
                           ('recorder_node', 1.5))]
