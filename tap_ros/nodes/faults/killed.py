@@ -35,10 +35,11 @@ def predictor(job):
     with rig.world():
         for _ in job.trials():
             rig.commands.forget()
+            moment = time.monotonic()  # from here on it is as good as dead
             victim.send(signal.SIGSTOP)  # so that it dies during the call
             handle = rig.begin(**goal_fields('subgoal'))
             time.sleep(job.random.uniform(0.1, 0.3))
-            moment = victim.kill()
+            victim.kill()
             noticed, seconds = judge_notice(watch, moment)
             end, lost = outcome(rig.result, handle, 30.0)
             took = time.monotonic() - moment
