@@ -94,6 +94,8 @@ class RecorderNode(Node):
         now = time.time_ns()
         for topic, (type_name, data, qos) in self._last.items():
             self._write(topic, type_name, data, now, now, qos)
+        if self._writer is not None:
+            self._flush()  # a full disk is to be known now, not at the first message
         if self._failure is not None:
             raise RecordingError(self._failure)
 
@@ -126,6 +128,14 @@ class RecorderNode(Node):
             return
         self._count += 1
         self._unflushed += 1
+
+    def _flush(self):
+        """Bring what was written so far to the disk."""
+        self._unflushed = 0
+        try:
+            self._writer.flush()
+        except Exception as error:
+            self._give_up(error)
 
     def _give_up(self, error):
         """Stop recording after a failed write."""
@@ -220,11 +230,7 @@ class RecorderNode(Node):
     def _look_after(self):
         """Bring what was written to the disk, and look after topics."""
         if self._writer is not None and self._unflushed:
-            self._unflushed = 0
-            try:
-                self._writer.flush()
-            except Exception as error:
-                self._give_up(error)
+            self._flush()
         while self._mismatched:  # a publisher offers less than was asked for: ask for less
             topic, policy = self._mismatched.pop()
             source = self._sources[topic]

@@ -122,17 +122,17 @@ def opcodes(job):
     """Read a file where the kind of a chunk's record is another one."""
     def change(data, position, _):
         data[position] = int(job.random.choice([0, 3, 4, 5, 9, 15, 99, 200]))
-    _chunks(job, change)
+    _chunks(job, change, lost=False)  # the summary says where it is, so it can be read
 
 
 def missing_chunks(job):
     """Read a file where a chunk is gone."""
     def change(data, position, length):
         del data[position:position + length]
-    _chunks(job, change)
+    _chunks(job, change, lost=True)
 
 
-def _chunks(job, change):
+def _chunks(job, change, lost):
     path = job.folder / 'chunks.mcap'
     with Reader() as reader:
         write_recording(path)
@@ -144,7 +144,7 @@ def _chunks(job, change):
             path.write_bytes(data)
             found = reader.read('recording', path)
             why = known.judge(found, path.name, readable=True)
-            if not why and found['content'] == known.episodes:
+            if lost and not why and found['content'] == known.episodes:
                 why = 'everything was read though a chunk is gone'
             job.record(not why, why, known.share(found))
 

@@ -22,6 +22,12 @@ def judge_notice(watch, moment):
     return (f'its death was noticed after {seconds:.1f} s' if seconds > NOTICED_S else ''), seconds
 
 
+def restart(victim, watch):
+    """Start a node again, and wait until it is ready and its heartbeat is heard."""
+    victim.start().wait_until_ready()
+    watch.wait_until_alive(5.0)
+
+
 def joined(*reasons):
     """Return the reasons that are not empty, in one line."""
     return ' + '.join(reason for reason in reasons if reason)
@@ -48,7 +54,7 @@ def predictor(job):
                 end.startswith('aborted') and 'predict' in end) else f'the goal {end}'
             if not lost and not told and took > max(NOTICED_S, seconds):
                 told = f'the goal was told after {took:.1f} s'
-            victim.start().wait_until_ready()
+            restart(victim, watch)
             begin = time.monotonic()
             response, unanswered = outcome(rig.predict, 5.0, **predict_fields())
             if response is not None and not response.success:
@@ -85,7 +91,7 @@ def planner(job):
         time.sleep(1.0)
         drift = float(np.abs(np.array(rig.joints.wait(5.0).position[:3]) - before).max())
         moved = f'the arm still moved {1000 * drift:.0f} mm' if drift > 2e-3 else ''
-        victim.start().wait_until_ready()
+        restart(victim, watch)
         handle, lost = outcome(rig.begin, 10.0, mode='direct', step_budget=1)
         if handle is not None:
             end, lost = outcome(rig.result, handle, 20.0)
@@ -115,7 +121,7 @@ def simulator(job):
         stopped, _ = judge_stop(rig.commands, moment)
         end, lost = outcome(rig.result, handle, 30.0)
         told = f'the goal {end}' if end is not None and not end.startswith('aborted') else ''
-        victim.start().wait_until_ready()
+        restart(victim, watch)
         answer, unanswered = outcome(rig.reset, trial % 10)
         handle, again = outcome(rig.begin, 10.0, mode='direct', step_budget=1)
         if handle is not None:
