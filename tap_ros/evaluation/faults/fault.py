@@ -54,9 +54,12 @@ class Job:
     :param folder: for whatever the trials write.
     :param rig: what runs the nodes, for faults that need some; else None.
     :param progress: whether to show a bar.
+    :param patience: factor of what a promise says in seconds; more than 1 on a machine that does
+        something else meanwhile.
     """
 
-    def __init__(self, fault, share, folder, rig=None, progress=True):
+    def __init__(self, fault, share, folder, rig=None, progress=True, patience=1.0):
+        self.patience = patience
         self.fault, self.share, self.folder, self.rig = fault, share, folder, rig
         self.count = max(1, round(fault.count * share))
         self.random = np.random.default_rng(0)

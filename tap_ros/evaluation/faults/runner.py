@@ -22,7 +22,8 @@ from tap_ros.evaluation.faults.results import (
 from tap_ros.text import escaped
 
 
-def run_faults(groups, out, only=(), share=1.0, again=False, rig=None, progress=True):
+def run_faults(groups, out, only=(), share=1.0, again=False, rig=None, progress=True,
+               patience=1.0):
     """
     Try faults.
 
@@ -33,6 +34,7 @@ def run_faults(groups, out, only=(), share=1.0, again=False, rig=None, progress=
     :param again: also try what faults.json says already.
     :param rig: handed to each Job.
     :param progress: whether to show bars.
+    :param patience: see Job.
     :return: the rows, those that were there included, of the faults chosen.
     :raises ConfigError: for an unknown name or a bad share.
     """
@@ -45,7 +47,7 @@ def run_faults(groups, out, only=(), share=1.0, again=False, rig=None, progress=
     for fault in faults:
         row = load_rows(out).get(fault.name)
         if again or not is_done(row, share):
-            row = _try(fault, share, rig, progress, about)
+            row = _try(fault, share, rig, progress, patience, about)
             save_row(out, row, order)
             write_page(out, groups)
             print(summary(row), flush=True)
@@ -72,10 +74,10 @@ def summary(row):
             f'{row["seconds"]:.0f} s{why}')
 
 
-def _try(fault, share, rig, progress, about):
+def _try(fault, share, rig, progress, patience, about):
     """Return the row of one fault, whatever happens meanwhile."""
     folder = Path(tempfile.mkdtemp(prefix='faults-'))
-    job = Job(fault, share, folder, rig, progress)
+    job = Job(fault, share, folder, rig, progress, patience)
     begin = time.monotonic()
     try:
         fault.run(job)

@@ -35,7 +35,7 @@ def _judge(job, handle, moment):
         why = f'the goal went on: {why}'
     elif not end.startswith('aborted: ') or end == 'aborted: ':
         why = f'the goal {end}'
-    late = job.rig.commands.moves(moment + STOP_S)
+    late = job.rig.commands.moves(moment + STOP_S * job.patience)
     if not why and late:
         why = f'a move was sent {late[-1].at - moment:.1f} s after the change'
     job.record(not why, why, took)

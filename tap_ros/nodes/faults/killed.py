@@ -14,12 +14,13 @@ from tap_ros.nodes.faults.world import goal_fields, predict_fields
 NOTICED_S = 1.0
 
 
-def judge_notice(watch, moment):
+def judge_notice(job, watch, moment):
     """Say what is wrong with how a death was noticed; and the seconds it took."""
     seconds = watch.seconds_to_notice(moment)
     if seconds == float('inf'):
         return 'its heartbeat told nobody that it had died', seconds
-    return (f'its death was noticed after {seconds:.1f} s' if seconds > NOTICED_S else ''), seconds
+    late = seconds > NOTICED_S * job.patience
+    return f'its death was noticed after {seconds:.1f} s' if late else '', seconds
 
 
 def restart(victim, watch):
@@ -46,13 +47,13 @@ def predictor(job):
             handle = rig.begin(**goal_fields('subgoal'))
             time.sleep(job.random.uniform(0.1, 0.3))
             victim.kill()
-            noticed, seconds = judge_notice(watch, moment)
+            noticed, seconds = judge_notice(job, watch, moment)
             end, lost = outcome(rig.result, handle, 30.0)
             took = time.monotonic() - moment
-            stopped, _ = judge_stop(rig.commands, moment)
+            stopped, _ = judge_stop(job, moment)
             told = '' if end is None or (
                 end.startswith('aborted') and 'predict' in end) else f'the goal {end}'
-            if not lost and not told and took > max(NOTICED_S, seconds):
+            if not lost and not told and took > max(NOTICED_S * job.patience, seconds):
                 told = f'the goal was told after {took:.1f} s'
             restart(victim, watch)
             begin = time.monotonic()
@@ -84,8 +85,9 @@ def planner(job):
         moment = victim.kill()
         _, told = outcome(rig.result, handle, 4.0)
         took = time.monotonic() - moment
-        told = '' if took <= NOTICED_S + 0.2 else f'its client was told after {took:.1f} s: {told}'
-        noticed, seconds = judge_notice(watch, moment)
+        late = took > NOTICED_S * job.patience + 0.2
+        told = f'its client was told after {took:.1f} s: {told}' if late else ''
+        noticed, seconds = judge_notice(job, watch, moment)
         time.sleep(max(0.0, moment + 1.0 - time.monotonic()))
         before = np.array(rig.joints.wait(5.0).position[:3])
         time.sleep(1.0)
@@ -116,9 +118,9 @@ def simulator(job):
             rig.need('visual_mpc_node', sim='real')
             continue
         moment = victim.kill()
-        noticed, seconds = judge_notice(watch, moment)
+        noticed, seconds = judge_notice(job, watch, moment)
         time.sleep(max(0.0, moment + 1.0 - time.monotonic()))
-        stopped, _ = judge_stop(rig.commands, moment)
+        stopped, _ = judge_stop(job, moment)
         end, lost = outcome(rig.result, handle, 30.0)
         told = f'the goal {end}' if end is not None and not end.startswith('aborted') else ''
         restart(victim, watch)

@@ -17,17 +17,18 @@ ABSURD = (5.4e8, 5000.0, -7000.0, float('inf'), float('-inf'), float('nan'), 1e3
           -10.0)
 
 
-def judge_stop(commands, moment):
+def judge_stop(job, moment):
     """
     Say what is wrong with how the arm was stopped after a moment.
 
     :return: what is wrong, or an empty string; and the seconds to the stop.
     """
+    commands, limit = job.rig.commands, STOP_S * job.patience
     seconds = commands.seconds_to_stop(moment)
-    late = [command.at - moment for command in commands.moves(moment + STOP_S)]
+    late = [command.at - moment for command in commands.moves(moment + limit)]
     if late:
         return f'a move was sent after {max(late):.1f} s', seconds
-    if seconds > STOP_S:
+    if seconds > limit:
         return ('no stop was sent' if seconds == float('inf')
                 else f'the stop came after {seconds:.2f} s'), seconds
     return '', seconds
@@ -46,7 +47,7 @@ def silent(job, topics):
             time.sleep(job.random.uniform(0, 0.4))
             moment = world.silence(*topics)
             time.sleep(max(0.0, moment + 1.2 - time.monotonic()))
-            why, seconds = judge_stop(rig.commands, moment)
+            why, seconds = judge_stop(job, moment)
             world.restore()
             outcome(rig.finish, handle)
             job.record(not why, why, seconds)
@@ -96,7 +97,7 @@ def absurd_to_planner(job):
                 moment = time.monotonic()
                 handle = rig.begin(**goal_fields())
             end, error = outcome(rig.result, handle, 12.0)
-            moves = rig.commands.moves(moment + (STOP_S if during else 0.0))
+            moves = rig.commands.moves(moment + (STOP_S * job.patience if during else 0.0))
             why = error or judge_refusal(end.removeprefix('aborted: '), name, value)
             if end and not end.startswith('aborted'):
                 why = f'pixel {value:g}: the goal {end}'
