@@ -8,14 +8,12 @@ import time
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from std_msgs.msg import Float64
 from tap_ros.errors import PlanningError
 from tap_ros.nodes.topics import LATCHED, STREAM
 
-WATCH_S = 0.05  # how often it is checked whether the arm has to be stopped
+WATCH_S = 0.02  # how often it is checked whether the arm has to be stopped
 REPEAT_S = 0.2  # a stop is repeated after so long, while a goal is in progress
 
 
@@ -24,8 +22,8 @@ class Arm:
     Commands for one goal at a time; safe to use from several threads.
 
     While a goal is in progress, the arm is sent zero unless a command is younger than max_silence
-    and so is all that is watched. A timer does this, in a thread of its own: it does not matter
-    what keeps the planner busy.
+    and so is all that is watched. A thread of its own does this: it does not matter what keeps the
+    planner or the executor busy.
 
     :param node: rclpy Node.
     :param params: its Parameters.
@@ -34,15 +32,16 @@ class Arm:
 
     def __init__(self, node, params, sensors):
         self._node, self._params, self._sensors = node, params, sensors
-        self._lock = threading.Lock()  # no command may follow the end of a goal
+        self._lock = threading.Condition()  # no command may follow the end of a goal
         self._goal, self._topics = None, ()
         self._moved_at = self._stopped_at = -math.inf  # monotonic time
         self._gripper = node.create_publisher(Float64, 'gripper/command', STREAM)
         self._twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
         self._timeout = node.create_publisher(Float64, 'arm/command_timeout', LATCHED)
         self._timeout.publish(Float64(data=params['command_timeout']))
-        node.create_timer(WATCH_S, self._watch, MutuallyExclusiveCallbackGroup(),
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._closed = False
+        self._thread = threading.Thread(target=self._watch, name='arm watch', daemon=True)
+        self._thread.start()
 
     def begin(self, goal):
         """Let a goal, any object, move the arm; nothing else may from now on."""
@@ -50,6 +49,7 @@ class Arm:
             self._goal, self._topics = goal, ()
             self._moved_at = -math.inf
             self._stop()
+            self._lock.notify()
 
     def end(self, goal=None):
         """
@@ -94,19 +94,28 @@ class Arm:
             self._twist.publish(message)
         return True
 
-    def wait_until_sent(self, seconds):
-        """Wait until all has left, the last stop above all."""
+    def close(self, seconds):
+        """Stop the arm for good; wait until that has left, at most so many seconds."""
+        self.end()
+        with self._lock:
+            self._closed = True
+            self._lock.notify()
+        self._thread.join(seconds)
         self._twist.wait_for_all_acked(Duration(seconds=seconds))
 
     def _watch(self):
-        """Stop the arm when it is time to."""
-        with self._lock:
-            now = time.monotonic()
-            if self._goal is None or now - self._stopped_at < REPEAT_S:
-                return
-            if (now - self._moved_at > self._params['max_silence']
-                    or self._silent(self._topics, now, renewed=True)):
-                self._stop()
+        """Stop the arm whenever it is time to, until close."""
+        while not self._closed:
+            with self._lock:
+                if self._goal is None:
+                    self._lock.wait_for(lambda: self._goal is not None or self._closed)
+                    continue
+                now = time.monotonic()
+                if now - self._stopped_at >= REPEAT_S and (
+                        now - self._moved_at > self._params['max_silence']
+                        or self._silent(self._topics, now, renewed=True)):
+                    self._stop()
+            time.sleep(WATCH_S)
 
     def _silent(self, topics, now, renewed=False):
         """Tell whether one of the topics is silent."""

@@ -53,7 +53,7 @@ def declare_parameters(node):
                        'every picture (ground_truth), or there only at first, then carried by '
                        'the forward model and found again in the pictures.', choices=TRACKING,
                        read_only=False)
-    parameters.declare('max_silence', 0.4,
+    parameters.declare('max_silence', 0.35,
                        'The arm is stopped when the picture, the objects or the joints have been '
                        'silent for so many seconds, or when the last command is so old.',
                        low=0.05, high=60.0, read_only=False)

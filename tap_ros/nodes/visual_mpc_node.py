@@ -84,8 +84,7 @@ class VisualMpcNode(Node):
         self._arm.end()
         self._sensors.wake()
         self._busy.acquire(timeout=10.0)  # longer than a plan takes
-        self._arm.end()
-        self._arm.wait_until_sent(1.0)
+        self._arm.close(1.0)
 
     # Callbacks
 

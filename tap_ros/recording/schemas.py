@@ -59,6 +59,7 @@ uint32 width
 bool do_rectify""",
     'std_msgs/msg/Float64': 'float64 data',
     'std_msgs/msg/Header': 'builtin_interfaces/Time stamp\nstring frame_id',
+    'tap_msgs/msg/CommandRefused': 'std_msgs/Header header\nstring message',
     'tap_msgs/msg/Episode': """
 uint8 START=0
 uint8 END=1
@@ -100,6 +101,8 @@ TYPE_HASHES = {
         'RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e',
     'std_msgs/msg/Float64':
         'RIHS01_705ba9c3d1a09df43737eb67095534de36fd426c0587779bda2bc51fe790182a',
+    'tap_msgs/msg/CommandRefused':
+        'RIHS01_027bf0b0bf92e854e36759a30c80c55282b64dc397f65ba33c216aeddb7b22bb',
     'tap_msgs/msg/Episode':
         'RIHS01_4b355d513f5756a151f29200fa362d801ce3baa5ff3f074f01a00a6afc6c0d72',
     'tap_msgs/msg/ObjectStates':

@@ -230,7 +230,7 @@ def test_beyond_the_queue_requests_are_told_that_the_node_is_busy(services):
         PredictSubgoal, '/both/predict_subgoal', qos_profile=SERVICE_QOS)
     assert client.wait_for_service(30)
     request = PredictSubgoal.Request(
-        mode='forward', num_samples=25, recursion_depth=8, **WITH_GOAL)
+        mode='forward', num_samples=6, recursion_depth=8, **WITH_GOAL)
     futures = [client.call_async(request) for _ in range(150)]
     assert all(wait_for_future(future, 120) for future in futures)
     refused = [f.result().message for f in futures if not f.result().success]
