@@ -12,6 +12,7 @@ from rclpy.duration import Duration
 from std_msgs.msg import Float64
 from tap_ros.errors import PlanningError
 from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.text import escaped
 
 WATCH_S = 0.02  # how often it is checked whether the arm has to be stopped
 REPEAT_S = 0.2  # a stop is repeated after so long, while a goal is in progress
@@ -110,12 +111,20 @@ class Arm:
                 if self._goal is None:
                     self._lock.wait_for(lambda: self._goal is not None or self._closed)
                     continue
-                now = time.monotonic()
-                if now - self._stopped_at >= REPEAT_S and (
-                        now - self._moved_at > self._params['max_silence']
-                        or self._silent(self._topics, now, renewed=True)):
-                    self._stop()
+                try:
+                    self._stop_if_due(time.monotonic())
+                except Exception as error:  # this thread must not end
+                    self._node.get_logger().error(
+                        f'the watch of the arm failed: {type(error).__name__}: {escaped(error)}',
+                        throttle_duration_sec=1.0)
             time.sleep(WATCH_S)
+
+    def _stop_if_due(self, now):
+        """Stop the arm when a command or a sensor is too old, and again after REPEAT_S."""
+        if now - self._stopped_at >= REPEAT_S and (
+                now - self._moved_at > self._params['max_silence']
+                or self._silent(self._topics, now, renewed=True)):
+            self._stop()
 
     def _silent(self, topics, now, renewed=False):
         """Tell whether one of the topics is silent."""
