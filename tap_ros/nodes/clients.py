@@ -6,7 +6,7 @@ import threading
 import time
 
 from action_msgs.msg import GoalStatus
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from tap_ros.errors import TapError
 
 NEWBORN_S = 1.0  # until others have heard of a node that has just started
@@ -26,7 +26,7 @@ class Spinner:
     """
 
     def __init__(self, node):
-        self._executor = MultiThreadedExecutor(num_threads=2, context=node.context)
+        self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._spin, name='spinner', daemon=True)
