@@ -43,7 +43,7 @@ STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
 
 class Watch:
     """
-    Keep every camera picture, and the objects in it, since the last call of begin.
+    Keep every camera picture of a scene, and the objects in it.
 
     :param node: rclpy Node that another thread spins.
     """
@@ -59,12 +59,13 @@ class Watch:
 
     def begin(self):
         """Forget what was seen."""
+        self.first_ns = 0  # what is stamped before this is of another scene
         self._kept = {topic: {} for topic in self._topics}
 
     def seen(self):
         """Return the images and the objects that belong to them, in order of their stamps."""
         images, objects = (dict(found) for found in self._kept.values())
-        stamps = sorted(set(images) & set(objects))
+        stamps = sorted(stamp for stamp in set(images) & set(objects) if stamp >= self.first_ns)
         return [images[stamp] for stamp in stamps], [objects[stamp] for stamp in stamps]
 
     def _keep(self, topic, message):
@@ -85,7 +86,7 @@ class DemoClient:
         self._predict = self.node.create_client(PredictSubgoal, 'predict_subgoal')
         self._reach = ActionClient(self.node, ReachGoal, 'reach_goal')
         self._camera = Watch(self.node)
-        self._goal = Observations('image', 'objects')
+        self._goal = Observations('image', 'objects', latched=True)
         self._goal.subscribe(self.node, {
             'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}, LATCHED)
 
@@ -105,6 +106,8 @@ class DemoClient:
                 raise TapError(
                     f'{", ".join(waiting)} not ready after {START_TIMEOUT_S:g} s; see the logs')
             time.sleep(0.1)
+        # That of the first scene, which is kept for late joiners: the next one is another.
+        self._goal.wait(('image', 'objects'), CALL_TIMEOUT_S)
 
     def reset(self, task, seed):
         """Start a scene; return its goal as a dict of image and objects."""
@@ -115,6 +118,8 @@ class DemoClient:
         if not answer.success:
             raise TapError(f'sim/reset: {answer.message}')
         goal = self._goal.wait(('image', 'objects'), CALL_TIMEOUT_S, after_ns)
+        if goal is not None:  # of the same stamp as the first picture of the scene
+            self._camera.first_ns = to_nanoseconds(goal['image'].header.stamp)
         deadline = time.monotonic() + CALL_TIMEOUT_S
         while goal is not None and not self._camera.seen()[0] and time.monotonic() < deadline:
             time.sleep(0.01)
