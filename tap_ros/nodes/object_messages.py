@@ -54,8 +54,6 @@ def decode_objects(message, name, size=None):
             f'{name}: has {len(message.objects)} objects; at most {MAX_OBJECTS} are taken')
     names = tuple(state.name for state in message.objects)
     pixels = np.array([(state.u, state.v) for state in message.objects]).reshape(len(names), 2)
-    with np.errstate(over='ignore'):  # what float32 cannot hold becomes infinite, and is refused
-        pixels = pixels.astype(np.float32)
     for index, object_name in enumerate(names):
         if not object_name or object_name in names[:index]:
             raise PlanningError(
@@ -66,7 +64,7 @@ def decode_objects(message, name, size=None):
                 f'{name}: objects[{index}].name has {len(object_name)} characters; '
                 f'at most {MAX_NAME} are taken')
         _check_pixel(f'{name}: {escaped(object_name)}', pixels[index], size)
-    return names, pixels
+    return names, pixels.astype(np.float32)
 
 
 def _check_pixel(name, pixel, size):

@@ -32,7 +32,7 @@ from tap_ros.nodes.run import run_node
 from tap_ros.nodes.sight import Sight
 from tap_ros.nodes.sight import TOPICS as SENSORS
 from tap_ros.nodes.subgoal_messages import decode_subgoals
-from tap_ros.nodes.topics import STREAM, to_nanoseconds
+from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.hierarchy import choose_sample, targets_by
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig
 from tap_ros.text import escaped
@@ -169,7 +169,7 @@ class VisualMpcNode(Node):
                 targets = self._aim(handle, mode, seen)
                 num_subgoals = len(targets) - 1
                 reach.head_for(targets, time.monotonic())
-            elif isinstance(answer, Command) and self._send(handle, answer, topics):
+            elif isinstance(answer, Command) and self._send(handle, reach, answer, topics):
                 reach.sent(self._sight.newest_stamp()
                            + int(0.9e9 * self.params['control_period']))
                 result.steps = reach.steps
@@ -236,11 +236,21 @@ class VisualMpcNode(Node):
             raise PlanningError(f'service {self._predict.service_name}: {response.message}')
         return decode_subgoals(response, names, self._mpc.image_size)
 
-    def _send(self, handle, command, topics):
-        """Send a command, unless the goal has ended or the sensors are silent; tell whether."""
+    def _send(self, handle, reach, command, topics):
+        """
+        Send a command; tell whether it was: not when a sensor is silent, or it is for an old goal.
+
+        :raises TapError: when what was seen while it was planned forbids it.
+        """
         self._go_on(handle)
-        stamp = self._sight.messages['image'].header.stamp
-        return self._arm.send(handle, command.plan.action, stamp, topics)
+        seen, _ = self._sight.look(topics)
+        end = reach.interrupted(seen)
+        if end:
+            raise PlanningError(end.message)
+        if self._goal.changed(self._accepted):
+            return False
+        return self._arm.send(
+            handle, command.plan.action, to_stamp(command.seen.stamp_ns), topics)
 
 
 def cancel_is_known(handle, seconds=1.0):

@@ -141,10 +141,9 @@ class Reach:
         :return: Aim, Command, Wait or End.
         :raises PlanningError: for what cannot be planned with.
         """
-        if seen is not None and self._first is not None:
-            change = scene_change(self._first, seen)
-            if change:
-                return End('aborted', f'the scene has changed: {change}')
+        end = self.interrupted(seen)
+        if end:
+            return end
         reason = self._unusable(seen, now, lacking)
         if reason:
             silence = now - self._usable_at
@@ -156,6 +155,18 @@ class Reach:
         self._usable_at = now
         self._first = self._first or seen
         return Aim(seen) if self._targets is None else self._plan(seen)
+
+    def interrupted(self, seen):
+        """
+        Return the End if another scene is seen, else None.
+
+        To be asked again before a command is carried out, as planning takes time.
+        """
+        if seen is not None and self._first is not None:
+            change = scene_change(self._first, seen)
+            if change:
+                return End('aborted', f'the scene has changed: {change}')
+        return None
 
     def head_for(self, targets, now=0.0):
         """
