@@ -68,13 +68,12 @@ def call(client, request, timeout_s, give_up=lambda: False, server=None):
             raise CallError(
                 f'service {name}: nobody offers it after {timeout_s:g} s; '
                 'start its node and wait until it says that it is ready')
-    deaths = server.deaths if server is not None else 0
     future = client.call_async(request)
     done = threading.Event()
     future.add_done_callback(lambda _: done.set())
     try:
         while not done.wait(min(0.05, max(deadline - time.monotonic(), 0))):
-            if not client.service_is_ready() or (server and server.deaths > deaths):
+            if not client.service_is_ready() or (server is not None and server.dead):
                 raise CallError(f'service {name}: its node ended during the call')
             if time.monotonic() >= deadline or give_up():
                 raise CallError(

