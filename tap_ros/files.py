@@ -7,12 +7,15 @@ A kill or a full disk leaves what was there before: the old file stays until the
 """
 
 from contextlib import contextmanager, suppress
+import errno
 import fcntl
 import os
 from pathlib import Path
 
 from tap_ros.errors import StorageError
 from tap_ros.text import escaped
+
+_NOT_OF_STORAGE = (errno.ENOENT, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ECONNRESET)
 
 
 def write_atomically(path, data):
@@ -53,9 +56,13 @@ def storage_errors(path):
     except BrokenPipeError:  # nobody reads the output any more
         raise
     except OSError as error:
+        place = escaped(error.filename or path)
+        reason = escaped(error.strerror or error)
         raise StorageError(
-            f'{escaped(path)}: cannot be written: {escaped(error.strerror or error)}; make room '
-            'or choose another place, then start again') from error
+            f'{place}: cannot be used: {reason}; mend that, then start again'
+            if error.errno in _NOT_OF_STORAGE else
+            f'{escaped(path)}: cannot be written: {reason}; make room or choose another place, '
+            'then start again') from error
 
 
 @contextmanager

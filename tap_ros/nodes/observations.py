@@ -31,6 +31,7 @@ class Observations:
     A stamp that goes back, or that is more than JUMP_NS ahead, is believed only when PROOF
     messages in a row say the same: a single one is a stray publisher's, several are another
     simulator or a bag that loops. Then all that came before is forgotten, and `jumps` counts it.
+    A stray that is less ahead is dropped when the next message goes on from the one before.
 
     :param topics: short names, for example 'image', 'objects'; the first is the one whose stamp
         counts, the others describe it.
@@ -45,6 +46,7 @@ class Observations:
         self._changed = threading.Condition()
         self._by_stamp = OrderedDict()  # stamp in ns -> {topic: (message, received)}
         self._newest = {}  # topic -> stamp in ns
+        self._previous = {}  # topic -> the stamp before that
         self._received = {}  # topic -> monotonic time of its last message
         self._renewed = {}  # topic -> monotonic time of its last message with a new stamp
         self._suspects = {topic: [] for topic in topics}  # stamps in a row that are not believed
@@ -82,6 +84,7 @@ class Observations:
                 return
             if stamp != self._newest.get(topic):
                 self._renewed[topic] = received
+                self._previous[topic] = self._newest.get(topic, stamp)
             self._newest[topic] = stamp
             self._received[topic] = received
             self._by_stamp.setdefault(stamp, {})[topic] = message, received
@@ -93,6 +96,7 @@ class Observations:
 
     def _believe(self, topic, stamp):
         """Tell whether a stamp is used; forget all others when the clock has jumped to it."""
+        self._drop_stray(topic, stamp)
         clock = max(self._newest.values(), default=stamp)
         if self._newest.get(topic, 0) <= stamp <= clock + JUMP_NS:
             self._suspects[topic].clear()
@@ -106,9 +110,17 @@ class Observations:
         self.jumps += 1
         self._by_stamp.clear()
         self._newest.clear()
+        self._previous.clear()
         for others in self._suspects.values():
             others.clear()
         return True
+
+    def _drop_stray(self, topic, stamp):
+        """Forget the newest message of a topic when this stamp goes on from the one before it."""
+        newest, previous = self._newest.get(topic), self._previous.get(topic)
+        if newest is not None and previous <= stamp < newest:
+            self._newest[topic] = previous
+            self._by_stamp.get(newest, {}).pop(topic, None)
 
     def newest(self, *topics, after_ns=-1, since=-math.inf):
         """

@@ -55,7 +55,8 @@ def declare_parameters(node):
                        read_only=False)
     parameters.declare('max_silence', 0.35,
                        'The arm is stopped when the picture, the objects or the joints have been '
-                       'silent for so many seconds, or when the last command is so old.',
+                       'silent for so many seconds, or when the last command is so old. Has to '
+                       'be longer than the time from one picture to the next.',
                        low=0.05, high=60.0, read_only=False)
     parameters.declare('command_timeout', 0.5,
                        'Seconds that a command is valid after it came; told to the arm on '

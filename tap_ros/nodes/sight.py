@@ -9,7 +9,7 @@ from sensor_msgs.msg import Image, JointState
 from tap_msgs.msg import Episode, ObjectStates
 from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
-from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.observations import JUMP_NS, Observations
 from tap_ros.nodes.topics import STREAM, to_nanoseconds
 from tap_ros.planning.reach import Seen
 
@@ -31,7 +31,7 @@ class Sight:
 
     def __init__(self, node, params, image_size, on_message):
         self._node, self._params, self._size = node, params, image_size
-        self._scene_ns = 0  # stamp of the newest mark that an episode begins
+        self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
         self.sensors = Observations(*TOPICS)
         self.begin(0.0)
         node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
@@ -55,7 +55,7 @@ class Sight:
             return None, lacking or (
                 f'no messages of the same stamp on {self._names(topics)} since the goal was '
                 'accepted')
-        times = {'received': moment.received, 'scene_ns': self._scene_ns,
+        times = {'received': moment.received, 'scene_ns': self._scene_ns(moment.stamp_ns),
                  'jumps': self.sensors.jumps}
         if self._seen is not None and (self._seen.stamp_ns, self._seen.jumps) == (
                 moment.stamp_ns, times['jumps']):
@@ -66,9 +66,15 @@ class Sight:
         return self._seen, lacking
 
     def newest_stamp(self):
-        """Return the stamp of the newest picture that has come, in ns."""
-        newest = self.sensors.newest('image') or self.messages
-        return to_nanoseconds(newest['image'].header.stamp)
+        """Return the stamp of the newest picture that has come with its joints, in ns."""
+        moment = self.sensors.moment(('image', 'joints'))
+        return moment.stamp_ns if moment is not None else -1
+
+    def _scene_ns(self, stamp_ns):
+        """Return when the scene began, 0 if that is unknown or of another clock."""
+        begun_ns, jumps = self._mark
+        known = jumps == self.sensors.jumps and begun_ns <= stamp_ns + JUMP_NS
+        return begun_ns if known else 0
 
     def _decode(self, moment, topics, times):
         """Return a Seen; the objects keep the order in which they were seen first."""
@@ -97,5 +103,5 @@ class Sight:
 
     def _on_episode(self, message):
         if message.event == Episode.START:
-            self._scene_ns = to_nanoseconds(message.header.stamp)
+            self._mark = to_nanoseconds(message.header.stamp), self.sensors.jumps
             self.sensors.wake()

@@ -22,6 +22,7 @@ from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.goal_source import GoalSource, needed_topics
 from tap_ros.nodes.goal_source import TOPICS as GOAL
 from tap_ros.nodes.heartbeat import Liveness
+from tap_ros.nodes.late_answers import SERVICE_QOS
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.planner_setup import (
     check_request,
@@ -57,8 +58,7 @@ class VisualMpcNode(Node):
         self._mpc = load_planner(self.params)
         self._ending = False
         self._cancelled = None  # the goal that was cancelled last
-        self._busy = threading.Lock()  # held from the acceptance of a goal to its end
-        self._accepted = 0.0
+        self._busy = threading.Lock()  # held while a goal is executed
         self._refusals = deque(maxlen=10)
         self._diagnostics = Diagnostics(self, {
             **dict.fromkeys((name for _, name in SENSORS.values()), STALE_S),
@@ -71,7 +71,7 @@ class VisualMpcNode(Node):
         self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM)
         group = ReentrantCallbackGroup()  # answers and cancels arrive while a goal is executed
         self._predict = self.create_client(
-            PredictSubgoal, 'predict_subgoal', callback_group=group)
+            PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS, callback_group=group)
         self._predictor = Liveness(self, 'predictor_node', callback_group=group)
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
@@ -89,16 +89,15 @@ class VisualMpcNode(Node):
     # Callbacks
 
     def _on_goal(self, _):
-        if self._ending or not self._busy.acquire(blocking=False):
+        if self._ending or self._busy.locked():
             self.get_logger().warning(
                 'reach_goal rejected: another goal is in progress; cancel it or wait for its end')
             return GoalResponse.REJECT
-        self._accepted = time.monotonic()
         return GoalResponse.ACCEPT
 
     def _on_cancel(self, handle):
         self._cancelled = handle  # who asks its state still finds it executing
-        self._arm.end()  # at once: a plan may be in progress
+        self._arm.end(handle)  # at once: a plan may be in progress
         self._sensors.wake()
         return CancelResponse.ACCEPT
 
@@ -109,9 +108,13 @@ class VisualMpcNode(Node):
     def _execute(self, handle):
         """Run a goal to its end; runs in a thread of the executor."""
         result = ReachGoal.Result()
-        self._arm.begin(handle)
+        if not self._busy.acquire(blocking=False):  # two were accepted at the same time
+            result.message = 'another goal is in progress; cancel it or wait for its end'
+            handle.abort()
+            return result
         try:
-            self._reach(handle, result)
+            self._arm.begin(handle)
+            self._reach(handle, time.monotonic(), result)
             handle.succeed()
         except Cancelled as error:
             result.message = str(error)
@@ -129,17 +132,19 @@ class VisualMpcNode(Node):
             self.get_logger().error(traceback.format_exc())
             handle.abort()
         finally:
-            self._arm.end(handle)
-            self._busy.release()
+            try:
+                self._arm.end(handle)
+            finally:
+                self._busy.release()
         self.get_logger().info(
             f'reach_goal ended after {result.steps} steps: {escaped(result.message, 1000)}')
         return result
 
     # One goal
 
-    def _reach(self, handle, result):
-        """Show the loop what is seen, and do what it answers, filling the result."""
-        request, accepted = handle.request, self._accepted
+    def _reach(self, handle, accepted, result):
+        """Show the loop what is seen since `accepted`, do what it answers, fill the result."""
+        request = handle.request
         mode = check_request(request)
         self._goal.begin(needed_topics(request, mode))
         self._sight.begin(accepted)
@@ -169,9 +174,12 @@ class VisualMpcNode(Node):
                 targets = self._aim(handle, mode, seen)
                 num_subgoals = len(targets) - 1
                 reach.head_for(targets, time.monotonic())
-            elif isinstance(answer, Command) and self._send(handle, reach, answer, topics):
-                reach.sent(self._sight.newest_stamp()
-                           + int(0.9e9 * self.params['control_period']))
+                continue
+            # Before sending: the picture that answers may come at once.
+            newest_ns = self._sight.newest_stamp()
+            if isinstance(answer, Command) and self._send(handle, accepted, reach, answer, topics):
+                reach.sent(newest_ns + int(0.9e9 * self.params['control_period']),
+                           time.monotonic())
                 result.steps = reach.steps
                 self._diagnostics.took(answer.plan.planning_ms, 'plan')
                 handle.publish_feedback(ReachGoal.Feedback(
@@ -236,9 +244,9 @@ class VisualMpcNode(Node):
             raise PlanningError(f'service {self._predict.service_name}: {response.message}')
         return decode_subgoals(response, names, self._mpc.image_size)
 
-    def _send(self, handle, reach, command, topics):
+    def _send(self, handle, accepted, reach, command, topics):
         """
-        Send a command; tell whether it was: not when a sensor is silent, or it is for an old goal.
+        Send a command; tell whether it was: not when a sensor is silent or it comes too late.
 
         :raises TapError: when what was seen while it was planned forbids it.
         """
@@ -247,7 +255,9 @@ class VisualMpcNode(Node):
         end = reach.interrupted(seen)
         if end:
             raise PlanningError(end.message)
-        if self._goal.changed(self._accepted):
+        age = time.monotonic() - (
+            seen if seen.stamp_ns == command.seen.stamp_ns else command.seen).received
+        if age > self.params['max_age'] or self._goal.changed(accepted):
             return False
         return self._arm.send(
             handle, command.plan.action, to_stamp(command.seen.stamp_ns), topics)

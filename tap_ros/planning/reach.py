@@ -49,7 +49,7 @@ class ReachConfig:
     :param tracking: 'ground_truth': Seen.pixels at every step; 'carried': those of the first step,
         then followed by tracking.ObjectTracker.
     :param max_age: s; nothing is planned from what was received longer ago.
-    :param timeout: s without anything to plan from, after which the goal ends.
+    :param timeout: s without a command, planning apart, after which the goal ends.
     :param objects: indices of the objects that are planned for; None: all.
     """
 
@@ -118,7 +118,7 @@ class Reach:
         self._after_ns = -1  # pictures count that are stamped later than this
         self._kept = self._before = None  # memories: after the last command, and before it
         self._refusal = ''
-        self._usable_at = now
+        self._sent_at = now  # of the last command, or when there was reason to wait
         self.steps, self.distance, self.pixels = 0, float('nan'), None
 
     @property
@@ -141,23 +141,26 @@ class Reach:
         :return: Aim, Command, Wait or End.
         :raises PlanningError: for what cannot be planned with.
         """
-        end = self.interrupted(seen)
-        if end:
-            return end
+        answer = self.interrupted(seen) or self._answer(seen, now, lacking)
+        silence = now - self._sent_at
+        if isinstance(answer, (Wait, Command)) and silence > self._config.timeout:
+            why = answer.reason if isinstance(answer, Wait) else (
+                lacking or 'what is seen is always too old when its command is planned')
+            return End('aborted', f'no command could be sent for {silence:.1f} s: {why}')
+        if isinstance(answer, Command) and answer is not self._planned:
+            self._planned = answer
+            self._sent_at += answer.plan.planning_ms / 1e3  # planning is no silence
+        return answer
+
+    def _answer(self, seen, now, lacking):
+        """Answer what is seen, whatever the time that has passed without a command."""
         reason = self._unusable(seen, now, lacking)
         if reason:
-            silence = now - self._usable_at
-            if silence <= self._config.timeout:
-                return Wait(reason)
-            return End('aborted', f'no observation for {silence:.1f} s: {reason}')
+            return Wait(reason)
         if self._planned is not None and self._planned.seen.stamp_ns == seen.stamp_ns:
             return self._planned
-        self._usable_at = now
         self._first = self._first or seen
-        answer = Aim(seen) if self._targets is None else self._plan(seen)
-        if isinstance(answer, Command):  # the time that it took is no silence
-            self._usable_at += answer.plan.planning_ms / 1e3
-        return answer
+        return Aim(seen) if self._targets is None else self._plan(seen)
 
     def interrupted(self, seen):
         """
@@ -187,17 +190,19 @@ class Reach:
             self._tracker = ObjectTracker(
                 self._mpc.model.learned, first.image, first.gripper, first.pixels)
         self._mpc.reset(self._seed)
-        self._kept, self._usable_at = self._memory(), now
+        self._kept, self._sent_at = self._memory(), now
 
-    def sent(self, after_ns=None):
+    def sent(self, after_ns=None, now=0.0):
         """
         Say that the last Command is carried out.
 
         :param after_ns: pictures show its effect that are stamped later than this; None: than the
             picture that it answers.
+        :param now: s.
         """
         command, self._planned = self._planned, None
-        self._before = self._kept, self._answered, self._after_ns
+        self._before = self._kept, self._answered, self._sent_at
+        self._sent_at = now
         self._kept, self._answered = self._memory(), command
         self._after_ns = command.seen.stamp_ns if after_ns is None else after_ns
         self.steps += 1
@@ -214,7 +219,7 @@ class Reach:
         if self._before is None or self._answered.seen.stamp_ns != stamp_ns:
             return False
         refused = self._answered
-        (self._kept, self._answered, _), self._before = self._before, None
+        (self._kept, self._answered, self._sent_at), self._before = self._before, None
         self._after_ns, self._planned = refused.seen.stamp_ns, None
         self.steps -= 1
         self._refusal = reason
@@ -250,8 +255,7 @@ class Reach:
         limit = np.array(seen.image.shape[1::-1]) - 1
         plan = self._mpc.act(seen.image, seen.gripper, chosen,
                              **target.goal(np.clip(chosen, 0, limit)))
-        self._planned = Command(plan, len(self._itinerary.switches), seen)
-        return self._planned
+        return Command(plan, len(self._itinerary.switches), seen)
 
     def _find_objects(self, seen):
         """Return where the objects are, (K, 2)."""

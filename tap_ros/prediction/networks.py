@@ -51,6 +51,9 @@ class PredictorConfig:
                 raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
         if self.latent_size < 0:
             raise ConfigError(f'latent_size: expected 0 or more, got {self.latent_size}')
+        if not 0 < self.flow_scale <= 16 * self.image_size:
+            raise ConfigError(f'flow_scale: expected more than 0 and at most 16 times image_size, '
+                              f'got {self.flow_scale}')
         # Beyond this a network takes many gigabytes; it is a wrong number rather than a wish.
         if self.image_size * self.base_width > 2 ** 15:
             raise ConfigError(f'image_size times base_width: expected at most {2 ** 15}, got '

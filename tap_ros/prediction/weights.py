@@ -172,7 +172,7 @@ def save_tensors(path, tensors, about):
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     text = json.dumps(about, sort_keys=True)
     write_atomically(path, save(tensors, {
-        'format': _FORMAT, 'about': text, 'sha256': _digest(tensors, text)}))
+        'format': _FORMAT, 'about': text, 'sha256': content_digest(tensors, text)}))
 
 
 def load_tensors(path):
@@ -210,7 +210,7 @@ def _load(path):
                 f'{name}: written by format {escaped(metadata.get("format"), 40)}, not by '
                 f'{_FORMAT}, which holds a SHA-256; train again with this version')
         tensors = load(data)
-        digest = _digest(tensors, metadata['about'])
+        digest = content_digest(tensors, metadata['about'])
         about = json.loads(metadata['about'])
     except (SafetensorError, ArithmeticError, AssertionError, AttributeError, LookupError,
             MemoryError, RecursionError, RuntimeError, TypeError, ValueError) as error:
@@ -251,7 +251,7 @@ def _header_length(data):
     return int.from_bytes(data[:8], 'little')
 
 
-def _digest(tensors, about):
+def content_digest(tensors, about):
     """Return the SHA-256 of tensors, in the order of their names, and of a description."""
     found = hashlib.sha256()
     for part in (_FORMAT, about):

@@ -127,6 +127,8 @@ def bag_files(folder):
         compression = information.get('compression_format') or ''
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise ValueError('relative_file_paths is no list of names')
+        if not isinstance(storage, str) or not isinstance(compression, str):
+            raise ValueError('storage_identifier and compression_format are no texts')
         if len(set(names)) < len(names):
             raise ValueError('relative_file_paths names a file twice')
     except _UNUSABLE as error:

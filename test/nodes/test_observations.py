@@ -75,6 +75,20 @@ def test_a_stray_stamp_now_and_then_is_not_believed(stray, topic):
     assert seen.jumps == 0
 
 
+@pytest.mark.parametrize('ahead', [1, 5, 9])
+def test_a_stray_that_is_seconds_ahead_is_dropped(ahead):
+    seen = Observations('image', 'joints')
+    for stamp in range(10**9, 20 * 10**9, 10**9 // 4):
+        put(seen, stamp, 'image', 'joints')
+        assert stamp_of(seen.newest('image', 'joints')) == stamp
+        if stamp % 10**9 == 0:
+            put(seen, stamp + ahead * 10**9, 'image')
+            put(seen, stamp, 'image')  # sent again, as in lock-step
+            assert stamp_of(seen.newest('image')) == stamp
+            put(seen, stamp + ahead * 10**9, 'joints')
+    assert seen.jumps == 0
+
+
 def test_a_stray_that_comes_first_is_found_out():
     seen = Observations('image', 'joints')
     put(seen, 10**17, 'image')

@@ -13,8 +13,9 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
-from tap_msgs.msg import Episode, ObjectStates
+from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
 from tap_ros.nodes.clients import call, Newest
 from tap_ros.nodes.image_messages import decode_image
@@ -38,6 +39,7 @@ class Rig:
         self.objects = Newest(node, ObjectStates, 'objects', STREAM)
         self.joints = Newest(node, JointState, 'joint_states', STREAM)
         self.clock = Newest(node, Clock, 'clock', STREAM)
+        self.refused = Newest(node, CommandRefused, 'arm/refused', STREAM)
         self.marks = []
         node.create_subscription(Episode, 'episode', self.marks.append, STREAM)
         self.twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
@@ -205,6 +207,8 @@ def test_a_paused_simulation_takes_no_commands_but_steps(rig):
     call(rig.pause_client, SetBool.Request(data=True), 10)
     rig.send(x=0.05, stamp=first.header.stamp)
     rig.process.wait_for('the simulation is paused')
+    refused = rig.refused.wait(10, lambda m: m.header.stamp == first.header.stamp)
+    assert 'paused' in refused.message
     response = rig.step(1)
     assert to_nanoseconds(response.stamp) == to_nanoseconds(first.header.stamp) + PERIOD_NS
     call(rig.pause_client, SetBool.Request(data=False), 10)
@@ -246,6 +250,34 @@ def test_in_real_time_the_clock_runs_by_itself_unless_paused(tmp_path):
                 == to_nanoseconds(stamp) + PERIOD_NS
             assert process.end() == 0, process.text
             assert 'Traceback' not in process.text
+    finally:
+        process.kill()
+
+
+def test_in_real_time_a_command_that_has_run_out_moves_nothing(tmp_path):
+    # One tick a second, in which a control period passes.
+    process = NodeProcess('sim_bridge.sim_node', tmp_path / 'log.txt', {'real_time_factor': 0.25},
+                          ['-r __ns:=/slow'])
+    try:
+        with Client() as node:
+            process.wait_for('ready')
+            images = Newest(node, Image, '/slow/camera/image_raw', STREAM)
+            joints = Newest(node, JointState, '/slow/joint_states', STREAM)
+            twists = node.create_publisher(TwistStamped, '/slow/arm/delta_twist_cmds', STREAM)
+            timeouts = node.create_publisher(Float64, '/slow/arm/command_timeout', LATCHED)
+            moved = []
+            for timeout in (0.02, 5.0):  # simulated seconds
+                timeouts.publish(Float64(data=timeout))
+                first = images.wait(20)
+                images.wait(20, lambda m, old=first: m.header.stamp != old.header.stamp)
+                before = joints.wait(10)
+                command = TwistStamped(header=images.wait(1).header)
+                command.twist.linear.x = 0.05 if before.position[0] < 0 else -0.05
+                twists.publish(command)
+                after = joints.wait(10, lambda m, old=before: to_nanoseconds(m.header.stamp)
+                                    >= to_nanoseconds(old.header.stamp) + 2 * PERIOD_NS)
+                moved.append(abs(after.position[0] - before.position[0]))
+            assert moved[0] < 0.002 and moved[1] > 0.03
     finally:
         process.kill()
 

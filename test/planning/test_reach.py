@@ -43,7 +43,7 @@ def begun(mpc, config=None, seed=3):
 def act(reach, t):
     answer = reach.step(look(t), float(t))
     assert isinstance(answer, Command)
-    reach.sent()
+    reach.sent(now=float(t))
     return answer.plan.action
 
 
@@ -118,11 +118,31 @@ def test_old_and_missing_sights_are_waited_for_and_then_end_the_goal(mpc):
     assert '5.1 s' in end.message and 'nothing on the table' in end.message
 
 
-def test_time_begins_anew_with_every_picture_that_is_used(mpc):
+def test_time_begins_anew_with_every_command_that_is_sent(mpc):
     reach = begun(mpc)
     act(reach, 4)
     assert isinstance(reach.step(None, now=8.9), Wait)
-    assert isinstance(reach.step(None, now=60.0), End)
+    assert isinstance(reach.step(None, now=9.1), End)
+
+
+def test_pictures_alone_do_not_keep_a_goal_alive(mpc):
+    reach = begun(mpc)
+    act(reach, 0)
+    spent = 0.0
+    for t in range(1, 100):  # planned from each, and never sent
+        answer = reach.step(look(t), float(t))
+        if isinstance(answer, End):
+            break
+        spent += answer.plan.planning_ms / 1e3
+    assert answer.outcome == 'aborted' and 5 + spent < t < 7 + spent
+    refused = begun(mpc)
+    for t in range(1, 100):  # sent, and always refused
+        answer = refused.step(look(t), float(t))
+        if isinstance(answer, End):
+            break
+        refused.sent(now=float(t))
+        assert refused.refused((t + 1) * SECOND, 'it is paused')
+    assert answer.outcome == 'aborted' and refused.steps == 0
 
 
 def test_pictures_of_an_old_scene_are_not_used(mpc):

@@ -5,6 +5,7 @@
 from pathlib import Path
 
 from tap_ros.evaluation.faults.results import COMMAND, FILE, load_rows
+from tap_ros.files import write_atomically
 
 PAGE = 'faults.md'
 INTRODUCTION = f"""\
@@ -25,7 +26,7 @@ def write_page(folder, groups):
     :param folder: of faults.json, and of the page.
     :param groups: {title: list of Fault}, in the order of the page.
     """
-    (Path(folder) / PAGE).write_text(make_page(load_rows(folder), groups))
+    write_atomically(Path(folder) / PAGE, make_page(load_rows(folder), groups))
 
 
 def make_page(rows, groups):

@@ -43,7 +43,7 @@ def read_weights(path):
 
 
 def read_predictor(path):
-    """Predict with weights as predictor_node does at its start; return how often maps sum to 1."""
+    """Load the network of a predictor; return what its training says of itself."""
     from tap_ros.prediction.predictor import load_network
     _, training = load_network(path)
     return sorted(training)

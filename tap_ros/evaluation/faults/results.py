@@ -10,6 +10,7 @@ import subprocess
 import time
 
 from tap_ros.errors import TapError
+from tap_ros.files import write_atomically
 
 FILE = 'faults.json'
 COMMAND = 'python -m tap_ros evaluate faults'
@@ -43,13 +44,10 @@ def save_row(folder, row, order):
     :param order: names of all faults, in the order of the file.
     """
     path = Path(folder) / FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = {**load_rows(folder), row['fault']: row}
     known = {name: rank for rank, name in enumerate(order)}
+    rows = {**load_rows(folder), row['fault']: row}
     listed = sorted(rows.values(), key=lambda row: known.get(row['fault'], len(known)))
-    part = path.with_name(f'{path.name}.{os.getpid()}.part')
-    part.write_text('[\n' + ',\n'.join(json.dumps(row) for row in listed) + '\n]\n')
-    os.replace(part, path)
+    write_atomically(path, '[\n' + ',\n'.join(map(json.dumps, listed)) + '\n]\n')
 
 
 def is_done(row, share):

@@ -5,9 +5,11 @@
 import json
 import struct
 
+from safetensors.torch import load
 from tap_ros.evaluation.faults.children import Reader
 from tap_ros.evaluation.faults.fault import Fault
 from tap_ros.evaluation.faults.recordings import one_line
+from tap_ros.prediction.weights import content_digest
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL, PREDICTORS
 
 
@@ -76,8 +78,8 @@ def _nonsense():
 
     for source in (FORWARD_MODEL, PREDICTORS[DEFAULT_PREDICTOR]):
         yield 'zero weights', source, lambda header, numbers: bytes(len(numbers))
-        yield 'random weights', source, lambda header, numbers: bytes(
-            (i * 31) % 251 for i in range(len(numbers)))
+        yield 'infinite weights', source, lambda header, numbers: b'\x00\x00\x80\x7f' * (
+            len(numbers) // 4) + bytes(len(numbers) % 4)
         yield 'no description', source, no_metadata
         for value in ('', 'null', '7', '[]', '{', '{}', '"x"', '[' * 100_000):
             yield f'about: {value[:9]}', source, about(value)
@@ -93,11 +95,18 @@ def _nonsense():
 
 
 def _changed(source, change):
-    """Return a weights file with another header or other numbers."""
+    """Return a weights file with another header or other numbers, and the hash of these."""
     data = source.read_bytes()
     length, = struct.unpack('<Q', data[:8])
     header = json.loads(data[8:8 + length])
     numbers = change(header, data[8 + length:])
+    about = header.get('__metadata__', {}).get('about')
+    if about is not None:  # so that it is the nonsense that is refused, and not the hash
+        header['__metadata__']['sha256'] = content_digest(load(_pack(header, numbers)), about)
+    return _pack(header, numbers)
+
+
+def _pack(header, numbers):
     packed = json.dumps(header).encode()
     packed += b' ' * (-len(packed) % 8)
     return struct.pack('<Q', len(packed)) + packed + numbers

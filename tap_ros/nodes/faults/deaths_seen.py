@@ -5,15 +5,9 @@
 import threading
 import time
 
-from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
-
-LEASE_S = 0.5
-QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
-                 liveliness=LivelinessPolicy.AUTOMATIC,
-                 liveliness_lease_duration=Duration(seconds=LEASE_S))
+from tap_ros.nodes.heartbeat import QOS
 
 
 class DeathWatch:
