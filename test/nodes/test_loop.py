@@ -8,6 +8,7 @@ import sys
 import threading
 
 from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from mcap.reader import make_reader
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from tap_ros.nodes.clients import call, send_goal
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.predictor_node import OVERLAY_SCALE
-from tap_ros.nodes.topics import to_stamp
+from tap_ros.nodes.topics import STREAM, to_stamp
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
@@ -122,6 +123,27 @@ def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
     assert result.expected_distance == pytest.approx(
         np.linalg.norm(pixels - goals, axis=1).mean(), abs=1e-3)
     assert loop.stopped()
+
+
+def test_every_node_tells_how_it_is(loop):
+    loop.reset()
+    assert loop.predict().success
+    told = {}
+    loop.node.create_subscription(
+        DiagnosticArray, '/diagnostics',
+        lambda array: told.update({status.name: status for status in array.status}), STREAM)
+    wanted = [*(f'{name}: service' for name in MODULES),
+              'visual_mpc_node: /joint_states', 'predictor_node: /goal/image',
+              'sim_node: /arm/delta_twist_cmds', 'recorder_node: /objects']
+    for _ in range(200):
+        if all(name in told for name in wanted):
+            break
+        threading.Event().wait(0.1)
+    told = {name: {pair.key: pair.value for pair in told[name].values} for name in wanted}
+    assert told['visual_mpc_node: /joint_states']['status'] == 'OK'
+    assert float(told['recorder_node: /objects']['rate_hz']) > 1  # sent again in lock-step
+    assert told['predictor_node: service']['queue'] == '0'
+    assert float(told['predictor_node: service']['predict_subgoal p50_ms']) > 0
 
 
 def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
