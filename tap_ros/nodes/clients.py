@@ -91,7 +91,7 @@ def wait_for_future(future, timeout_s):
     return done.wait(max(timeout_s, 0.0))
 
 
-def send_goal(action_client, goal, timeout_s, on_feedback=None):
+def send_goal(action_client, goal, timeout_s, on_feedback=None, server=None):
     """
     Send a goal and wait until it is accepted.
 
@@ -99,17 +99,20 @@ def send_goal(action_client, goal, timeout_s, on_feedback=None):
     :param goal: the action's goal.
     :param timeout_s: most seconds to wait.
     :param on_feedback: called with each feedback message, or None.
+    :param server: heartbeat.Liveness of the node that offers it, as in call.
     :return: the client's goal handle.
     :raises CallError: when no server answers in time, or it rejects the goal.
     """
     name = action_client._action_name
     deadline = time.monotonic() + timeout_s
+    if server is not None and not server.wait_until_alive(min(NEWBORN_S, timeout_s)):
+        raise CallError(f'action {name}: its node, {server.name}, has ended; start it again')
     if not action_client.wait_for_server(timeout_sec=timeout_s):
         raise CallError(f'action {name}: nobody offers it after {timeout_s:g} s')
     future = action_client.send_goal_async(
         goal, None if on_feedback is None else lambda message: on_feedback(message.feedback))
-    while not wait_for_future(future, 0.1):
-        if not action_client.server_is_ready():
+    while not wait_for_future(future, 0.05):
+        if not action_client.server_is_ready() or (server is not None and server.dead):
             raise CallError(f'action {name}: its node ended before it answered the goal')
         if time.monotonic() >= deadline:
             raise CallError(f'action {name}: no answer to the goal within {timeout_s:g} s')
@@ -120,20 +123,21 @@ def send_goal(action_client, goal, timeout_s, on_feedback=None):
     return handle
 
 
-def wait_for_result(handle, timeout_s):
+def wait_for_result(handle, timeout_s, server=None):
     """
     Wait for the end of a goal; cancel it when it takes too long.
 
     :param handle: goal handle of send_goal.
     :param timeout_s: most seconds to wait.
+    :param server: heartbeat.Liveness of the node that offers it, as in call.
     :return: status, one of the STATUS_ constants of action_msgs/GoalStatus, and the result.
     :raises CallError: when it has not ended in time, or the node that pursues it has.
     """
     client = handle._action_client
     future = handle.get_result_async()
     deadline = time.monotonic() + timeout_s
-    while not wait_for_future(future, 0.1):
-        if not client.server_is_ready():
+    while not wait_for_future(future, 0.05):
+        if not client.server_is_ready() or (server is not None and server.dead):
             raise CallError(f'action {client._action_name}: its node ended before the goal did; '
                             'what the arm does now is up to its driver')
         if time.monotonic() >= deadline:

@@ -29,7 +29,9 @@ from tap_ros.evaluation.demo_report import (
 )
 from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS, step_budget
 from tap_ros.nodes.clients import call, send_goal, Spinner, wait_for_result
+from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.image_messages import decode_image, decode_map
+from tap_ros.nodes.late_answers import SERVICE_QOS
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
@@ -83,8 +85,11 @@ class DemoClient:
         self.node = rclpy.create_node('demo')
         self._processes = processes
         self._reset = self.node.create_client(ResetScene, 'sim/reset')
-        self._predict = self.node.create_client(PredictSubgoal, 'predict_subgoal')
+        self._predict = self.node.create_client(
+            PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS)
         self._reach = ActionClient(self.node, ReachGoal, 'reach_goal')
+        self._alive = {name: Liveness(self.node, name) for name in (
+            'sim_node', 'predictor_node', 'visual_mpc_node')}
         self._camera = Watch(self.node)
         self._goal = Observations('image', 'objects', latched=True)
         self._goal.subscribe(self.node, {
@@ -114,7 +119,8 @@ class DemoClient:
         before = self._goal.newest('image', 'objects')
         after_ns = -1 if before is None else to_nanoseconds(before['image'].header.stamp)
         self._camera.begin()
-        answer = call(self._reset, ResetScene.Request(task=task, seed=seed), CALL_TIMEOUT_S)
+        answer = call(self._reset, ResetScene.Request(task=task, seed=seed), CALL_TIMEOUT_S,
+                      server=self._alive['sim_node'])
         if not answer.success:
             raise TapError(f'sim/reset: {answer.message}')
         goal = self._goal.wait(('image', 'objects'), CALL_TIMEOUT_S, after_ns)
@@ -136,7 +142,8 @@ class DemoClient:
         """Ask for a subgoal as a person would by hand: with an empty request."""
         deadline = time.monotonic() + CALL_TIMEOUT_S
         while True:
-            answer = call(self._predict, PredictSubgoal.Request(), CALL_TIMEOUT_S)
+            answer = call(self._predict, PredictSubgoal.Request(), CALL_TIMEOUT_S,
+                          server=self._alive['predictor_node'])
             if answer.success and answer.subgoals[0].object_maps:
                 return answer.subgoals[0]
             # Right after the start the predictor may not have heard of the simulator yet.
@@ -158,9 +165,10 @@ class DemoClient:
                     f'to the {feedback.stage}, {feedback.expected_distance:.1f} px expected')
                 bar.update(feedback.step - bar.n)
             request = ReachGoal.Goal(mode=mode, step_budget=step_budget, seed=seed)
-            handle = send_goal(self._reach, request, CALL_TIMEOUT_S, on_feedback)
+            planner = self._alive['visual_mpc_node']
+            handle = send_goal(self._reach, request, CALL_TIMEOUT_S, on_feedback, planner)
             status, result = wait_for_result(
-                handle, CALL_TIMEOUT_S + STEP_TIMEOUT_S * step_budget)
+                handle, CALL_TIMEOUT_S + STEP_TIMEOUT_S * step_budget, planner)
         if status != GoalStatus.STATUS_SUCCEEDED:
             raise TapError(f'reach_goal ({mode}): {result.message}')
         self._processes.check()

@@ -22,6 +22,7 @@ from tap_ros.nodes.faults.attacked import Attacked
 from tap_ros.nodes.faults.commands import Commands
 from tap_ros.nodes.faults.deaths_seen import DeathWatch
 from tap_ros.nodes.faults.world import goal_fields, predict_fields, World
+from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.node_processes import MODULES
 from tap_ros.nodes.topics import LATCHED, STREAM
 
@@ -78,6 +79,7 @@ class Rig:
         self.goal_image = Newest(node, Image, 'goal/image', LATCHED)
         self.commands = Commands(node)
         self.watches = {name: DeathWatch(node, name) for name in MODULES}
+        self.alive = {name: Liveness(node, name) for name in MODULES}
 
     # Nodes
 
@@ -148,7 +150,8 @@ class Rig:
 
     def predict(self, timeout_s=CALL_S, **fields):
         """Call predict_subgoal; return the response."""
-        return call(self.predict_client, PredictSubgoal.Request(**fields), timeout_s)
+        return call(self.predict_client, PredictSubgoal.Request(**fields), timeout_s,
+                    server=self.alive['predictor_node'])
 
     def expect_prediction(self, timeout_s):
         """Make a good call; raise TapError when it is not answered well."""
@@ -159,11 +162,13 @@ class Rig:
 
     def reset(self, seed, task='push2'):
         """Start a scene; return the response."""
-        return call(self.reset_client, ResetScene.Request(task=task, seed=seed), CALL_S)
+        return call(self.reset_client, ResetScene.Request(task=task, seed=seed), CALL_S,
+                    server=self.alive['sim_node'])
 
     def begin(self, timeout_s=CALL_S, on_feedback=None, **fields):
         """Send a goal, straight to the pixels of the goal by default; return its handle."""
-        return send_goal(self.reach_client, ReachGoal.Goal(**fields), timeout_s, on_feedback)
+        return send_goal(self.reach_client, ReachGoal.Goal(**fields), timeout_s, on_feedback,
+                         self.alive['visual_mpc_node'])
 
     def begin_moving(self, moves=2, **fields):
         """Send a goal that a World never fulfils; return its handle once the arm moves."""
@@ -181,7 +186,7 @@ class Rig:
 
     def result(self, handle, timeout_s=60.0):
         """Wait for the end of a goal; return it in words, the message behind a colon."""
-        status, result = wait_for_result(handle, timeout_s)
+        status, result = wait_for_result(handle, timeout_s, self.alive['visual_mpc_node'])
         return f'{ENDS.get(status, status)}: {result.message}'
 
 
