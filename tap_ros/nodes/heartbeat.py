@@ -13,7 +13,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
-LEASE_S = 0.5  # after so long without a sign of life a node is thought dead
+LEASE_S = 0.4  # after so long without a sign of life a node is thought dead
 LATE_S = 0.25  # that a sign of life may come after that
 QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                  liveliness=LivelinessPolicy.AUTOMATIC,
