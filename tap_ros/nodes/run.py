@@ -43,12 +43,12 @@ def run_node(make_node, name, args=None, num_threads=1):
         use_short_leases()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
         executor = (SingleThreadedExecutor() if num_threads == 1
                     else MultiThreadedExecutor(num_threads))
         executor.add_node(node)
         Heartbeat(node)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
         while rclpy.ok() and not stop.is_set():
             _spin_once(executor, node)
     except (KeyboardInterrupt, ExternalShutdownException):
