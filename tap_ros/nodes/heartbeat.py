@@ -86,7 +86,7 @@ class Liveness:
 
 def use_short_leases():
     """
-    Let Fast DDS give up this process one second after its death, instead of twenty.
+    Let Fast DDS give up this process three seconds after its death, instead of twenty.
 
     Until then others would send their calls to it. To be called before rclpy.init; profiles that
     the user has chosen, and other middlewares, are left alone.
