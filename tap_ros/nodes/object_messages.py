@@ -69,6 +69,9 @@ def decode_objects(message, name, size=None):
 
 def _check_pixel(name, pixel, size):
     """Refuse a pixel (u, v) that is unknown, or not in a picture of this (height, width)."""
+    if size is None:
+        with np.errstate(over='ignore'):  # what float32 cannot hold becomes infinite
+            pixel = pixel.astype(np.float32)
     u, v = pixel
     if not np.isfinite(pixel).all():
         raise PlanningError(f'{name} has the pixel ({u}, {v}); expected finite numbers, '

@@ -167,7 +167,7 @@ def test_pixels_outside_the_picture_are_refused_with_the_bounds(pixel):
     object_messages.decode_objects(message, 'objects')  # of no known picture
     with pytest.raises(PlanningError) as error:
         object_messages.decode_objects(message, 'objects', (48, 64))
-    for word in ('objects: blue', f'{np.float32(pixel[0])}', '-0.5 to 63.5', '-0.5 to 47.5'):
+    for word in ('objects: blue', f'({float(pixel[0])}, ', '-0.5 to 63.5', '-0.5 to 47.5'):
         assert word in str(error.value)
     border = objects([[-0.5, 47.5], [63.5, -0.5]])
     assert len(object_messages.decode_objects(border, 'objects', (48, 64))[0]) == 2

@@ -18,8 +18,8 @@ def recorder(job):
     rig = job.rig
     rig.need()
     for trial in job.trials():
-        with small_disk(job.folder / f'disk{trial}', int(job.random.integers(400_000, 1_200_000))) \
-                as disk:
+        size = int(job.random.integers(400_000, 1_200_000))
+        with small_disk(job.folder / f'disk{trial}', size) as disk:
             if disk is None:
                 raise TapError('no file system may be mounted here; try as root')
             why = _fill(rig, disk, disk / 'bag')
