@@ -34,7 +34,7 @@ from tap_ros.text import escaped
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 SHOW_PERIOD = 0.1  # s between two looks for a subgoal to publish
 STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
-CLOSE_TIMEOUT = 5.0  # s; longer than any batch takes
+CLOSE_TIMEOUT = 5.0  # s that the batch in progress has to end
 
 
 class PredictorNode(Node):
