@@ -15,7 +15,8 @@ from rclpy.executors import (
 )
 from rclpy.signals import SignalHandlerOptions
 from tap_ros.errors import TapError
-from tap_ros.nodes.heartbeat import Heartbeat, use_short_leases
+from tap_ros.nodes.heartbeat import Heartbeat
+from tap_ros.nodes.middleware import configure_fast_dds
 from tap_ros.text import escaped
 
 
@@ -40,7 +41,7 @@ def run_node(make_node, name, args=None, num_threads=1):
     node = executor = None
     code = 0
     try:
-        use_short_leases()
+        configure_fast_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -20,7 +20,6 @@ from tap_ros.errors import TapError
 from tap_ros.nodes.clients import call, Newest, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.faults.attacked import Attacked
 from tap_ros.nodes.faults.commands import Commands
-from tap_ros.nodes.faults.deaths_seen import DeathWatch
 from tap_ros.nodes.faults.world import goal_fields, predict_fields, World
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.node_processes import MODULES
@@ -78,7 +77,6 @@ class Rig:
         self.joints = Newest(node, JointState, 'joint_states', STREAM)
         self.goal_image = Newest(node, Image, 'goal/image', LATCHED)
         self.commands = Commands(node)
-        self.watches = {name: DeathWatch(node, name) for name in MODULES}
         self.alive = {name: Liveness(node, name) for name in MODULES}
 
     # Nodes

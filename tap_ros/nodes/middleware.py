@@ -1,0 +1,39 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Fast DDS for the nodes: it forgets a dead process soon, and a restarted one is heard."""
+
+import os
+from pathlib import Path
+
+SUBNET = Path(__file__).with_name('fastdds_subnet.xml')
+LOCALHOST = Path(__file__).with_name('fastdds_localhost.xml')
+PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+LOCALHOST_ONLY = 'ROS_LOCALHOST_ONLY'  # older than RANGE, and still stronger
+
+
+def configure_fast_dds(environ=os.environ):
+    """
+    Let Fast DDS give up this process 3 s after its death, and use UDP alone.
+
+    By default it waits for 20 s, and until then others send calls of its services to it. Much
+    less than 3 s is too little on a loaded machine: a node that is given up and comes back can
+    lose what is sent to it for a while. Shared memory is left out as Fast DDS 2.14 loses what a
+    process sends to one that was killed and started again (its pull request 4728).
+
+    To be called before rclpy.init. Profiles that the user has chosen, and other middlewares, are
+    left alone.
+
+    :param environ: the variables of this process, which rclpy.init reads.
+    """
+    if any(name in environ for name in PROFILE_VARIABLES):
+        return
+    local = (environ.get(LOCALHOST_ONLY) == '1'
+             or environ.get(RANGE, '').upper() == 'LOCALHOST')
+    if local and not environ.get('ROS_STATIC_PEERS'):
+        # rmw_fastrtps would add shared memory; it leaves the system's default alone.
+        environ.pop(LOCALHOST_ONLY, None)
+        environ[RANGE] = 'SYSTEM_DEFAULT'
+        environ[PROFILE_VARIABLES[1]] = str(LOCALHOST)
+    else:
+        environ[PROFILE_VARIABLES[1]] = str(SUBNET)
