@@ -13,6 +13,7 @@ from tap_ros.text import escaped
 from tqdm import tqdm
 
 SUMMARIES = {'worst': max, 'least': min, 'median': statistics.median, 'mean': statistics.fmean}
+MAX_TOLD = 10  # failures shown as they happen
 MAX_REASONS = 4
 
 
@@ -94,6 +95,8 @@ class Job:
             alike = re.sub(r'\d+', '#', why)  # reasons that differ in numbers only count as one
             self._examples.setdefault(alike, why)
             self.reasons[alike] += times
+            if sum(self.reasons.values()) <= MAX_TOLD:
+                self._bar.write(f'{self.fault.name}, trial {self.tried}: {why}')
         if figure is not None:
             self.figures.append(float(figure))
         self._bar.update(times)
