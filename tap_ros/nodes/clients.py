@@ -9,7 +9,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.executors import SingleThreadedExecutor
 from tap_ros.errors import TapError
 
-NEWBORN_S = 1.0  # until others have heard of a node that has just started
+NEWBORN_S = 0.7  # until others have heard of a node that has just started
 
 
 class CallError(TapError):
