@@ -60,8 +60,8 @@ def _table(faults, rows):
         row = rows[fault.name]
         held = f'{row["held"]}' if row['held'] == row['tried'] else f'**{row["held"]}**'
         figure = '' if row['figure'] is None else f'{row["figure"]} {row["unit"]}'
-        words = f'{fault.figure}, {fault.summary}' if figure else ''
-        words += f'; {row["note"]}' if row.get('note') else ''
+        words = '; '.join(part for part in (
+            f'{fault.figure}, {fault.summary}' if figure else '', row.get('note')) if part)
         lines.append(f'| {fault.title} | {row["tried"]} | {held} | {figure} | {words} |')
     return '\n'.join(lines) + '\n'
 
