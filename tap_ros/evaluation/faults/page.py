@@ -48,6 +48,10 @@ def make_page(rows, groups):
     if other:
         parts.append('Rows of faults that this version does not have: '
                      + ', '.join(f'`{row["fault"]}`' for row in other) + '.\n')
+    missing = [fault.name for faults in groups.values() for fault in faults
+               if fault.name not in rows]
+    if missing:
+        parts.append('Not measured yet: ' + ', '.join(f'`{name}`' for name in missing) + '.\n')
     if rows:
         parts += ['## Commands\n', *(f'    {row["command"]}' for row in rows.values()), '',
                   _machines(rows.values())]
