@@ -16,6 +16,12 @@ from tap_ros.nodes.node_processes import MODULES
 START_S = 90.0
 
 
+def _hear_signals():
+    """Take back what nohup and background jobs of a shell ignore."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 class Attacked:
     """
     One node in a process group of its own.
@@ -43,7 +49,7 @@ class Attacked:
             self.process = subprocess.Popen(
                 command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                 start_new_session=True,
-                preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL))  # despite nohup
+                preexec_fn=_hear_signals)
         return self
 
     @property
