@@ -12,6 +12,7 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
 
 SWITCHES = ('reached', 'half')
@@ -82,7 +83,7 @@ class Itinerary:
     :ivar switches: steps at which the second, third ... target began.
     """
 
-    def __init__(self, targets, step_budget, switch='reached', reached=1.0):
+    def __init__(self, targets, step_budget, switch='reached', reached=GOAL_TOLERANCE):
         if switch not in SWITCHES:
             raise ConfigError(f'switch {switch!r} is unknown; expected one of {SWITCHES}')
         self._targets, self._budget = list(targets), step_budget

@@ -14,9 +14,10 @@ import os
 import time
 
 import numpy as np
+from tap_ros.contract import LOW
 from tap_ros.errors import PlanningError
 from tap_ros.images import to_float
-from tap_ros.planning.action_sequences import LOW, SequenceShape
+from tap_ros.planning.action_sequences import SequenceShape
 from tap_ros.planning.cem import cem
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import VisualMPCConfig

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.planning.methods import BASES, DEFAULTS, parse_method, SUBGOALS_ONLY
 from tap_ros.evaluation.planning.runs import read_results
@@ -14,7 +15,6 @@ from tap_ros.files import write_atomically
 
 # Results are compared where these settings agree; what an option changes is not among them.
 SAME = ('step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
-SUCCESS_CM = 5.0
 
 
 def load_results(folder):
@@ -131,8 +131,8 @@ def _how(name, settings):
 
 
 def _success(scene):
-    """Say whether every object ended within 5 cm of its goal, as 0 or 1."""
-    return int(max(scene['objects_cm']) < SUCCESS_CM)
+    """Say whether every object ended within SUCCESS_DISTANCE of its goal, as 0 or 1."""
+    return int(max(scene['objects_cm']) < 100 * SUCCESS_DISTANCE)
 
 
 def standard_error(values):
