@@ -18,21 +18,14 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
-from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD
+from tap_ros.contract import ACTION_LIMIT, CAMERA_FRAME, CONTROL_PERIOD, WORLD_FRAME
 from tap_ros.errors import TapError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
-from tap_ros.nodes.topics import (
-    CAMERA_FRAME,
-    LATCHED,
-    STREAM,
-    to_nanoseconds,
-    to_stamp,
-    WORLD_FRAME,
-)
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later

@@ -26,6 +26,9 @@ EPISODE_FRAMES = {'push2': 40, 'push3': 75, 'grasp': 15, 'pick_place': 20}
 SUCCESS_DISTANCE = 0.05  # m; an episode succeeds when every object ends nearer to its goal
 GOAL_TOLERANCE = 1.0  # px; the planner takes a goal or subgoal for reached within this distance
 
+WORLD_FRAME = 'world'  # frame of positions and commands
+CAMERA_FRAME = 'camera'  # of pictures
+
 # Names of the gripper's state in joint states: metres, and the opening from 0 to 1.
 GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
 

@@ -6,10 +6,10 @@ from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import ObjectState, ObjectStates
+from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import PlanningError
 from tap_ros.text import escaped, listing
 
-GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
 MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is predicted
 MAX_NAME = 100  # characters
 

@@ -9,10 +9,10 @@ from tap_ros.contract import (
     GOAL_TOLERANCE,
     MOVE_LIMIT,
     step_budget,
+    WORLD_FRAME,
 )
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.parameters import check_device, Parameters
-from tap_ros.nodes.topics import WORLD_FRAME
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
