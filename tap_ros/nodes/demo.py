@@ -297,7 +297,8 @@ def add_arguments(parser):
         '--task', default='push2', choices=PLANNING_TASKS, help='task (default: %(default)s)')
     parser.add_argument(
         '--step-budget', type=int, default=0,
-        help="most steps of one run; 0: the task's, 40 and 75 (default: %(default)s)")
+        help=f"most steps of one run; 0: the task's, {step_budget(2)} and "
+        f'{step_budget(3)} (default: %(default)s)')
     parser.add_argument(
         '--out', default='runs/demo', help='folder for the page, the recording and the logs '
         '(default: %(default)s; a number is added when it exists)')

@@ -21,7 +21,7 @@ class TrueModel:
     """
 
     def __init__(self, model, simulator, objects=None):
-        self.config, self.grid, self.pixels = model.config, model.grid, model.pixels
+        self.config, self.grid = model.config, model.grid
         self.pixel_table, self.seed_maps = model.pixel_table, model.seed_maps
         self.objects = objects
         self.learned = model  # for what looks at pictures
