@@ -21,7 +21,7 @@ LOW = 0.012  # at which the arm pushes
 CLEAR = 0.1  # above which no object is touched
 LIFTED = 0.13  # at which the arm travels
 
-# The longest episode of each task in frames, one a control period, as in the paper.
+# The longest episode of each task in frames, one a control period, as in the authors' data.
 EPISODE_FRAMES = {'push2': 40, 'push3': 75, 'grasp': 15, 'pick_place': 20}
 SUCCESS_DISTANCE = 0.05  # m; an episode succeeds when every object ends nearer to its goal
 GOAL_TOLERANCE = 1.0  # px; the planner takes a goal or subgoal for reached within this distance
