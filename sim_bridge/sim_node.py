@@ -25,7 +25,7 @@ from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
@@ -71,9 +71,10 @@ class SimNode(Node):
         self.create_subscription(TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM)
         self.create_subscription(Float64, 'arm/command_timeout', self._on_timeout, LATCHED)
         self._reset(task, self.params['seed'], False)
-        self.create_service(ResetScene, 'sim/reset', answering(self, self._on_reset))
-        self.create_service(StepScene, 'sim/step', answering(self, self._on_step))
-        self.create_service(SetBool, 'sim/pause', answering(self, self._on_pause))
+        for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
+                                   (StepScene, 'sim/step', self._on_step),
+                                   (SetBool, 'sim/pause', self._on_pause)):
+            self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         if self.params['lock_step']:
             mode = 'lock-step'

@@ -15,6 +15,7 @@ from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.text import escaped
 
 WATCH_S = 0.02  # how often it is checked whether the arm has to be stopped
+STOOD_S = 2.0  # a watch that was away for longer shows that the process, or all, stood still
 REPEAT_S = 0.2  # a stop is repeated after so long, while a goal is in progress
 
 
@@ -36,6 +37,7 @@ class Arm:
         self._lock = threading.Condition()  # no command may follow the end of a goal
         self._goal, self._topics = None, ()
         self._moved_at = self._stopped_at = -math.inf  # monotonic time
+        self._ticked_at, self._stood_s = now_awake(), 0.0
         self._gripper = node.create_publisher(Float64, 'gripper/command', STREAM)
         self._twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
         self._timeout = node.create_publisher(Float64, 'arm/command_timeout', LATCHED)
@@ -49,6 +51,7 @@ class Arm:
         with self._lock:
             self._goal, self._topics = goal, ()
             self._moved_at = -math.inf
+            self._ticked_at, self._stood_s = now_awake(), 0.0
             self._stop()
             self._lock.notify()
 
@@ -72,7 +75,8 @@ class Arm:
         :param stamp: builtin_interfaces/Time of the image that it answers.
         :param topics: sensors that the arm depends on until the next command.
         :return: whether it was sent; not when the goal has ended or a sensor is silent.
-        :raises PlanningError: for numbers that are not finite.
+        :raises PlanningError: for numbers that are not finite, and after this process stood still:
+            what is received then may have waited all the time.
         """
         if not np.isfinite(action).all():
             raise PlanningError(f'the planner chose {action}; expected finite numbers')
@@ -88,6 +92,10 @@ class Arm:
         linear.x, linear.y, linear.z = move.tolist()
         with self._lock:
             now = time.monotonic()
+            self._tick()
+            if self._stood_s:
+                raise PlanningError(f'the planner stood still for {self._stood_s:.1f} s; what it '
+                                    'sees may be old. Send the goal again')
             if self._goal is not goal or self._silent(topics, now):
                 return False
             self._topics, self._moved_at = tuple(topics), now
@@ -111,6 +119,7 @@ class Arm:
                 if self._goal is None:
                     self._lock.wait_for(lambda: self._goal is not None or self._closed)
                     continue
+                self._tick()
                 try:
                     self._stop_if_due(time.monotonic())
                 except Exception as error:  # this thread must not end
@@ -118,6 +127,13 @@ class Arm:
                         f'the watch of the arm failed: {type(error).__name__}: {escaped(error)}',
                         throttle_duration_sec=1.0)
             time.sleep(WATCH_S)
+
+    def _tick(self):
+        """Find out whether the process has stood still since the watch last came by."""
+        now = now_awake()
+        if now - self._ticked_at > STOOD_S:
+            self._stood_s = now - self._ticked_at
+        self._ticked_at = now
 
     def _stop_if_due(self, now):
         """Stop the arm when a command or a sensor is too old, and again after REPEAT_S."""
@@ -135,3 +151,8 @@ class Arm:
         """Send a zero command; it has no stamp, since it answers no image."""
         self._stopped_at = time.monotonic()
         self._twist.publish(TwistStamped())
+
+
+def now_awake():
+    """Return a time in s that goes on while the machine is suspended."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)

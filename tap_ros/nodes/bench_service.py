@@ -29,10 +29,9 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.nodes.clients import call, CallError, Spinner
 from tap_ros.nodes.image_messages import encode_image
-from tap_ros.nodes.late_answers import SERVICE_QOS
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.object_messages import encode_objects
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import DEFAULT_PREDICTOR
 

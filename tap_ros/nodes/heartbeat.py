@@ -5,16 +5,15 @@
 import threading
 import time
 
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 from tap_ros.nodes.observations import reception_time
 
 BEAT_S = 0.1
-LEASE_S = 0.4  # after so long without a sign of life a node is thought dead
-LATE_S = 0.25  # a beat within this time after the loss shows that another one lives
+LEASE_S = 0.4  # of the topic's liveliness, for other programs that watch it
+SILENT_S = 0.7  # without a beat for so long a node is thought dead
+DOUBT_S = 0.1  # if none comes in so long after that: the watcher itself may have been held up
 QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                  liveliness=LivelinessPolicy.AUTOMATIC,
                  liveliness_lease_duration=Duration(seconds=LEASE_S))
@@ -24,8 +23,7 @@ class Heartbeat:
     """
     Publish <node>/heartbeat ten times a second.
 
-    The middleware itself asserts that the process lives, so a long callback is no death; a killed
-    or stopped process is.
+    A thread does it: a long callback is no death; a killed or stopped process is.
 
     :param node: rclpy Node.
     """
@@ -33,18 +31,26 @@ class Heartbeat:
     def __init__(self, node):
         self._node = node
         self._publisher = node.create_publisher(Header, '~/heartbeat', QOS)
-        node.create_timer(BEAT_S, self._beat, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='heartbeat', daemon=True)
+        self._thread.start()
 
-    def _beat(self):
-        self._publisher.publish(Header(stamp=self._node.get_clock().now().to_msg()))
+    def end(self):
+        """Beat no more; to be called before the node is destroyed."""
+        self._ended.set()
+        self._thread.join(1.0)
+
+    def _run(self):
+        while not self._ended.wait(BEAT_S):
+            self._publisher.publish(Header(stamp=self._node.get_clock().now().to_msg()))
 
 
 class Liveness:
     """
     Watch the heartbeat of a node.
 
-    The middleware tells the loss of a heartbeat; the beats themselves tell that there is one. The
-    numbers of those alive that Fast DDS keeps are wrong after a restart, below zero even.
+    Only the beats count. Fast DDS tells the loss of liveliness too, but not always where a node
+    was started again soon after its death.
 
     :param node: rclpy Node that watches; another thread spins it.
     :param name: of the node that is watched, as seen from this one's namespace.
@@ -53,36 +59,33 @@ class Liveness:
 
     def __init__(self, node, name, callback_group=None):
         self.name = name
-        self._died_at = None  # monotonic time; None while one is alive, or none has died yet
+        self._beat_at = None  # monotonic time of the newest beat
+        self._doubted_at = None  # when its silence was seen first
         self._changed = threading.Condition()
         node.create_subscription(
-            Header, f'{name}/heartbeat', self._on_beat, QOS, callback_group=callback_group,
-            event_callbacks=SubscriptionEventCallbacks(liveliness=self._on_liveliness))
-
-    def wait_until_alive(self, seconds):
-        """Wait until one that has died lives again; tell so, and True if none has died yet."""
-        with self._changed:
-            return self._changed.wait_for(lambda: self._died_at is None, seconds)
+            Header, f'{name}/heartbeat', self._on_beat, QOS, callback_group=callback_group)
 
     @property
     def dead(self):
-        """
-        Tell whether it has died for sure.
+        """Tell whether a node that was heard is heard no more; to be asked again and again."""
+        now = time.monotonic()
+        if not self._silent(now):
+            self._doubted_at = None
+        elif self._doubted_at is None:
+            self._doubted_at = now
+        doubted_at = self._doubted_at
+        return doubted_at is not None and now - doubted_at > DOUBT_S
 
-        The loss of one that was started again, or a sign of life that comes late on a machine that
-        is short of time, is no death.
-        """
-        died_at = self._died_at
-        return died_at is not None and time.monotonic() - died_at > LATE_S
+    def wait_until_alive(self, seconds):
+        """Wait until one that has died lives again; tell so, and True if none was heard yet."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._silent(time.monotonic()), seconds)
+
+    def _silent(self, now):
+        beat_at = self._beat_at
+        return beat_at is not None and now - beat_at > SILENT_S
 
     def _on_beat(self, _, info):
         with self._changed:
-            if self._died_at is not None and reception_time(info) > self._died_at:
-                self._died_at = None
-                self._changed.notify_all()
-
-    def _on_liveliness(self, event):
-        with self._changed:
-            lost = event.alive_count_change < 0 or event.not_alive_count_change > 0
-            if lost and self._died_at is None:
-                self._died_at = time.monotonic()
+            self._beat_at = reception_time(info)
+            self._changed.notify_all()

@@ -2,12 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A service whose answers are sent when they are ready, by any thread."""
 
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-
-# Of servers: requests that wait to be taken, answers that wait to be received. Of clients: answers
-# that wait to be taken, those to all other clients among them, since every client receives all.
-# With the default depth of 10, DDS drops what comes beyond without a word.
-SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+from tap_ros.nodes.topics import SERVICE_QOS
 
 
 def create_late_service(node, service_type, name, take):

@@ -7,7 +7,9 @@ from pathlib import Path
 
 SUBNET = Path(__file__).with_name('fastdds_subnet.xml')
 LOCALHOST = Path(__file__).with_name('fastdds_localhost.xml')
-PROFILE_VARIABLES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+CHOICES = (PROFILE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS')
+FAST_DDS = (None, '', 'rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
 RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 LOCALHOST_ONLY = 'ROS_LOCALHOST_ONLY'  # older than RANGE, and still stronger
 
@@ -21,19 +23,23 @@ def configure_fast_dds(environ=os.environ):
     lose what is sent to it for a while. Shared memory is left out as Fast DDS 2.14 loses what a
     process sends to one that was killed and started again (its pull request 4728).
 
-    To be called before rclpy.init. Profiles that the user has chosen, and other middlewares, are
-    left alone.
+    To be called before rclpy.init. Another middleware, and profiles or transports that the user
+    has chosen, are left alone; so is LOCALHOST with ROS_STATIC_PEERS, where rmw_fastrtps adds
+    shared memory.
 
     :param environ: the variables of this process, which rclpy.init reads.
     """
-    if any(name in environ for name in PROFILE_VARIABLES):
+    if environ.get('RMW_IMPLEMENTATION') not in FAST_DDS or any(
+            name in environ for name in CHOICES):
         return
-    local = (environ.get(LOCALHOST_ONLY) == '1'
-             or environ.get(RANGE, '').upper() == 'LOCALHOST')
-    if local and not environ.get('ROS_STATIC_PEERS'):
-        # rmw_fastrtps would add shared memory; it leaves the system's default alone.
+    profile = SUBNET
+    alone = environ.get(LOCALHOST_ONLY) == '1'
+    local = alone or environ.get(RANGE, '').upper() == 'LOCALHOST'
+    if local and (alone or not environ.get('ROS_STATIC_PEERS')):
+        profile = LOCALHOST
+    if not profile.is_file():  # without it the range must stay as it is
+        return
+    environ[PROFILE] = str(profile)
+    if profile is LOCALHOST:  # rmw_fastrtps leaves the system's default alone
         environ.pop(LOCALHOST_ONLY, None)
         environ[RANGE] = 'SYSTEM_DEFAULT'
-        environ[PROFILE_VARIABLES[1]] = str(LOCALHOST)
-    else:
-        environ[PROFILE_VARIABLES[1]] = str(SUBNET)

@@ -19,6 +19,7 @@ from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
+from tap_ros.nodes.topics import SERVICE_QOS
 from tap_ros.recording import topics
 from tap_ros.recording.writer import BagWriter
 from tap_ros.text import escaped
@@ -68,7 +69,8 @@ class RecorderNode(Node):
         if self.params['record_on_start']:
             self._start()
         self._subscribe_known()
-        self.create_service(SetBool, 'recorder/record', self._on_record)
+        self.create_service(
+            SetBool, 'recorder/record', self._on_record, qos_profile=SERVICE_QOS)
         self.create_timer(0.5, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(
             f'ready: recording to {escaped(self._writer.folder)}' if self._writer

@@ -22,7 +22,7 @@ from tap_ros.text import escaped
 
 def run_node(make_node, name, args=None, num_threads=1):
     """
-    Run one node until SIGINT or SIGTERM.
+    Run one node until SIGINT, SIGTERM, or its terminal is closed.
 
     On a signal the callback in progress is finished and `node.close()` is called before ROS shuts
     down: rclpy's own signal handlers would end the context first, and neither a last command nor a
@@ -36,20 +36,18 @@ def run_node(make_node, name, args=None, num_threads=1):
     :return: exit code: 1 when the node could not be started, or close says so by returning 1.
     """
     stop = threading.Event()
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    node = executor = None
+    node = executor = heartbeat = None
     code = 0
     try:
+        _handle_signals(signal.default_int_handler)
         configure_fast_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
+        _handle_signals(lambda *_: stop.set())
         executor = (SingleThreadedExecutor() if num_threads == 1
                     else MultiThreadedExecutor(num_threads))
         executor.add_node(node)
-        Heartbeat(node)
+        heartbeat = Heartbeat(node)
         while rclpy.ok() and not stop.is_set():
             _spin_once(executor, node)
     except (KeyboardInterrupt, ExternalShutdownException):
@@ -63,6 +61,9 @@ def run_node(make_node, name, args=None, num_threads=1):
         print(f'{name}: {escaped(error, 1000)}', file=sys.stderr)
         code = 1
     finally:
+        _handle_signals(lambda *_: None)  # it is ending already
+        if heartbeat is not None:
+            heartbeat.end()
         if node is not None:
             code = _close(node) or code
         if executor is not None:
@@ -91,6 +92,13 @@ def answering(node, callback):
                 message=f'internal error: {type(error).__name__}: {escaped(error)}')
 
     return answer
+
+
+def _handle_signals(handler):
+    """Handle what ends a node, but for what the user ignores, as nohup does."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 def _spin_once(executor, node):

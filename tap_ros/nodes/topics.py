@@ -11,6 +11,10 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
 # Reliable, for everything that happens at control rate.
 STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE,
                     durability=DurabilityPolicy.VOLATILE)
+# Of servers: requests that wait to be taken, answers that wait to be received. Of clients: answers
+# that wait to be taken, those to all other clients among them, since every client receives all.
+# With the default depth of 10, DDS drops what comes beyond without a word.
+SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
 def to_stamp(nanoseconds):

@@ -22,7 +22,6 @@ from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.goal_source import GoalSource, needed_topics
 from tap_ros.nodes.goal_source import TOPICS as GOAL
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.late_answers import SERVICE_QOS
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.planner_setup import (
     check_request,
@@ -33,7 +32,7 @@ from tap_ros.nodes.run import run_node
 from tap_ros.nodes.sight import Sight
 from tap_ros.nodes.sight import TOPICS as SENSORS
 from tap_ros.nodes.subgoal_messages import decode_subgoals
-from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.hierarchy import choose_sample, targets_by
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig
 from tap_ros.text import escaped
@@ -252,6 +251,8 @@ class VisualMpcNode(Node):
         """
         self._go_on(handle)
         seen, _ = self._sight.look(topics)
+        if seen is None:  # the clock has jumped; the next step says so
+            return False
         end = reach.interrupted(seen)
         if end:
             raise PlanningError(end.message)

@@ -8,6 +8,12 @@ import numpy as np
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.images import check_image, check_pixels, in_picture
 
+# What a gripper over the table can be: x, y, z in metres, opening. Anything else is another unit,
+# another frame or nonsense; learned models would answer it with a move all the same.
+GRIPPER_LOW = np.array([-1.0, -1.0, -0.1, -0.1], np.float32)
+GRIPPER_HIGH = np.array([1.0, 1.0, 1.0, 1.1], np.float32)
+GRIPPER_PARTS = ('x', 'y', 'z', 'opening')
+
 
 def check_scene(image, gripper, object_pixels, size):
     """
@@ -26,6 +32,12 @@ def check_scene(image, gripper, object_pixels, size):
     if gripper.shape != (4,) or not np.isfinite(gripper).all():
         raise PlanningError(
             f'gripper: expected 4 finite numbers (x, y, z in m, opening), got {gripper}')
+    outside = np.flatnonzero((gripper < GRIPPER_LOW) | (gripper > GRIPPER_HIGH))
+    if len(outside):
+        at = outside[0]
+        raise PlanningError(
+            f'gripper: {GRIPPER_PARTS[at]} is {gripper[at]:g}; expected {GRIPPER_LOW[at]:g} to '
+            f'{GRIPPER_HIGH[at]:g} (metres from the middle of the table, opening 0 to 1)')
     return gripper, pixels
 
 

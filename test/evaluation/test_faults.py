@@ -90,6 +90,9 @@ def test_the_page_needs_only_the_rows(tmp_path):
     run_faults(faults, tmp_path, progress=False)
     rows = {row['fault']: row for row in json.loads((tmp_path / 'faults.json').read_text())}
     assert make_page(rows, faults) == (tmp_path / 'faults.md').read_text()
+    assert 'Not measured yet' not in make_page(rows, faults)
+    some = {name: row for name, row in rows.items() if name != 'a'}
+    assert 'Not measured yet: `a`.' in make_page(some, faults)
     assert '`a`' in make_page(rows, {})  # a row whose fault is gone
 
 

@@ -3,6 +3,7 @@
 """Who may import whom, and who may import ROS."""
 
 import ast
+import os
 from pathlib import Path
 import re
 import subprocess
@@ -121,3 +122,14 @@ def test_nodes_load_nothing_slow_that_they_do_not_need(nodes):
     loaded = run.stdout.split()
     assert set(nodes) <= set(loaded)
     assert not set(DONE_WITHOUT[nodes]) & set(loaded)
+
+
+@pytest.mark.parametrize('chosen, found', [
+    ({}, '60000'), ({'GOMP_SPINCOUNT': '5'}, '5'), ({'OMP_WAIT_POLICY': 'ACTIVE'}, 'None')])
+def test_threads_do_not_spin_for_long_unless_the_user_wants_it(chosen, found):
+    kept = {name: value for name, value in os.environ.items()
+            if name not in ('GOMP_SPINCOUNT', 'OMP_WAIT_POLICY')}
+    output = subprocess.run(
+        [sys.executable, '-c', 'import os, tap_ros; print(os.environ.get("GOMP_SPINCOUNT"))'],
+        cwd=ROOT, env=kept | chosen, capture_output=True, text=True, check=True).stdout
+    assert output.strip() == found

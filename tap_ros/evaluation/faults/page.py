@@ -48,6 +48,10 @@ def make_page(rows, groups):
     if other:
         parts.append('Rows of faults that this version does not have: '
                      + ', '.join(f'`{row["fault"]}`' for row in other) + '.\n')
+    missing = [fault.name for faults in groups.values() for fault in faults
+               if fault.name not in rows]
+    if missing:
+        parts.append('Not measured yet: ' + ', '.join(f'`{name}`' for name in missing) + '.\n')
     if rows:
         parts += ['## Commands\n', *(f'    {row["command"]}' for row in rows.values()), '',
                   _machines(rows.values())]
@@ -60,8 +64,8 @@ def _table(faults, rows):
         row = rows[fault.name]
         held = f'{row["held"]}' if row['held'] == row['tried'] else f'**{row["held"]}**'
         figure = '' if row['figure'] is None else f'{row["figure"]} {row["unit"]}'
-        words = f'{fault.figure}, {fault.summary}' if figure else ''
-        words += f'; {row["note"]}' if row.get('note') else ''
+        words = '; '.join(part for part in (
+            f'{fault.figure}, {fault.summary}' if figure else '', row.get('note')) if part)
         lines.append(f'| {fault.title} | {row["tried"]} | {held} | {figure} | {words} |')
     return '\n'.join(lines) + '\n'
 

@@ -33,7 +33,7 @@ def _judge(job, handle, moment):
     if why:
         outcome(job.rig.finish, handle)
         why = f'the goal went on: {why}'
-    elif not end.startswith('aborted: ') or end == 'aborted: ':
+    elif not end.startswith('aborted: ') or end == 'aborted: ' or 'internal error' in end:
         why = f'the goal {end}'
     late = job.rig.commands.moves(moment + STOP_S * job.patience)
     if not why and late:

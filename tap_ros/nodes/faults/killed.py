@@ -12,6 +12,7 @@ from tap_ros.nodes.faults.silence import judge_stop
 from tap_ros.nodes.faults.world import goal_fields, predict_fields
 
 NOTICED_S = 1.0
+PAUSED_S = 5.0
 
 
 def judge_notice(job, watch, moment):
@@ -137,6 +138,29 @@ def simulator(job):
         job.record(not why, why, None if seconds == float('inf') else seconds)
 
 
+def paused(job):
+    """Stop the planner for some seconds while it moves an arm, and let it go on."""
+    rig = job.rig
+    rig.need('visual_mpc_node')
+    victim = rig.processes['visual_mpc_node']
+    with rig.world():
+        for _ in job.trials():
+            handle = rig.begin_moving()
+            victim.send(signal.SIGSTOP)
+            time.sleep(PAUSED_S)
+            moment = time.monotonic()
+            victim.send(signal.SIGCONT)
+            _, lost = outcome(rig.result, handle, 20.0)
+            if not lost:
+                lost = 'nobody told the client that the planner was away'
+            elif 'node ended' in lost:
+                lost = ''
+            time.sleep(2.0)  # it is found again, and would move by now
+            moves = rig.commands.moves(moment)
+            moved = f'{len(moves)} moves after it went on' if moves else ''
+            job.record(not (lost or moved), joined(lost, moved))
+
+
 FAULTS = [
     Fault('predictor-killed', 'the predictor is killed during a call', 'It ran out of memory, or '
           'its machine went down, while the planner waits for a subgoal.', 'Its death is noticed '
@@ -150,4 +174,8 @@ FAULTS = [
     Fault('simulator-killed', 'the simulator is killed during a goal', 'Camera and arm are gone '
           'at once.', 'Its death is noticed within 1 s, a zero command is sent within 0.5 s, the '
           'goal is aborted, and the first reset and goal after the restart succeed.', 50, 15.0,
-          simulator, 'until its death was noticed', 's')]
+          simulator, 'until its death was noticed', 's'),
+    Fault('planner-paused', f'the planner stands still for {PAUSED_S:g} s during a goal', 'Its '
+          'machine sleeps or swaps. What waited for it meanwhile looks new and is old.', 'Its '
+          'client is told, and nothing moves before the next goal.', 20, 9.0,
+          paused)]

@@ -10,6 +10,7 @@ from tap_ros.evaluation.faults.fault import Fault
 from tap_ros.nodes.faults.rig import outcome
 from tap_ros.nodes.faults.world import first_pictures, goal_fields, objects_message, predict_fields
 from tap_ros.nodes.topics import to_stamp
+from tap_ros.planning.mpc_inputs import GRIPPER_PARTS
 
 STOP_S = 0.5
 AGES_S = (0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 60.0)
@@ -76,23 +77,36 @@ def dead_before(job):
             job.record(not why, why, len(moves))
 
 
-def absurd_to_planner(job):
-    """Publish pixels outside the picture: before a goal, or from its middle on."""
+def absurd_pixels(trial):
+    """Return what a World publishes: pixels with one absurd; whose it is, and its value."""
+    seen = first_pictures()[0]
+    pixels = seen.object_pixels.astype(float)
+    value = pixels[1, trial % 2] = ABSURD[trial % len(ABSURD)]
+    return {'pixels': pixels}, seen.object_names[1], value
+
+
+def absurd_joints(trial):
+    """Return the same for joints of the gripper."""
+    gripper = first_pictures()[0].gripper.astype(float)
+    value = gripper[trial % 4] = ABSURD[trial % len(ABSURD)]
+    return {'gripper': gripper}, GRIPPER_PARTS[trial % 4], value
+
+
+def absurd_to_planner(job, spoil):
+    """Publish absurd values: before a goal, or from its middle on."""
     rig = job.rig
     rig.need('visual_mpc_node')
-    right = first_pictures()[0].object_pixels
-    name = first_pictures()[0].object_names[1]
     with rig.world() as world:
         for trial in job.trials():
-            pixels = right.astype(float)
-            value = pixels[1, trial % 2] = ABSURD[trial % len(ABSURD)]
+            spoiled, name, value = spoil(trial)
             world.restore()
             during = trial % 4 == 3
             if during:
                 handle = rig.begin_moving()
-                world.pixels, moment = pixels, time.monotonic()
+                world.spoil(**spoiled)
+                moment = time.monotonic()
             else:
-                world.pixels = pixels
+                world.spoil(**spoiled)
                 time.sleep(0.5)
                 moment = time.monotonic()
                 handle = rig.begin(**goal_fields())
@@ -100,9 +114,9 @@ def absurd_to_planner(job):
             moves = rig.commands.moves(moment + (STOP_S * job.patience if during else 0.0))
             why = error or judge_refusal(end.removeprefix('aborted: '), name, value)
             if end and not end.startswith('aborted'):
-                why = f'pixel {value:g}: the goal {end}'
+                why = f'{name} {value:g}: the goal {end}'
             if moves:
-                why = f'pixel {value:g}: {len(moves)} moves'
+                why = f'{name} {value:g}: {len(moves)} moves'
             rig.check()
             job.record(not why, why)
 
@@ -131,9 +145,9 @@ def absurd_to_predictor(job):
 
 def judge_refusal(message, name, value):
     """Say what a refusal of a pixel lacks; an empty string if nothing."""
-    if name not in message:
-        return f'the refusal does not name the object: {message}'
-    if np.isfinite(value) and '63' not in message and '64' not in message:
+    if name not in message and np.isfinite(np.float32(value)):
+        return f'the refusal does not name {name}: {message}'
+    if np.isfinite(value) and not any(bound in message for bound in ('63', '64', 'expected')):
         return f'the refusal does not name the bounds: {message}'
     return ''
 
@@ -155,7 +169,12 @@ FAULTS = [
           'moves sent', 'moves'),
     Fault('pixels-planner', 'absurd object pixels, to the planner', 'The object tracker reports a '
           'place outside the picture, infinity or NaN.', 'The goal is aborted with the name of '
-          'the object and the bounds; nothing moves by such a pixel.', 40, 2.0, absurd_to_planner),
+          'the object and the bounds; nothing moves by such a pixel.', 40, 2.0,
+          partial(absurd_to_planner, spoil=absurd_pixels)),
+    Fault('joints-planner', 'absurd joints, to the planner', 'The driver of the arm speaks of '
+          'millimetres or of another frame, or says nonsense.', 'The goal is aborted with the '
+          'joint and the bounds; nothing moves by such a joint.', 40, 2.0,
+          partial(absurd_to_planner, spoil=absurd_joints)),
     Fault('pixels-predictor', 'absurd object pixels, to the predictor', 'The same in a request '
           'for a subgoal.', 'Refused with the name of the object and the bounds; the node lives.',
           40, 0.5, absurd_to_predictor)]

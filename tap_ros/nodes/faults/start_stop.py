@@ -17,7 +17,7 @@ END_S = 10.0
 USUAL_S = 4.0  # that a start takes
 SIDE_BY_SIDE = 2
 EARLY = 'ended by Python itself, while it imported'
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def start_stop(job, name):
@@ -49,7 +49,7 @@ def _one(folder, name, trial, early_s, late_s):
         node.wait_until_ready()
         time.sleep(late_s)
     began = '[INFO]' in node.text
-    number = SIGNALS[trial // 2 % 2]
+    number = SIGNALS[trial // 2 % len(SIGNALS)]
     asked = time.monotonic()
     code = node.end(number, END_S)
     seconds = time.monotonic() - asked

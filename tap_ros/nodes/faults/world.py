@@ -66,6 +66,7 @@ class World:
     :param rate_hz: how often.
     :ivar silent: names of what is not published, of TOPICS.
     :ivar pixels: (K, 2) pixels published, or None for the true ones.
+    :ivar gripper: (4,) published, or None for the true one.
     :ivar names: object names, or None for the true ones.
     :ivar shift_s: added to all stamps.
     :ivar sent: when each topic was published last, time.monotonic().
@@ -73,7 +74,7 @@ class World:
 
     def __init__(self, node, rate_hz=10.0):
         self.silent, self.sent = set(), {}
-        self.pixels = self.names = None
+        self.pixels = self.names = self.gripper = None
         self.shift_s = 0.0
         self._seen = first_pictures()[0]
         self._node, self._period = node, 1.0 / rate_hz
@@ -102,12 +103,19 @@ class World:
         """Publish everything as it is again."""
         with self._lock:
             self.silent = set()
-            self.pixels = self.names = None
+            self.pixels = self.names = self.gripper = None
             self.shift_s = 0.0
+
+    def spoil(self, **values):
+        """Set pixels, names or gripper to something else until restore."""
+        with self._lock:
+            for name, value in values.items():
+                setattr(self, name, value)
 
     def messages(self, stamp):
         """Return {topic: message} of this moment."""
-        return {'joints': encode_gripper(self._seen.gripper, stamp, WORLD_FRAME),
+        gripper = self._seen.gripper if self.gripper is None else self.gripper
+        return {'joints': encode_gripper(gripper, stamp, WORLD_FRAME),
                 'objects': objects_message(self._seen, stamp, self.pixels, self.names),
                 'image': encode_image(self._seen.image, stamp, CAMERA_FRAME)}
 
