@@ -95,10 +95,11 @@ def answering(node, callback):
 
 
 def _handle_signals(handler):
-    """Handle what ends a node, but for what the user ignores, as nohup does."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, handler)
+    """Handle what ends a node. A shell ignores SIGINT for jobs in the background; nodes do not."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT):
+        signal.signal(number, handler)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        signal.signal(signal.SIGHUP, handler)
 
 
 def _spin_once(executor, node):

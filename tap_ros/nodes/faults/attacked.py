@@ -42,7 +42,8 @@ class Attacked:
         with self.log.open('ab') as log:
             self.process = subprocess.Popen(
                 command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-                start_new_session=True)
+                start_new_session=True,
+                preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL))  # despite nohup
         return self
 
     @property
