@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from glob import glob
+from runpy import run_path
 
 from setuptools import find_packages, setup
 
 NAME = 'tap_ros'
+NODE_MODULES = run_path('tap_ros/contract.py')['NODE_MODULES']
 
 setup(
     name=NAME,
@@ -26,11 +28,6 @@ setup(
     install_requires=['setuptools'],
     zip_safe=False,
     entry_points={
-        'console_scripts': [
-            'predictor_node = tap_ros.nodes.predictor_node:main',
-            'recorder_node = tap_ros.nodes.recorder_node:main',
-            'sim_node = sim_bridge.sim_node:main',
-            'visual_mpc_node = tap_ros.nodes.visual_mpc_node:main',
-        ],
+        'console_scripts': [f'{name} = {module}:main' for name, module in NODE_MODULES.items()],
     },
 )

@@ -18,11 +18,9 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from sim_bridge.grasp_expert import run_grasp_episode
-from sim_bridge.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, SUBSTEPS
+from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
 
-LIFTED = 0.13  # m, height that clears every object
-LOW = 0.012  # m, height at which the fingers push
 MAX_PUSH_STEPS = 24  # longest macro action, in control periods
 STILL = 0.002  # m, an object within this of its last place has come to rest
 TILT_COST = 0.2  # m, added to a sample that topples an object
@@ -140,9 +138,9 @@ class Expert:
         aside = np.array([-along[1], along[0]])
         start = poses[k, :2] - 0.13 * along + offset * aside
         length = np.linalg.norm(self._goals[k, :2] - poses[k, :2]) + 0.07 + overshoot
-        limit = WORKSPACE_HIGH[:2]
-        start = np.clip(start, -limit, limit)
-        end = np.clip(start + max(length, 0.04) * along, -limit, limit)
+        lowest, highest = WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2]
+        start = np.clip(start, lowest, highest)
+        end = np.clip(start + max(length, 0.04) * along, lowest, highest)
         waypoints = []
         travel = np.linalg.norm(start - here[:2])
         if travel > 0.02:

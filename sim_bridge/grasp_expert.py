@@ -15,14 +15,12 @@ import time
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.scene import WORKSPACE_HIGH, WORKSPACE_LOW
 from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls
+from tap_ros.contract import CLEAR, MOVE_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW
 
-STEP = 0.08  # m, farthest that the arm goes along x and along y in one control period
 RANGE = 0.3  # m, |x| and |y| of the random walk, all in view
 FAR = 0.22  # m, a start so far from the grasp that the first step cannot hit the object
 LOST = 0.12  # m, an object whose origin is farther from the gripper is not held
-CLEAR = 0.1  # m, lowest height at which the open gripper passes over an object
 
 
 @dataclass(frozen=True)
@@ -144,7 +142,7 @@ class GraspExpert:
 
     def _travel_steps(self, way):
         """Draw how many control periods a way (2,) takes, and say how few would do."""
-        fastest = max(int(np.ceil(np.abs(way).max() / STEP)), 1)
+        fastest = max(int(np.ceil(np.abs(way).max() / MOVE_LIMIT)), 1)
         speed = self._rng.uniform(*self._config.travel_speed)
         return max(int(np.ceil(np.linalg.norm(way) / speed)), fastest), fastest
 

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from tap_ros.contract import GRIPPER_JOINTS
 
 SHAPES = ('L', 'T', 'bar', 'disc')
 HALF_HEIGHT = 0.03  # m, of every object
 HALF_THICKNESS = 0.025  # m, of the boxes an object is made of
-WORKSPACE_LOW = np.array([-0.45, -0.45, 0.0])  # m, of the fingertips; z = 0 just clears the table
-WORKSPACE_HIGH = np.array([0.45, 0.45, 0.15])
 FINGER_CLEARANCE = 0.006  # m between fingertips and table at z = 0
 FINGER_GAP = 0.001  # m, half the gap between closed fingers
 FINGER_TRAVEL = 0.04  # m each finger moves from closed (0) to open (1)
@@ -137,11 +136,10 @@ def _add_gripper(spec, world, surface):
         name='palm', type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, 0.03, 0.02],
         pos=[0, 0, 0.14], rgba=[0.55, 0.55, 0.58, 1], contype=0, conaffinity=0, **arm)
     gripper.mass, gripper.inertia, gripper.explicitinertial = 0.5, [1e-3, 1e-3, 1e-3], True
-    for i, axis in enumerate('xyz'):
-        gripper.add_joint(
-            name=f'gripper_{axis}', type=mujoco.mjtJoint.mjJNT_SLIDE, axis=list(np.eye(3)[i]))
-        # Weak downwards: fingers that come down on an object rest on it and do not shoot it away.
-        _add_servo(spec, f'gripper_{axis}', kp=1500, kv=60, limit=8 if axis == 'z' else 30)
+    # Weak downwards: fingers that come down on an object rest on it and do not shoot it away.
+    for name, axis, limit in zip(GRIPPER_JOINTS[:3], np.eye(3), (30, 30, 8)):
+        gripper.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=list(axis))
+        _add_servo(spec, name, kp=1500, kv=60, limit=limit)
     for side, sign in (('left', -1), ('right', 1)):
         finger = gripper.add_body(
             name=f'{side}_finger', pos=[sign * 0.011, 0, 0.06], gravcomp=1)

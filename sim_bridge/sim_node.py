@@ -12,28 +12,22 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from sim_bridge.simulator import ACTION_LIMIT, Simulator
+from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import TASKS
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
+from tap_ros.contract import ACTION_LIMIT, CAMERA_FRAME, CONTROL_PERIOD, WORLD_FRAME
 from tap_ros.errors import TapError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
-from tap_ros.nodes.topics import (
-    CAMERA_FRAME,
-    LATCHED,
-    SERVICE_QOS,
-    STREAM,
-    to_nanoseconds,
-    to_stamp,
-    WORLD_FRAME,
-)
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 
+PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
 MAX_TIMEOUT = 60.0  # s
@@ -87,8 +81,7 @@ class SimNode(Node):
             self.create_timer(RESEND_S, self._send_newest, clock=clock)
         else:
             factor = self.params['real_time_factor']
-            self.create_timer(
-                self._sim.control_period / factor, self._on_timer, clock=clock)
+            self.create_timer(CONTROL_PERIOD / factor, self._on_timer, clock=clock)
             mode = f'{factor:g} x real time'
         self.get_logger().info(
             f'ready: task {task}, seed {self.params["seed"]}, {mode}')
@@ -229,7 +222,7 @@ class SimNode(Node):
             self._sim.close()
         self._sim, self._hide_arm = sim, hide_arm
         self._opening, self._twist = 0.0, None
-        self._stamp_ns += self._period_ns()
+        self._stamp_ns += PERIOD_NS
         self._reset_ns = self._stamp_ns
         self._num_steps = 0
         self._in_episode = True
@@ -242,12 +235,9 @@ class SimNode(Node):
         begin = time.perf_counter()
         observation = self._sim.step(np.append(move, self._opening))
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'step')
-        self._stamp_ns += self._period_ns()
+        self._stamp_ns += PERIOD_NS
         self._num_steps += 1
         self._publish(observation)
-
-    def _period_ns(self):
-        return round(self._sim.control_period * 1e9)
 
     def _end_episode(self):
         if self._in_episode:

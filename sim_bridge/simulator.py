@@ -17,18 +17,21 @@ from sim_bridge.scene import (
     HALF_HEIGHT,
     object_names,
     TIMESTEP,
+)
+from sim_bridge.tasks import get_task, gripper_away_from, nearest_first, sample_scene
+from tap_ros.contract import (
+    ACTION_LIMIT,
+    CONTROL_PERIOD,
+    SUCCESS_DISTANCE,
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
 )
-from sim_bridge.tasks import get_task, gripper_away_from, sample_scene, SUCCESS_DISTANCE
 from tap_ros.errors import SceneError
 
-CONTROL_PERIOD = 0.25  # s of simulated time for one action
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
 if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
     raise SceneError(f'the control period {CONTROL_PERIOD} s is no multiple of {TIMESTEP} s')
 RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time to catch up
-ACTION_LIMIT = np.array([0.08, 0.08, 0.15])  # m per control period, x, y, z
 GRASP_HEIGHT = 0.012  # m of the gripper when it holds an object on the table, in the goal picture
 LEAVE_HEIGHT = 0.12  # m of the gripper when it has put the object down, in the goal picture
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers
@@ -57,7 +60,12 @@ def clip_action(action):
     action = np.asarray(action, np.float64)
     if action.shape != (4,) or not np.isfinite(action).all():
         raise SceneError(f'action {action}: expected 4 finite numbers (dx, dy, dz, opening)')
-    return np.append(np.clip(action[:3], -ACTION_LIMIT, ACTION_LIMIT), np.clip(action[3], 0, 1))
+    return np.append(clip_moves(action[:3]), np.clip(action[3], 0, 1))
+
+
+def clip_moves(moves):
+    """Limit displacements (..., 3), in m, to what the arm does in one control period."""
+    return np.clip(moves, np.negative(ACTION_LIMIT), ACTION_LIMIT)
 
 
 def ramp_controls(target, actions):
@@ -91,8 +99,6 @@ class Simulator:
     :param image_size: pixels of the square picture.
     :raises SceneError: for an unknown task, a bad size, or when nothing can be rendered.
     """
-
-    control_period = CONTROL_PERIOD
 
     def __init__(self, task='push2', image_size=64):
         self.task = get_task(task)
@@ -235,12 +241,7 @@ class Simulator:
     def _after_last_push(self):
         """Return where the gripper touches one object that it has just pushed to its goal."""
         starts, goals = self.scene.start_poses[:, :2], self.scene.goal_poses[:, :2]
-        # The expert mostly takes the nearest object first: follow it to the last one.
-        here, left = self.scene.gripper_start[:2], list(range(self.task.num_objects))
-        while left:
-            k = min(left, key=lambda i: np.linalg.norm(starts[i] - here))
-            left.remove(k)
-            here = goals[k]
+        k = nearest_first(self.scene.gripper_start[:2], starts, goals)[-1]
         along = (goals[k] - starts[k]) / np.linalg.norm(goals[k] - starts[k])
         fingers, state = self._fingers(), self.state()
         for behind in np.arange(0.04, 0.16, 0.005):

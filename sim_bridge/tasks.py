@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from sim_bridge.grasping import grasp_place, graspable_shape, graspable_yaw
 from sim_bridge.scene import random_shape
+from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.errors import SceneError
 
 OBJECT_RANGE = 0.35  # m, |x| and |y| of object origins at start and goal
@@ -27,7 +28,6 @@ GOAL_SEPARATION = 0.2  # m between goals
 GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
 GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
 GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the start
-SUCCESS_DISTANCE = 0.05  # m; an episode succeeds when every object ends nearer to its goal
 GRASP_RANGE = 0.2  # m, |x| and |y| of the start of an object to be grasped
 GRASP_REACH_RANGE = 0.3  # m, |x| and |y| of the gripper's start before a grasp, all in view
 PLACE_RANGE = 0.2  # m, |x| and |y| of the place where a picked object goes
@@ -41,12 +41,16 @@ class Task:
 
     name: str
     num_objects: int
-    num_frames: int  # the longest episode
     start_separation: float  # m between object origins at the start
     kind: str = 'push'  # or 'grasp', 'pick_place'
     reach: tuple = ()  # m, nearest and farthest start of the gripper, for grasps
     lift: float = 0.0  # m, height of the goal above the table
     stream: int = 0  # of random numbers, besides the seed; no two tasks have the same
+
+    @property
+    def num_frames(self):
+        """Number of frames of the longest episode."""
+        return EPISODE_FRAMES[self.name]
 
     @property
     def gripping(self):
@@ -55,13 +59,13 @@ class Task:
 
 
 TASKS = {
-    'push2': Task('push2', num_objects=2, num_frames=40, start_separation=0.35, stream=2),
-    'push3': Task('push3', num_objects=3, num_frames=75, start_separation=0.3, stream=3),
+    'push2': Task('push2', num_objects=2, start_separation=0.35, stream=2),
+    'push3': Task('push3', num_objects=3, start_separation=0.3, stream=3),
     'grasp': Task(
-        'grasp', num_objects=1, num_frames=15, start_separation=0.0, kind='grasp',
+        'grasp', num_objects=1, start_separation=0.0, kind='grasp',
         reach=(0.13, 0.32), lift=LIFT_HEIGHT, stream=4),
     'pick_place': Task(
-        'pick_place', num_objects=1, num_frames=20, start_separation=0.0, kind='pick_place',
+        'pick_place', num_objects=1, start_separation=0.0, kind='pick_place',
         reach=(0.27, 0.33), stream=5),
 }
 
@@ -149,6 +153,22 @@ def gripper_away_from(rng, positions):
         xy = rng.uniform(-GRIPPER_RANGE, GRIPPER_RANGE, 2)
         if np.linalg.norm(positions - xy, axis=1).min() > GRIPPER_MARGIN:
             return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
+
+
+def nearest_first(hand, starts, goals):
+    """
+    Order objects as the expert mostly takes them: always the one nearest to the gripper.
+
+    :param hand: (2,) metres, where the gripper is; starts (K, 2), goals (K, 2) of the objects.
+    :return: list of K object indices.
+    """
+    order, left = [], list(range(len(starts)))
+    while left:
+        k = min(left, key=lambda i: np.linalg.norm(starts[i] - hand))
+        left.remove(k)
+        order.append(k)
+        hand = goals[k]
+    return order
 
 
 def _draw_starts(rng, task):

@@ -9,6 +9,7 @@ A kill or a full disk leaves what was there before: the old file stays until the
 from contextlib import contextmanager, suppress
 import errno
 import fcntl
+import json
 import os
 from pathlib import Path
 
@@ -41,6 +42,17 @@ def write_atomically(path, data):
                 part.unlink(missing_ok=True)
                 raise
         _sync_folder(path.parent)
+
+
+def write_rows(path, rows):
+    """
+    Write a table as JSON in one step, a row a line, so that changes can be read.
+
+    :param path: of the file; its folder is made.
+    :param rows: iterable of dicts.
+    :raises StorageError: when it cannot be written. An existing file is then what it was.
+    """
+    write_atomically(path, '[\n' + ',\n'.join(map(json.dumps, rows)) + '\n]\n')
 
 
 @contextmanager

@@ -56,3 +56,35 @@ def check_image(image, name, size=None):
             f'{name}: expected {size[1]}x{size[0]} pixels (width x height), '
             f'got {image.shape[1]}x{image.shape[0]}; resize it or use weights for that size')
     return image
+
+
+def check_pixels(pixels, name):
+    """
+    Accept object positions or say what is wrong with them.
+
+    :param pixels: (K, 2) numbers in (u, v) order, or None for no objects.
+    :param name: how the message calls them.
+    :return: float32 (K, 2).
+    :raises ImageError: for another shape, or positions that are not finite.
+    """
+    if pixels is None or np.size(pixels) == 0:
+        return np.zeros((0, 2), np.float32)
+    pixels = np.asarray(pixels, np.float32)
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise ImageError(f'{name}: expected shape (objects, 2), got {pixels.shape}')
+    unknown = np.flatnonzero(~np.isfinite(pixels).all(1)).tolist()
+    if unknown:
+        raise ImageError(f'{name}: unknown (not finite) for objects {unknown}; give (u, v) in '
+                         'pixels for every object, or leave those out')
+    return pixels
+
+
+def in_picture(pixels, size):
+    """
+    Tell which positions are in a picture; it reaches half a pixel beyond the outermost centres.
+
+    :param pixels: (..., 2) as (u, v).
+    :param size: (height, width).
+    :return: bool (...); False where a position is not a number.
+    """
+    return ((pixels >= -0.5) & (pixels <= np.array(size[::-1]) - 0.5)).all(-1)

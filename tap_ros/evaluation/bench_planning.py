@@ -14,11 +14,11 @@ import time
 
 import numpy as np
 from sim_bridge.simulator import Simulator
+from tap_ros.contract import CLEAR, LOW
 from tap_ros.errors import PlanningError
 from tap_ros.evaluation.planning.scenes import FIRST_SCENE
 from tap_ros.evaluation.speed import matrix_rate, matrix_side
 from tap_ros.images import to_float
-from tap_ros.planning.forward_model import CLEAR
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.weights import FORWARD_MODEL
@@ -171,5 +171,5 @@ def random_actions(mpc, count):
 def _inputs(mpc, seen):
     """Return the picture (1, 3, H, W), and the gripper (1, 4) brought down to push."""
     device = mpc.model.grid.device
-    gripper = torch.from_numpy(np.append(seen.gripper[:2], [0.012, 0]).astype(np.float32))
+    gripper = torch.from_numpy(np.append(seen.gripper[:2], [LOW, 0]).astype(np.float32))
     return to_float(seen.image)[None].to(device), gripper[None].to(device)

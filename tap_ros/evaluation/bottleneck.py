@@ -9,6 +9,7 @@ Object positions are the recordings', that is, the simulator's ground truth; the
 from itertools import product
 
 import numpy as np
+from tap_ros.planning.expected_distance import distances_to_pixels
 from tap_ros.prediction.batches import fixed_time, uses_recorded_goal
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps, WarpedMaps
 import torch
@@ -18,20 +19,6 @@ THRESHOLDS = tuple(range(11))  # px
 MIN_MOTION = 4.0  # px
 # A map is normalised, so an object that a prediction leaves out is still somewhere by its map.
 VISIBLE = 0.5  # least mass, of 1, that the maps of all objects keep if these are to be seen
-
-
-def expected_distances(maps, pixels):
-    """
-    Compute the expected distance between an object under a map and a position.
-
-    :param maps: (..., H, W), each sums to 1.
-    :param pixels: (..., 2), (u, v).
-    :return: (...), in pixels.
-    """
-    H, W = maps.shape[-2:]
-    u = torch.arange(W, device=maps.device) - pixels[..., 0, None, None]
-    v = torch.arange(H, device=maps.device)[:, None] - pixels[..., 1, None, None]
-    return (maps * torch.sqrt(u ** 2 + v ** 2)).sum((-2, -1))
 
 
 def bottleneck_scores(maps, start_pixels, goal_pixels):
@@ -47,7 +34,7 @@ def bottleneck_scores(maps, start_pixels, goal_pixels):
     :param goal_pixels: (B, K, 2), in the goal picture.
     :return: (B,), in pixels.
     """
-    return _least_sum(*(expected_distances(maps, pixels) for pixels in (
+    return _least_sum(*(distances_to_pixels(maps, pixels) for pixels in (
         start_pixels, goal_pixels)))
 
 

@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros evaluate forward`: how well object maps are carried."""
 
-import json
 from pathlib import Path
 import shlex
 
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
-from tap_ros.files import write_atomically
+from tap_ros.files import write_rows
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
 from tap_ros.prediction.batches import split_episodes
@@ -64,8 +63,7 @@ def run(args):
         print(f'{row["task"]:12s} step {row["step"]:2d}  {row["method"]:16s}{row["value"]:6.2f} '
               f'({row["ci_low"]:.2f}, {row["ci_high"]:.2f}), {row["n"]} objects')
     if args.out:
-        write_atomically(Path(args.out, FILE),
-                         '[\n' + ',\n'.join(json.dumps(row) for row in rows) + '\n]\n')
+        write_rows(Path(args.out, FILE), rows)
 
 
 def make_rows(task, measured, data_hash, command):

@@ -26,6 +26,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.nodes.clients import call, CallError, Spinner
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.node_processes import NodeProcesses
@@ -257,9 +258,9 @@ def pictures():
 def make_request():
     """Return a request that has all it needs."""
     stamp = to_stamp(1)
-    start, goal = (encode_image(picture, stamp, 'camera') for picture in pictures())
+    start, goal = (encode_image(picture, stamp, CAMERA_FRAME) for picture in pictures())
     start_objects, goal_objects = (
-        encode_objects(NAMES, pixels, [[0, 0, 0, 0, 0, 0, 1]] * len(NAMES), stamp, 'world',
+        encode_objects(NAMES, pixels, [[0, 0, 0, 0, 0, 0, 1]] * len(NAMES), stamp, WORLD_FRAME,
                        ObjectStates.SOURCE_TRACKED) for pixels in PIXELS)
     return PredictSubgoal.Request(
         start=start, goal=goal, start_objects=start_objects, goal_objects=goal_objects)

@@ -16,9 +16,11 @@ import rclpy
 from rclpy.action import ActionClient
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
+from sim_bridge.tasks import get_task
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal, ResetScene
+from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.evaluation.demo_report import (
     results_table,
@@ -27,7 +29,7 @@ from tap_ros.evaluation.demo_report import (
     write_overview,
     write_report,
 )
-from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS, step_budget
+from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS
 from tap_ros.nodes.clients import call, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.image_messages import decode_image, decode_map
@@ -233,7 +235,7 @@ def run(args):
     """
     if args.scenes < 1 or args.step_budget < 0:
         raise ConfigError('scenes must be at least 1, and step-budget 0 or more')
-    budget = args.step_budget or step_budget(args.task)
+    budget = args.step_budget or step_budget(get_task(args.task).num_objects)
     folder = new_folder(args.out)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     client = None
@@ -294,7 +296,8 @@ def add_arguments(parser):
         '--task', default='push2', choices=PLANNING_TASKS, help='task (default: %(default)s)')
     parser.add_argument(
         '--step-budget', type=int, default=0,
-        help="most steps of one run; 0: the task's, 40 and 75 (default: %(default)s)")
+        help=f"most steps of one run; 0: the task's, {step_budget(2)} and "
+        f'{step_budget(3)} (default: %(default)s)')
     parser.add_argument(
         '--out', default='runs/demo', help='folder for the page, the recording and the logs '
         '(default: %(default)s; a number is added when it exists)')

@@ -7,14 +7,11 @@ import sys
 
 import numpy as np
 from sensor_msgs.msg import Image
+from tap_ros.contract import ENCODINGS, MAP_ENCODING, PICTURE_ENCODING
 from tap_ros.errors import ImageError
 from tap_ros.images import check_image
 from tap_ros.text import escaped
 
-# Bytes per pixel, and which of them are red, green and blue.
-ENCODINGS = {
-    'rgb8': (3, (0, 1, 2)), 'bgr8': (3, (2, 1, 0)),
-    'rgba8': (4, (0, 1, 2)), 'bgra8': (4, (2, 1, 0)), 'mono8': (1, (0, 0, 0))}
 MAX_BYTES = 32 * 2**20  # of one picture: rgb8 of 3840x2160 pixels has 24 MiB
 MAX_FRAME_ID = 100  # characters; it comes back with every picture and map of an answer
 
@@ -31,10 +28,10 @@ def encode_image(image, stamp, frame_id):
     :param image: uint8 (H, W, 3) rgb.
     :param stamp: builtin_interfaces/Time, the moment of the snapshot.
     :param frame_id: frame of the camera.
-    :return: sensor_msgs/Image, rgb8.
+    :return: sensor_msgs/Image in PICTURE_ENCODING.
     :raises ImageError: for another type or shape.
     """
-    return _pack(check_image(image, 'image'), 'rgb8', stamp, frame_id)
+    return _pack(check_image(image, 'image'), PICTURE_ENCODING, stamp, frame_id)
 
 
 def encode_map(values, stamp, frame_id):
@@ -44,9 +41,9 @@ def encode_map(values, stamp, frame_id):
     :param values: float32 (H, W).
     :param stamp: builtin_interfaces/Time.
     :param frame_id: frame of the camera.
-    :return: sensor_msgs/Image, 32FC1.
+    :return: sensor_msgs/Image in MAP_ENCODING.
     """
-    return _pack(np.asarray(values, np.float32), '32FC1', stamp, frame_id)
+    return _pack(np.asarray(values, np.float32), MAP_ENCODING, stamp, frame_id)
 
 
 def decode_image(message, name, size=None, resize=False):
@@ -73,15 +70,15 @@ def decode_image(message, name, size=None, resize=False):
 
 def decode_map(message, name, size=None):
     """
-    Turn a 32FC1 message into an object map.
+    Turn a message into an object map.
 
-    :param message: sensor_msgs/Image, 32FC1.
+    :param message: sensor_msgs/Image in MAP_ENCODING.
     :param name: how an error calls it.
     :param size: the (height, width) wanted, or None for any.
     :return: float32 (H, W).
     :raises ImageError: for another encoding, size, step or length, or values that are not finite.
     """
-    _check_encoding(message, name, ('32FC1',))
+    _check_encoding(message, name, (MAP_ENCODING,))
     if size is not None and (message.height, message.width) != tuple(size):
         raise ImageError(f'{name}: expected {size[1]}x{size[0]} pixels (width x height), '
                          f'got {message.width}x{message.height}')

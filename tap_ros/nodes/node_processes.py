@@ -7,14 +7,8 @@ import signal
 import subprocess
 import sys
 
+from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
-
-MODULES = {
-    'sim_node': 'sim_bridge.sim_node',
-    'predictor_node': 'tap_ros.nodes.predictor_node',
-    'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
-    'recorder_node': 'tap_ros.nodes.recorder_node',
-}
 
 
 class NodeEnded(TapError):
@@ -37,10 +31,10 @@ class NodeProcesses:
         """
         Start a node.
 
-        :param name: one of MODULES.
+        :param name: one of NODE_MODULES.
         :param parameters: its ROS parameters.
         """
-        command = [sys.executable, '-m', MODULES[name], '--ros-args']
+        command = [sys.executable, '-m', NODE_MODULES[name], '--ros-args']
         for key, value in parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']

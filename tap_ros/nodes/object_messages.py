@@ -6,10 +6,11 @@ from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import ObjectState, ObjectStates
+from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import PlanningError
+from tap_ros.images import in_picture
 from tap_ros.text import escaped, listing
 
-GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
 MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is predicted
 MAX_NAME = 100  # characters
 
@@ -79,7 +80,7 @@ def _check_pixel(name, pixel, size):
     if size is None:
         return
     height, width = size
-    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5):
+    if not in_picture(pixel, size):
         raise PlanningError(
             f'{name} has the pixel ({u}, {v}), which is outside the picture; expected u from -0.5 '
             f'to {width - 0.5} and v from -0.5 to {height - 0.5}, leave out objects that are not '

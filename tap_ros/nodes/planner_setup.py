@@ -3,12 +3,18 @@
 """Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
 
 import numpy as np
+from tap_ros.contract import (
+    CLIMB_LIMIT,
+    CONTROL_PERIOD,
+    GOAL_TOLERANCE,
+    MOVE_LIMIT,
+    step_budget,
+    WORLD_FRAME,
+)
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.parameters import check_device, Parameters
-from tap_ros.nodes.topics import WORLD_FRAME
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
-from tap_ros.planning.reach import default_budget
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 
@@ -27,7 +33,7 @@ def declare_parameters(node):
     parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
                        'with more samples, or what the paper says.', choices=list(PRESETS))
     parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
-    parameters.declare('control_period', 0.25,
+    parameters.declare('control_period', CONTROL_PERIOD,
                        'Seconds (of image stamps) that the arm takes for one command.',
                        low=0.01, high=10.0)
     parameters.declare('twist_scale', 1.0,
@@ -39,10 +45,11 @@ def declare_parameters(node):
                        'instead of the stamp of the image that they answer.')
     parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
     for name, default, low, high, description in (
-            ('max_step_xy', 0.08, 0.001, 0.08, 'Largest |dx| and |dy| of a command in metres; '
-             'the planner knows it, from the next goal on.'),
-            ('max_step_z', 0.15, 0.02, 0.15, 'Largest |dz| of a command in metres; likewise.'),
-            ('goal_tolerance', 1.0, 0.0, 64.0,
+            ('max_step_xy', MOVE_LIMIT, 0.001, MOVE_LIMIT, 'Largest |dx| and |dy| of a command in '
+             'metres; the planner knows it, from the next goal on.'),
+            ('max_step_z', CLIMB_LIMIT, 0.02, CLIMB_LIMIT,
+             'Largest |dz| of a command in metres; likewise.'),
+            ('goal_tolerance', GOAL_TOLERANCE, 0.0, 64.0,
              'A goal is reached at this mean distance of the objects in pixels, a subgoal where '
              'the mean expected distance to its maps is so much above the least possible.')):
         parameters.declare(name, default, description, low=low, high=high, read_only=False)
@@ -103,5 +110,5 @@ def check_request(request):
         raise ConfigError(f'mode is {mode!r}; valid modes: {", ".join(MODES)}')
     if request.step_budget > MAX_BUDGET:
         raise ConfigError(f'step_budget is {request.step_budget}; expected 1 to {MAX_BUDGET}, or '
-                          f'0 for {default_budget(2)}, with three objects {default_budget(3)}')
+                          f'0 for {step_budget(2)}, with three objects {step_budget(3)}')
     return mode

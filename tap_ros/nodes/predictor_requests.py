@@ -9,6 +9,7 @@ import numpy as np
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.contract import CAMERA_FRAME
 from tap_ros.errors import ImageError
 from tap_ros.nodes.image_messages import decode_image, is_empty, resize_pixels
 from tap_ros.nodes.object_messages import decode_objects, match_objects
@@ -21,7 +22,7 @@ from tap_ros.nodes.predictor_setup import (
 )
 from tap_ros.nodes.pulled import PulledObservations
 from tap_ros.nodes.subgoal_messages import encode_subgoal
-from tap_ros.nodes.topics import CAMERA_FRAME, LATCHED, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 from tap_ros.prediction.predictor import Question
 from tap_ros.text import listing
 

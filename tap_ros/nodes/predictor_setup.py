@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, weights and requests of predictor_node: what is checked before it predicts."""
 
-import numpy as np
-from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.errors import ConfigError
 from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.prediction.methods import MODES
@@ -55,39 +54,19 @@ def load_predictors(weights, forward_weights, device):
     :raises ConfigError: when the device is not there, or no file is needed for what both are for.
     """
     check_device(device)
-    predictor = load_predictor(weights, device)
+    predictor = SubgoalPredictor.load(weights, device)
     predictors = {predictor.mode: predictor}
     if forward_weights:
         if predictor.mode == 'forward':
             raise ConfigError(f'parameter forward_weights: {weights}, given as weights, is for '
                               'forward prediction already; leave one of them out')
-        forward = load_predictor(forward_weights, device)
+        forward = SubgoalPredictor.load(forward_weights, device)
         if forward.mode != 'forward':
             raise ConfigError(f'parameter forward_weights: {forward_weights} needs start and '
                               'goal; give weights trained for the start alone, or give these as '
                               'weights')
         predictors['forward'] = forward
     return predictors
-
-
-def load_predictor(path, device):
-    """
-    Load weights, and predict once, so that the first request is as fast as the others.
-
-    :raises WeightsError: when the file cannot be used or predicts nonsense.
-    :raises ConfigError: when it is for another number of context pictures than one or two.
-    """
-    predictor = SubgoalPredictor.load(path, device=device)
-    height, width = predictor.image_size
-    picture = np.full((height, width, 3), 128, np.uint8)
-    pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
-    goal = {} if predictor.mode == 'forward' else {'goal': picture, 'goal_pixels': pixels}
-    subgoal, = predictor.predict(picture, start_pixels=pixels, **goal)
-    if not np.allclose(subgoal.object_maps.sum((1, 2)), 1, atol=1e-3):
-        raise WeightsError(
-            f'{path}: predicts object maps that do not sum to 1; the weights are damaged or were '
-            'not trained, train them again')
-    return predictor
 
 
 def choose_mode(request, modes):

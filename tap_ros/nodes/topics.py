@@ -5,9 +5,6 @@
 from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-WORLD_FRAME = 'world'
-CAMERA_FRAME = 'camera'
-
 # Reliable and kept for late joiners: goals, the last subgoal.
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)

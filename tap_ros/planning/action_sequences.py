@@ -15,11 +15,9 @@ past; the horizon then reaches into one segment more.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from tap_ros.contract import CLIMB_LIMIT, LIFTED, LOW, MOVE_LIMIT
 
-LIFTED = 0.13  # m, height of the gripper that clears the objects
-LOW = 0.012  # m, height at which it pushes
 VERTICAL = 0.06  # m, a change of height beyond which the arm does not move sideways meanwhile
-CLIMB_LIMIT = 0.15  # m per control period
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,7 @@ class SequenceShape:
     segments: int = 5
     repeat: int = 3
     phase: int | None = 0
-    move_limit: float = 0.08
+    move_limit: float = MOVE_LIMIT
     max_lift: int = 4
     push_limit: float = 0.05
     upright: bool = True

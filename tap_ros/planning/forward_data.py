@@ -5,6 +5,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import RecordingError
 from tap_ros.images import to_float
 from tap_ros.planning.table import mirror_table
@@ -48,7 +49,7 @@ def read_windows(store, episodes, starts, steps):
         bad = int(np.asarray(episodes)[~np.isfinite(grippers).all((1, 2))][0])
         raise RecordingError(
             f'/joint_states: episode {bad} lacks gripper positions; the forward model needs '
-            'gripper_x, gripper_y, gripper_z and gripper_opening at every picture')
+            f'{", ".join(GRIPPER_JOINTS)} at every picture')
     return np.stack(images), grippers, np.stack(actions).astype(np.float32)
 
 

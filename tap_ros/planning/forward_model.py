@@ -21,6 +21,7 @@ is not predicted but drawn where its kinematics put it.
 
 from dataclasses import dataclass
 
+from tap_ros.contract import ACTION_LIMIT, CLEAR, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import ConfigError
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
 from tap_ros.planning.table import (
@@ -37,9 +38,7 @@ from tap_ros.prediction.weights import load_weights, make_network
 import torch
 from torch import nn
 
-MOVE_LIMIT = (0.08, 0.08, 0.15)  # m per control period
 LEAST_MASS = 0.05  # of a carried map, beneath which it is lost
-CLEAR = 0.1  # m, gripper height above which no object is touched
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,8 @@ class ForwardModelConfig:
     table: tuple  # 9 numbers, row-major: homography from table metres to pixels
     arm: tuple  # 12 numbers, row-major: camera from gripper metres to the arm's pixels
     image_size: int = 64
-    workspace_low: tuple = (-0.45, -0.45, 0.0)  # m, of the gripper
-    workspace_high: tuple = (0.45, 0.45, 0.15)
+    workspace_low: tuple = WORKSPACE_LOW  # m, of the gripper
+    workspace_high: tuple = WORKSPACE_HIGH
     table_half: float = 0.55  # m, half the side of the table grid
     table_cells: int = 44
     window_cells: int = 26  # of the table grid around the gripper: the crop in any direction
@@ -123,7 +122,7 @@ class ForwardModel(nn.Module):
         low = torch.tensor([*config.workspace_low, 0.0])
         high = torch.tensor([*config.workspace_high, 1.0])
         constant('limits', torch.stack([low, high]))
-        constant('move_limit', torch.tensor(MOVE_LIMIT))
+        constant('move_limit', torch.tensor(ACTION_LIMIT))
 
     @property
     def learned(self):

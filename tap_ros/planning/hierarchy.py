@@ -12,7 +12,9 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
+from tap_ros.planning.expected_distance import distances_to_all_pixels
 
 SWITCHES = ('reached', 'half')
 
@@ -52,11 +54,7 @@ class Target:
     @cached_property
     def _excess(self):
         """Return the expected distance (K, H, W) of each pixel to the maps, less the least."""
-        maps = np.asarray(self.maps, np.float32)
-        H, W = maps.shape[1:]
-        gaps = np.hypot(*np.mgrid[1 - H:H, 1 - W:W]).astype(np.float32)
-        tables = np.stack([cv2.filter2D(m / m.sum(), -1, gaps, borderType=cv2.BORDER_CONSTANT)
-                           for m in maps])
+        tables = distances_to_all_pixels(np.asarray(self.maps, np.float32))
         return tables - tables.min((1, 2), keepdims=True)
 
     def goal(self, pixels):
@@ -82,7 +80,7 @@ class Itinerary:
     :ivar switches: steps at which the second, third ... target began.
     """
 
-    def __init__(self, targets, step_budget, switch='reached', reached=1.0):
+    def __init__(self, targets, step_budget, switch='reached', reached=GOAL_TOLERANCE):
         if switch not in SWITCHES:
             raise ConfigError(f'switch {switch!r} is unknown; expected one of {SWITCHES}')
         self._targets, self._budget = list(targets), step_budget

@@ -4,8 +4,9 @@
 
 from dataclasses import dataclass, replace
 
+from tap_ros.contract import MOVE_LIMIT
 from tap_ros.errors import ConfigError
-from tap_ros.planning.action_sequences import CLIMB_LIMIT
+from tap_ros.planning.action_sequences import SequenceShape
 from tap_ros.planning.cem import CEMConfig
 
 
@@ -42,16 +43,16 @@ class VisualMPCConfig:
     """
 
     search: CEMConfig = CEMConfig(num_samples=64, num_iterations=2, num_elites=8)
-    segments: int = 5
-    repeat: int = 3
+    segments: int = SequenceShape.segments
+    repeat: int = SequenceShape.repeat
     free_phase: bool = True
     std_move: float = 0.04
-    move_limit: float = 0.08
-    push_limit: float = 0.05
-    upright: bool = True
-    climb_limit: float = CLIMB_LIMIT
+    move_limit: float = SequenceShape.move_limit
+    push_limit: float = SequenceShape.push_limit
+    upright: bool = SequenceShape.upright
+    climb_limit: float = SequenceShape.climb_limit
     clearance: float = 0.1
-    max_lift: int = 4
+    max_lift: int = SequenceShape.max_lift
     last_weight: float = 10.0
     unfinished: float = 4.0
     warm_start: bool = True
@@ -90,7 +91,7 @@ class VisualMPCConfig:
 LARGE = VisualMPCConfig(search=CEMConfig(), proposals=80, batch_size=50)
 # 0.08 m std and 0.16 m clip in the paper are for actions of 1 s; ours last 0.25 s.
 PAPER = VisualMPCConfig(
-    search=CEMConfig(), warm_start=False, proposals=0, cost_every=1, push_limit=0.08,
+    search=CEMConfig(), warm_start=False, proposals=0, cost_every=1, push_limit=MOVE_LIMIT,
     upright=False, clearance=0.0, unfinished=0.0, free_phase=False, recheck=0, batch_size=50)
 PRESETS = {'default': VisualMPCConfig(), 'large': LARGE, 'paper': PAPER}
 

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the planner is given: checks that name what is wrong."""
 
+from contextlib import contextmanager
+
 import numpy as np
 from tap_ros.errors import ImageError, PlanningError
-from tap_ros.images import check_image
+from tap_ros.images import check_image, check_pixels, in_picture
 
 # What a gripper over the table can be: x, y, z in metres, opening. Anything else is another unit,
 # another frame or nonsense; learned models would answer it with a move all the same.
@@ -21,10 +23,11 @@ def check_scene(image, gripper, object_pixels, size):
     :return: gripper (4,) and object pixels (K, 2) as float32.
     :raises PlanningError: for inputs that cannot be planned with.
     """
-    try:
+    with _as_planning_error():
         check_image(image, 'image', size)
-    except ImageError as error:
-        raise PlanningError(str(error)) from error
+        pixels = check_pixels(object_pixels, 'object_pixels')
+    if not len(pixels):
+        raise PlanningError('object_pixels: no objects; give the position of one at least')
     gripper = np.asarray(gripper, np.float32)
     if gripper.shape != (4,) or not np.isfinite(gripper).all():
         raise PlanningError(
@@ -35,32 +38,24 @@ def check_scene(image, gripper, object_pixels, size):
         raise PlanningError(
             f'gripper: {GRIPPER_PARTS[at]} is {gripper[at]:g}; expected {GRIPPER_LOW[at]:g} to '
             f'{GRIPPER_HIGH[at]:g} (metres from the middle of the table, opening 0 to 1)')
-    return gripper, check_pixels(object_pixels, 'object_pixels', None, size)
+    return gripper, pixels
 
 
-def check_pixels(pixels, name, count, size):
+def check_goal_pixels(pixels, count, size):
     """
-    Check pixels (K, 2); return them as float32.
+    Check goal pixels (K, 2); return them as float32.
 
-    :param name: 'object_pixels' or 'goal_pixels'; goals have to lie in the picture.
-    :param count: K, or None for any; size: (height, width).
+    :param count: K; size: (height, width) of the picture that they have to lie in.
     :raises PlanningError: for another shape, or positions that are unknown or outside.
     """
-    pixels = np.asarray(pixels, np.float32)
-    if pixels.ndim != 2 or pixels.shape[1] != 2 or not len(pixels):
-        raise PlanningError(f'{name}: expected shape (K, 2) with K at least 1, '
-                            f'got {pixels.shape}')
-    if count is not None and len(pixels) != count:
-        raise PlanningError(f'{name}: {len(pixels)} goals for {count} objects; '
+    with _as_planning_error():
+        pixels = check_pixels(pixels, 'goal_pixels')
+    if len(pixels) != count:
+        raise PlanningError(f'goal_pixels: {len(pixels)} goals for {count} objects; '
                             'give one for each object, in the same order')
-    if not np.isfinite(pixels).all():
-        bad = np.flatnonzero(~np.isfinite(pixels).all(1)).tolist()
-        raise PlanningError(f'{name}: unknown (not finite) for objects {bad}; '
-                            'plan for known objects only')
-    size = np.array(size[::-1])
-    if name == 'goal_pixels' and ((pixels < -0.5) | (pixels > size - 0.5)).any():
-        bad = pixels[((pixels < -0.5) | (pixels > size - 0.5)).any(1)].tolist()
-        raise PlanningError(f'{name}: {bad} outside the {size[0]}x{size[1]} picture')
+    outside = pixels[~in_picture(pixels, size)].tolist()
+    if outside:
+        raise PlanningError(f'goal_pixels: {outside} outside the {size[1]}x{size[0]} picture')
     return pixels
 
 
@@ -79,3 +74,12 @@ def check_maps(maps, count, size):
         raise PlanningError('goal_maps: expected finite values of at least 0 and a positive sum '
                             f'for each object, got sums {mass.tolist()}')
     return maps
+
+
+@contextmanager
+def _as_planning_error():
+    """Raise what is wrong with a picture as a PlanningError."""
+    try:
+        yield
+    except ImageError as error:
+        raise PlanningError(str(error)) from error

@@ -19,6 +19,7 @@ visual_mpc_node and the evaluation both drive it, so that they act alike:
 from dataclasses import dataclass
 
 import numpy as np
+from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.planning.hierarchy import Itinerary
 from tap_ros.planning.tracking import ObjectTracker
 from tap_ros.text import listing
@@ -43,7 +44,7 @@ class ReachConfig:
     """
     Settings of one goal.
 
-    :param step_budget: commands at most; 0: default_budget.
+    :param step_budget: commands at most; 0: contract.step_budget.
     :param switch: when to go on from a subgoal, see hierarchy.Itinerary.
     :param reached: px, mean distance of the objects; nearer than this is there. 0: never.
     :param tracking: 'ground_truth': Seen.pixels at every step; 'carried': those of the first step,
@@ -55,7 +56,7 @@ class ReachConfig:
 
     step_budget: int = 0
     switch: str = 'reached'
-    reached: float = 1.0
+    reached: float = GOAL_TOLERANCE
     tracking: str = 'ground_truth'
     max_age: float = float('inf')
     timeout: float = float('inf')
@@ -183,7 +184,7 @@ class Reach:
         """
         config = self._config
         self._targets = list(targets)
-        self._budget = config.step_budget or default_budget(len(targets[-1].pixels))
+        self._budget = config.step_budget or step_budget(len(targets[-1].pixels))
         self._itinerary = Itinerary(targets, self._budget, config.switch, config.reached)
         if config.tracking == 'carried':
             first = self._first
@@ -277,11 +278,6 @@ class Reach:
         self._itinerary.switches = list(switches)
         if self._tracker is not None:
             self._tracker.memory = tracked
-
-
-def default_budget(num_objects):
-    """Return how many steps a goal may take, as in the paper's Table 2."""
-    return 40 if num_objects <= 2 else 75
 
 
 def scene_change(first, seen):

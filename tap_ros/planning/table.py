@@ -9,6 +9,7 @@ a homography. Both are fitted from recordings, see fit_table and fit_arm.
 """
 
 import numpy as np
+from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import RecordingError
 import torch
 from torch.nn import functional as F
@@ -170,7 +171,7 @@ def fit_arm(episodes):
     if len(points) < 50 or points[:, :2].std(0).min() < 0.01:
         raise RecordingError(
             '/joint_states: the forward model needs gripper positions of a moving arm '
-            f'(gripper_x, gripper_y, gripper_z); {len(points)} usable steps found')
+            f'({", ".join(GRIPPER_JOINTS[:3])}); {len(points)} usable steps found')
     return fit_projection(points.astype(np.float64), np.concatenate(pixels))
 
 

@@ -14,13 +14,15 @@ import os
 import time
 
 import numpy as np
+from tap_ros.contract import LOW
 from tap_ros.errors import PlanningError
 from tap_ros.images import to_float
-from tap_ros.planning.action_sequences import LOW, SequenceShape
+from tap_ros.planning.action_sequences import SequenceShape
 from tap_ros.planning.cem import cem
+from tap_ros.planning.expected_distance import distances_to_places
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import check_maps, check_pixels, check_scene
+from tap_ros.planning.mpc_inputs import check_goal_pixels, check_maps, check_scene
 from tap_ros.planning.proposals import push_proposals
 import torch
 
@@ -242,8 +244,8 @@ class VisualMPC:
         """
         Tabulate the distance of every table cell to each goal.
 
-        For a goal map q the distance of a cell x is E_q|x - y|, so that an object map p costs the
-        expected distance between the two, E_{p,q}|x - y|.
+        For a goal map q it is the expected distance, so that an object map p costs that between
+        the two, E_{p,q}|x - y|.
 
         :return: (K, n n) pixels.
         """
@@ -251,13 +253,10 @@ class VisualMPC:
             raise PlanningError('goal: give exactly one of goal_maps and goal_pixels')
         cells = self.model.pixel_table().flatten(0, 1)  # (n n, 2)
         if goal_pixels is not None:
-            goals = check_pixels(goal_pixels, 'goal_pixels', count, self.image_size)
+            goals = check_goal_pixels(goal_pixels, count, self.image_size)
             return torch.cdist(torch.from_numpy(goals).to(cells.device), cells)
         maps = check_maps(goal_maps, count, self.image_size)
-        grid = self.model.pixels.flatten(0, 1)
-        weights = torch.from_numpy(maps).flatten(1).to(cells.device)
-        weights = weights / weights.sum(1, keepdim=True)
-        return weights @ torch.cdist(grid, cells)
+        return distances_to_places(torch.from_numpy(maps).to(cells.device), cells)
 
 
 def landing_clash(landings, objects, clearance):

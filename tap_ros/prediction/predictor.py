@@ -5,11 +5,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from tap_ros.errors import ConfigError, ImageError
-from tap_ros.images import check_image, to_float, to_uint8
+from tap_ros.errors import ConfigError, ImageError, WeightsError
+from tap_ros.images import check_image, check_pixels, to_float, to_uint8
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
 from tap_ros.prediction.weights import load_weights, make_network
+from tap_ros.text import escaped
 from tap_ros.weights import find_predictor
 import torch
 
@@ -60,13 +61,15 @@ class SubgoalPredictor:
     :ivar training: dict saying how the weights were made.
     """
 
-    def __init__(self, network, training=None):
+    def __init__(self, network, training=None, source='predictor'):
         """
-        Take a network into service, and run it once so that the first request is not slow.
+        Take a network into service, and run it once, so that the first request is not slow.
 
         :param network: Predictor, on the device it shall run on.
         :param training: dict saying how the weights were made.
+        :param source: how errors call it, for example the file of its weights.
         :raises ConfigError: if it takes more than a start and a goal picture.
+        :raises WeightsError: if it predicts nonsense.
         """
         if network.config.num_context not in (1, 2):
             raise ConfigError('predictor: needs weights for 2 context pictures, start and goal, '
@@ -78,10 +81,14 @@ class SubgoalPredictor:
         self.training = training or {}
         self._network = network.eval().requires_grad_(False)
         self._device = next(network.parameters()).device
-        blank = np.zeros((*self.image_size, 3), np.uint8)
-        one = np.zeros((1, 2))
-        goal = {} if self.mode == 'forward' else {'goal': blank, 'goal_pixels': one}
-        self.predict(blank, start_pixels=one, **goal)
+        grey = np.full((*self.image_size, 3), 128, np.uint8)
+        pixels = np.array([[0.25, 0.25], [0.5, 0.5]], np.float32) * self.image_size[::-1]
+        goal = {} if self.mode == 'forward' else {'goal': grey, 'goal_pixels': pixels}
+        subgoal, = self.predict(grey, start_pixels=pixels, **goal)
+        if not np.allclose(subgoal.object_maps.sum((1, 2)), 1, atol=1e-3):
+            raise WeightsError(
+                f'{escaped(source)}: predicts object maps that do not sum to 1; the weights are '
+                'damaged or were not trained, train them again')
 
     @classmethod
     def load(cls, path, device='cpu'):
@@ -93,7 +100,7 @@ class SubgoalPredictor:
         :return: SubgoalPredictor.
         :raises WeightsError: if the file is missing, damaged or for something else.
         """
-        return cls(*load_network(path, device))
+        return cls(*load_network(path, device), source=path)
 
     def predict(self, start, goal=None, start_pixels=None, goal_pixels=None, num_samples=1,
                 recursion_depth=1, seed=0):
@@ -224,29 +231,6 @@ def load_network(path, device='cpu'):
     network = make_network(Predictor, PredictorConfig, values, state, path)
     network.eval().requires_grad_(False)
     return network.to(device, memory_format=torch.channels_last), training
-
-
-def check_pixels(pixels, name):
-    """
-    Accept object positions or say what is wrong with them.
-
-    :param pixels: (K, 2) numbers in (u, v) order, or None for no objects.
-    :param name: how the message calls them.
-    :return: float32 (K, 2).
-    :raises ImageError: for another shape, or positions that are not finite.
-    """
-    if pixels is None:
-        return np.zeros((0, 2), np.float32)
-    pixels = np.asarray(pixels, np.float32)
-    if pixels.size == 0:
-        return np.zeros((0, 2), np.float32)
-    if pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise ImageError(f'{name}: expected shape (objects, 2), got {pixels.shape}')
-    unknown = np.flatnonzero(~np.isfinite(pixels).all(1))
-    if len(unknown):
-        raise ImageError(f'{name}: the position of object {unknown[0]} is unknown (not finite); '
-                         'give (u, v) in pixels for every object, or leave that object out')
-    return pixels
 
 
 def _join(parts):

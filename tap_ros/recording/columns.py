@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import json
 
 import numpy as np
+from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import RecordingError
 from tap_ros.recording import topics
 from tap_ros.recording.codec import Layout
@@ -357,7 +358,7 @@ class _Decoder:
         names = [layout.strings[f'name[{i}]'] for i in range(layout.counts['name'])]
         positions = layout.column(data, 'position')
         joints = np.full((len(data), 4), np.nan, np.float32)
-        for column, name in enumerate(topics.GRIPPER_JOINTS):
+        for column, name in enumerate(GRIPPER_JOINTS):
             if name in names and names.index(name) < positions.shape[1]:
                 joints[:, column] = positions[:, names.index(name)]
         if not np.isnan(joints).all():

@@ -5,9 +5,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+from tap_ros.contract import ENCODINGS, PICTURE_ENCODING
 from tap_ros.errors import RecordingError
-
-_CHANNELS = {'rgb8': 3, 'bgr8': 3, 'rgba8': 4, 'bgra8': 4, 'mono8': 1}
 
 
 @dataclass(frozen=True)
@@ -25,12 +24,12 @@ class Picture:
         height, width, step = (
             layout.column(head, field).item() for field in ('height', 'width', 'step'))
         encoding, length = layout.strings['encoding'], layout.counts['data']
-        channels = _CHANNELS.get(encoding)
+        channels, _ = ENCODINGS.get(encoding, (None, None))
         if length == height * width == 0:
             return cls((0, 0), encoding, 0)
         if channels is None:
             raise RecordingError(
-                f'encoding {encoding[:40]!r} cannot be read; choose one of {", ".join(_CHANNELS)}')
+                f'encoding {encoding[:40]!r} cannot be read; choose one of {", ".join(ENCODINGS)}')
         if height * width == 0 or step < width * channels or length != height * step:
             raise RecordingError(
                 f'a {encoding} image of {width}x{height} pixels with step {step} and {length} '
@@ -44,11 +43,8 @@ class Picture:
         if 0 in self.size:
             return buffer[:0]
         data = buffer[start:start + height * self.step]
-        channels = _CHANNELS.get(self.encoding)
-        if self.encoding == 'rgb8' and self.step == 3 * width:
+        channels, order = ENCODINGS[self.encoding]
+        if self.encoding == PICTURE_ENCODING and self.step == channels * width:
             return data
         pixels = data.reshape(height, self.step)[:, :width * channels].reshape(height, width, -1)
-        if self.encoding == 'mono8':
-            return np.repeat(pixels, 3, 2)
-        return np.ascontiguousarray(
-            pixels[..., :3] if self.encoding.startswith('rgb') else pixels[..., 2::-1])
+        return np.ascontiguousarray(pixels[..., list(order)])

@@ -30,7 +30,6 @@ TYPES = {
     EPISODE: 'tap_msgs/msg/Episode',
     CLOCK: 'rosgraph_msgs/msg/Clock',
 }
-GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')  # names
 LATCHED = frozenset({GOAL_IMAGE, GOAL_OBJECTS})  # transient_local, depth 1: late joiners get it
 
 

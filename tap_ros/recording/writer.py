@@ -15,6 +15,7 @@ import time
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
+from tap_ros.contract import CAMERA_FRAME, GRIPPER_JOINTS, PICTURE_ENCODING, WORLD_FRAME
 from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
 from tap_ros.recording import metadata, topics
@@ -160,7 +161,8 @@ class EpisodeWriter:
         """Write all messages of one time step."""
         frame = episode.frames[t]
         camera = {
-            'header': _header(stamp, 'camera'), 'height': frame.shape[0], 'width': frame.shape[1]}
+            'header': _header(stamp, CAMERA_FRAME),
+            'height': frame.shape[0], 'width': frame.shape[1]}
         self._put(topics.CLOCK, stamp, {'clock': _time(stamp)})
         self._put(topics.CAMERA_INFO, stamp, {**camera, **self._camera})
         self._put(topics.IMAGE, stamp, _image(frame, stamp))
@@ -169,12 +171,12 @@ class EpisodeWriter:
                 stamp, episode.object_names, episode.object_pixels[t], episode.object_poses[t]))
         if not np.isnan(episode.grippers[t]).all():
             self._put(topics.JOINT_STATES, stamp, {
-                'header': _header(stamp, 'world'), 'name': topics.GRIPPER_JOINTS,
+                'header': _header(stamp, WORLD_FRAME), 'name': GRIPPER_JOINTS,
                 'position': episode.grippers[t]})
         if t < len(episode.stamps) - 1:
             x, y, z, opening = episode.actions[t].tolist()
             self._put(topics.TWIST, stamp, {
-                'header': _header(stamp, 'world'),
+                'header': _header(stamp, WORLD_FRAME),
                 'twist': {'linear': {'x': x, 'y': y, 'z': z}}})
             self._put(topics.GRIPPER_COMMAND, stamp, {'data': opening})
 
@@ -258,8 +260,8 @@ def _header(stamp, frame_id):
 def _image(frame, stamp):
     height, width, _ = frame.shape
     return {
-        'header': _header(stamp, 'camera'), 'height': height, 'width': width,
-        'encoding': 'rgb8', 'step': 3 * width, 'data': frame}
+        'header': _header(stamp, CAMERA_FRAME), 'height': height, 'width': width,
+        'encoding': PICTURE_ENCODING, 'step': 3 * width, 'data': frame}
 
 
 def _objects(stamp, names, pixels, poses):
@@ -269,4 +271,4 @@ def _objects(stamp, names, pixels, poses):
             'name': name, 'u': u, 'v': v,
             'pose': {'position': dict(zip('xyz', pose[:3], strict=True)),
                      'orientation': dict(zip('xyzw', pose[3:], strict=True))}})
-    return {'header': _header(stamp, 'world'), 'source': 'ground_truth', 'objects': states}
+    return {'header': _header(stamp, WORLD_FRAME), 'source': 'ground_truth', 'objects': states}

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
+from sim_bridge.tasks import nearest_first
+from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.planning.episode import (
     as_recording,
@@ -15,7 +17,6 @@ from tap_ros.evaluation.planning.episode import (
     true_configuration,
 )
 from tap_ros.evaluation.planning.methods import BASES, parse_method
-from tap_ros.evaluation.planning.scenes import nearest_first, step_budget
 from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.images import to_float
 from tap_ros.planning.cem import CEMConfig
@@ -202,7 +203,7 @@ def test_options_change_the_planner():
 
 
 def test_budgets_are_the_papers():
-    assert (step_budget('push2'), step_budget('push3')) == (40, 75)
+    assert (step_budget(2), step_budget(3)) == (40, 75)
 
 
 def test_replanning_less_often_carries_the_plan_out(simulator, mpc):

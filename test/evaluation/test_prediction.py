@@ -13,7 +13,6 @@ from tap_ros.errors import ConfigError
 from tap_ros.evaluation.bottleneck import (
     bottleneck_frequency,
     bottleneck_scores,
-    expected_distances,
     MIN_MOTION,
     target_bottlenecks,
 )
@@ -80,17 +79,6 @@ class Pasting(torch.nn.Module):
 # Object 0 stays in the left half, object 1 in the right one.
 EPISODES = Store(make_episode([[6, 6], [24, y]], [[12, 10], [27, y - 9]])
                  for y in (16, 20, 24))
-
-
-def test_distances_to_a_sure_position_are_plain_distances():
-    maps = one_hot_maps(torch.tensor([[3.0, 4.0]]), (SIZE, SIZE))
-    assert expected_distances(maps, torch.tensor([[0.0, 0.0]])) == 5
-    assert expected_distances(maps, torch.tensor([[3.0, 4.0]])) == 0
-
-
-def test_distance_is_expected_over_the_map_not_from_its_mean():
-    maps = one_hot_maps(torch.tensor([[0.0, 5.0], [10.0, 5.0]]), (SIZE, SIZE)).mean(0)
-    assert expected_distances(maps, torch.tensor([5.0, 5.0])) == 5
 
 
 def test_bottleneck_is_either_object_first_and_the_sum_over_objects():

@@ -30,10 +30,6 @@ from tap_ros.weights import FORWARD_MODEL
 import torch
 
 SEED = 1_000_003
-MODULES = {
-    'sim_node': 'sim_bridge.sim_node', 'predictor_node': 'tap_ros.nodes.predictor_node',
-    'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
-    'recorder_node': 'tap_ros.nodes.recorder_node'}
 
 
 class Loop:
@@ -57,8 +53,7 @@ class Loop:
             TwistStamped, 'arm/delta_twist_cmds', self.twists.append, STREAM)
 
     def start(self, name, **parameters):
-        self.processes[name] = NodeProcess(
-            MODULES[name], self.folder / f'{name}.log', parameters)
+        self.processes[name] = NodeProcess(name, self.folder / f'{name}.log', parameters)
 
     def reset(self, seed=SEED):
         """Start a scene, and wait for what is published at its start."""

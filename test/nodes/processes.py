@@ -11,6 +11,7 @@ import time
 
 from rclpy.context import Context
 from rclpy.node import Node
+from tap_ros.contract import NODE_MODULES
 from tap_ros.nodes.clients import Spinner
 
 ROOT = Path(__file__).parents[2]
@@ -20,16 +21,16 @@ class NodeProcess:
     """
     One node in a process group of its own.
 
-    :param module: Python module with the node's main.
+    :param name: of the node, one of NODE_MODULES.
     :param log: file for what it prints.
     :param parameters: its ROS parameters.
     :param remaps: further arguments after --ros-args.
     """
 
-    def __init__(self, module, log, parameters=None, remaps=()):
+    def __init__(self, name, log, parameters=None, remaps=()):
         self.log = Path(log)
         arguments = [f'-p {name}:={value}' for name, value in (parameters or {}).items()]
-        command = [sys.executable, '-m', module, '--ros-args',
+        command = [sys.executable, '-m', NODE_MODULES[name], '--ros-args',
                    *' '.join([*arguments, *remaps]).split()]
         with open(self.log, 'wb') as output:
             self.process = subprocess.Popen(

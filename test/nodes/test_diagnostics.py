@@ -45,7 +45,7 @@ def test_an_input_is_not_received_then_ok_then_stale_and_a_failed_write_an_error
     newest = Newest(client, DiagnosticArray, '/diagnostics', 10)
     joints = client.create_publisher(JointState, 'joint_states', STREAM)
     process = NodeProcess(
-        'tap_ros.nodes.recorder_node', tmp_path / 'log.txt',
+        'recorder_node', tmp_path / 'log.txt',
         {'folder': tmp_path / 'bag', 'compression': 'none'})
     topic, service = 'recorder_node: /joint_states', 'recorder_node: service'
     try:

@@ -25,7 +25,7 @@ def recorder(tmp_path):
 
     def start():
         process = NodeProcess(
-            'tap_ros.nodes.recorder_node', tmp_path / f'{len(started)}.log',
+            'recorder_node', tmp_path / f'{len(started)}.log',
             {'folder': tmp_path / 'bag', 'record_on_start': 'false'})
         started.append(process)
         return process.wait_for('ready')

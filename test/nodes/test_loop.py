@@ -15,6 +15,7 @@ import pytest
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.contract import NODE_MODULES
 from tap_ros.nodes.clients import call, send_goal
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
@@ -24,7 +25,7 @@ from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
-from loop import MODULES, SEED  # noqa: E402
+from loop import SEED  # noqa: E402
 from processes import Client, NodeProcess  # noqa: E402
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
@@ -132,7 +133,7 @@ def test_every_node_tells_how_it_is(loop):
     loop.node.create_subscription(
         DiagnosticArray, '/diagnostics',
         lambda array: told.update({status.name: status for status in array.status}), STREAM)
-    wanted = [*(f'{name}: service' for name in MODULES),
+    wanted = [*(f'{name}: service' for name in NODE_MODULES),
               'visual_mpc_node: /joint_states', 'predictor_node: /goal/image',
               'sim_node: /arm/delta_twist_cmds', 'recorder_node: /objects']
     for _ in range(200):
@@ -183,7 +184,7 @@ def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
 
 
 def test_a_predictor_alone_says_what_is_missing_and_may_resize(tmp_path):
-    process = NodeProcess(MODULES['predictor_node'], tmp_path / 'log.txt',
+    process = NodeProcess('predictor_node', tmp_path / 'log.txt',
                           {'resize_images': 'true'}, ['-r __ns:=/alone'])
     try:
         with Client() as node:
@@ -220,7 +221,7 @@ def test_bad_weights_end_the_start_with_one_line_that_names_the_file(tmp_path, n
         weights.write_text('these are not weights')
     elif damage == 'of another kind':
         weights.write_bytes(FORWARD_MODEL.with_name(f'{other}.safetensors').read_bytes())
-    process = NodeProcess(MODULES[name], tmp_path / 'log.txt', {'weights': weights})
+    process = NodeProcess(name, tmp_path / 'log.txt', {'weights': weights})
     try:
         assert process.process.wait(120) == 1
         line, = [line for line in process.text.splitlines() if line.strip()]

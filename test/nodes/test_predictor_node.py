@@ -20,7 +20,6 @@ from lively import lively_network  # noqa: E402
 from processes import Client, NodeProcess  # noqa: E402
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
-MODULE = 'tap_ros.nodes.predictor_node'
 NAMES = ('cup', 'box')
 STAMP = to_stamp(2_500_000_000)
 PICTURES = np.random.default_rng(0).integers(0, 256, (2, 32, 32, 3), np.uint8)
@@ -50,7 +49,7 @@ class Service:
 
     def __init__(self, node, name, folder, **parameters):
         self.name, self.node = name, node
-        self.process = NodeProcess(MODULE, folder / f'{name}.log', parameters,
+        self.process = NodeProcess('predictor_node', folder / f'{name}.log', parameters,
                                    ['-r', f'__ns:=/{name}'])
         self.client = node.create_client(PredictSubgoal, f'/{name}/predict_subgoal')
         self.subgoal = Newest(node, Subgoal, f'/{name}/subgoal', LATCHED)
@@ -275,7 +274,7 @@ def test_forward_weights_must_be_that_and_given_once(tmp_path, swapped):
     forward = weights_file(tmp_path / 'forward.safetensors', num_context=1)
     given = {'weights': forward if swapped else between,
              'forward_weights': forward if swapped else between}
-    process = NodeProcess(MODULE, tmp_path / 'log.txt', given)
+    process = NodeProcess('predictor_node', tmp_path / 'log.txt', given)
     try:
         assert process.process.wait(120) == 1
         line, = [line for line in process.text.splitlines() if line.strip()]

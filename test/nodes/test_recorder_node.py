@@ -51,7 +51,7 @@ def record(tmp_path):
     def start(**parameters):
         parameters.setdefault('folder', tmp_path / 'bag')
         started.append(NodeProcess(
-            'tap_ros.nodes.recorder_node', tmp_path / f'log{len(started)}.txt', parameters))
+            'recorder_node', tmp_path / f'log{len(started)}.txt', parameters))
         return started[-1]
 
     yield start

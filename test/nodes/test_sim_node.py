@@ -81,7 +81,7 @@ class Rig:
 
 @pytest.fixture(scope='module')
 def rig(tmp_path_factory):
-    process = NodeProcess('sim_bridge.sim_node', tmp_path_factory.mktemp('sim') / 'log.txt',
+    process = NodeProcess('sim_node', tmp_path_factory.mktemp('sim') / 'log.txt',
                           {'lock_step': 'true', 'seed': 3})
     try:
         with Client() as node:
@@ -231,7 +231,7 @@ def test_a_bad_or_late_parameter_is_refused_with_the_reason(rig):
 
 
 def test_in_real_time_the_clock_runs_by_itself_unless_paused(tmp_path):
-    process = NodeProcess('sim_bridge.sim_node', tmp_path / 'log.txt', {'real_time_factor': 4.0},
+    process = NodeProcess('sim_node', tmp_path / 'log.txt', {'real_time_factor': 4.0},
                           ['-r __ns:=/second'])
     try:
         with Client() as node:
@@ -256,7 +256,7 @@ def test_in_real_time_the_clock_runs_by_itself_unless_paused(tmp_path):
 
 def test_in_real_time_a_command_that_has_run_out_moves_nothing(tmp_path):
     # One tick a second, in which a control period passes.
-    process = NodeProcess('sim_bridge.sim_node', tmp_path / 'log.txt', {'real_time_factor': 0.25},
+    process = NodeProcess('sim_node', tmp_path / 'log.txt', {'real_time_factor': 0.25},
                           ['-r __ns:=/slow'])
     try:
         with Client() as node:
@@ -288,7 +288,7 @@ def test_in_real_time_a_command_that_has_run_out_moves_nothing(tmp_path):
     ({'image_size': '64.5'}, ['image_size', '64.5', 'INTEGER']),
 ])
 def test_a_bad_parameter_ends_the_start_with_one_clear_line(tmp_path, parameters, words):
-    process = NodeProcess('sim_bridge.sim_node', tmp_path / 'log.txt', parameters)
+    process = NodeProcess('sim_node', tmp_path / 'log.txt', parameters)
     try:
         assert process.process.wait(60) == 1
         line, = [line for line in process.text.splitlines() if line.strip()]

@@ -5,24 +5,13 @@
 import ast
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-
-# Data flows down this list. A module imports from its own line and from those above it.
-LAYERS = (
-    ('tap_ros', 'tap_ros.errors', 'tap_ros.images', 'tap_ros.pictures', 'tap_ros.weights'),
-    ('sim_bridge',),
-    ('tap_ros.recording',),
-    ('sim_bridge.collect',),  # records what the simulator and the expert do
-    ('tap_ros.prediction',),
-    ('tap_ros.planning',),
-    ('tap_ros.evaluation',),
-    ('tap_ros.nodes', 'sim_bridge.sim_node', 'tap_ros.cli', 'tap_ros.__main__'),
-)
 
 # What takes seconds to import: what each node does without, so that it is back soon after a crash.
 DONE_WITHOUT = {
@@ -62,7 +51,16 @@ def modules():
     return {name.removesuffix('.__init__'): path for name, path in zip(names, paths, strict=True)}
 
 
+def layers():
+    """Return what each row of the table in docs/architecture.md names, as modules."""
+    section = (ROOT / 'docs' / 'architecture.md').read_text().split('\n## Folders\n')[1]
+    rows = re.findall(r'^\| (`.*?) \|', section.split('\n## ')[0], re.MULTILINE)
+    return [[name.removesuffix('.py').strip('/').replace('/', '.')
+             for name in re.findall('`(.*?)`', row)] for row in rows]
+
+
 MODULES = modules()
+LAYERS = layers()
 
 
 def imported(path):
@@ -86,6 +84,13 @@ def layer(name):
 
 def may_import_ros(name):
     return name.endswith('_node') or name.startswith('tap_ros.nodes')
+
+
+def test_every_folder_has_its_row_and_every_row_its_folder():
+    listed = {name for row in LAYERS for name in row}
+    assert {name for name, path in MODULES.items() if path.stem == '__init__'
+            and name.count('.') < 2} <= listed
+    assert all((ROOT / name.replace('.', '/')).exists() or name in MODULES for name in listed)
 
 
 @pytest.mark.parametrize('name', MODULES)

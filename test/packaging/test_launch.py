@@ -6,6 +6,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
+from tap_ros.contract import NODE_MODULES
 
 launch_ros = pytest.importorskip('launch_ros.actions', reason='there are no wheels of launch_ros')
 launch = pytest.importorskip('launch.actions')
@@ -24,8 +25,7 @@ def described(name):
 
 def test_nodes_launch_starts_each_executable_once():
     nodes = [e for e in described('nodes.launch.py') if isinstance(e, launch_ros.Node)]
-    assert sorted(node.node_executable for node in nodes) == [
-        'predictor_node', 'recorder_node', 'sim_node', 'visual_mpc_node']
+    assert sorted(node.node_executable for node in nodes) == sorted(NODE_MODULES)
 
 
 def test_demo_launch_ends_with_its_driver():

@@ -4,7 +4,7 @@
 
 import ast
 import configparser
-from importlib.metadata import packages_distributions
+from importlib import metadata
 import os
 from pathlib import Path
 import re
@@ -13,15 +13,9 @@ import sys
 from ament_index_python import get_package_prefix, get_package_share_directory
 from catkin_pkg.package import parse_package
 import pytest
-import yaml
+from tap_ros.contract import NODE_MODULES
 
 ROOT = Path(__file__).parents[2]
-NODES = {
-    'sim_node': 'sim_bridge/sim_node.py',
-    'predictor_node': 'tap_ros/nodes/predictor_node.py',
-    'visual_mpc_node': 'tap_ros/nodes/visual_mpc_node.py',
-    'recorder_node': 'tap_ros/nodes/recorder_node.py',
-}
 # Imported name: the key by which rosdep knows it.
 ROSDEP_KEYS = {
     'cv2': 'python3-opencv',
@@ -71,22 +65,25 @@ def requirements(name):
 
 def distributions_of(package):
     """Return the names of the distributions that a top-level package may come from."""
-    return {normalized(owner) for owner in packages_distributions().get(package, [package])}
+    owners = metadata.packages_distributions().get(package, [package])
+    return {normalized(owner) for owner in owners}
 
 
-@pytest.mark.parametrize('node', NODES)
+@pytest.mark.parametrize('node', NODE_MODULES)
 def test_every_executable_is_installed(node):
     path = Path(get_package_prefix('tap_ros'), 'lib', 'tap_ros', node)
     assert os.access(path, os.X_OK), f'{path} is missing: make build'
 
 
-@pytest.mark.parametrize('node', NODES)
+@pytest.mark.parametrize('node', NODE_MODULES)
 def test_every_executable_has_its_main(node):
-    functions = [item.name for item in ast.parse((ROOT / NODES[node]).read_text()).body
+    path = ROOT / (NODE_MODULES[node].replace('.', '/') + '.py')
+    functions = [item.name for item in ast.parse(path.read_text()).body
                  if isinstance(item, ast.FunctionDef)]
-    module = NODES[node].removesuffix('.py').replace('/', '.')
     assert 'main' in functions
-    assert f"'{node} = {module}:main'" in (ROOT / 'setup.py').read_text()
+    entries = metadata.distribution('tap_ros').entry_points
+    assert [entry.value for entry in entries if entry.name == node] == [
+        f'{NODE_MODULES[node]}:main']
 
 
 def test_launch_files_and_parameters_are_installed():
@@ -148,13 +145,3 @@ def test_scripts_go_where_ros2_run_looks():
     config.read(ROOT / 'setup.cfg')
     assert config['develop']['script_dir'] == '$base/lib/tap_ros'
     assert config['install']['install_scripts'] == '$base/lib/tap_ros'
-
-
-def test_parameter_file_names_only_nodes_and_parameters_that_exist():
-    config = yaml.safe_load((ROOT / 'config' / 'tap_ros.yaml').read_text())
-    assert {key.split('/')[-1] for key in config} <= set(NODES)
-    source = ''.join(path.read_text() for path in [ROOT / NODES['sim_node'],
-                                                   *(ROOT / 'tap_ros' / 'nodes').glob('*.py')])
-    for section in config.values():
-        for name in section['ros__parameters']:
-            assert f"'{name}'" in source, f'config/tap_ros.yaml: no node has a parameter {name}'

@@ -4,7 +4,8 @@
 
 import numpy as np
 import pytest
-from tap_ros.planning.action_sequences import LIFTED, LOW, SequenceShape
+from tap_ros.contract import LIFTED, LOW
+from tap_ros.planning.action_sequences import SequenceShape
 from tap_ros.planning.proposals import push_proposals
 
 SHAPE = SequenceShape()

@@ -190,7 +190,7 @@ def test_unusable_pictures_are_named(predictor, start, goal, message):
 
 
 @pytest.mark.parametrize('start, goal, message', [
-    ([[1, np.nan]], [[1, 2]], 'start_pixels: the position of object 0 is unknown'),
+    ([[1, np.nan]], [[1, 2]], r'start_pixels: unknown .* objects \[0\]'),
     ([[1, 2]], [[1, 2], [3, 4]], 'goal_pixels: expected 1 objects'),
     ([[1, 2]], None, 'goal_pixels: expected 1 objects'),
     ([1, 2], [[1, 2]], r'start_pixels: expected shape \(objects, 2\)')])
@@ -221,6 +221,15 @@ def test_a_saved_predictor_answers_the_same(tmp_path):
     assert loaded.training == {'steps': 7}
     expected, = SubgoalPredictor(network).predict(START, GOAL)
     assert np.array_equal(loaded.predict(START, GOAL)[0].image, expected.image)
+
+
+def test_weights_that_predict_nonsense_are_refused(tmp_path):
+    path, network = tmp_path / 'predictor.safetensors', Predictor(CONFIG)
+    for weight in network.parameters():
+        weight.data.fill_(3e38)  # finite, unlike what comes of it
+    save_weights(path, network, 'predictor', CONFIG, {})
+    with pytest.raises(WeightsError, match='predictor.safetensors: .* damaged'):
+        SubgoalPredictor.load(path)
 
 
 def test_weights_of_something_else_are_refused(tmp_path):

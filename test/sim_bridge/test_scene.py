@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 from sim_bridge.camera import Camera
 from sim_bridge.grasping import GRASP_YAW
-from sim_bridge.scene import (
-    build_scene,
-    GRIP_FOVY,
-    GRIP_TILT,
-    random_shape,
-    WORKSPACE_HIGH,
-)
+from sim_bridge.scene import build_scene, GRIP_FOVY, GRIP_TILT, random_shape
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import (
     GOAL_DISTANCE,
@@ -26,6 +20,7 @@ from sim_bridge.tasks import (
     sample_scene,
     TASKS,
 )
+from tap_ros.contract import WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 
 PUSHING = [task for task in TASKS.values() if not task.gripping]

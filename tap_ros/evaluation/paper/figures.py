@@ -6,11 +6,11 @@ import io
 
 from matplotlib.figure import Figure
 import numpy as np
+from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.evaluation.bottleneck import THRESHOLDS
 from tap_ros.evaluation.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
-    FRAMES,
     GAINS,
     TITLES,
 )
@@ -117,7 +117,7 @@ def forward_scatter(rows, task='grasp'):
             name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
     figure, axes = _new_figure(3.9, len(panels))
     for axis, (title, points) in zip(axes[0], panels):
-        _scatter(axis, points, FRAMES[task])
+        _scatter(axis, points, EPISODE_FRAMES[task])
         axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
         axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
     axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)

@@ -6,9 +6,10 @@ The results page, in Markdown, from rows and runs.
 Sentences that judge depend on the numbers; what a person has to say stands in findings.md.
 """
 
+from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.evaluation.bottleneck import MIN_MOTION
 from tap_ros.evaluation.paper.figures import file_name
-from tap_ros.evaluation.paper.published import BOTTLENECK_2PX, FRAMES, TITLES
+from tap_ros.evaluation.paper.published import BOTTLENECK_2PX, TITLES
 from tap_ros.evaluation.paper.rows import BEST, find, method_order
 from tap_ros.evaluation.paper.runs import paper_runs
 from tap_ros.evaluation.paper.tables import (
@@ -123,8 +124,9 @@ def _setting(runs):
         if own:
             data, config = own[0]['data'], own[0]['config']
             lines.append([
-                TITLES[task], f'{FRAMES[task]}', f'{data["episodes"]}', f'{data["held_out"]}',
-                f'`{data["hash"][:8]}`', _range(run['training']['steps'] for run in own),
+                TITLES[task], f'{EPISODE_FRAMES[task]}', f'{data["episodes"]}',
+                f'{data["held_out"]}', f'`{data["hash"][:8]}`',
+                _range(run['training']['steps'] for run in own),
                 f'{config.get("batch_size", "-")}', f'{config.get("base_width", "-")}',
                 f'{len(own)}', f'{sum(run["training"]["seconds"] for run in own) / 60:.0f}'])
     machines = sorted({run['training']['machine'] for run in runs})

@@ -12,7 +12,7 @@ from tap_ros.evaluation.paper.page import make_page
 from tap_ros.evaluation.paper.pictures import write_grids
 from tap_ros.evaluation.paper.rows import group_runs, make_rows
 from tap_ros.evaluation.paper.runs import label
-from tap_ros.files import write_atomically
+from tap_ros.files import write_atomically, write_rows
 
 SCALES = ('full', 'small')  # the order on the page
 _KEYS = {'name', 'task', 'mode', 'method', 'new_pixels', 'seed', 'scale', 'command', 'config',
@@ -84,7 +84,7 @@ def write_results(folder='docs/results', runs='runs/paper', recordings='bags', p
     kept, left_out = on_same_recordings(loaded)
     groups = group_runs(kept)
     rows = make_rows(groups)
-    write_atomically(folder / 'prediction.json', rows_as_json(told_apart(rows)))
+    write_rows(folder / 'prediction.json', told_apart(rows))
     scales = [scale for scale in SCALES if any(run['scale'] == scale for run in kept)]
     for scale in scales:
         _write_plots(folder, scale, rows, groups)
@@ -115,11 +115,6 @@ def told_apart(rows):
     return [{**row, 'metric': f'{row["metric"]}_warp_only'}
             if row.get('new_pixels') is False and 'bottleneck' not in row['metric']
             and place(row) in both else row for row in rows]
-
-
-def rows_as_json(rows):
-    """Write rows as JSON, one in a line, so that changes can be read."""
-    return '[\n' + ',\n'.join(json.dumps(row) for row in rows) + '\n]\n'
 
 
 def _write_plots(folder, scale, rows, groups):

@@ -8,15 +8,16 @@ import os
 from pathlib import Path
 import shlex
 
+from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import forward
 from tap_ros.evaluation.planning.films import write_films
 from tap_ros.evaluation.planning.methods import parse_method
 from tap_ros.evaluation.planning.page import make_page
-from tap_ros.evaluation.planning.results import load_results, make_rows, write_rows
+from tap_ros.evaluation.planning.results import load_results, make_rows
 from tap_ros.evaluation.planning.runs import Job, run_jobs
 from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS
-from tap_ros.files import write_atomically
+from tap_ros.files import write_atomically, write_rows
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.weights import find_predictor, FORWARD_MODEL
@@ -62,7 +63,8 @@ def add_arguments(parser):
     add('--replan-every', type=int, default=0, metavar='N',
         help="plan anew at every so many actions; 0: the preset's (default: %(default)s)")
     add('--step-budget', type=int, default=0,
-        help="control periods; 0: the paper's, 40 and 75 (default: %(default)s)")
+        help=f"control periods; 0: the paper's, {step_budget(2)} and {step_budget(3)} "
+        '(default: %(default)s)')
     add('--forward-weights', metavar='FILE', default=str(FORWARD_MODEL),
         help='of the forward model (default: the shipped ones)')
     add('--device', default='cpu', help='of the networks: cpu or cuda (default: %(default)s)')

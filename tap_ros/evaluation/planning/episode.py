@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from sim_bridge.tasks import nearest_first
+from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
-from tap_ros.evaluation.planning.scenes import nearest_first
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
 from tap_ros.recording.episode import Episode
-
-REACHED = 1.0  # px of Target.distance at which a goal or subgoal is reached
 
 
 @dataclass
@@ -45,7 +44,7 @@ class PlannedEpisode:
         return float(np.linalg.norm(self.tracked - true, axis=-1).mean())
 
 
-def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reached=REACHED,
+def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reached=GOAL_TOLERANCE,
                 objects=None):
     """
     Push the objects of one scene.

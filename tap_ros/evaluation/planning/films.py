@@ -5,6 +5,7 @@
 from pathlib import Path
 
 import numpy as np
+from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.evaluation.planning.episode import as_recording
 from tap_ros.evaluation.planning.runs import plan_scene
@@ -53,7 +54,7 @@ def write_films(job, scenes, picture, recording):
                     f'{job.method.name}: scene {seed} ended at {100 * final.mean():.2f} cm, not '
                     f'at {before:.2f} cm as in the results, which are of another machine or '
                     'version; remove them, or give --no-films')
-            outcome = 'success' if (final < 0.05).all() else 'failure'
+            outcome = 'success' if (final < SUCCESS_DISTANCE).all() else 'failure'
             writer.write(as_recording(run, job.task, seed, outcome))
             rows.append([*film_strip(run.frames, PICTURES),
                          *(subgoal.image for subgoal in run.subgoals), run.goal.image])

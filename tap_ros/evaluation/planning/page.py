@@ -2,13 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page about planning, in Markdown, from the rows of planning.json."""
 
+from tap_ros.evaluation.paper.published import PLANNING_BOUNDS, TABLE_2
 from tap_ros.evaluation.planning.methods import BOUNDS
 
-PAPER = {  # Table 2: mean final distance in cm and its standard error
-    ('push2', 'direct'): (12.9, 0.6), ('push2', 'fix'): (12.5, 0.5),
-    ('push2', 'genmin'): (11.9, 0.6), ('push3', 'direct'): (15.8, 0.6),
-    ('push3', 'fix'): (17.6, 0.6), ('push3', 'genmin'): (12.9, 0.7)}
-PAPER_NOTHING, PAPER_ONE_OBJECT = '20', 'about 5'
 TITLES = {'push2': 'Two objects', 'push3': 'Three objects'}
 PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward model',
          'search': 'the search', 'cost': 'its cost', 'tracking': 'object pixels',
@@ -141,9 +137,9 @@ def _rank(method):
 
 
 def _paper(task, method):
-    if method in ('nothing', 'one_object'):
-        return PAPER_NOTHING if method == 'nothing' else PAPER_ONE_OBJECT
-    value = PAPER.get((task, method.replace(':half', '').replace(':paper', '')))
+    if method in PLANNING_BOUNDS:
+        return PLANNING_BOUNDS[method]
+    value = TABLE_2.get((task, method.replace(':half', '').replace(':paper', '')))
     return f'{value[0]} ± {value[1]}' if value else ''
 
 

@@ -3,18 +3,16 @@
 """Numbers from result files: means with intervals, and differences between paired scenes."""
 
 from dataclasses import replace
-import json
 from pathlib import Path
 
 import numpy as np
+from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.planning.methods import BASES, DEFAULTS, parse_method, SUBGOALS_ONLY
 from tap_ros.evaluation.planning.runs import read_results
-from tap_ros.files import write_atomically
 
 # Results are compared where these settings agree; what an option changes is not among them.
 SAME = ('step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
-SUCCESS_CM = 5.0
 
 
 def load_results(folder):
@@ -131,19 +129,14 @@ def _how(name, settings):
 
 
 def _success(scene):
-    """Say whether every object ended within 5 cm of its goal, as 0 or 1."""
-    return int(max(scene['objects_cm']) < SUCCESS_CM)
+    """Say whether every object ended within SUCCESS_DISTANCE of its goal, as 0 or 1."""
+    return int(max(scene['objects_cm']) < 100 * SUCCESS_DISTANCE)
 
 
 def standard_error(values):
     """Return the standard error of a mean; 0 for a single value."""
     values = np.asarray(values, float)
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
-
-
-def write_rows(path, rows):
-    """Write planning.json, a row a line."""
-    write_atomically(path, '[\n' + ',\n'.join(json.dumps(row) for row in rows) + '\n]\n')
 
 
 def _short(value):

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 from sim_bridge.simulator import Simulator
+from sim_bridge.tasks import get_task
+from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.errors import ConfigError, PlanningError
-from tap_ros.evaluation.planning.episode import REACHED, run_episode
+from tap_ros.evaluation.planning.episode import run_episode
 from tap_ros.evaluation.planning.methods import Method
-from tap_ros.evaluation.planning.scenes import step_budget
 from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.files import write_atomically
 from tap_ros.planning.forward_model import load_forward_model
@@ -44,14 +45,14 @@ class Job:
 
     def steps(self):
         """Return the step budget."""
-        return self.budget or step_budget(self.task)
+        return self.budget or step_budget(get_task(self.task).num_objects)
 
     def settings(self):
         """Return as a dict all that changes results; weights by what is in them."""
         planner = asdict(self.method.planner(self.planner))
         settings = {
             'task': self.task, 'method': self.method.name, 'step_budget': self.steps(),
-            'reached_px': REACHED, 'object_pixels': self.method.tracking,
+            'reached_px': GOAL_TOLERANCE, 'object_pixels': self.method.tracking,
             'planner': {k: v for k, v in planner.items() if k not in SPEED_ONLY},
             'preset': self.preset, 'device': self.device,
             'precision': str(next(_model(

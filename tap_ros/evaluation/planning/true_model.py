@@ -5,7 +5,7 @@
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.simulator import ACTION_LIMIT, OBJECT_QPOS_START, ramp_controls, SUBSTEPS
+from sim_bridge.simulator import clip_moves, OBJECT_QPOS_START, ramp_controls, SUBSTEPS
 import torch
 
 
@@ -21,7 +21,7 @@ class TrueModel:
     """
 
     def __init__(self, model, simulator, objects=None):
-        self.config, self.grid, self.pixels = model.config, model.grid, model.pixels
+        self.config, self.grid = model.config, model.grid
         self.pixel_table, self.seed_maps = model.pixel_table, model.seed_maps
         self.objects = objects
         self.learned = model  # for what looks at pictures
@@ -43,7 +43,7 @@ class TrueModel:
         model, state, target = start
         actions, same = torch.unique(actions, dim=0, return_inverse=True)
         steps = actions.cpu().double().numpy()
-        steps[..., :3] = np.clip(steps[..., :3], -ACTION_LIMIT, ACTION_LIMIT)
+        steps[..., :3] = clip_moves(steps[..., :3])
         controls, _ = ramp_controls(target, steps)
         states, _ = self._rollout.rollout(
             model, mujoco.MjData(model), np.tile(state, (len(steps), 1)), controls)

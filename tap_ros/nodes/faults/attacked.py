@@ -9,9 +9,9 @@ import subprocess
 import sys
 import time
 
+from tap_ros.contract import NODE_MODULES as MODULES
 from tap_ros.errors import TapError
 from tap_ros.evaluation.faults.children import end_group
-from tap_ros.nodes.node_processes import MODULES
 
 START_S = 90.0
 

@@ -16,13 +16,13 @@ from sensor_msgs.msg import Image, JointState
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
+from tap_ros.contract import NODE_MODULES as MODULES
 from tap_ros.errors import TapError
 from tap_ros.nodes.clients import call, Newest, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.faults.attacked import Attacked
 from tap_ros.nodes.faults.commands import Commands
 from tap_ros.nodes.faults.world import goal_fields, predict_fields, World
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.node_processes import MODULES
 from tap_ros.nodes.topics import LATCHED, STREAM
 
 CALL_S = 20.0

@@ -10,9 +10,10 @@ import numpy as np
 from sensor_msgs.msg import Image, JointState
 from sim_bridge.simulator import Simulator
 from tap_msgs.msg import ObjectStates
+from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.object_messages import encode_gripper, encode_objects
-from tap_ros.nodes.topics import CAMERA_FRAME, STREAM, to_stamp, WORLD_FRAME
+from tap_ros.nodes.topics import STREAM, to_stamp
 
 TOPICS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
           'joints': (JointState, 'joint_states')}

@@ -1,0 +1,54 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The contract between simulator, recordings, planner and nodes: what they share stands here, once.
+
+Constants and a function of them. Nothing is imported, so that setup.py can read this file, too.
+"""
+
+# Motion: an action is (dx, dy, dz, opening).
+CONTROL_PERIOD = 0.25  # s that one action takes
+MOVE_LIMIT = 0.08  # m per control period, |dx| and |dy|
+CLIMB_LIMIT = 0.15  # m per control period, |dz|
+ACTION_LIMIT = (MOVE_LIMIT, MOVE_LIMIT, CLIMB_LIMIT)
+
+# Where the fingertips may be, x, y, z in m; at z = 0 they just clear the table.
+WORKSPACE_LOW = (-0.45, -0.45, 0.0)
+WORKSPACE_HIGH = (0.45, 0.45, 0.15)
+
+# Heights of the fingertips, m.
+LOW = 0.012  # at which the arm pushes
+CLEAR = 0.1  # above which no object is touched
+LIFTED = 0.13  # at which the arm travels
+
+# The longest episode of each task in frames, one a control period, as in the authors' data.
+EPISODE_FRAMES = {'push2': 40, 'push3': 75, 'grasp': 15, 'pick_place': 20}
+SUCCESS_DISTANCE = 0.05  # m; an episode succeeds when every object ends nearer to its goal
+GOAL_TOLERANCE = 1.0  # px; the planner takes a goal or subgoal for reached within this distance
+
+WORLD_FRAME = 'world'  # frame of positions and commands
+CAMERA_FRAME = 'camera'  # of pictures
+
+# Names of the gripper's state in joint states: metres, and the opening from 0 to 1.
+GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
+
+# Encodings of sensor_msgs/Image that can be read: bytes per pixel, and which of them are red,
+# green and blue.
+ENCODINGS = {
+    'rgb8': (3, (0, 1, 2)), 'bgr8': (3, (2, 1, 0)),
+    'rgba8': (4, (0, 1, 2)), 'bgra8': (4, (2, 1, 0)), 'mono8': (1, (0, 0, 0))}
+PICTURE_ENCODING = 'rgb8'  # in which pictures are sent and recorded
+MAP_ENCODING = '32FC1'  # of object maps
+
+# The module with the main of each node, by the name of the node and of its executable.
+NODE_MODULES = {
+    'sim_node': 'sim_bridge.sim_node',
+    'predictor_node': 'tap_ros.nodes.predictor_node',
+    'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
+    'recorder_node': 'tap_ros.nodes.recorder_node',
+}
+
+
+def step_budget(num_objects):
+    """Return B of App. F, how many commands a goal may take: as many as an episode has frames."""
+    return EPISODE_FRAMES['push2' if num_objects <= 2 else 'push3']

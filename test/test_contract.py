@@ -1,0 +1,142 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Simulator, experts, planner, shipped weights and nodes keep to the contract."""
+
+import ast
+from importlib import import_module
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sim_bridge.expert import run_episode
+from sim_bridge.scene import HALF_HEIGHT
+from sim_bridge.simulator import clip_action, ramp_controls, Simulator
+from sim_bridge.tasks import nearest_first, TASKS
+from tap_ros import contract
+from tap_ros.evaluation.planning.scenes import PLANNING_TASKS
+from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.mpc_config import PRESETS
+from tap_ros.recording.reader import iter_episodes
+from tap_ros.weights import FORWARD_MODEL
+import torch
+import yaml
+
+ROOT = Path(__file__).parents[1]
+CONFIG = yaml.safe_load((ROOT / 'config' / 'tap_ros.yaml').read_text())
+
+
+@pytest.fixture
+def simulator(request):
+    simulator = Simulator(getattr(request, 'param', 'push2'))
+    yield simulator
+    simulator.close()
+
+
+def test_the_contract_imports_nothing():
+    tree = ast.parse(Path(contract.__file__).read_text())
+    assert not [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('name', contract.NODE_MODULES)
+def test_parameter_file_shows_the_defaults_of_every_node(name):
+    from rclpy.context import Context
+    from rclpy.node import Node
+    assert set(CONFIG) == {f'/**/{name}' for name in contract.NODE_MODULES}
+    context = Context()
+    context.init()
+    node = Node(f'a_{name}', context=context)
+    try:
+        declared = import_module(contract.NODE_MODULES[name]).declare_parameters(node)
+        listed = CONFIG[f'/**/{name}']['ros__parameters']
+        assert {key: declared[key] for key in listed} == listed
+        for key, limit in (('max_step_xy', contract.MOVE_LIMIT),
+                           ('max_step_z', contract.CLIMB_LIMIT)):
+            if name == 'visual_mpc_node':  # neither more than the arm does, nor less
+                allowed, = node.describe_parameter(key).floating_point_range
+                assert allowed.to_value == declared[key] == limit
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def test_the_forward_model_moves_the_gripper_as_the_simulator_does():
+    model = load_forward_model(FORWARD_MODEL)
+    assert model.config.workspace_low == contract.WORKSPACE_LOW
+    assert model.config.workspace_high == contract.WORKSPACE_HIGH
+    actions = np.random.default_rng(0).normal(0, 0.1, (200, 4))
+    start = np.array([0.4, -0.4, 0.1, 0.0])
+    _, targets = ramp_controls(start, np.array([clip_action(action) for action in actions]))
+    gripper = torch.tensor(start)[None].float()
+    for action, target in zip(torch.tensor(actions).float(), targets, strict=True):
+        gripper = model.move_gripper(gripper, action[None])
+        np.testing.assert_allclose(gripper[0, :3], target[:3], atol=1e-5)
+    assert np.abs(targets[:, :2]).max() == contract.WORKSPACE_HIGH[0]  # it has been at the edge
+
+
+def test_the_sample_recording_keeps_to_the_contract():
+    episode = next(iter_episodes(ROOT / 'bags' / 'sample_push2'))
+    assert set(np.diff(episode.stamps)) == {round(1e9 * contract.CONTROL_PERIOD)}
+    assert (np.abs(episode.actions[:, :3]) <= np.array(contract.ACTION_LIMIT) + 1e-6).all()
+    places = episode.grippers[:, :3]
+    assert (places > np.array(contract.WORKSPACE_LOW) - 0.01).all()
+    assert (places < np.array(contract.WORKSPACE_HIGH) + 0.01).all()
+    assert np.abs(np.diff(places, axis=0) - episode.actions[:-1, :3]).mean() < 0.005
+
+
+def test_each_joint_follows_its_part_of_an_action(simulator):
+    simulator.reset(3)
+    for i, name in enumerate(contract.GRIPPER_JOINTS[:3]):
+        before = [simulator.data.joint(joint).qpos.item() for joint in contract.GRIPPER_JOINTS[:3]]
+        simulator.step(np.append(0.05 * np.eye(3)[i] * -np.sign(before[i] - 0.07), 0))
+        moved = simulator.data.joint(name).qpos.item() - before[i]
+        assert abs(moved) == pytest.approx(0.05, abs=0.01)
+
+
+def pushed(simulator, height):
+    """Return how far, in m, an object is moved by the arm that crosses it at a height."""
+    place = simulator.reset(3).object_poses[0, :2]
+    start = place - [0.13, 0]
+    for goal in ([*simulator.target[:2], contract.LIFTED], [*start, contract.LIFTED],
+                 [*start, height], [*place, height]):
+        while np.abs(gap := goal - simulator.target[:3]).max() > 1e-6:
+            seen = simulator.step([*gap, 0])
+    return np.linalg.norm(seen.object_poses[0, :2] - place)
+
+
+def test_the_arm_pushes_where_it_is_low_and_clears_all_objects_above(simulator):
+    heights = [contract.WORKSPACE_LOW[2], contract.LOW, 2 * HALF_HEIGHT, contract.CLEAR,
+               contract.LIFTED, contract.WORKSPACE_HIGH[2]]
+    assert all(lower < higher for lower, higher in pairwise(heights))
+    assert pushed(simulator, contract.LOW) > 0.03
+    assert pushed(simulator, contract.CLEAR) < 1e-4
+
+
+@pytest.mark.parametrize('simulator', TASKS, indirect=True)
+def test_what_an_expert_commands_is_what_the_arm_does(simulator):
+    observations, actions, _, _ = run_episode(simulator, 1)
+    assert (np.abs(actions[:, :3]).max(0) <= np.array(contract.ACTION_LIMIT) + 1e-6).all()
+    assert len(observations) <= contract.EPISODE_FRAMES[simulator.task.name]
+
+
+@pytest.mark.parametrize('preset', PRESETS)
+def test_no_preset_plans_more_than_the_arm_does(preset):
+    config = PRESETS[preset]
+    assert config.push_limit <= config.move_limit <= contract.MOVE_LIMIT
+    assert config.climb_limit <= contract.CLIMB_LIMIT
+
+
+def test_a_goal_may_take_as_long_as_an_episode():
+    assert set(contract.EPISODE_FRAMES) == set(TASKS)
+    for task in map(TASKS.get, PLANNING_TASKS):
+        assert contract.step_budget(task.num_objects) == task.num_frames
+
+
+@pytest.mark.parametrize('simulator', PLANNING_TASKS, indirect=True)
+def test_the_goal_picture_shows_the_arm_at_the_object_that_is_pushed_last(simulator):
+    for seed in range(5):
+        seen, goal = simulator.reset(seed), simulator.goal()
+        goals = goal.object_poses[:, :2]
+        last = nearest_first(seen.gripper[:2], seen.object_poses[:, :2], goals)[-1]
+        assert np.linalg.norm(goals - goal.gripper[:2], axis=1).argmin() == last
