@@ -10,7 +10,7 @@ import subprocess
 import time
 
 from tap_ros.errors import TapError
-from tap_ros.files import write_atomically
+from tap_ros.files import write_rows
 
 FILE = 'faults.json'
 COMMAND = 'python -m tap_ros evaluate faults'
@@ -47,7 +47,7 @@ def save_row(folder, row, order):
     known = {name: rank for rank, name in enumerate(order)}
     rows = {**load_rows(folder), row['fault']: row}
     listed = sorted(rows.values(), key=lambda row: known.get(row['fault'], len(known)))
-    write_atomically(path, '[\n' + ',\n'.join(map(json.dumps, listed)) + '\n]\n')
+    write_rows(path, listed)
 
 
 def is_done(row, share):

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 
-from tap_ros.contract import NODE_MODULES as MODULES
+from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
 from tap_ros.evaluation.faults.children import end_group
 
@@ -26,7 +26,7 @@ class Attacked:
     """
     One node in a process group of its own.
 
-    :param name: a key of MODULES.
+    :param name: a name of NODE_MODULES.
     :param log: file for what it prints; a new start adds to it.
     :param parameters: {name: value} of its ROS parameters.
     :param arguments: more arguments after --ros-args.
@@ -40,7 +40,7 @@ class Attacked:
 
     def start(self):
         """Start it, without waiting."""
-        command = [sys.executable, '-m', MODULES[self.name], '--ros-args', *self.arguments]
+        command = [sys.executable, '-m', NODE_MODULES[self.name], '--ros-args', *self.arguments]
         for key, value in self.parameters.items():
             text = str(value).lower() if isinstance(value, bool) else str(value)
             command += ['-p', f'{key}:={text}']

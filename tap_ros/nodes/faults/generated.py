@@ -8,6 +8,7 @@ import hypothesis
 from rcl_interfaces.srv import GetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool
+from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
 from tap_ros.evaluation.faults.fault import Fault
 from tap_ros.nodes.clients import call, wait_for_future
@@ -20,7 +21,6 @@ ROUND = 200  # batches between two good calls to everything
 MOST_FAILURES = 5  # of which each is shrunk, with nodes that start anew each time
 SHRINK_S = 240.0
 ANSWER_S = 10.0
-NODES = ('visual_mpc_node', 'predictor_node', 'recorder_node', 'sim_node')
 LATCHED_TOPICS = ('goal/image', 'goal/objects')
 TEST = """\
 @pytest.mark.parametrize('where, fields', {cases!r})
@@ -52,7 +52,8 @@ class Target:
         self._clients = {name: node.create_client(strategies.message_type(kind), name)
                          for name, kind in strategies.SERVICES.items()}
         self._parameters = {
-            name: node.create_client(GetParameters, f'{name}/get_parameters') for name in NODES}
+            name: node.create_client(GetParameters, f'{name}/get_parameters')
+            for name in NODE_MODULES}
         self.restore()
 
     def restore(self):
@@ -61,9 +62,10 @@ class Target:
         for name, attacked in list(rig.processes.items()):
             if not attacked.alive or self._blocked(name):
                 attacked.kill()
-        if len(rig.processes) < len(NODES) or not all(a.alive for a in rig.processes.values()):
-            rig.need(*NODES[:3], sim='real')
-            for name in NODES:
+        if len(rig.processes) < len(NODE_MODULES) or not all(
+                attacked.alive for attacked in rig.processes.values()):
+            rig.need(*NODE_MODULES.keys() - {'sim_node'}, sim='real')
+            for name in NODE_MODULES:
                 if not self._parameters[name].wait_for_service(20):
                     raise TapError(f'{name}: its parameters were not found')
         time.sleep(0.5)
@@ -80,7 +82,7 @@ class Target:
                 calls.append((where, fields))
         for where, fields in calls:
             self._call(where, fields)
-        for name in NODES:
+        for name in NODE_MODULES:
             attacked = self._rig.processes[name]
             if self._blocked(name):
                 time.sleep(0.5)

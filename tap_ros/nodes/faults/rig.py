@@ -16,7 +16,7 @@ from sensor_msgs.msg import Image, JointState
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
-from tap_ros.contract import NODE_MODULES as MODULES
+from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
 from tap_ros.nodes.clients import call, Newest, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.faults.attacked import Attacked
@@ -77,7 +77,7 @@ class Rig:
         self.joints = Newest(node, JointState, 'joint_states', STREAM)
         self.goal_image = Newest(node, Image, 'goal/image', LATCHED)
         self.commands = Commands(node)
-        self.alive = {name: Liveness(node, name) for name in MODULES}
+        self.alive = {name: Liveness(node, name) for name in NODE_MODULES}
 
     # Nodes
 
@@ -85,7 +85,7 @@ class Rig:
         """
         Have these nodes running and ready, and no others.
 
-        :param names: keys of MODULES without sim_node.
+        :param names: names of NODE_MODULES without sim_node.
         :param sim: 'lock-step', 'real' or None for no simulator.
         """
         assert self.node

@@ -6,6 +6,7 @@ import array
 from importlib import import_module
 
 from hypothesis import strategies as st
+from tap_ros.contract import ENCODINGS, GRIPPER_JOINTS, MAP_ENCODING, PICTURE_ENCODING
 from tap_ros.errors import TapError
 from tap_ros.nodes.faults.world import first_pictures
 
@@ -53,12 +54,12 @@ def headers():
 def images():
     """Return pictures: whole ones, and such whose fields do not fit together."""
     def whole(side, header, value):
-        return {'header': header, 'width': side, 'height': side, 'encoding': 'rgb8',
+        return {'header': header, 'width': side, 'height': side, 'encoding': PICTURE_ENCODING,
                 'step': 3 * side, 'data': [value] * (3 * side * side)}
     return st.builds(whole, st.sampled_from((64, 64, 1, 16, 65)), headers(),
                      st.integers(0, UINT8)) | st.fixed_dictionaries({
                          'header': headers(), 'width': counts(UINT32), 'height': counts(UINT32),
-                         'encoding': st.sampled_from(('rgb8', 'bgr8', 'mono8', '32FC1')) | texts(),
+                         'encoding': st.sampled_from((*ENCODINGS, MAP_ENCODING)) | texts(),
                          'step': counts(UINT32), 'is_bigendian': counts(UINT8),
                          'data': st.lists(st.integers(0, UINT8), max_size=12)})
 
@@ -89,8 +90,7 @@ def few(values, empty):
 def fields(type_name):
     """Return the strategy of a type, for its fields as a dict."""
     vector = st.fixed_dictionaries({axis: numbers() for axis in 'xyz'})
-    joints = st.sampled_from(
-        ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')) | texts()
+    joints = st.sampled_from(GRIPPER_JOINTS) | texts()
     amounts = st.sampled_from((0, 1, 2, 0, 1, 101, UINT32))
     request = {'num_samples': amounts, 'recursion_depth': amounts,
                'seed': st.sampled_from((0, 1, 2, -1, 2**63 - 1, -2**63)),
