@@ -145,7 +145,7 @@ def absurd_to_predictor(job):
 
 def judge_refusal(message, name, value):
     """Say what a refusal of a pixel lacks; an empty string if nothing."""
-    if name not in message and np.isfinite(np.float32(value)):
+    if name not in message and abs(value) < 1e30:
         return f'the refusal does not name {name}: {message}'
     if np.isfinite(value) and not any(bound in message for bound in ('63', '64', 'expected')):
         return f'the refusal does not name the bounds: {message}'
