@@ -84,6 +84,52 @@ def call(client, request, timeout_s, give_up=lambda: False, server=None):
     return future.result()
 
 
+def in_executor(node, function, timeout_s):
+    """
+    Call a function in the thread that spins a node, where no answer is handled meanwhile.
+
+    rclpy's action client takes down a request only after it was sent: an answer that is handled in
+    between by another thread is lost.
+
+    :param node: rclpy Node that one other thread spins.
+    :param function: called without arguments.
+    :param timeout_s: most seconds to wait.
+    :return: what the function returns; what it raises is raised.
+    :raises CallError: when the node is not spun, or its thread is busy for too long.
+    """
+    done, found = threading.Event(), []
+
+    def run():
+        try:
+            found.append((function(), None))
+        except Exception as error:  # it would end the executor
+            found.append((None, error))
+        done.set()
+
+    if node.executor is None:
+        raise CallError(f'node {node.get_name()} is not spun')
+    node.executor.create_task(run)
+    if not done.wait(timeout_s):
+        raise CallError(f'node {node.get_name()}: its callbacks have kept it busy for '
+                        f'{timeout_s:g} s')
+    value, error = found[0]
+    if error is not None:
+        raise error
+    return value
+
+
+def cancel_goal(handle, timeout_s=1.0):
+    """
+    Ask for the end of a goal.
+
+    :param handle: goal handle of send_goal.
+    :param timeout_s: most seconds until the request is sent.
+    :return: future of the answer.
+    :raises CallError: as in_executor.
+    """
+    return in_executor(handle._action_client._node, handle.cancel_goal_async, timeout_s)
+
+
 def wait_for_future(future, timeout_s):
     """Wait until a future is done, without spinning; tell whether it is."""
     done = threading.Event()
@@ -109,8 +155,9 @@ def send_goal(action_client, goal, timeout_s, on_feedback=None, server=None):
         raise CallError(f'action {name}: its node, {server.name}, has ended; start it again')
     if not action_client.wait_for_server(timeout_sec=timeout_s):
         raise CallError(f'action {name}: nobody offers it after {timeout_s:g} s')
-    future = action_client.send_goal_async(
-        goal, None if on_feedback is None else lambda message: on_feedback(message.feedback))
+    told = None if on_feedback is None else lambda message: on_feedback(message.feedback)
+    future = in_executor(
+        action_client._node, lambda: action_client.send_goal_async(goal, told), timeout_s)
     while not wait_for_future(future, 0.05):
         if not action_client.server_is_ready() or (server is not None and server.dead):
             raise CallError(f'action {name}: its node ended before it answered the goal')
@@ -134,14 +181,14 @@ def wait_for_result(handle, timeout_s, server=None):
     :raises CallError: when it has not ended in time, or the node that pursues it has.
     """
     client = handle._action_client
-    future = handle.get_result_async()
     deadline = time.monotonic() + timeout_s
+    future = in_executor(client._node, handle.get_result_async, timeout_s)
     while not wait_for_future(future, 0.05):
         if not client.server_is_ready() or (server is not None and server.dead):
             raise CallError(f'action {client._action_name}: its node ended before the goal did; '
                             'what the arm does now is up to its driver')
         if time.monotonic() >= deadline:
-            cancelled = wait_for_future(handle.cancel_goal_async(), 1.0)
+            cancelled = wait_for_future(cancel_goal(handle), 1.0)
             raise CallError(
                 f'the goal has not ended within {timeout_s:g} s and '
                 + ('was cancelled' if cancelled else 'its node does not answer the cancel'))

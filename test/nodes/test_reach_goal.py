@@ -15,7 +15,7 @@ from sim_bridge.simulator import Simulator
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.srv import ResetScene
-from tap_ros.nodes.clients import call, CallError, send_goal, wait_for_result
+from tap_ros.nodes.clients import call, CallError, cancel_goal, send_goal, wait_for_result
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.weights import save_weights
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
@@ -65,7 +65,7 @@ def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
         loop.reset()
         handle = send_goal(loop.reach_client, ReachGoal.Goal(num_samples=100), 30)
         threading.Event().wait(3)  # it would make 200 plans before it moves
-        handle.cancel_goal_async()
+        cancel_goal(handle)
         status, result = wait_for_result(handle, 20)
         assert status == GoalStatus.STATUS_CANCELED and result.steps == 0
     finally:
@@ -84,7 +84,7 @@ def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
     with pytest.raises(CallError, match='rejected'):
         send_goal(loop.reach_client, ReachGoal.Goal(), 30)
     assert 'another goal is in progress' in loop.processes['visual_mpc_node'].text
-    handle.cancel_goal_async()
+    cancel_goal(handle)
     status, result = wait_for_result(handle, 60)
     assert status == GoalStatus.STATUS_CANCELED
     assert 'cancelled' in result.message and 1 <= result.steps < 40
@@ -121,7 +121,7 @@ def test_a_goal_right_after_a_cancel_or_a_reset_is_served(loop, _):
     handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
                        lambda feedback: moving.set())
     assert moving.wait(120)
-    handle.cancel_goal_async()
+    cancel_goal(handle)
     status, _ = wait_for_result(handle, 60)
     assert status == GoalStatus.STATUS_CANCELED
     status, result = loop.reach(mode='direct', step_budget=2)

@@ -8,6 +8,7 @@ import numpy as np
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.evaluation.faults.fault import Fault
+from tap_ros.nodes.clients import in_executor
 from tap_ros.nodes.faults.attacked import Attacked
 from tap_ros.nodes.faults.rig import outcome
 from tap_ros.nodes.faults.world import (
@@ -120,7 +121,7 @@ def future_stamps(job):
                     messages = world.messages(to_stamp(time.time_ns() + 10**15))
                     for topic in chosen:
                         publishers[topic].publish(messages[topic])
-                    ends = ends or handle.get_result_async()
+                    ends = ends or in_executor(rig.node, handle.get_result_async, 5.0)
                     time.sleep(1.0)
                     if ends.done():
                         break

@@ -11,7 +11,7 @@ from std_srvs.srv import SetBool
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
 from tap_ros.evaluation.faults.fault import Fault
-from tap_ros.nodes.clients import call, wait_for_future
+from tap_ros.nodes.clients import call, cancel_goal, in_executor, wait_for_future
 from tap_ros.nodes.faults import strategies
 from tap_ros.nodes.faults.rig import outcome
 from tap_ros.nodes.topics import LATCHED
@@ -116,14 +116,15 @@ class Target:
 
     def _goal(self, goal):
         """Send a goal, let it begin, and cancel it; say what went wrong."""
-        future = self._rig.reach_client.send_goal_async(goal)
+        node, client = self._rig.node, self._rig.reach_client
+        future = in_executor(node, lambda: client.send_goal_async(goal), ANSWER_S)
         if not wait_for_future(future, ANSWER_S):
             return 'no answer to a goal'
         handle = future.result()
         if handle.accepted:
-            ends = handle.get_result_async()
+            ends = in_executor(node, handle.get_result_async, ANSWER_S)
             if not wait_for_future(ends, 0.2):
-                handle.cancel_goal_async()
+                cancel_goal(handle, ANSWER_S)
                 if not wait_for_future(ends, ANSWER_S):
                     return 'a cancelled goal did not end'
         return ''

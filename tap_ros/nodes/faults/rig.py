@@ -18,7 +18,7 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
-from tap_ros.nodes.clients import call, Newest, send_goal, Spinner, wait_for_result
+from tap_ros.nodes.clients import call, cancel_goal, Newest, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.faults.attacked import Attacked
 from tap_ros.nodes.faults.commands import Commands
 from tap_ros.nodes.faults.world import goal_fields, predict_fields, World
@@ -179,7 +179,7 @@ class Rig:
 
     def finish(self, handle, timeout_s=CALL_S):
         """Cancel a goal, and return its end in words."""
-        handle.cancel_goal_async()
+        cancel_goal(handle)
         return self.result(handle, timeout_s)
 
     def result(self, handle, timeout_s=60.0):
