@@ -12,7 +12,7 @@ from tap_ros.nodes.faults.silence import judge_stop
 from tap_ros.nodes.faults.world import goal_fields, predict_fields
 
 NOTICED_S = 1.0
-PAUSED_S = 5.0
+PAUSED_S = 2.5  # less than the lease of its process: nobody has forgotten it
 
 
 def judge_notice(job, watch, moment):
