@@ -150,11 +150,9 @@ def paused(job):
             time.sleep(PAUSED_S)
             moment = time.monotonic()
             victim.send(signal.SIGCONT)
-            _, lost = outcome(rig.result, handle, 20.0)
-            if not lost:
-                lost = 'nobody told the client that the planner was away'
-            elif 'node ended' in lost:
-                lost = ''
+            end, lost = outcome(rig.result, handle, 20.0)
+            if end is not None and not (end.startswith('aborted') and 'stood still' in end):
+                lost = f'the goal {end}'
             time.sleep(2.0)  # it is found again, and would move by now
             moves = rig.commands.moves(moment)
             moved = f'{len(moves)} moves after it went on' if moves else ''
@@ -176,6 +174,6 @@ FAULTS = [
           'goal is aborted, and the first reset and goal after the restart succeed.', 50, 15.0,
           simulator, 'until its death was noticed', 's'),
     Fault('planner-paused', f'the planner stands still for {PAUSED_S:g} s during a goal', 'Its '
-          'machine sleeps or swaps. What waited for it meanwhile looks new and is old.', 'Its '
-          'client is told, and nothing moves before the next goal.', 20, 9.0,
+          'machine sleeps or swaps. What waited for it meanwhile looks new and is old.', 'The '
+          'goal is aborted with that reason, and nothing moves before the next one.', 20, 9.0,
           paused)]
