@@ -17,26 +17,30 @@ from tap_ros.evaluation.faults.fault import Fault
 from tap_ros.nodes.faults.load import PATIENCE_S
 from tap_ros.nodes.faults.rig import outcome
 from tap_ros.nodes.faults.world import first_pictures, predict_fields, TOPICS
+from tap_ros.nodes.topics import SERVICE_QOS
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import find_predictor
 import torch
 
 PER_PROCESS = 8
+DEFAULT_DEPTH = 10  # of the queue of a client in ROS 2
 SOON_S = 10.0
 
 
-def call_at_once(clients, seconds, calls=0):
+def call_at_once(clients, seconds, calls=0, depth=SERVICE_QOS.depth):
     """
     Have many clients call at once, from processes of their own.
 
     :param clients: how many.
     :param seconds: for how long.
     :param calls: most calls of each; 0: any number.
+    :param depth: answers that wait in the queue of each.
     :return: dict of good, busy, refused, lost calls, and seconds.
     """
     counts = [min(PER_PROCESS, clients - at) for at in range(0, clients, PER_PROCESS)]
     processes = [subprocess.Popen(
-        [sys.executable, '-m', 'tap_ros.nodes.faults.load', str(count), str(seconds), str(calls)],
+        [sys.executable, '-m', 'tap_ros.nodes.faults.load', str(count), str(seconds), str(calls),
+         str(depth)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
         start_new_session=True) for count in counts]
     try:
@@ -60,12 +64,12 @@ def call_at_once(clients, seconds, calls=0):
     return {**total, 'seconds': max(part['seconds'] for part in found)}
 
 
-def many(job, clients):
+def many(job, clients, depth=SERVICE_QOS.depth):
     """Have many clients make a few calls each; a trial is a call."""
     job.rig.need('predictor_node')
     calls = max(1, round(job.count / clients))
     job.expect(calls * clients)
-    _take_down(job, call_at_once(clients, 3600.0, calls))
+    _take_down(job, call_at_once(clients, 3600.0, calls, depth))
 
 
 def for_long(job):
@@ -180,11 +184,17 @@ def _median_ms(work, times):
 
 
 ANSWERED = 'Each call is answered, with a subgoal or with how many requests are waiting.'
-MEANING = 'A whole team, or a program with many threads, asks one predictor at once.'
+MEANING = ('A whole team, or a program with many threads, asks one predictor at once. Each client '
+           f'has a queue of {SERVICE_QOS.depth}, since DDS brings it the answers to all of them.')
 FAULTS = [
     *[Fault(f'clients-{count}', f'{count} clients at once', MEANING, ANSWERED, 10 * count, 0.03,
             partial(many, clients=count), 'answers a second', '1/s')
       for count in (12, 16, 64)],
+    Fault('clients-16-default', f'16 clients at once with the default queue of {DEFAULT_DEPTH}',
+          'As clients-16, without the deep queue that one client of many needs: where a busy '
+          'machine keeps a client from taking what comes, DDS drops its answer.',
+          ANSWERED, 1600, 0.03, partial(many, clients=16, depth=DEFAULT_DEPTH),
+          'answers a second', '1/s'),
     Fault('clients-16-long', '16 clients for 10 min', MEANING, ANSWERED, 30_000, 0.02, for_long,
           'answers a second', '1/s'),
     Fault('clients-throughput', 'answers a second of 16 clients against one', 'Requests that wait '

@@ -3,10 +3,11 @@
 """
 Clients that call predict_subgoal as fast as they are answered, in a process of their own.
 
-    python -m tap_ros.nodes.faults.load CLIENTS SECONDS CALLS
+    python -m tap_ros.nodes.faults.load CLIENTS SECONDS CALLS DEPTH
 
 Each client sends its next request when the one before is answered, until so many seconds have
-passed or it has made so many calls (0: any number). One line of JSON says what came of them.
+passed or it has made so many calls (0: any number). DEPTH answers wait in its queue. One line of
+JSON says what came of them.
 """
 
 from collections import Counter
@@ -18,6 +19,7 @@ import time
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.nodes.faults.world import predict_fields
 
@@ -31,10 +33,12 @@ class Caller:
     :param node: rclpy Node.
     :param until: time.monotonic() at which it sends no more.
     :param calls: most calls; 0: any number.
+    :param depth: answers that wait in its queue, those to all other clients among them.
     """
 
-    def __init__(self, node, until, calls):
-        self._client = node.create_client(PredictSubgoal, 'predict_subgoal')
+    def __init__(self, node, until, calls, depth):
+        self._client = node.create_client(
+            PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth))
         self._request = PredictSubgoal.Request(**predict_fields())
         self._until, self._left = until, calls or float('inf')
         self._future = self._sent = None
@@ -78,14 +82,15 @@ class Caller:
 
 def main():
     """Call, and print what came of it."""
-    count, seconds, calls = int(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
+    count, seconds = int(sys.argv[1]), float(sys.argv[2])
+    calls, depth = int(sys.argv[3]), int(sys.argv[4])
     context = Context()
     context.init()
     node = Node('load', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
     begin = time.monotonic()
-    callers = [Caller(node, begin + 3600, calls) for _ in range(count)]
+    callers = [Caller(node, begin + 3600, calls, depth) for _ in range(count)]
     while not all(caller.ready() for caller in callers) and time.monotonic() < begin + 20:
         executor.spin_once(timeout_sec=0.1)
     settled = time.monotonic() + 1.0
