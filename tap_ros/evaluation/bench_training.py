@@ -12,7 +12,8 @@ import os
 import tempfile
 
 from tap_ros.evaluation.speed import matrix_rate, matrix_side
-from tap_ros.prediction.training import make_autocast, pick_device, train
+from tap_ros.learning.devices import make_autocast, pick_device
+from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch

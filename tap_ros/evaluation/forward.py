@@ -8,9 +8,9 @@ import shlex
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.files import write_rows
+from tap_ros.learning.split import split_episodes, TEST_FRACTION
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
-from tap_ros.prediction.batches import split_episodes
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights import FORWARD_MODEL
 
@@ -25,7 +25,7 @@ def add_arguments(parser):
                         help='bag folders with object pixels; each is scored on its own')
     parser.add_argument('--weights', default=str(FORWARD_MODEL), metavar='FILE',
                         help='of a forward model (default: the shipped ones)')
-    parser.add_argument('--test-fraction', type=float, default=0.05,
+    parser.add_argument('--test-fraction', type=float, default=TEST_FRACTION,
                         help='share of the episodes that training held out, by seed; 1: all '
                         '(default: %(default)s)')
     parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
@@ -53,7 +53,7 @@ def run(args):
                               'pixels that move; give more of them, or --test-fraction 1')
         words = ['python', '-m', 'tap_ros', 'evaluate', 'forward', '--recordings', recording]
         for option, value, usual in (('--weights', args.weights, str(FORWARD_MODEL)),
-                                     ('--test-fraction', args.test_fraction, 0.05)):
+                                     ('--test-fraction', args.test_fraction, TEST_FRACTION)):
             words += [option, str(value)] if value != usual else []
         command = shlex.join(words)
         rows += make_rows(Path(recording).name, measured, store.data_hash, command)

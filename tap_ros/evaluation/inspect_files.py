@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 from tap_ros.files import write_atomically
+from tap_ros.learning.weights import load_tensors
 from tap_ros.pictures import film_strip, grid, png_bytes
-from tap_ros.prediction.weights import load_tensors
 from tap_ros.recording.cache import open_recordings
 from tap_ros.text import escaped, listing
 

@@ -26,8 +26,9 @@ from tap_ros.evaluation.intervals import bootstrap, gain_interval, mean_interval
 from tap_ros.evaluation.samples import draw_latents, SAMPLES, score_samples
 from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
+from tap_ros.learning.split import split_episodes, TEST_FRACTION
 from tap_ros.pictures import grid, overlay
-from tap_ros.prediction.batches import make_batch, split_episodes
+from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
@@ -217,7 +218,7 @@ def run(args):
     if store.image_size != (network.config.image_size,) * 2:
         raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
-    fraction = training.get('settings', {}).get('test_fraction', 0.05)
+    fraction = training.get('settings', {}).get('test_fraction', TEST_FRACTION)
     kept, held_out = split_episodes(store, fraction)
     episodes = np.sort(np.concatenate([kept, held_out])) if args.all else held_out
     if not len(episodes):

@@ -23,6 +23,8 @@ from dataclasses import dataclass
 
 from tap_ros.contract import ACTION_LIMIT, CLEAR, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import ConfigError
+from tap_ros.learning.devices import has_bfloat16
+from tap_ros.learning.weights import load_weights, make_network
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
 from tap_ros.planning.table import (
     channels_first,
@@ -34,7 +36,6 @@ from tap_ros.planning.table import (
     sample_picture,
     splat_on_table,
 )
-from tap_ros.prediction.weights import load_weights, make_network
 import torch
 from torch import nn
 
@@ -369,10 +370,3 @@ def load_forward_model(path, device='cpu', precision='auto'):
         model.push.bfloat16()
         model.push.fields = fields
     return model.to(memory_format=torch.channels_last)
-
-
-def has_bfloat16(device):
-    """Say whether a device multiplies bfloat16 itself; others emulate it many times slower."""
-    if torch.device(device).type == 'cuda':
-        return True
-    return getattr(torch.cpu, '_is_avx512_bf16_supported', lambda: False)()

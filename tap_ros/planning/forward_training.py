@@ -10,24 +10,24 @@ same result.
 from dataclasses import asdict, dataclass
 import os
 from pathlib import Path
-import platform
 import time
 
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.images import to_uint8
+from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start
+from tap_ros.learning.devices import pick_device
+from tap_ros.learning.panels import grey_panels
+from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
+from tap_ros.learning.schedule import learning_rate
+from tap_ros.learning.split import split_episodes, TEST_FRACTION
+from tap_ros.learning.weights import save_weights
 from tap_ros.pictures import grid
 from tap_ros.planning.forward_data import draw_windows
 from tap_ros.planning.forward_loss import draw_arm_like, forward_loss
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.table import fit_arm, fit_table
-from tap_ros.prediction.batches import split_episodes
-from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
-from tap_ros.prediction.pictures import grey_panels
-from tap_ros.prediction.run_folder import describe_run, run_folder
-from tap_ros.prediction.training import learning_rate, pick_device
-from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings
 import torch
 from torch.utils.tensorboard import SummaryWriter
@@ -72,7 +72,7 @@ class ForwardTrainingConfig:
     width: int = 32
     features: int = 8
     augment: bool = True
-    test_fraction: float = 0.05
+    test_fraction: float = TEST_FRACTION
     seed: int = 0
     device: str = 'auto'
     threads: int = 0
@@ -129,7 +129,8 @@ def _train(config, device, store, stop_at, progress):
     with SummaryWriter(config.out, purge_step=state.step) as curves, bar:
         began = time.monotonic() - state.seconds
         for step in range(state.step, last):
-            rate = learning_rate(step, config, config.learning_rate)
+            rate = learning_rate(
+                step, config.steps, config.warmup, config.learning_rate)
             for group in state.optimizers[0].param_groups:
                 group['lr'] = rate
             # One step of Adam towards the recorded pictures.
@@ -199,12 +200,7 @@ def _report(state, curves, config, store, training, held_out):
         if len(episodes):
             picture = sample_grid(state.average, store, episodes, config)
             curves.add_image(name, picture, state.step, dataformats='HWC')
-    device = next(state.network.parameters()).device.type
-    about = {
-        'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
-        'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
-        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device}',
-        'torch': torch.__version__, 'python': platform.python_version()}
+    about = run_facts(state, config.seed, store, training, held_out)
     describe_run(config.out, config=asdict(config), run=about, scores=scores)
     save_weights(
         Path(config.out) / 'forward_model.safetensors', state.average, 'forward_model',

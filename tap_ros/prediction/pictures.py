@@ -3,18 +3,9 @@
 """What the network does with a batch, as a picture for people."""
 
 from tap_ros.images import to_uint8
+from tap_ros.learning.panels import grey_panels
 from tap_ros.pictures import grid
 import torch
-
-
-def grey_panels(maps):
-    """
-    Show numbers from 0 to 1 as grey.
-
-    :param maps: tensor (N, H, W).
-    :return: list of N uint8 (H, W, 3).
-    """
-    return list(to_uint8(maps[:, None].expand(-1, 3, -1, -1) * 2 - 1))
 
 
 @torch.no_grad()

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from tap_ros.errors import ConfigError, ImageError, WeightsError
 from tap_ros.images import check_image, check_pixels, to_float, to_uint8
+from tap_ros.learning.weights import load_weights, make_network
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
-from tap_ros.prediction.weights import load_weights, make_network
 from tap_ros.text import escaped
 from tap_ros.weights import find_predictor
 import torch

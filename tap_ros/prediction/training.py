@@ -8,16 +8,20 @@ from functools import partial
 import math
 import os
 from pathlib import Path
-import platform
 import time
 
 import numpy as np
 from tap_ros.errors import ConfigError
+from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start
+from tap_ros.learning.devices import make_autocast, pick_device
+from tap_ros.learning.frames import MappedFrames, ResidentFrames
+from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
+from tap_ros.learning.schedule import learning_rate
+from tap_ros.learning.split import split_episodes
+from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.augmentation import Augmentation
-from tap_ros.prediction.batches import episode_order, make_batch, split_episodes
-from tap_ros.prediction.checkpoints import load_checkpoint, save_checkpoint, start
+from tap_ros.prediction.batches import episode_order, make_batch
 from tap_ros.prediction.discriminator import Discriminator
-from tap_ros.prediction.frames import MappedFrames, ResidentFrames
 from tap_ros.prediction.held_out import held_out_scores, matched
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.objective import (
@@ -30,9 +34,7 @@ from tap_ros.prediction.pictures import sample_grid
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.pretraining import pretrain_decoders
 from tap_ros.prediction.recognition import Recognition
-from tap_ros.prediction.run_folder import describe_run, run_folder
 from tap_ros.prediction.training_config import DEFAULTS
-from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings
 import torch
 from torch.utils.tensorboard import SummaryWriter
@@ -104,7 +106,8 @@ def _train(config, device, store, stop_at, deadline, progress):
             for optimizer, highest in zip(
                     state.optimizers, (config.learning_rate, config.discriminator_rate)):
                 for group in optimizer.param_groups:
-                    group['lr'] = learning_rate(step, config, highest)
+                    group['lr'] = learning_rate(
+                        step, config.steps, config.warmup, highest)
             batch, augmentation = batch.to(device), augmentation.to(device)
             draws = Draws.make(batch, config.latent_size, config.seed, step)
             outcome, norm = _step(state, networks, batch, augmentation, draws, config, autocast)
@@ -114,7 +117,7 @@ def _train(config, device, store, stop_at, deadline, progress):
             bar.update()
             if state.step % config.log_every == 0:
                 _log(curves, bar, state.step, outcome, batch, norm,
-                     learning_rate(step, config, config.learning_rate))
+                     state.optimizers[0].param_groups[0]['lr'])
             late = time.monotonic() > deadline
             if state.step % config.save_every == 0 or state.step == last or late:
                 state.seconds = time.monotonic() - began
@@ -158,8 +161,9 @@ def _step(state, networks, batch, augmentation, draws, config, autocast):
     """Do one step of the predictor, then one of the discriminators; return (Outcome, norm)."""
     state.network.train()
     state.helpers.train()
-    judges = [networks.discriminator, networks.posterior_discriminator]
-    for judge in filter(None, judges):
+    judges = [judge for judge in (networks.discriminator, networks.posterior_discriminator)
+              if judge is not None]  # a compiled network has no truth value
+    for judge in judges:
         judge.requires_grad_(False)
     outcome = predictor_loss(networks, batch, augmentation, config, draws, autocast)
     state.optimizers[0].zero_grad()
@@ -168,7 +172,7 @@ def _step(state, networks, batch, augmentation, draws, config, autocast):
         state.optimizers[0].param_groups[0]['params'], config.gradient_clip or math.inf)
     state.optimizers[0].step()
     if outcome.judged is not None:
-        for judge in filter(None, judges):
+        for judge in judges:
             judge.requires_grad_(True)
         loss = discriminators_loss(outcome.judged, autocast)
         state.optimizers[1].zero_grad()
@@ -198,57 +202,6 @@ def _single_frames(store, frames, episodes, config, step):
     rng = np.random.default_rng([config.seed, 3, step])
     chosen = rng.choice(episodes, config.batch_size)
     return frames(chosen, rng.integers(store.lengths[chosen])[:, None])[:, 0]
-
-
-def learning_rate(step, config, highest):
-    """
-    Compute a step's learning rate: a linear rise, then half a cosine down to 2 %.
-
-    :param step: from 0 on.
-    :param config: TrainingConfig.
-    :param highest: the rate at the start, after the rise.
-    :return: the rate.
-    """
-    rise = min(1.0, (step + 1) / (config.warmup + 1))
-    fall = 0.5 + 0.5 * math.cos(math.pi * step / config.steps)
-    return highest * rise * (0.02 + 0.98 * fall)
-
-
-def pick_device(name):
-    """
-    Choose the device to train on.
-
-    :param name: 'auto', 'cpu', 'cuda' or 'cuda:1'.
-    :return: torch device.
-    :raises ConfigError: if it is not there.
-    """
-    if name == 'auto':
-        return torch.device('cuda' if torch.cuda.is_available() else 'cpu')
-    try:
-        torch.empty(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f'device: {name!r} is not usable here ({error}); '
-                          "choose 'cpu' or 'auto'") from error
-    return torch.device(name)
-
-
-def make_autocast(precision, device):
-    """
-    Choose the precision to run networks in.
-
-    :param precision: 'float32', 'bfloat16', or 'auto': bfloat16 on a GPU and on CPUs that have
-        instructions for it; on others it is ten times slower than float32.
-    :param device: torch device.
-    :return: function that makes a context manager.
-    """
-    fast = device.type == 'cuda' or _cpu_has_bfloat16()
-    half = precision == 'bfloat16' or (precision == 'auto' and fast)
-    return partial(torch.autocast, device.type, torch.bfloat16, enabled=half)
-
-
-def _cpu_has_bfloat16():
-    """Say whether the CPU multiplies bfloat16 itself (AVX512_BF16)."""
-    return getattr(torch.cpu, '_is_avx512_bf16_supported', lambda: False)()
 
 
 def _batches(store, frames, episodes, config, first, last):
@@ -288,11 +241,6 @@ def _log(curves, bar, step, outcome, batch, norm, rate):
     bar.set_postfix(loss=f'{loss:.4f}', match=f'{fraction.mean().item():.2f}')
 
 
-def _name(device):
-    """Say what computes: 'cpu', or the name of the GPU."""
-    return torch.cuda.get_device_name(device) if device.type == 'cuda' else device.type
-
-
 def _report(state, curves, config, store, frames, training, held_out, autocast):
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
     device = next(state.average.parameters()).device
@@ -314,11 +262,7 @@ def _report(state, curves, config, store, frames, training, held_out, autocast):
             shown = batch(episodes)
             picture = sample_grid(shown, *matched(state.average, shown, config, autocast))
             curves.add_image(name, picture, state.step, dataformats='HWC')
-    about = {
-        'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': config.seed,
-        'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
-        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {_name(device)}',
-        'torch': torch.__version__, 'python': platform.python_version()}
+    about = run_facts(state, config.seed, store, training, held_out)
     describe_run(config.out, config=asdict(config), run=about, scores=scores)
     save_weights(Path(config.out) / 'predictor.safetensors', state.average, 'predictor',
                  state.network.config, about | {'settings': asdict(config), 'scores': scores})

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 from tap_ros.errors import ConfigError
+from tap_ros.learning.split import TEST_FRACTION
 from tap_ros.prediction.methods import MODES, parse_method
 
 POSTERIORS = ('video', 'frame')
@@ -103,7 +104,7 @@ class TrainingConfig:
     flip: bool = True
     colour: bool = True
     brightness: float = 0.2
-    test_fraction: float = 0.05
+    test_fraction: float = TEST_FRACTION
     seed: int = 0
     device: str = 'auto'
     precision: str = 'auto'

@@ -13,8 +13,8 @@ import numpy as np
 from tap_ros.evaluation.paper.pictures import _contrast, draw, write_grids
 from tap_ros.evaluation.paper.results import write_results
 from tap_ros.evaluation.paper.runs import paper_runs
+from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.networks import Predictor, PredictorConfig
-from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.cache import open_recordings
 import torch
 

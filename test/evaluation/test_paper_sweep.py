@@ -27,7 +27,7 @@ from tap_ros.evaluation.paper.runs import paper_runs, PaperRun
 from tap_ros.evaluation.paper.shipping import ship
 from tap_ros.evaluation.paper.sweep import find_state, sweep
 from tap_ros.files import locked
-from tap_ros.prediction.batches import split_episodes
+from tap_ros.learning.split import split_episodes
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode

@@ -19,10 +19,10 @@ from tap_ros.evaluation.bottleneck import (
 from tap_ros.evaluation.prediction import add_arguments, evaluate, run, write_pictures
 from tap_ros.evaluation.samples import draw_latents, score_samples
 from tap_ros.images import to_float
+from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.batches import fixed_time, make_batch
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
-from tap_ros.prediction.weights import save_weights
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.writer import EpisodeWriter
 import torch

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.learning.weights import save_weights
 from tap_ros.nodes.clients import call, Newest, wait_for_future
 from tap_ros.nodes.image_messages import decode_image, encode_image
 from tap_ros.nodes.object_messages import encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, to_stamp
-from tap_ros.prediction.weights import save_weights
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
 from lively import lively_network  # noqa: E402

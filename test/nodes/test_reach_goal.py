@@ -15,9 +15,9 @@ from sim_bridge.simulator import Simulator
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.srv import ResetScene
+from tap_ros.learning.weights import save_weights
 from tap_ros.nodes.clients import call, CallError, cancel_goal, send_goal, wait_for_result
 from tap_ros.planning.visual_mpc import VisualMPC
-from tap_ros.prediction.weights import save_weights
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]

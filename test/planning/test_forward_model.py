@@ -4,9 +4,9 @@
 
 import pytest
 from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.learning.weights import save_weights
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig, load_forward_model
 from tap_ros.prediction.warp import one_hot_maps
-from tap_ros.prediction.weights import save_weights
 import torch
 from toy_world import ARM, TABLE
 

@@ -6,16 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tap_ros.errors import RecordingError
+from tap_ros.learning.frames import ResidentFrames
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import (
     episode_order,
     make_batch,
-    split_episodes,
     target_times,
     uses_recorded_goal,
 )
-from tap_ros.prediction.frames import ResidentFrames
 from tap_ros.recording.cache import open_recordings
 import torch
 
@@ -123,28 +121,6 @@ def test_recorded_goals_stand_in_for_last_frames_where_they_were_reached(store):
     assert 70 < sum(mixed) < 130
     batch = make_batch(store, [0], goal_picture='recorded')
     assert np.array_equal(batch.context[0, 1], reached.goal_frame)
-
-
-def test_split_is_complete_and_does_not_depend_on_what_else_there_is(store):
-    training, held_out = split_episodes(store, 0.3)
-    assert sorted([*training, *held_out]) == list(range(len(store)))
-    assert 0 < len(held_out) < len(training)
-
-    class Half:
-        lengths = store.lengths[:12]
-
-        def __len__(self):
-            return 12
-
-        def __getitem__(self, i):
-            return store[i]
-
-    assert split_episodes(Half(), 0.3)[1].tolist() == [i for i in held_out if i < 12]
-
-
-def test_nothing_to_train_on_is_said(store):
-    with pytest.raises(RecordingError, match='no episode has at least 100 frames'):
-        split_episodes(store, 0.1, min_frames=100)
 
 
 def test_each_pass_has_every_episode_once():

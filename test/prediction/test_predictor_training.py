@@ -4,6 +4,7 @@
 
 import argparse
 from dataclasses import replace
+from functools import partial
 import json
 from pathlib import Path
 import resource
@@ -12,12 +13,13 @@ import pytest
 from tap_ros.errors import ConfigError, StorageError, WeightsError
 from tap_ros.files import only_writer
 from tap_ros.images import to_float
+from tap_ros.learning.schedule import learning_rate
+from tap_ros.learning.weights import load_tensors, load_weights, save_tensors
 from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.train_command import add_arguments, run
-from tap_ros.prediction.training import learning_rate, train
+from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
-from tap_ros.prediction.weights import load_tensors, load_weights, save_tensors
 from tap_ros.recording.cache import open_recordings
 import torch
 
@@ -98,6 +100,12 @@ def test_every_method_learns(config, mode, method):
         with open(f'{config.out}/scores.json') as file:
             losses.append(json.load(file)['loss'])
     assert losses[1] < losses[0]
+
+
+def test_a_compiled_discriminator_is_trained(config, monkeypatch):
+    monkeypatch.setattr(torch, 'compile', partial(torch.compile, backend='eager'))
+    path = train(replace(config, method='genmin', compile=True, steps=1), progress=False)
+    assert load_network(path)[1]['steps'] == 1
 
 
 def test_a_run_leaves_what_is_needed_to_repeat_it(config):
@@ -205,7 +213,7 @@ def test_a_network_in_use_predicts_as_in_training(config):
 
 def test_learning_rate_rises_and_falls():
     config = TrainingConfig(recordings=('bag',), out='', steps=1000, warmup=10)
-    rates = [learning_rate(step, config, 1.0) for step in range(1000)]
+    rates = [learning_rate(step, config.steps, config.warmup, 1.0) for step in range(1000)]
     assert rates[0] < 0.1 and max(rates) == pytest.approx(1, abs=0.01)
     assert rates[-1] == pytest.approx(0.02, abs=0.001)
     assert all(a >= b for a, b in zip(rates[10:], rates[11:]))

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.evaluation.prediction import evaluate
-from tap_ros.prediction.batches import make_batch, split_episodes
+from tap_ros.learning.split import split_episodes
+from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.recording.bair import add_arguments, find_shards, import_bair
 from tap_ros.recording.cache import open_recordings

@@ -9,7 +9,7 @@ from safetensors.torch import load
 from tap_ros.evaluation.faults.children import Reader
 from tap_ros.evaluation.faults.fault import Fault
 from tap_ros.evaluation.faults.recordings import one_line
-from tap_ros.prediction.weights import content_digest
+from tap_ros.learning.weights import content_digest
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL, PREDICTORS
 
 

@@ -102,9 +102,9 @@ def score(run, config, weights, places):
     from tap_ros.evaluation.bottleneck import target_bottlenecks
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.evaluation.samples import score_samples
-    from tap_ros.prediction.batches import split_episodes
+    from tap_ros.learning.devices import pick_device
+    from tap_ros.learning.split import split_episodes
     from tap_ros.prediction.predictor import load_network
-    from tap_ros.prediction.training import pick_device
     from tap_ros.recording.cache import open_recordings
 
     network, about = load_network(weights, pick_device(config.device))

@@ -20,8 +20,9 @@ from tap_ros.evaluation.paper.rows import method_order
 from tap_ros.evaluation.samples import draw_latents
 from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
+from tap_ros.learning.split import split_episodes, TEST_FRACTION
 from tap_ros.pictures import GAP, grid, png_bytes
-from tap_ros.prediction.batches import make_batch, split_episodes
+from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.warp import warp
@@ -91,7 +92,7 @@ def _held_out(run, recordings):
     if not Path(paths[0]).exists():
         return None
     store = open_recordings(paths)
-    _, held_out = split_episodes(store, run['config'].get('test_fraction', 0.05))
+    _, held_out = split_episodes(store, run['config'].get('test_fraction', TEST_FRACTION))
     # Of other recordings the pictures would not be those that the scores are of.
     if not len(held_out) or store.data_hash != run['data']['hash']:
         return None

@@ -14,9 +14,9 @@ from tap_ros.evaluation.paper.sweep import trained_on
 from tap_ros.evaluation.paper.tables import markdown
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.files import write_atomically
-from tap_ros.prediction.batches import split_episodes
+from tap_ros.learning.split import split_episodes
+from tap_ros.learning.weights import load_weights, save_weights
 from tap_ros.prediction.predictor import load_network
-from tap_ros.prediction.weights import load_weights, save_weights
 from tap_ros.recording.cache import open_recordings
 import torch
 

@@ -21,7 +21,7 @@ import time
 from tap_ros.evaluation.paper.job import BUSY, DONE, UNFINISHED
 from tap_ros.evaluation.paper.places import is_collected, read_json, recording_hash
 from tap_ros.evaluation.paper.runs import PaperRun
-from tap_ros.prediction.checkpoints import FREE
+from tap_ros.learning.checkpoints import FREE
 from tap_ros.prediction.training_config import DEFAULTS
 from tqdm import tqdm
 

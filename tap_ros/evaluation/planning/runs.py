@@ -18,11 +18,11 @@ from tap_ros.evaluation.planning.episode import run_episode
 from tap_ros.evaluation.planning.methods import Method
 from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.files import write_atomically
+from tap_ros.learning.weights import stored_digest
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
-from tap_ros.prediction.weights import stored_digest
 import torch
 from tqdm import tqdm
 

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 from safetensors.torch import save_file
 from tap_ros.errors import WeightsError
-from tap_ros.planning.forward_model import load_forward_model
-from tap_ros.prediction.networks import Predictor, PredictorConfig
-from tap_ros.prediction.predictor import load_network
-from tap_ros.prediction.weights import (
+from tap_ros.learning.weights import (
     load_tensors,
     load_weights,
     make_config,
@@ -22,6 +19,9 @@ from tap_ros.prediction.weights import (
     save_weights,
     stored_digest,
 )
+from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.predictor import load_network
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 import torch
 

@@ -5,9 +5,12 @@
 from contextlib import contextmanager
 import json
 from pathlib import Path
+import platform
 import threading
 
 from tap_ros.files import only_writer, storage_errors, write_atomically
+from tap_ros.learning.devices import device_name
+import torch
 
 
 @contextmanager
@@ -29,6 +32,23 @@ def run_folder(folder):
             yield
         finally:
             threading.excepthook = before
+
+
+def run_facts(state, seed, store, training, held_out):
+    """
+    Return what is known of a run, for run.json and the weights file.
+
+    :param state: checkpoints.TrainingState.
+    :param seed: of the run.
+    :param store: EpisodeStore; training, held_out: indices of its episodes.
+    :return: dict that JSON can hold.
+    """
+    device = device_name(next(state.network.parameters()).device)
+    return {
+        'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': seed,
+        'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
+        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device}',
+        'torch': torch.__version__, 'python': platform.python_version()}
 
 
 def describe_run(folder, **files):

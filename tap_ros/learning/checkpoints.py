@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from tap_ros.errors import ConfigError, WeightsError
-from tap_ros.prediction.weights import load_tensors, save_tensors
+from tap_ros.learning.weights import load_tensors, save_tensors
 from tap_ros.text import escaped
 import torch
 

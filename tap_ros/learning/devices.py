@@ -1,0 +1,56 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Where networks run, and in which precision."""
+
+from functools import partial
+
+from tap_ros.errors import ConfigError
+import torch
+
+
+def pick_device(name):
+    """
+    Choose the device to train on.
+
+    :param name: 'auto', 'cpu', 'cuda' or 'cuda:1'.
+    :return: torch device.
+    :raises ConfigError: if it is not there.
+    """
+    if name == 'auto':
+        return torch.device('cuda' if torch.cuda.is_available() else 'cpu')
+    try:
+        torch.empty(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f'device: {name!r} is not usable here ({error}); '
+                          "choose 'cpu' or 'auto'") from error
+    return torch.device(name)
+
+
+def make_autocast(precision, device):
+    """
+    Choose the precision to run networks in.
+
+    :param precision: 'float32', 'bfloat16', or 'auto': bfloat16 on a GPU and on CPUs that have
+        instructions for it; on others it is ten times slower than float32.
+    :param device: torch device.
+    :return: function that makes a context manager.
+    """
+    half = precision == 'bfloat16' or (precision == 'auto' and has_bfloat16(device))
+    return partial(torch.autocast, device.type, torch.bfloat16, enabled=half)
+
+
+def has_bfloat16(device):
+    """
+    Say whether a device multiplies bfloat16 itself; others emulate it many times slower.
+
+    :param device: torch device or its name.
+    :return: bool; of CPUs, those with AVX512_BF16.
+    """
+    if torch.device(device).type == 'cuda':
+        return True
+    return getattr(torch.cpu, '_is_avx512_bf16_supported', lambda: False)()
+
+
+def device_name(device):
+    """Say what computes: 'cpu', or the name of the GPU."""
+    return torch.cuda.get_device_name(device) if device.type == 'cuda' else device.type

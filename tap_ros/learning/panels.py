@@ -1,0 +1,15 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What networks say, as panels of a picture for people."""
+
+from tap_ros.images import to_uint8
+
+
+def grey_panels(maps):
+    """
+    Show numbers from 0 to 1 as grey.
+
+    :param maps: tensor (N, H, W).
+    :return: list of N uint8 (H, W, 3).
+    """
+    return list(to_uint8(maps[:, None].expand(-1, 3, -1, -1) * 2 - 1))

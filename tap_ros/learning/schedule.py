@@ -1,0 +1,20 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The learning rate over a training."""
+
+import math
+
+
+def learning_rate(step, steps, warmup, highest):
+    """
+    Compute a step's learning rate: a linear rise, then half a cosine down to 2 %.
+
+    :param step: from 0 on.
+    :param steps: length of the training.
+    :param warmup: steps of the rise.
+    :param highest: the rate after the rise.
+    :return: the rate.
+    """
+    rise = min(1.0, (step + 1) / (warmup + 1))
+    fall = 0.5 + 0.5 * math.cos(math.pi * step / steps)
+    return highest * rise * (0.02 + 0.98 * fall)
