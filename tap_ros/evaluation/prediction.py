@@ -28,7 +28,7 @@ from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
 from tap_ros.pictures import grid, overlay
-from tap_ros.prediction.batches import make_batch
+from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
@@ -125,8 +125,8 @@ def evaluate(network, store, episodes, margin=0, goal_picture='last', seed=0):
     parts = {method: [] for method in methods}
     for at in range(0, len(episodes), _BATCH):
         chosen = episodes[at:at + _BATCH]
-        batch = make_batch(store, chosen, margin, goal_picture=goal_picture,
-                           forward=forward).to(device)
+        batch = make_batch(store, chosen, Sampling(
+            margin, goal_picture=goal_picture, forward=forward)).to(device)
         context = to_float(batch.context)
         z = None
         if latent_size:
@@ -171,8 +171,8 @@ def write_pictures(path, network, store, episodes, goal_picture='last', scale=2)
     """
     from matplotlib.image import imsave
 
-    batch = make_batch(store, episodes, goal_picture=goal_picture,
-                       forward=network.config.num_context == 1)
+    batch = make_batch(store, episodes, Sampling(
+        goal_picture=goal_picture, forward=network.config.num_context == 1))
     context = to_float(batch.context).to(next(network.parameters()).device)
     with torch.inference_mode():
         prediction = network(context)

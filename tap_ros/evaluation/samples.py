@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from tap_ros.evaluation.bottleneck import context_pixels
 from tap_ros.images import to_float
-from tap_ros.prediction.batches import make_batch
+from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
 import torch
@@ -75,8 +75,9 @@ def score_samples(network, store, episodes, margin=0, goal_picture='last', count
     device = next(network.parameters()).device
     rows = []
     for i in episodes:
-        batch = make_batch(store, [i], margin, goal_picture=goal_picture,
-                           forward=network.config.num_context == 1).to(device)
+        batch = make_batch(store, [i], Sampling(
+            margin, goal_picture=goal_picture,
+            forward=network.config.num_context == 1)).to(device)
         z = draw_latents([i], count, network.config.latent_size, seed)[0].to(device)
         with torch.inference_mode():
             prediction = network(to_float(batch.context).expand(count, -1, -1, -1, -1), z)

@@ -47,6 +47,34 @@ class Batch:
                         for name, tensor in vars(self).items() if tensor is not None})
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """
+    What is taken from an episode.
+
+    :param margin: frames left out of the targets next to each context picture.
+    :param num_targets: at most so many targets, drawn at random without repetition; 0: all.
+    :param max_frames: longer episodes are cut to a random piece of this many; 0: never.
+    :param min_crop: cut episodes to a random piece of at least this share; 1: never.
+    :param goal_picture: 'last', 'recorded' or 'mixed', see uses_recorded_goal.
+    :param forward: whether the start picture is all of the context.
+    :param fraction: take only the frame at this share of the episode, 0 to 1, as fixed-time
+        prediction does; None: all.
+    :param num_others: with a fraction, so many random other targets after that one.
+    :param video_frames: length of Batch.video; 0: none.
+    """
+
+    margin: int = 0
+    num_targets: int = 0
+    max_frames: int = 0
+    min_crop: float = 1.0
+    goal_picture: str = 'last'
+    forward: bool = False
+    fraction: float | None = None
+    num_others: int = 0
+    video_frames: int = 0
+
+
 def episode_order(num_episodes, batch_size, seed, step):
     """
     Say which episodes the batch of a step has: shuffled passes over all of them.
@@ -108,65 +136,69 @@ def fixed_time(fraction, end, first, last):
     return int(np.clip(int(fraction * end + 0.5), first, last))
 
 
-def make_batch(store, episodes, margin=0, num_targets=0, fraction=None, max_frames=0,
-               min_crop=1.0, goal_picture='last', forward=False, num_others=0, video_frames=0,
-               frames=None, rng=None):
+def make_batch(store, episodes, sampling=Sampling(), frames=None, rng=None):
     """
     Gather context pictures and targets.
 
     :param store: the EpisodeStore.
     :param episodes: indices of B episodes.
-    :param margin: frames left out next to each context picture.
-    :param num_targets: at most so many targets, drawn at random without repetition; 0: all.
-    :param fraction: take only the frame at this share of the episode, 0 to 1, as fixed-time
-        prediction does; None: all.
-    :param max_frames: longer episodes are cut to a random piece of this many; 0: never.
-    :param min_crop: cut episodes to a random piece of at least this share; 1: never.
-    :param goal_picture: see uses_recorded_goal.
-    :param forward: whether the start picture is all of the context.
-    :param num_others: with a fraction, so many random other targets after that one.
-    :param video_frames: length of Batch.video; 0: none.
-    :param frames: where the pictures come from, see frames.py; None: the store.
+    :param sampling: Sampling; by default all frames between the first and the last.
+    :param frames: where the pictures come from, see learning/frames.py; None: the store.
     :param rng: numpy Generator; needed only where something is drawn.
     :return: Batch.
     """
     rng = rng or np.random.default_rng(0)
-    rows = []
-    for i in episodes:
-        available = length = int(store.lengths[i])
-        if min_crop < 1:
-            length = max(3, round(length * rng.uniform(min_crop, 1)))
-        if max_frames:
-            length = min(length, max_frames)
-        start = rng.integers(available - length + 1) if length < available else 0
-        end = length - 1
-        first, last = target_times(end, margin, forward)
-        times = np.arange(first, last + 1)
-        if fraction is not None:
-            fixed = fixed_time(fraction, end, first, last)
-            others = rng.permutation(times[times != fixed])[:num_others]
-            times = np.append(fixed, others if len(others) or not num_others else fixed)
-        elif num_targets and len(times) > num_targets:
-            times = np.sort(rng.choice(times, num_targets, replace=False))
-        goal = start + end
-        if (goal_picture != 'last' and uses_recorded_goal(store[i], goal_picture, rng)
-                and start + length == available):
-            goal = GOAL
-        context = [start] if forward else [start, goal]
-        video = start + np.rint(np.linspace(0, end, video_frames)).astype(int)
-        video[video == start + end] = goal
-        rows.append((context, video, start, times, first, last, end))
-    B, T = len(rows), max(len(row[3]) for row in rows)
+    rows = [_choose(store, i, sampling, rng) for i in episodes]
+    B, T = len(rows), max(len(row.times) for row in rows)
     times, shown = np.zeros((B, T), np.int64), np.zeros((B, T), np.int64)
     valid = np.zeros((B, T), bool)
-    for b, (_, _, start, at, *_) in enumerate(rows):
-        times[b, :len(at)], valid[b, :len(at)] = at, True
-        shown[b] = start + times[b]
-    bounds = np.array([row[4:] for row in rows], np.int64)[:, :, None]  # B, 3, 1
-    context, video = (np.array([row[k] for row in rows]) for k in (0, 1))
+    for b, row in enumerate(rows):
+        n = len(row.times)
+        times[b, :n], valid[b, :n] = row.times, True
+        shown[b] = row.start + times[b]
+    context, video, bounds = (np.array([getattr(row, name) for row in rows])
+                              for name in ('context', 'video', 'bounds'))
     frames = frames or MappedFrames(store)
     return Batch(
-        frames(episodes, context), frames(episodes, shown),
-        *(torch.from_numpy(array) for array in (
-            times, bounds[:, 0], bounds[:, 1], bounds[:, 2], valid)),
-        frames(episodes, video) if video_frames else None)
+        frames(episodes, context), frames(episodes, shown), torch.from_numpy(times),
+        *torch.from_numpy(bounds).split(1, dim=1), torch.from_numpy(valid),
+        frames(episodes, video) if sampling.video_frames else None)
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What is taken from one episode: frame numbers, and times from `start` on."""
+
+    start: int
+    context: list  # frame numbers, or GOAL
+    video: np.ndarray  # the same
+    times: np.ndarray  # of the targets
+    bounds: tuple  # first and last time that a target could have, time of the goal
+
+
+def _choose(store, i, sampling, rng):
+    """Choose a piece of episode i, and its targets."""
+    available = length = int(store.lengths[i])
+    if sampling.min_crop < 1:
+        length = max(3, round(length * rng.uniform(sampling.min_crop, 1)))
+    if sampling.max_frames:
+        length = min(length, sampling.max_frames)
+    start = rng.integers(available - length + 1) if length < available else 0
+    end = length - 1
+    first, last = target_times(end, sampling.margin, sampling.forward)
+    times = np.arange(first, last + 1)
+    if sampling.fraction is not None:
+        fixed = fixed_time(sampling.fraction, end, first, last)
+        others = rng.permutation(times[times != fixed])[:sampling.num_others]
+        times = np.append(fixed, others if len(others) or not sampling.num_others else fixed)
+    elif sampling.num_targets and len(times) > sampling.num_targets:
+        times = np.sort(rng.choice(times, sampling.num_targets, replace=False))
+    goal = start + end
+    if (sampling.goal_picture != 'last'
+            and uses_recorded_goal(store[i], sampling.goal_picture, rng)
+            and start + length == available):
+        goal = GOAL
+    context = [start] if sampling.forward else [start, goal]
+    video = start + np.rint(np.linspace(0, end, sampling.video_frames)).astype(int)
+    video[video == start + end] = goal
+    return _Row(start, context, video, times, (first, last, end))

@@ -20,7 +20,7 @@ from tap_ros.learning.schedule import learning_rate
 from tap_ros.learning.split import split_episodes
 from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.augmentation import Augmentation
-from tap_ros.prediction.batches import episode_order, make_batch
+from tap_ros.prediction.batches import episode_order, make_batch, Sampling
 from tap_ros.prediction.discriminator import Discriminator
 from tap_ros.prediction.held_out import held_out_scores, matched
 from tap_ros.prediction.networks import Predictor, PredictorConfig
@@ -207,16 +207,15 @@ def _single_frames(store, frames, episodes, config, step):
 def _batches(store, frames, episodes, config, first, last):
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
     whole = config.chosen.vae and config.posterior == 'video'
-    video_frames = config.video_frames if whole else 0
+    sampling = Sampling(
+        config.margin, config.num_targets, config.max_frames, config.min_crop,
+        config.goal_picture, config.forward, config.chosen.fraction, int(config.chosen.gan),
+        config.video_frames if whole else 0)
 
     def make(step):
         rng = np.random.default_rng([config.seed, 2, step])
         chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
-        batch = make_batch(
-            store, chosen, config.margin, config.num_targets, config.chosen.fraction,
-            config.max_frames, config.min_crop, config.goal_picture, config.forward,
-            num_others=int(config.chosen.gan), video_frames=video_frames, frames=frames,
-            rng=rng)
+        batch = make_batch(store, chosen, sampling, frames, rng)
         return step, batch, Augmentation.draw(
             len(chosen), config.flip, config.colour, config.brightness, rng)
 
@@ -245,11 +244,12 @@ def _report(state, curves, config, store, frames, training, held_out, autocast):
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
     device = next(state.average.parameters()).device
 
+    sampling = Sampling(
+        config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
+        forward=config.forward, fraction=config.chosen.fraction)
+
     def batch(episodes):
-        goal_picture = 'recorded' if config.goal_picture == 'recorded' else 'last'
-        return make_batch(store, episodes, config.margin, fraction=config.chosen.fraction,
-                          goal_picture=goal_picture, forward=config.forward,
-                          frames=frames).to(device)
+        return make_batch(store, episodes, sampling, frames).to(device)
 
     scores = {}
     if len(held_out):

@@ -20,7 +20,7 @@ from tap_ros.evaluation.prediction import add_arguments, evaluate, run, write_pi
 from tap_ros.evaluation.samples import draw_latents, score_samples
 from tap_ros.images import to_float
 from tap_ros.learning.weights import save_weights
-from tap_ros.prediction.batches import fixed_time, make_batch
+from tap_ros.prediction.batches import fixed_time, make_batch, Sampling
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.recording.episode import Episode
@@ -115,7 +115,7 @@ def test_with_three_objects_one_or_two_may_have_moved_but_not_none_or_all():
 
 def test_true_frames_are_scored_at_the_frame_that_fixed_time_prediction_has():
     for fraction in (0.0, 0.25, 0.5, 0.75, 1.0):
-        batch = make_batch(EPISODES, [0, 1, 2], fraction=fraction)
+        batch = make_batch(EPISODES, [0, 1, 2], Sampling(fraction=fraction))
         frames = [fixed_time(fraction, 8, 1, 7) for _ in EPISODES]
         assert frames == batch.times[:, 0].tolist()
     at = {share: target_bottlenecks(EPISODES, share, 'last') for share in (0.25, 0.5, 0.75)}

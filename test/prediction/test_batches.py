@@ -11,6 +11,7 @@ from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import (
     episode_order,
     make_batch,
+    Sampling,
     target_times,
     uses_recorded_goal,
 )
@@ -49,7 +50,7 @@ def test_forward_targets_are_all_later_frames(end, margin, expected):
 
 
 def test_forward_context_is_the_start_alone(store):
-    batch = make_batch(store, [0, 3], forward=True)
+    batch = make_batch(store, [0, 3], Sampling(forward=True))
     for b, i in enumerate([0, 3]):
         frames = store.frames(i)
         assert np.array_equal(batch.context[b], frames[:1])
@@ -57,14 +58,14 @@ def test_forward_context_is_the_start_alone(store):
 
 
 def test_few_targets_are_drawn_without_repetition(store):
-    batch = make_batch(store, [4] * 20, num_targets=3, rng=np.random.default_rng(0))
+    batch = make_batch(store, [4] * 20, Sampling(num_targets=3), rng=np.random.default_rng(0))
     assert batch.targets.shape[1] == 3
     assert (batch.times.diff(dim=1) > 0).all()
     assert len(batch.times.unique()) == len(store.frames(4)) - 2
 
 
 def test_middle_frame_alone_for_fixed_time(store):
-    batch = make_batch(store, [0, 1], fraction=0.5)
+    batch = make_batch(store, [0, 1], Sampling(fraction=0.5))
     assert batch.times.tolist() == [[3], [4]]
     assert np.array_equal(batch.targets[0, 0], store.frames(0)[3])
 
@@ -72,13 +73,14 @@ def test_middle_frame_alone_for_fixed_time(store):
 def test_fixed_time_is_a_share_of_the_episode(store):
     end = store.lengths[4] - 1
     for fraction, expected in ((0.01, 1), (0.25, int(0.25 * end + 0.5)), (1.0, end)):
-        batch = make_batch(store, [4], fraction=fraction, forward=True)
+        batch = make_batch(store, [4], Sampling(fraction=fraction, forward=True))
         assert batch.times.tolist() == [[expected]]
-    assert make_batch(store, [4], fraction=1.0).times.tolist() == [[end - 1]]
+    assert make_batch(store, [4], Sampling(fraction=1.0)).times.tolist() == [[end - 1]]
 
 
 def test_others_beside_the_fixed_frame_are_other_targets(store):
-    batch = make_batch(store, [4] * 30, fraction=0.5, num_others=1, rng=np.random.default_rng(0))
+    batch = make_batch(store, [4] * 30, Sampling(fraction=0.5, num_others=1),
+                       rng=np.random.default_rng(0))
     assert (batch.times[:, 0] == (store.lengths[4]) // 2).all()
     assert (batch.times[:, 1] != batch.times[:, 0]).all() and batch.valid.all()
     assert len(batch.times[:, 1].unique()) > 3
@@ -87,7 +89,7 @@ def test_others_beside_the_fixed_frame_are_other_targets(store):
 
 
 def test_the_video_is_the_whole_episode(store):
-    batch = make_batch(store, [0, 4], margin=2, num_targets=2, video_frames=7)
+    batch = make_batch(store, [0, 4], Sampling(margin=2, num_targets=2, video_frames=7))
     assert np.array_equal(batch.video[0], store.frames(0))  # 7 frames
     assert len(store.frames(4)) == 11
     assert np.array_equal(batch.video[1], store.frames(4)[[0, 2, 3, 5, 7, 8, 10]])
@@ -95,7 +97,7 @@ def test_the_video_is_the_whole_episode(store):
 
 def test_pieces_of_episodes_are_pieces(store):
     rng = np.random.default_rng(0)
-    batch = make_batch(store, [4] * 30, min_crop=0.4, max_frames=8, rng=rng)
+    batch = make_batch(store, [4] * 30, Sampling(min_crop=0.4, max_frames=8), rng=rng)
     frames = store.frames(4)
     assert batch.end.min() >= 2 and batch.end.max() <= 7
     for b in range(30):
@@ -119,7 +121,7 @@ def test_recorded_goals_stand_in_for_last_frames_where_they_were_reached(store):
     rng = np.random.default_rng(0)
     mixed = [uses_recorded_goal(reached, 'mixed', rng) for _ in range(200)]
     assert 70 < sum(mixed) < 130
-    batch = make_batch(store, [0], goal_picture='recorded')
+    batch = make_batch(store, [0], Sampling(goal_picture='recorded'))
     assert np.array_equal(batch.context[0, 1], reached.goal_frame)
 
 
@@ -162,7 +164,7 @@ def test_resident_frames_are_the_mapped_ones(store):
         settings = {'goal_picture': 'mixed', 'video_frames': 12, 'min_crop': 0.5,
                     'forward': forward}
         mapped, gathered = (
-            make_batch(store, range(12), frames=frames, rng=np.random.default_rng(1), **settings)
+            make_batch(store, range(12), Sampling(**settings), frames, np.random.default_rng(1))
             for frames in (None, resident))
         for name, values in vars(mapped).items():
             assert values.equal(getattr(gathered, name)), name

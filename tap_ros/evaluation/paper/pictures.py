@@ -22,7 +22,7 @@ from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
 from tap_ros.pictures import GAP, grid, png_bytes
-from tap_ros.prediction.batches import make_batch
+from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.warp import warp
@@ -157,7 +157,8 @@ def _inputs(batch):
 
 
 def _gather(store, episodes, mode, goal_picture):
-    batch = make_batch(store, episodes, goal_picture=goal_picture, forward=mode == 'forward')
+    batch = make_batch(store, episodes, Sampling(
+        goal_picture=goal_picture, forward=mode == 'forward'))
     return batch, to_float(batch.context)
 
 
