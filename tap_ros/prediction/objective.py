@@ -102,7 +102,7 @@ def predictor_loss(networks, batch, augmentation, config, draws=None,
     :param networks: Networks.
     :param batch: batches.Batch.
     :param augmentation: Augmentation, or None.
-    :param config: TrainingConfig.
+    :param config: ObjectiveSettings.
     :param draws: Draws; needed with GAN or VAE.
     :param autocast: makes the context manager to run the networks in.
     :param selection: function as selection.selection_errors: any preference.

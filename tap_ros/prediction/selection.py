@@ -26,7 +26,7 @@ def time_preference(batch, config):
     Compute w(t) for the configured method: linear in forward prediction, else a bell.
 
     :param batch: batches.Batch.
-    :param config: TrainingConfig.
+    :param config: ObjectiveSettings.
     :return: (B, T).
     """
     if config.forward:
@@ -44,7 +44,7 @@ def selection_errors(error, copy_error, batch, config):
     :param copy_error: function without arguments that returns (B, C, T), the errors of the context
         pictures against each target.
     :param batch: batches.Batch.
-    :param config: TrainingConfig.
+    :param config: ObjectiveSettings.
     :return: (B, T).
     """
     if config.chosen.loss == 'min':
@@ -64,7 +64,7 @@ class Targets:
 
     :param batch: batches.Batch.
     :param augmentation: Augmentation of all pictures that networks see, or None.
-    :param config: TrainingConfig.
+    :param config: ObjectiveSettings.
     """
 
     def __init__(self, batch, augmentation, config):
@@ -126,7 +126,7 @@ def outer_error(error, config):
     Raise errors to the configured power; not in the paper, see objective.predictor_loss.
 
     :param error: l1 errors on [0, 1].
-    :param config: TrainingConfig.
+    :param config: ObjectiveSettings.
     :return: the same shape.
     """
     power = config.outer_power

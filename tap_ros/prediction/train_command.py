@@ -10,6 +10,7 @@ from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import (
     GOAL_PICTURES,
+    PARTS,
     POSTERIORS,
     PRECISIONS,
     TrainingConfig,
@@ -55,6 +56,7 @@ def run(args):
 
 
 def _help(name):
-    """Find a field's line in the docstring of TrainingConfig, its one description."""
-    found = re.search(rf':param {name}: (.*?)(?=\n\s*:param|\Z)', TrainingConfig.__doc__, re.S)
+    """Find a field's line in the docstring of its part of TrainingConfig, its one description."""
+    described = '\n'.join(part.__doc__ for part in PARTS)
+    found = re.search(rf':param {name}: (.*?)(?=\n\s*:param|\n\s*\n|\n\s*\Z)', described, re.S)
     return ' '.join(found[1].split()).replace('%', '%%')

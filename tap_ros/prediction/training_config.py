@@ -1,6 +1,11 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a training run of the predictor."""
+"""
+The settings of a training run of the predictor, in parts.
+
+A TrainingConfig has the fields of all parts: options on the command line and settings in files are
+one flat list.
+"""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -15,52 +20,12 @@ PRECISIONS = ('auto', 'float32', 'bfloat16')
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
+class RunSettings:
     """
-    All that a training run is made from.
+    Where a run happens and what it leaves.
 
     :param recordings: .mcap files, bag folders, or folders of these.
     :param out: the run's folder; if it holds a checkpoint, training goes on from there.
-    :param mode: 'bidirectional', from start and goal, or 'forward', from the start alone.
-    :param method: 'fix' (Eq. 1), 'min' (Eq. 2) or 'genmin' (Eq. 5), as the paper names them: with
-        l1 and GAN; fix0.25 with its target at a quarter of the episode, genmin2 with beta = 2
-        (forward); -wo-gan is l1 alone, -vae adds z (Eq. 9), -vae-gan both (Eq. 10). +relative
-        selects by the error relative to copying, +reach by the cost of reaching (losses.py).
-    :param bell_edge: w at both ends of the targets; 2/3 in the paper.
-    :param margin: frames left out of the targets next to each context picture.
-    :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
-    :param changed_weight: how much more pixels of the target weigh in the outer error that differ
-        from every input; 0 in the paper, see losses.weighted_l1_error.
-    :param num_targets: at most so many random targets an episode and step; 0: all of them.
-    :param max_frames: longer episodes are cut to a random piece of this length; 0: never.
-    :param min_crop: cut episodes to a random piece of at least this share; 1: never.
-    :param goal_picture: the goal picture is the episode's 'last' frame; the 'recorded' goal
-        where the episode reached it; or 'mixed', one or the other at random.
-    :param recursion: levels of Eq. 3; 1: none. The GAN's and the VAE's terms stand at the first.
-    :param initial_weights: begin with these instead of fresh ones: a file, or the name of shipped
-        weights; to learn another task from few episodes. The network must have the same shape.
-    :param pretrain_steps: steps of training the decoders as a frame generator first, at a rate of
-        1e-4 (appendix C).
-    :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
-    :param kl_weight: of the KL divergence beside it.
-    :param latent_size: length of z, for the methods that have it.
-    :param video_frames: the recognition network sees the video at so many moments; the paper: all.
-    :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
-        B, slow: choose a small num_targets).
-    :param new_pixels: whether the network may paint; object maps are best without.
-    :param base_width: the network's width; 32 in the paper.
-    :param flow_scale: see PredictorConfig.
-    :param steps: length of the training, and of the cosine schedule of the learning rate.
-    :param batch_size: 64 in the paper.
-    :param learning_rate: at the start; Adam (beta1 is 0.5 with a GAN, else 0.9). 1e-4 in the
-        paper, for 200 epochs.
-    :param discriminator_rate: the discriminators' learning rate at the start.
-    :param warmup: steps over which the learning rate rises.
-    :param gradient_clip: largest norm of the gradient; 0: any.
-    :param average_decay: of the exponential moving average that is shipped; 0: none.
-    :param flip: mirror half of the episodes.
-    :param colour: permute the colour channels of each episode.
-    :param brightness: change each channel's brightness by up to this share.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, batches and augmentation.
     :param device: 'auto', 'cpu', 'cuda'.
@@ -73,37 +38,6 @@ class TrainingConfig:
 
     recordings: tuple[str, ...]
     out: str
-    mode: str = 'bidirectional'
-    method: str = 'genmin-wo-gan+relative'
-    bell_edge: float = 2 / 3
-    margin: int = 3
-    outer_power: float = 0.5
-    changed_weight: float = 0.0
-    num_targets: int = 0
-    max_frames: int = 0
-    min_crop: float = 1.0
-    goal_picture: str = 'mixed'
-    recursion: int = 1
-    initial_weights: str = ''
-    pretrain_steps: int = 0
-    gan_weight: float = 5e-5
-    kl_weight: float = 1e-4
-    latent_size: int = 32
-    video_frames: int = 16
-    posterior: str = 'video'
-    new_pixels: bool = False
-    base_width: int = 16
-    flow_scale: float = 16.0
-    steps: int = 5000
-    batch_size: int = 32
-    learning_rate: float = 1e-3
-    discriminator_rate: float = 2e-4
-    warmup: int = 100
-    gradient_clip: float = 1.0
-    average_decay: float = 0.999
-    flip: bool = True
-    colour: bool = True
-    brightness: float = 0.2
     test_fraction: float = TEST_FRACTION
     seed: int = 0
     device: str = 'auto'
@@ -114,37 +48,52 @@ class TrainingConfig:
     save_every: int = 500
 
     def __post_init__(self):
-        """Refuse settings that cannot be trained with."""
+        """Refuse settings that cannot be run with."""
         if not self.recordings:
             raise ConfigError('recordings: expected at least one .mcap file or bag folder')
-        for name, choices in (('mode', MODES), ('goal_picture', GOAL_PICTURES),
-                              ('posterior', POSTERIORS), ('precision', PRECISIONS)):
-            if getattr(self, name) not in choices:
-                raise ConfigError(f'{name}: expected one of {", ".join(choices)}, '
-                                  f'got {getattr(self, name)!r}')
-        if self.initial_weights and self.pretrain_steps:
-            raise ConfigError('initial_weights: they have decoders already; expected '
-                              f'pretrain_steps 0, got {self.pretrain_steps}')
-        self._check_method()
-        for name in ('steps', 'batch_size', 'base_width', 'log_every', 'save_every',
-                     'latent_size', 'recursion', 'video_frames'):
-            if getattr(self, name) < 1:
-                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
-        for name in ('margin', 'num_targets', 'max_frames', 'warmup', 'threads',
-                     'pretrain_steps', 'gan_weight', 'kl_weight', 'changed_weight'):
-            if getattr(self, name) < 0:
-                raise ConfigError(f'{name}: expected 0 or more, got {getattr(self, name)}')
-        if 0 < self.max_frames < 3:
-            raise ConfigError(f'max_frames: expected 0 or at least 3, got {self.max_frames}')
-        for name, low, high in (('bell_edge', 1e-6, 1), ('outer_power', 0.1, 1),
-                                ('min_crop', 1e-6, 1),
-                                ('test_fraction', 0, 0.9), ('brightness', 0, 0.9),
-                                ('average_decay', 0, 0.99999)):
-            if not low <= getattr(self, name) <= high:
-                raise ConfigError(f'{name}: expected {low}..{high}, got {getattr(self, name)}')
+        _check_choice(self, precision=PRECISIONS)
+        _check_least(self, 1, 'log_every', 'save_every')
+        _check_least(self, 0, 'threads')
+        _check_range(self, test_fraction=(0, 0.9))
 
-    def _check_method(self):
-        """Refuse methods that are unknown or do not go with the other settings."""
+
+@dataclass(frozen=True)
+class ObjectiveSettings:
+    """
+    What the loss of a batch is.
+
+    :param mode: 'bidirectional', from start and goal, or 'forward', from the start alone.
+    :param method: 'fix' (Eq. 1), 'min' (Eq. 2) or 'genmin' (Eq. 5), as the paper names them: with
+        l1 and GAN; fix0.25 with its target at a quarter of the episode, genmin2 with beta = 2
+        (forward); -wo-gan is l1 alone, -vae adds z (Eq. 9), -vae-gan both (Eq. 10). +relative
+        selects by the error relative to copying, +reach by the cost of reaching (losses.py).
+    :param bell_edge: w at both ends of the targets; 2/3 in the paper.
+    :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
+    :param changed_weight: how much more pixels of the target weigh in the outer error that differ
+        from every input; 0 in the paper, see losses.weighted_l1_error.
+    :param recursion: levels of Eq. 3; 1: none. The GAN's and the VAE's terms stand at the first.
+    :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
+    :param kl_weight: of the KL divergence beside it.
+    :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
+        B, slow: choose a small num_targets).
+    """
+
+    mode: str = 'bidirectional'
+    method: str = 'genmin-wo-gan+relative'
+    bell_edge: float = 2 / 3
+    outer_power: float = 0.5
+    changed_weight: float = 0.0
+    recursion: int = 1
+    gan_weight: float = 5e-5
+    kl_weight: float = 1e-4
+    posterior: str = 'video'
+
+    def __post_init__(self):
+        """Refuse a loss that there is not."""
+        _check_choice(self, mode=MODES, posterior=POSTERIORS)
+        _check_least(self, 1, 'recursion')
+        _check_least(self, 0, 'changed_weight', 'gan_weight', 'kl_weight')
+        _check_range(self, bell_edge=(1e-6, 1), outer_power=(0.1, 1))
         method = self.chosen
         if method.beta is not None and not self.forward:
             raise ConfigError(f'method: {method.name} has the linear preference of forward '
@@ -168,4 +117,137 @@ class TrainingConfig:
         return self.mode == 'forward'
 
 
+@dataclass(frozen=True)
+class DataSettings:
+    """
+    What is taken from the episodes, and how it is changed; see batches.Sampling.
+
+    :param margin: frames left out of the targets next to each context picture.
+    :param num_targets: at most so many random targets an episode and step; 0: all of them.
+    :param max_frames: longer episodes are cut to a random piece of this length; 0: never.
+    :param min_crop: cut episodes to a random piece of at least this share; 1: never.
+    :param goal_picture: the goal picture is the episode's 'last' frame; the 'recorded' goal
+        where the episode reached it; or 'mixed', one or the other at random.
+    :param flip: mirror half of the episodes.
+    :param colour: permute the colour channels of each episode.
+    :param brightness: change each channel's brightness by up to this share.
+    """
+
+    margin: int = 3
+    num_targets: int = 0
+    max_frames: int = 0
+    min_crop: float = 1.0
+    goal_picture: str = 'mixed'
+    flip: bool = True
+    colour: bool = True
+    brightness: float = 0.2
+
+    def __post_init__(self):
+        """Refuse what cannot be taken from episodes."""
+        _check_choice(self, goal_picture=GOAL_PICTURES)
+        _check_least(self, 0, 'margin', 'num_targets', 'max_frames')
+        if 0 < self.max_frames < 3:
+            raise ConfigError(f'max_frames: expected 0 or at least 3, got {self.max_frames}')
+        _check_range(self, min_crop=(1e-6, 1), brightness=(0, 0.9))
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """
+    Which networks are trained; see PredictorConfig.
+
+    :param new_pixels: whether the network may paint; object maps are best without.
+    :param base_width: the network's width; 32 in the paper.
+    :param flow_scale: see PredictorConfig.
+    :param latent_size: length of z, for the methods that have it.
+    :param video_frames: the recognition network sees the video at so many moments; the paper: all.
+    :param initial_weights: begin with these instead of fresh ones: a file, or the name of shipped
+        weights; to learn another task from few episodes. The network must have the same shape.
+    :param pretrain_steps: steps of training the decoders as a frame generator first, at a rate of
+        1e-4 (appendix C).
+    """
+
+    new_pixels: bool = False
+    base_width: int = 16
+    flow_scale: float = 16.0
+    latent_size: int = 32
+    video_frames: int = 16
+    initial_weights: str = ''
+    pretrain_steps: int = 0
+
+    def __post_init__(self):
+        """Refuse networks that there are not."""
+        if self.initial_weights and self.pretrain_steps:
+            raise ConfigError('initial_weights: they have decoders already; expected '
+                              f'pretrain_steps 0, got {self.pretrain_steps}')
+        _check_least(self, 1, 'base_width', 'latent_size', 'video_frames')
+        _check_least(self, 0, 'pretrain_steps')
+
+
+@dataclass(frozen=True)
+class OptimizerSettings:
+    """
+    How the weights are moved.
+
+    :param steps: length of the training, and of the cosine schedule of the learning rate.
+    :param batch_size: 64 in the paper.
+    :param learning_rate: at the start; Adam (beta1 is 0.5 with a GAN, else 0.9). 1e-4 in the
+        paper, for 200 epochs.
+    :param discriminator_rate: the discriminators' learning rate at the start.
+    :param warmup: steps over which the learning rate rises.
+    :param gradient_clip: largest norm of the gradient; 0: any.
+    :param average_decay: of the exponential moving average that is shipped; 0: none.
+    """
+
+    steps: int = 5000
+    batch_size: int = 32
+    learning_rate: float = 1e-3
+    discriminator_rate: float = 2e-4
+    warmup: int = 100
+    gradient_clip: float = 1.0
+    average_decay: float = 0.999
+
+    def __post_init__(self):
+        """Refuse what cannot be optimised with."""
+        _check_least(self, 1, 'steps', 'batch_size')
+        _check_least(self, 0, 'warmup')
+        _check_range(self, average_decay=(0, 0.99999))
+
+
+# Of the bases the last has its fields first.
+@dataclass(frozen=True)
+class TrainingConfig(
+        OptimizerSettings, NetworkSettings, DataSettings, ObjectiveSettings, RunSettings):
+    """All that a training run is made from: the fields of its parts."""
+
+    def __post_init__(self):
+        """Refuse settings that cannot be trained with."""
+        for part in PARTS:
+            part.__post_init__(self)
+
+
+PARTS = TrainingConfig.__bases__
 DEFAULTS = {field.name: field.default for field in fields(TrainingConfig)}
+
+
+def _check_choice(config, **choices):
+    """Refuse a field that is none of its choices."""
+    for name, valid in choices.items():
+        if getattr(config, name) not in valid:
+            raise ConfigError(f'{name}: expected one of {", ".join(valid)}, '
+                              f'got {getattr(config, name)!r}')
+
+
+def _check_least(config, least, *names):
+    """Refuse fields that are less than they can be."""
+    for name in names:
+        if getattr(config, name) < least:
+            wanted = 'at least 1' if least else '0 or more'
+            raise ConfigError(f'{name}: expected {wanted}, got {getattr(config, name)}')
+
+
+def _check_range(config, **ranges):
+    """Refuse fields outside their range."""
+    for name, (low, high) in ranges.items():
+        if not low <= getattr(config, name) <= high:
+            raise ConfigError(f'{name}: expected {low}..{high}, got {getattr(config, name)}')

@@ -24,10 +24,10 @@ from tap_ros.prediction.objective import (
     predictor_loss,
 )
 from tap_ros.prediction.selection import selection_errors
-from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
-CONFIG = TrainingConfig(recordings=('bag',), out='out', outer_power=1.0)
+CONFIG = ObjectiveSettings(outer_power=1.0)
 
 
 class Showing(torch.nn.Module):
