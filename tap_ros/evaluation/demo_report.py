@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One self-contained HTML page about a few scenes, each pushed directly and by a subgoal."""
+"""One self-contained HTML page about a few scenes, each pushed directly and via a subgoal."""
 
 import base64
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from tap_ros.files import write_atomically
 from tap_ros.pictures import enlarge, film_strip, grid, overlay, png_bytes
 
 SCALE = 4
-MODE_NAMES = {'direct': 'straight to the goal', 'subgoal': 'by the subgoal'}
+MODE_NAMES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
 MODE_COLOURS = {'direct': '#648fff', 'subgoal': '#dc267f'}
 
 
@@ -76,7 +76,7 @@ def write_report(path, scenes, note=''):
     body = ''.join(_scene_section(scene) for scene in scenes)
     page = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>tap_ros: pushed by way of a predicted subgoal</title>
+<title>tap_ros: pushed via a predicted subgoal</title>
 <style>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 1120px; margin: 2rem auto;
   padding: 0 1rem; color: #222; background: #fff; }}
@@ -87,10 +87,10 @@ img {{ image-rendering: pixelated; display: block; max-width: 100%; }}
 img.smooth {{ image-rendering: auto; }}
 pre {{ background: #f4f4f6; padding: 1rem; overflow-x: auto; }}
 </style>
-<h1>Objects pushed to where a goal picture shows them, by way of a predicted subgoal</h1>
-<p>Each scene was pushed once straight towards its goal and once by the subgoal that
-<code>/predict_subgoal</code> answered: the picture of a moment on the way, with a probability map
-of where every object should then be. Doing nothing ends 20 cm from the goals.</p>
+<h1>Objects pushed to where a goal picture shows them, via a predicted subgoal</h1>
+<p>Each scene was pushed twice: directly, and via the subgoal that <code>/predict_subgoal</code>
+returned, a picture of a moment on the way with a probability map of where every object should then
+be. Doing nothing ends 20 cm from the goals.</p>
 <pre>{html.escape(results_table(scenes))}</pre>
 <p>{html.escape(note)}</p>
 {body}</html>

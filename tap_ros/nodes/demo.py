@@ -3,8 +3,8 @@
 """
 The demo: real nodes in processes of their own push objects to where a goal picture shows them.
 
-Each scene is pushed once straight to its goal and once by the subgoal that predict_subgoal
-answers. Everything goes through the topics, services and actions that any client would use.
+Each scene is pushed twice: directly, and via the subgoal that predict_subgoal answers. Everything
+goes through the topics, services and actions that any client would use.
 """
 
 from pathlib import Path
@@ -22,6 +22,7 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError, TapError
+from tap_ros.evaluation.demo_film import write_film
 from tap_ros.evaluation.demo_report import (
     results_table,
     Run,
@@ -262,6 +263,7 @@ def run(args):
     seconds = time.monotonic() - begin
     print(f'\n{results_table(scenes)}\n')
     write_overview(folder / 'subgoals.png', scenes)
+    write_film(folder / 'demo.gif', scenes)
     write_report(
         folder / 'report.html', scenes,
         f'Task {args.task}, seeds {args.seed} to {args.seed + args.scenes - 1}, at most '
@@ -269,6 +271,7 @@ def run(args):
         'distances, are ground truth of the simulator.')
     if not args.attach:
         print(f'recording  {folder / "recording"}')
+    print(f'film       {folder / "demo.gif"}')
     print(f'page       {folder / "report.html"}')
     return 0
 

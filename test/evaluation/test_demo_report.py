@@ -1,9 +1,11 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of the demo's page and table."""
+"""Laws of the demo's page, table and film."""
 
 import numpy as np
+from PIL import Image, ImageSequence
 import pytest
+from tap_ros.evaluation.demo_film import FRAMES_PER_S, GAP, HOLD, SCALE, write_film
 from tap_ros.evaluation.demo_report import results_table, Run, SceneRuns, write_report
 
 
@@ -36,3 +38,22 @@ def test_the_page_is_one_file_with_everything_inside(scenes, tmp_path):
     assert page.count('<h2>Scene') == 2
     assert page.count('data:image/png;base64,') == page.count('<img ')
     assert 'http' not in page and '<early>' not in page and '&lt;early&gt; &amp;' in page
+
+
+def test_the_film_shows_each_run_to_its_end_and_stops_there(scenes, tmp_path):
+    path, size = tmp_path / 'demo.gif', 16
+    greys = {'direct': (0, 60, 120, 180), 'subgoal': (240, 90)}  # one run is shorter
+    for scene in scenes:
+        for mode, run in scene.runs.items():
+            run.frames[:] = [np.full((size, size, 3), grey, np.uint8) for grey in greys[mode]]
+    write_film(path, scenes)
+    film, shown, seconds = Image.open(path), [], 0
+    for frame in ImageSequence.Iterator(film):
+        pixels = np.array(frame.convert('L'), int)[-GAP - 2]  # a row that no mark reaches
+        centres = [i * (size * SCALE + GAP) + GAP + size * SCALE // 2 for i in (2, 3)]
+        shown.append(tuple(pixels[centres]))
+        seconds += frame.info['duration'] / 1000
+    expected = [(0, 240), (60, 90), (120, 90), (180, 90)] * len(scenes)
+    assert np.abs(np.subtract(shown, expected)).max() <= 2
+    assert seconds == pytest.approx(len(scenes) * (4 + HOLD) / FRAMES_PER_S)
+    assert film.info['loop'] == 0  # for ever

@@ -1,0 +1,80 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the pages say can be run, followed and found."""
+
+import os
+from pathlib import Path
+import re
+import shlex
+import subprocess
+import sys
+
+import cv2
+import pytest
+from tap_ros.cli import build_parser
+
+ROOT = Path(__file__).parents[2]
+WRITTEN = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.md',
+           *sorted((ROOT / 'docs').glob('*.md'))]
+PAGES = [*WRITTEN, *sorted((ROOT / 'docs' / 'results').glob('*.md'))]
+SOURCES = [path for folder in ('tap_ros', 'sim_bridge', 'test', 'launch', 'scripts')
+           for path in sorted((ROOT / folder).rglob('*.py'))] + [ROOT / 'setup.py']
+COMMANDS = sorted({  # what is a pattern rather than a command has a | or ... in it
+    line.split('#')[0].strip() for page in WRITTEN
+    for line in re.findall(r'^python -m tap_ros (?!.*(?:\||\.\.\.)).*$', page.read_text(), re.M)})
+# `folder/file.py`, or `file.py: function, Class.method`
+REFERENCE = re.compile(r'`((?:[\w-]+/)*\w+\.py)(?:: ([\w., ]+))?`')
+
+
+def of(page):
+    """Return the name of a page for a test's id."""
+    return str(page.relative_to(ROOT))
+
+
+def anchors(page):
+    """Return the anchors that GitHub gives to the headings of a page."""
+    headings = re.findall(r'^#+ (.+)$', page.read_text(), re.M)
+    return {re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings}
+
+
+def test_the_readme_is_a_page():
+    assert len((ROOT / 'README.md').read_text().split()) <= 900
+
+
+def test_the_python_of_the_readme_runs_and_prints_what_it_says(tmp_path):
+    block, = re.findall(r'^```python\n(.*?)^```$', (ROOT / 'README.md').read_text(), re.M | re.S)
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
+    run = subprocess.run([sys.executable, '-c', block], cwd=tmp_path, capture_output=True,
+                         env=os.environ | {'PYTHONPATH': path}, text=True)
+    assert run.returncode == 0, run.stderr
+    said, = re.findall(r'print\(.*# (\[\[.*\]\])', block)
+    assert run.stdout.split() == said.split()
+    assert cv2.imread(str(tmp_path / 'subgoal.png')).shape == (256, 3 * 256 + 2 * 2, 3)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=of)
+def test_links_lead_somewhere(page):
+    for link in re.findall(r'\]\(([^)\s]+)\)', page.read_text()):
+        if re.match(r'\w+:', link):
+            continue
+        name, _, anchor = link.partition('#')
+        target = (page.parent / name) if name else page
+        assert target.exists(), f'{link} is not there'
+        assert not anchor or anchor in anchors(target), f'{link}: no such heading'
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_commands_have_the_options_that_they_are_shown_with(command):
+    words = shlex.split(command)[3:]
+    assert build_parser(words).parse_args(words).command == words[0]
+
+
+@pytest.mark.parametrize('page', WRITTEN, ids=of)
+def test_files_functions_and_tests_that_are_named_exist(page):
+    for name, inside in REFERENCE.findall(page.read_text()):
+        files = [path for path in SOURCES if f'/{of(path)}'.endswith(f'/{name}')]
+        assert files, f'{name} is not there'
+        for word in filter(None, re.split('[., ]+', inside)):
+            assert any(re.search(rf'\b(?:def|class) {word}\b|^{word} = ', path.read_text(), re.M)
+                       for path in files), f'{name} has no {word}'
