@@ -28,7 +28,7 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
         'planning': 'tap_ros.evaluation.planning.command',
         'faults': 'tap_ros.nodes.faults.command'}),
     'paper': ("make the paper's prediction results again", 'tap_ros.evaluation.paper.command'),
-    'demo': ('push objects by way of a subgoal, with real nodes', 'tap_ros.nodes.demo'),
+    'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo'),
     'bench': ('measure speed; without a name, all of it', {
         'collect': 'tap_ros.evaluation.bench_collect',
         'recording': 'tap_ros.evaluation.bench_recording',
