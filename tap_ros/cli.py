@@ -11,9 +11,10 @@ no simulator.
 import argparse
 import importlib
 import os
+from pathlib import Path
 import sys
 
-from tap_ros.errors import TapError
+from tap_ros.errors import ConfigError, TapError
 from tap_ros.text import escaped
 
 COMMANDS = {  # command: (one line of help, module or {what: module})
@@ -25,16 +26,16 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
     'evaluate': ('score trained weights', {
         'prediction': 'tap_ros.evaluation.prediction',
         'forward': 'tap_ros.evaluation.forward',
-        'planning': 'tap_ros.evaluation.planning.command',
-        'faults': 'tap_ros.nodes.faults.command'}),
-    'paper': ("make the paper's prediction results again", 'tap_ros.evaluation.paper.command'),
+        'planning': 'experiments.planning.command',
+        'faults': 'experiments.faults.nodes.command'}),
+    'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo'),
     'bench': ('measure speed; without a name, all of it', {
-        'collect': 'tap_ros.evaluation.bench_collect',
-        'recording': 'tap_ros.evaluation.bench_recording',
-        'training': 'tap_ros.evaluation.bench_training',
-        'planning': 'tap_ros.evaluation.bench_planning',
-        'service': 'tap_ros.nodes.bench_service'}),
+        'collect': 'experiments.bench.collect',
+        'recording': 'experiments.bench.recording',
+        'training': 'experiments.bench.training',
+        'planning': 'experiments.bench.planning',
+        'service': 'experiments.bench.nodes.service'}),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }
@@ -94,9 +95,21 @@ def build_parser(arguments):
 
 def _use(parser, module):
     """Give a parser the options and the work of a module."""
+    if module.startswith('experiments.'):
+        _find_experiments()
     module = importlib.import_module(module)
     module.add_arguments(parser)
     parser.set_defaults(run=module.run)
+
+
+def _find_experiments():
+    """Let experiments/ be imported, which is beside this package and not installed with it."""
+    checkout = Path(__file__).resolve().parents[1]
+    if not (checkout / 'experiments').is_dir():
+        raise ConfigError('this command is not installed with the package; run it in a checkout '
+                          'of its repository, after `make build`')
+    if str(checkout) not in sys.path:
+        sys.path.append(str(checkout))
 
 
 def _quiet(modules):

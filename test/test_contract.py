@@ -14,9 +14,9 @@ from sim_bridge.scene import HALF_HEIGHT
 from sim_bridge.simulator import clip_action, ramp_controls, Simulator
 from sim_bridge.tasks import nearest_first, TASKS
 from tap_ros import contract
-from tap_ros.evaluation.planning.scenes import PLANNING_TASKS
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import PRESETS
+from tap_ros.planning.scenes import PLANNING_TASKS
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 import torch

@@ -30,13 +30,13 @@ from tap_ros.evaluation.demo_report import (
     write_overview,
     write_report,
 )
-from tap_ros.evaluation.planning.scenes import FIRST_SCENE, PLANNING_TASKS
 from tap_ros.nodes.clients import call, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.image_messages import decode_image, decode_map
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds
+from tap_ros.planning.scenes import FIRST_SCENE, PLANNING_TASKS
 from tqdm import tqdm
 
 MODES = ('direct', 'subgoal')

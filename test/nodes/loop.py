@@ -7,6 +7,8 @@ import os
 import threading
 
 from action_msgs.msg import GoalStatus
+from experiments.planning.episode import run_episode
+from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from processes import Client, NodeProcess
@@ -20,8 +22,6 @@ from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
-from tap_ros.evaluation.planning.episode import run_episode
-from tap_ros.evaluation.planning.methods import parse_method
 from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 from tap_ros.planning.visual_mpc import VisualMPC

@@ -16,8 +16,9 @@ from tap_ros.cli import build_parser
 ROOT = Path(__file__).parents[2]
 WRITTEN = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.md',
            *sorted((ROOT / 'docs').glob('*.md'))]
-PAGES = [*WRITTEN, *sorted((ROOT / 'docs' / 'results').glob('*.md'))]
-SOURCES = [path for folder in ('tap_ros', 'sim_bridge', 'test', 'launch', 'scripts')
+PAGES = [*WRITTEN, *(page for page in sorted((ROOT / 'docs' / 'results').glob('*.md'))
+                     if not page.stem.endswith('findings'))]  # those are parts of pages
+SOURCES = [path for folder in ('tap_ros', 'sim_bridge', 'experiments', 'test', 'launch', 'scripts')
            for path in sorted((ROOT / folder).rglob('*.py'))] + [ROOT / 'setup.py']
 COMMANDS = sorted({  # what is a pattern rather than a command has a | or ... in it
     line.split('#')[0].strip() for page in WRITTEN

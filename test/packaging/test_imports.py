@@ -12,6 +12,7 @@ import sys
 import pytest
 
 ROOT = Path(__file__).parents[2]
+OWN = ('tap_ros', 'sim_bridge', 'experiments')
 
 # What takes seconds to import: what each node does without, so that it is back soon after a crash.
 DONE_WITHOUT = {
@@ -44,8 +45,8 @@ for name in sys.argv[1:]:
 
 
 def modules():
-    """Return {module name: path} of both packages."""
-    paths = [path for package in ('tap_ros', 'sim_bridge')
+    """Return {module name: path} of both packages and of the experiments."""
+    paths = [path for package in OWN
              for path in sorted((ROOT / package).rglob('*.py'))]
     names = ['.'.join(path.relative_to(ROOT).with_suffix('').parts) for path in paths]
     return {name.removesuffix('.__init__'): path for name, path in zip(names, paths, strict=True)}
@@ -83,7 +84,7 @@ def layer(name):
 
 
 def may_import_ros(name):
-    return name.endswith('_node') or name.startswith('tap_ros.nodes')
+    return name.endswith('_node') or 'nodes' in name.split('.')
 
 
 def test_every_folder_has_its_row_and_every_row_its_folder():
@@ -96,7 +97,7 @@ def test_every_folder_has_its_row_and_every_row_its_folder():
 @pytest.mark.parametrize('name', MODULES)
 def test_imports_come_only_from_above(name):
     own = [target for target in imported(MODULES[name])
-           if target.split('.')[0] in ('tap_ros', 'sim_bridge')]
+           if target.split('.')[0] in OWN]
     wrong = [target for target in own if layer(target) > layer(name)]
     assert not wrong, f'{name} imports from below itself: {wrong}'
 

@@ -48,7 +48,7 @@ def imported_packages(*folders):
                     found |= {alias.name.split('.')[0] for alias in node.names}
                 elif isinstance(node, ast.ImportFrom):
                     found.add(node.module.split('.')[0])
-    return found - set(sys.stdlib_module_names) - {'tap_ros', 'sim_bridge'}
+    return found - set(sys.stdlib_module_names) - {'tap_ros', 'sim_bridge', 'experiments'}
 
 
 def normalized(distribution):
@@ -122,7 +122,7 @@ def test_what_rosdep_brings_from_apt_comes_from_wheels_without_it():
 
 def test_nothing_is_required_that_nobody_imports():
     used = {'tensorboard'}  # by way of torch.utils.tensorboard
-    for name in imported_packages('tap_ros', 'sim_bridge', 'test'):
+    for name in imported_packages('tap_ros', 'sim_bridge', 'experiments', 'test'):
         used |= distributions_of(name)
     assert set(requirements('requirements.txt')) <= used
 

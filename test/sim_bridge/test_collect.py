@@ -9,13 +9,13 @@ import subprocess
 import sys
 import time
 
+from experiments.paper.places import is_collected
 import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.expert import run_episode
 from sim_bridge.simulator import Simulator
 from tap_ros.errors import ConfigError, StorageError
-from tap_ros.evaluation.paper.places import is_collected
 from tap_ros.files import only_writer
 from tap_ros.recording.reader import iter_episodes
 

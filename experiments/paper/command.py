@@ -1,0 +1,154 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m tap_ros paper`: make the paper's prediction results again."""
+
+from fnmatch import fnmatch
+
+from experiments.paper.places import Places
+from experiments.paper.runs import paper_runs, SCALES
+from experiments.paper.sweep import data_hashes, find_state, sweep
+import numpy as np
+from tap_ros.errors import ConfigError
+
+
+def add_arguments(parser):
+    """Add the options of the command to a parser."""
+    places = Places()
+    parser.add_argument('--scale', choices=list(SCALES), default='small',
+                        help='small: for two CPU cores; full: as in the paper, for a large GPU '
+                        '(default: %(default)s)')
+    parser.add_argument('--only', nargs='+', action='extend', metavar='PATTERN',
+                        help='only runs whose names fit, such as "grasp-forward-*"')
+    parser.add_argument('--list', action='store_true',
+                        help='show the runs, how far they are and their scores; do nothing')
+    parser.add_argument('--collect', action='store_true', help='make the recordings only')
+    parser.add_argument('--results-only', action='store_true',
+                        help='only write the page and its data from the runs that are done')
+    parser.add_argument('--ship', nargs=2, metavar=('RUN', 'FILE'),
+                        help='write the weights of a run that is done at half their size, with a '
+                        'model card beside them')
+    parser.add_argument('--jobs', type=int, default=1, metavar='N',
+                        help='processes at a time (default: %(default)s)')
+    parser.add_argument('--limit', '--slice-minutes', type=float, metavar='MINUTES',
+                        help='stop after so many; the next call goes on')
+    parser.add_argument('--seeds', type=int, nargs='+', default=[0], metavar='SEED',
+                        help='of the trainings (default: 0)')
+    parser.add_argument('--episodes', type=int, default=0, metavar='N',
+                        help="collect so many of each task instead of the scale's")
+    parser.add_argument('--steps', type=int, default=0, metavar='N',
+                        help="train for so many steps instead of the scale's")
+    parser.add_argument('--fresh', action='store_true',
+                        help='begin runs anew that were begun with other settings or recordings')
+    parser.add_argument('--recordings', default=places.recordings, metavar='FOLDER',
+                        help='holds a recording for each task (default: %(default)s)')
+    parser.add_argument('--runs', default=places.runs, metavar='FOLDER',
+                        help='for trainings and weights (default: %(default)s)')
+    parser.add_argument('--results', default=places.results, metavar='FOLDER',
+                        help='for the page and its data (default: %(default)s)')
+
+
+def run(args):
+    """
+    Do what the command line says.
+
+    :param args: parsed arguments, of a parser that add_arguments was called with.
+    :return: exit status: 0, or 1 if a run failed.
+    :raises ConfigError: if no run fits, or a number makes no sense.
+    """
+    if args.jobs < 1 or min(args.episodes, args.steps) < 0 or (args.limit or 1) <= 0:
+        raise ConfigError('jobs, limit, episodes, steps: expected numbers above 0')
+    places = Places(args.recordings, args.runs, args.results)
+    if args.results_only:
+        _write_results(places, pictures=True)
+        return 0
+    if args.ship:
+        return _ship(*args.ship, args, places)
+    runs = choose_runs(args)
+    if args.list:
+        show(runs, places)
+        return 0
+    ends = sweep(runs, places, args.jobs, args.limit, args.fresh, args.collect,
+                 on_done=lambda: _try_results(places, pictures=False))
+    failed = [end for end in ends if end.kind == 'failed']
+    if not args.collect:
+        _try_results(places, pictures=True)
+    hashes = data_hashes(runs, places)
+    states = [find_state(run, places, hashes) for run in runs]
+    print(f"{sum(state.kind == 'done' for state in states)} of {len(runs)} runs are done")
+    elsewhere = [run for run in runs if not hashes.keys() >= set(run.training_tasks)]
+    if elsewhere and not ends:
+        print(f'{len(elsewhere)} of them elsewhere: their scores are in {places.results}, their '
+              'recordings are not here. To make them again beside these: '
+              "make paper ARGS='--runs runs/again --results runs/again/results'")
+    for end in ends:
+        if end.kind == 'busy':
+            print(f'{end.name}: another sweep is at it')
+    for end in failed:
+        print(f'{end.name} failed: {end.reason} (see {end.log})')
+    if failed and any(state.kind == 'other' for state in states):
+        print('--fresh begins runs anew that were begun with other settings or recordings')
+    return 1 if failed else 0
+
+
+def _ship(name, file, args, places):
+    """Write weights and card of the run of this name."""
+    from experiments.paper.shipping import ship
+    runs = {run.name: run for run in paper_runs(
+        args.scale, args.seeds, args.episodes, args.steps)}
+    if name not in runs:
+        raise ConfigError(f'--ship {name}: there is no such run; --list shows all')
+    print(ship(runs[name], file, places))
+    return 0
+
+
+def choose_runs(args):
+    """
+    List the runs that are asked for.
+
+    :raises ConfigError: if a pattern fits none; the message names it.
+    """
+    runs = paper_runs(args.scale, args.seeds, args.episodes, args.steps)
+    if not args.only:
+        return runs
+    for pattern in args.only:
+        if not any(fnmatch(run.name, pattern) for run in runs):
+            raise ConfigError(f'--only {pattern}: no run has such a name; --list shows all')
+    return [run for run in runs if any(fnmatch(run.name, pattern) for pattern in args.only)]
+
+
+def show(runs, places):
+    """Print a line for each run: its state and scores."""
+    hashes = data_hashes(runs, places)
+    width = max(len(run.name) for run in runs)
+    print(f'{"run":{width}s}{"state":>16s}{"min l1":>9s}{"match (share)":>15s}{"2 px":>8s}')
+    for run in runs:
+        state = find_state(run, places, hashes)
+        text = {'partial': f'{state.steps}/{run.num_steps} steps',
+                'other': 'other settings'}.get(state.kind, state.kind)
+        print(f'{run.name:{width}s}{text:>16s}{_scores(state.result)}')
+
+
+def _scores(result):
+    """Write the scores of a run that is done: error, match, share of bottlenecks."""
+    if result is None:
+        return ''
+    scores = result['evaluation']['prediction']
+    placed = [x for x in scores['bottleneck'] if x is not None]
+    text = f'{np.mean(scores["min_l1"]):9.4f}{np.mean(scores["match_fraction"]):15.2f}'
+    return text + (f'{np.mean(np.array(placed) <= 2):8.0%}' if placed else '')
+
+
+def _write_results(places, pictures):
+    """Write the page and its data."""
+    from experiments.paper.results import write_results
+    write_results(places.results, runs=places.runs, recordings=places.recordings,
+                  pictures=pictures)
+
+
+def _try_results(places, pictures):
+    """Write the page, but let the runs go on if that fails."""
+    try:
+        _write_results(places, pictures)
+    except Exception as error:
+        print(f'{places.results}: the page could not be written: {error!r}; try again with '
+              '--results-only')

@@ -1,0 +1,297 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The plots: forward scatter (Fig. 4), gains over fix, bottleneck curve, match-steps."""
+
+import io
+
+from experiments.paper.published import (
+    BOTTLENECK_2PX,
+    FORWARD_GRASP,
+    GAINS,
+    TITLES,
+)
+from experiments.paper.rows import (
+    COPIES,
+    find,
+    lower_hull,
+    method_order,
+    variant_of,
+)
+from matplotlib.figure import Figure
+import numpy as np
+from tap_ros.contract import EPISODE_FRAMES
+from tap_ros.evaluation.bottleneck import THRESHOLDS
+
+# Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
+COLOURS = {'copy': '#8c8c8c', 'fix': '#0072b2', 'min': '#e69f00', 'genmin': '#d55e00',
+           'ours': '#009e73', 'vae': '#cc79a7'}
+_INK = '#333333'
+_WIDTH = 9.0  # inches
+
+
+def file_name(name, scale):
+    """
+    Name a picture of the results.
+
+    :param name: what it shows.
+    :param scale: the small one's pictures carry no mark.
+    """
+    return f'{name}.png' if scale == 'small' else f'{name}-{scale}.png'
+
+
+def family(method):
+    """
+    Say which family a method belongs to, a key of COLOURS.
+
+    :param method: its name; a form that is not in the paper ('+...') is of 'ours'.
+    """
+    if method in COPIES:
+        return 'copy'
+    if '+' in method:
+        return 'ours'
+    if '-vae' in method:
+        return 'vae'
+    return next(name for name in ('fix', 'min', 'genmin') if method.startswith(name))
+
+
+def _new_figure(height, columns, rows=1, **options):
+    figure = Figure(figsize=(_WIDTH, height), layout='constrained')
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    for axis in axes.flat:
+        for side in ('top', 'right'):
+            axis.spines[side].set_visible(False)
+        for side in ('left', 'bottom'):
+            axis.spines[side].set_color('#a0a0a0')
+        axis.tick_params(colors=_INK, labelsize=8, length=3)
+        axis.set_axisbelow(True)
+    return figure, axes
+
+
+def _png(figure):
+    """Return a figure as bytes that depend on nothing but what it shows."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format='png', dpi=110, metadata={'Software': None})
+    return stream.getvalue()
+
+
+def _spread(positions, gap):
+    """Move positions apart along a line until neighbours are `gap` apart; keeps the order."""
+    order = np.argsort(positions, kind='stable')
+    moved = np.array(positions, float)[order]
+    for _ in range(200):
+        short = gap - np.diff(moved)
+        if (short <= 1e-9).all():
+            break
+        push = np.where(short > 0, short / 2, 0)
+        moved[:-1] -= push
+        moved[1:] += push
+    result = np.empty_like(moved)
+    result[order] = moved
+    return result
+
+
+def forward_scatter(rows, task='grasp'):
+    """
+    Draw error against match-step in forward prediction, ours beside the authors' (Fig. 4).
+
+    :param rows: of one scale.
+    :param task: whose.
+    :return: bytes of a PNG, or None without such rows.
+    """
+    ours = {}  # a panel for each variant: errors are compared with fix of the same one
+    for row in rows:
+        if (row['metric'], row['task'], row['mode']) == ('min_l1', task, 'forward'):
+            if row['method'] in COPIES or not row['new_pixels']:
+                continue
+            step = find(rows, **{name: row[name] for name in (
+                'task', 'mode', 'method', 'new_pixels')}, metric='match_step')
+            if step:
+                variant = variant_of(row['method'])
+                ours.setdefault(variant, {})[row['method'].removesuffix(variant)] = (
+                    step['value'], row['value'], step, row)
+    if not ours:
+        return None
+    panels = [(f'ours {variant}'.strip(), ours[variant]) for variant in sorted(ours)]
+    if task == 'grasp':
+        panels.append(("the authors'", {
+            name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
+    figure, axes = _new_figure(3.9, len(panels))
+    for axis, (title, points) in zip(axes[0], panels):
+        _scatter(axis, points, EPISODE_FRAMES[task])
+        axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
+        axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
+    axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)
+    return _png(figure)
+
+
+def _scatter(axis, points, frames):
+    """Draw one panel: a point for each method, and the lower hull of the fixed-time ones."""
+    methods = sorted(points, key=method_order)
+    high = 1.18 * max(points[m][1] for m in methods)
+    fixed = [points[m][:2] for m in methods if family(m) == 'fix']
+    if fixed:
+        at = np.linspace(min(fixed)[0], max(fixed)[0], 200)
+        axis.plot(at, lower_hull(at, fixed), color=COLOURS['fix'], alpha=0.25, zorder=1)
+    for m in methods:
+        x, y, step, error = points[m]
+        colour = COLOURS[family(m)]
+        if step is not None:
+            axis.errorbar(
+                x, y, [[y - error['ci_low']], [error['ci_high'] - y]],
+                [[x - step['ci_low']], [step['ci_high'] - x]],
+                color=colour, elinewidth=0.8, alpha=0.5, zorder=2)
+        axis.plot(x, y, 's' if family(m) == 'fix' else 'o', color=colour, markersize=6,
+                  markeredgecolor='white', markeredgewidth=0.6, zorder=3)
+    heights = _spread([points[m][1] for m in methods], 0.05 * high)
+    for m, height in zip(methods, heights):  # in a column: beside the points they would overlap
+        axis.annotate(
+            m, points[m][:2], (1.06 * frames, height), fontsize=8, color=COLOURS[family(m)],
+            va='center', annotation_clip=False, arrowprops={
+                'arrowstyle': '-', 'color': COLOURS[family(m)], 'alpha': 0.35, 'linewidth': 0.7,
+                'shrinkA': 1, 'shrinkB': 4})
+    axis.set_xlim(0, frames)
+    axis.set_ylim(0, high)
+    axis.grid(color='#f0f0f0')
+
+
+def bottleneck_curve(rows, task='push2', new_pixels=False):
+    """
+    Draw the bottleneck frequency over the threshold, copying beside it (appendix E).
+
+    On the left as in the paper, on the right without predictions that leave out an object.
+
+    :param rows: of one scale.
+    :param task: whose.
+    :param new_pixels: which variant; the paper's curve is of the one without.
+    :return: bytes of a PNG, or None without such rows.
+    """
+    methods = sorted({row['method'] for row in rows if row['mode'] == 'bidirectional' and (
+        row['metric'], row['task']) == ('bottleneck_frequency_0px', task)
+        and row.get('new_pixels', new_pixels) == new_pixels}, key=method_order)
+    if not set(methods) - set(COPIES):
+        return None
+    figure, axes = _new_figure(4.2, 2, sharey=True)
+    styles = _line_styles(methods)
+    for axis, prefix, title in zip(axes[0], ('', 'visible_'), (
+            ': bottleneck frequency', ', no object left out')):
+        ends = {}
+        for method in methods:
+            points = [find(rows, task=task, mode='bidirectional', method=method,
+                           new_pixels=new_pixels,
+                           metric=f'{prefix}bottleneck_frequency_{threshold}px')
+                      for threshold in THRESHOLDS]
+            value, low, high = (np.array([100 * p[name] for p in points])
+                                for name in ('value', 'ci_low', 'ci_high'))
+            colour = COLOURS[family(method)]
+            axis.fill_between(THRESHOLDS, low, high, color=colour, alpha=0.10, linewidth=0)
+            axis.plot(THRESHOLDS, value, linestyle=styles[method], color=colour, linewidth=1.8)
+            ends[method] = value[-1]
+        axis.set(xlim=(0, 10), ylim=(0, 100), xticks=THRESHOLDS)
+        axis.grid(axis='y', color='#f0f0f0')
+        axis.set_xlabel('sum over both objects of the expected distance, px', fontsize=9,
+                        color=_INK)
+        axis.set_title(TITLES[task] + title, fontsize=10, loc='left', color=_INK)
+    axes[0, 0].set_ylabel('predictions within so many pixels, %', fontsize=9, color=_INK)
+    for method, share in BOTTLENECK_2PX.items() if task == 'push2' else ():
+        axes[0, 0].plot(2, 100 * share, 'D', color=COLOURS[method], markersize=6,
+                        markerfacecolor='white', markeredgewidth=1.4, clip_on=False, zorder=4)
+        axes[0, 0].annotate(
+            f"the paper's {method}", (2, 100 * share), (7, 1), textcoords='offset points',
+            ha='left', va='top' if share else 'bottom', fontsize=8, color=COLOURS[method],
+            zorder=5, bbox={'color': 'white', 'alpha': 0.75, 'pad': 0.5})
+    for method, y in zip(ends, _spread(list(ends.values()), 4.5)):
+        colour = COLOURS[family(method)]
+        axis.plot([10.15, 10.7], [y, y], linestyle=styles[method], color=colour, linewidth=1.8,
+                  clip_on=False)
+        axis.annotate(method, (10.9, y), fontsize=8.5, color=colour, va='center',
+                      annotation_clip=False)
+    return _png(figure)
+
+
+def _line_styles(methods):
+    """Tell methods of one family apart by the line: method -> style."""
+    styles, used = {}, {}
+    for method in sorted(methods, key=method_order):
+        number = used[family(method)] = used.get(family(method), -1) + 1
+        order = ('--', ':') if family(method) == 'copy' else (
+            '-', '--', '-.', ':', (0, (6, 1, 1, 1, 1, 1)))
+        styles[method] = order[number % len(order)]
+    return styles
+
+
+def gains(rows):
+    """
+    Draw how far each method's error is below fix's, with the paper's gains of genmin.
+
+    Dots compare with fix, squares with fixed-time prediction at the same match-step.
+
+    :param rows: of one scale.
+    :return: bytes of a PNG, or None without such rows.
+    """
+    markers = {'gain_over_fix': 'o', 'gain_over_fix_at_match_step': 's'}
+    chosen = [row for row in rows if row['metric'] in markers
+              and row['mode'] == 'bidirectional' and row.get('new_pixels', True)]
+    if not chosen:
+        return None
+    tasks = [task for task in TITLES if any(row['task'] == task for row in chosen)]
+    methods = sorted({row['method'] for row in chosen}, key=method_order)
+    figure, axes = _new_figure(1.3 + 0.27 * len(methods), len(tasks), sharey=True)
+    for axis, task in zip(axes[0], tasks):
+        axis.axvline(0, color='#a0a0a0', linewidth=1)
+        for y, method in enumerate(methods):
+            for shift, (metric, marker) in zip((-0.16, 0.16), markers.items()):
+                row = find(chosen, task=task, method=method, metric=metric)
+                if row is None:
+                    continue
+                value, low, high = (100 * row[name] for name in ('value', 'ci_low', 'ci_high'))
+                colour = COLOURS[family(method)]
+                axis.plot([low, high], [y + shift] * 2, color=colour, linewidth=2.2, alpha=0.45)
+                axis.plot(value, y + shift, marker, color=colour, markersize=5.5,
+                          markeredgecolor='white')
+        if task in GAINS and 'genmin' in methods:
+            axis.plot(100 * GAINS[task], methods.index('genmin'), 'D', color=COLOURS['genmin'],
+                      markerfacecolor='none', markersize=7, markeredgewidth=1.3)
+        axis.set_title(TITLES[task], fontsize=10, loc='left', color=_INK)
+        axis.set_yticks(range(len(methods)), methods)
+        axis.set_ylim(len(methods) - 0.4, -0.6)
+        axis.set_xlabel('error below fix, %', fontsize=9, color=_INK)
+        axis.grid(color='#f0f0f0')
+    for label, method in zip(axes[0, 0].get_yticklabels(), methods):
+        label.set_color(COLOURS[family(method)])
+    return _png(figure)
+
+
+def match_histograms(groups):
+    """
+    Draw at which share of the episode the matches of each method lie, a row for each task.
+
+    A predictor that copies an input matches a frame beside it.
+
+    :param groups: rows.Group of one scale.
+    :return: bytes of a PNG, or None without such groups.
+    """
+    shown = [group for group in groups if group.key['mode'] == 'bidirectional'
+             and group.key.get('new_pixels') and 'match_fraction' in group.scores]
+    if not shown:
+        return None
+    tasks = [task for task in TITLES if any(group.key['task'] == task for group in shown)]
+    methods = sorted({group.key['method'] for group in shown}, key=method_order)
+    figure, axes = _new_figure(0.75 + 1.0 * len(tasks), len(methods), len(tasks), sharex=True,
+                               sharey='row')
+    bins = np.linspace(0, 1, 16)
+    for row, task in zip(axes, tasks):
+        for axis, method in zip(row, methods):
+            axis.spines['left'].set_visible(False)
+            axis.set_yticks([])
+            axis.set_xticks([0, 0.5, 1], ['start', '', 'goal'])
+            axis.tick_params(labelsize=7)
+            for group in shown:
+                if (group.key['task'], group.key['method']) == (task, method):
+                    values = group.scores['match_fraction'].ravel()
+                    axis.hist(values, bins, weights=np.full(len(values), 1 / len(values)),
+                              color=COLOURS[family(method)])
+        row[0].set_ylabel(TITLES[task].replace(' ', '\n', 1), fontsize=8, color=_INK)
+    for axis, method in zip(axes[0], methods):
+        axis.set_title(method.replace('-', '\n', 1).replace('+', '\n+'),
+                       fontsize=8, color=COLOURS[family(method)])
+    return _png(figure)

@@ -1,0 +1,275 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Pictures of predictions in the paper's format (Figs. 5 to 7 and 10), headings drawn in.
+
+The episodes are the first held-out ones, whatever they look like. Only runs whose weights are at
+hand can be shown.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+import re
+
+from experiments.paper.figures import COLOURS, family, file_name
+from experiments.paper.published import TITLES
+from experiments.paper.rows import method_order
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+import numpy as np
+from tap_ros.evaluation.samples import draw_latents
+from tap_ros.files import write_atomically
+from tap_ros.images import to_float, to_uint8
+from tap_ros.learning.split import split_episodes, TEST_FRACTION
+from tap_ros.pictures import GAP, grid, png_bytes
+from tap_ros.prediction.batches import make_batch, Sampling
+from tap_ros.prediction.losses import l1_errors, match_step
+from tap_ros.prediction.predictor import load_network
+from tap_ros.prediction.warp import warp
+from tap_ros.recording.cache import open_recordings
+import torch
+
+EPISODES = 5
+SAMPLES = 6
+_DPI = 100
+_INK = '#333333'
+
+
+@dataclass(frozen=True)
+class Shown:
+    """
+    A trained network to show predictions of.
+
+    :param method: its name.
+    :param network: Predictor in eval mode.
+    """
+
+    method: str
+    network: torch.nn.Module
+
+
+def write_grids(folder, runs, weights, recordings='bags'):
+    """
+    Write the grids of every task and mode of one scale.
+
+    A picture that is there stays where not all the weights are at hand that it could show.
+
+    :param folder: to write PNG files to.
+    :param runs: dicts as results.load_runs returns them, of one scale.
+    :param weights: folder with <run>/predictor.safetensors.
+    :param recordings: folder with the recordings of each task, where those that a run was trained
+        on are no longer.
+    """
+    settings = sorted({(run['task'], run['mode'], run['new_pixels']) for run in runs})
+    for task, mode, new_pixels in settings:
+        same = [run for run in runs if (run['task'], run['mode'], run['new_pixels']) == (
+            task, mode, new_pixels)]
+        chosen = {}
+        for run in sorted(same, key=lambda run: run['seed'], reverse=True):
+            chosen[run['method']] = run
+        paths = {method: Path(weights) / run['name'] / 'predictor.safetensors'
+                 for method, run in chosen.items()}
+        at_hand = [m for m in sorted(paths, key=method_order) if paths[m].exists()]
+        episodes = at_hand and _held_out(chosen[at_hand[0]], recordings)
+        if not at_hand or episodes is None:
+            continue
+        shown = [Shown(method, load_network(paths[method])[0]) for method in at_hand]
+        variant = '' if new_pixels else '-warp'
+        title = f'{TITLES.get(task, task)}, {mode}' + ('' if new_pixels else ', no new pixels')
+        for name, make in GRIDS.items():
+            sheet = make(task, mode, shown, *episodes)
+            path = Path(folder) / file_name(f'{task}-{mode}{variant}{name}', chosen[
+                at_hand[0]]['scale'])
+            if sheet is not None and (len(at_hand) == len(paths) or not path.exists()):
+                write_atomically(path, png_bytes(draw(title, *sheet)))
+
+
+def _held_out(run, recordings):
+    """Return (store, indices of the first held-out episodes, goal picture), or None."""
+    own = run['config'].get('recordings', ())[-1:]
+    paths = [path for path in own if Path(path).exists()]
+    paths = paths or [Path(recordings) / run['task']]
+    if not Path(paths[0]).exists():
+        return None
+    store = open_recordings(paths)
+    _, held_out = split_episodes(store, run['config'].get('test_fraction', TEST_FRACTION))
+    # Of other recordings the pictures would not be those that the scores are of.
+    if not len(held_out) or store.data_hash != run['data']['hash']:
+        return None
+    return store, held_out[:EPISODES], run['evaluation'].get('goal_picture', 'last')
+
+
+def draw(title, headings, rows, scale=2):
+    """
+    Draw a sheet of panels with a title and headings above the columns.
+
+    :param title: one line of text.
+    :param headings: list of levels, the upper one first; each a list of (text, colour or None, how
+        many columns it is above).
+    :param rows: list of lists of uint8 (H, W, 3).
+    :param scale: whole number of times to enlarge each pixel.
+    :return: uint8 (height, width, 3).
+    """
+    sheet = grid(rows, scale)
+    pitch = rows[0][0].shape[1] * scale + GAP
+    depths = [max(text.count('\n') + 1 for text, *_ in level) for level in headings]
+    band = 32 + 16 * sum(depths)
+    figure = Figure(figsize=(sheet.shape[1] / _DPI, band / _DPI), dpi=_DPI)
+    canvas = FigureCanvasAgg(figure)
+
+    def write(x, y, text, **options):
+        figure.text(x / sheet.shape[1], 1 - y / band, text, linespacing=1.1,
+                    **{'fontsize': 9.5, 'color': _INK, **options})
+    write(1, 3, title, va='top', fontsize=10.5, weight='bold')
+    for n, level in enumerate(headings):
+        column = 0
+        for text, colour, span in level:
+            write(column * pitch + (span * pitch - GAP) / 2, 28 + 16 * sum(depths[:n + 1]), text,
+                  color=colour or _INK, ha='center', va='bottom', multialignment='center')
+            column += span
+    canvas.draw()
+    head = np.asarray(canvas.buffer_rgba())[:band, :sheet.shape[1], :3]
+    return np.vstack([head, sheet])
+
+
+def heading(method):
+    """
+    Break a method's name into lines that fit above a panel.
+
+    :return: text with line breaks.
+    """
+    stem, plus, suffix = method.partition('+')
+    stem = re.sub(r'-r(\d+)$', r'\n(trained r = \1)', stem)
+    stem = stem.replace('-wo-gan', '\nw/o gan').replace('-vae-gan', '\nvae + gan').replace(
+        '-vae', '\nvae')
+    return stem + (f'\n+ {suffix}' if plus else '')
+
+
+def _coloured(method, text=None, span=1):
+    return heading(method) if text is None else text, COLOURS[family(method)], span
+
+
+def _inputs(batch):
+    """Return the headings and, for each episode, the panels of the context pictures."""
+    context = batch.context.numpy()
+    return ([(text, None, 1) for text in ('start', 'goal')[:context.shape[1]]],
+            [list(pictures) for pictures in context])
+
+
+def _gather(store, episodes, mode, goal_picture):
+    batch = make_batch(store, episodes, Sampling(
+        goal_picture=goal_picture, forward=mode == 'forward'))
+    return batch, to_float(batch.context)
+
+
+def _predict(one, episodes, context, sample=0):
+    """Predict; with z, from that sample which the scores count as the first, or a later one."""
+    size = one.network.config.latent_size
+    return one.network(context, draw_latents(episodes, sample + 1, size)[:, sample] if size
+                       else None)
+
+
+def _append(rows, images):
+    for row, image in zip(rows, images):
+        row.append(image)
+
+
+@torch.inference_mode()
+def _methods(task, mode, shown, store, episodes, goal_picture):
+    """Show inputs, the output of each method, and matches of genmin and ours (Figs. 5, 6)."""
+    batch, context = _gather(store, episodes, mode, goal_picture)
+    headings, rows = _inputs(batch)
+    matched = _preferred(shown, ('genmin', 'genmin4', 'genmin-wo-gan'))
+    ours = next((one for one in _contrast(shown) if '+' in one.method), None)
+    matches = []
+    for one in shown:
+        image = _predict(one, episodes, context).image
+        _append(rows, to_uint8(image))
+        headings.append(_coloured(one.method))
+        if one is matched or one is ours:
+            errors = l1_errors(image[:, None], batch.targets.movedim(-1, 2))[:, 0]
+            match = match_step(errors, batch.valid)
+            matches.append((one, batch.targets.numpy()[np.arange(len(match)), match]))
+    for one, frames in matches:
+        _append(rows, frames)
+        headings.append((f'match of\n{heading(one.method)}', _INK, 1))
+    return [headings], rows
+
+
+def _preferred(shown, names):
+    """Return the first of the names that is shown, else None."""
+    at_hand = {one.method: one for one in shown}
+    return next((at_hand[name] for name in names if name in at_hand), None)
+
+
+def _contrast(shown):
+    """Choose fix, genmin and a form of ours that finds bottlenecks, those that are at hand."""
+    ours = [one.method for one in shown if re.match(r'genmin.*\+', one.method)]
+    ours = ['genmin+relative', 'genmin+changed', *ours]
+    found = [_preferred(shown, names) for names in (
+        ('fix', 'fix-wo-gan', 'fix0.50'), ('genmin', 'genmin-wo-gan', 'genmin4'), ours)]
+    return [one for one in found if one is not None]
+
+
+@torch.inference_mode()
+def _parts(task, mode, shown, store, episodes, goal_picture):
+    """Show what pushing predictions are blended from (Figs. 9, 15): masked warps, new pixels."""
+    chosen = _contrast(shown)
+    if not task.startswith('push') or mode != 'bidirectional' or not chosen:
+        return None
+    batch, context = _gather(store, episodes, mode, goal_picture)
+    headings, rows = _inputs(batch)
+    above = [('', None, len(headings))]
+    for one in chosen:
+        prediction = _predict(one, episodes, context)
+        parts = [*warp(context, prediction.flow).unbind(1)]
+        if prediction.new_pixels is not None:
+            parts.append(prediction.new_pixels)
+        for n, part in enumerate(parts):
+            # On [0, 1], so that what a mask leaves out is black.
+            masked = (part + 1) / 2 * prediction.masks[:, n]
+            _append(rows, to_uint8(masked * 2 - 1))
+        _append(rows, to_uint8(prediction.image))
+        names = [*('warped start', 'warped goal', 'new pixels')[:len(parts)], 'output']
+        headings += [_coloured(one.method, name) for name in names]
+        above.append(_coloured(one.method, one.method, len(names)))
+    return [above, headings], rows
+
+
+@torch.inference_mode()
+def _recursion(task, mode, shown, store, episodes, goal_picture):
+    """Show predictions with the prediction before as the goal (Fig. 7)."""
+    chosen = _contrast(shown) + [one for one in shown if re.search(r'-r\d+$', one.method)]
+    if mode != 'bidirectional' or not chosen:
+        return None
+    batch, context = _gather(store, episodes, mode, goal_picture)
+    headings, rows = _inputs(batch)
+    above = [('', None, len(headings))]
+    for one in chosen:
+        first = _predict(one, episodes, context).image
+        following = torch.stack([context[:, 0], first.clamp(-1, 1)], 1)
+        second = _predict(one, episodes, following).image
+        for r, image in ((1, first), (2, second)):  # the higher the level, the earlier the time
+            _append(rows, to_uint8(image))
+            headings.append(_coloured(one.method, f'r = {r}'))
+        above.append(_coloured(one.method, heading(one.method), 2))
+    return [above, headings], rows
+
+
+@torch.inference_mode()
+def _samples(task, mode, shown, store, episodes, goal_picture):
+    """Show samples of the VAE for one start and goal (Figs. 9, 16)."""
+    chosen = [one for one in shown if one.network.config.latent_size]
+    chosen = _preferred(chosen, [one.method for one in reversed(chosen)])
+    if chosen is None:
+        return None
+    batch, context = _gather(store, episodes, mode, goal_picture)
+    headings, rows = _inputs(batch)
+    for n in range(SAMPLES):
+        _append(rows, to_uint8(_predict(chosen, episodes, context, n).image))
+        headings.append((f'sample {n + 1}', None, 1))
+    above = [('', None, len(headings) - SAMPLES), _coloured(chosen.method, chosen.method, SAMPLES)]
+    return [above, headings], rows
+
+
+GRIDS = {'': _methods, '-masks': _parts, '-recursion': _recursion, '-samples': _samples}

@@ -1,0 +1,334 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+From the scores of runs to rows: one number each, with an interval and the command that makes it.
+
+Intervals are 95% bootstrap intervals over the held-out episodes. Runs that differ by the seed only
+are averaged, episode by episode; the interval does not tell how far another training would be off.
+"""
+
+from dataclasses import dataclass
+import re
+
+from experiments.paper.runs import VARIANTS
+import numpy as np
+from tap_ros.evaluation.bottleneck import THRESHOLDS, VISIBLE
+from tap_ros.evaluation.intervals import bootstrap
+from tap_ros.prediction.methods import parse_method
+
+COPIES = ('copy-start', 'copy-goal')
+BEST = 'best-of-100'
+# Of the samples of a VAE.
+SPREADS = ('sample_spread', 'sample_spread_near', 'sample_spread_elsewhere', 'sample_spread_px')
+RESAMPLES = 1000
+BESIDE = 0.1  # a match within this share of the episode from an input lies beside it
+_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class Group:
+    """
+    Runs that differ by the seed only; all scored on the same N episodes.
+
+    :param key: dict of task, mode, method, scale and, where something was trained, new_pixels.
+    :param scores: dict of float arrays (S, N), a row for each run; bottleneck only if defined.
+    :param command: makes the runs.
+    :param data_hash: of the recordings.
+    :param of: for the best of 100, the method that was sampled from.
+    """
+
+    key: dict
+    scores: dict
+    command: str
+    data_hash: str
+    of: str = ''
+
+
+def best_of_name(method):
+    """
+    Name the best of 100 samples of a method.
+
+    The paper's genmin + vae is its Eq. 10, with GAN: genmin-vae-gan here. So its samples are those
+    of genmin-vae-best-of-100; those of the CVAE without GAN (Eq. 9), genmin-vae here, are of
+    genmin-vae-wo-gan-best-of-100.
+
+    :param method: name of a method with a VAE.
+    :return: for example 'genmin-vae-best-of-100', with +relative or the like at its end.
+    """
+    stem, plus, suffix = method.partition('+')
+    stem = stem.removesuffix('-gan') if stem.endswith('-vae-gan') else f'{stem}-wo-gan'
+    return f'{stem}-{BEST}{plus}{suffix}'
+
+
+def group_runs(runs):
+    """
+    Put runs together that differ by the seed only, and add copying and the best of 100.
+
+    :param runs: dicts as results.load_runs returns them, on one recording per task and scale.
+    :return: list of Group.
+    """
+    sorted_runs = {}
+    for run in sorted(runs, key=lambda run: (run['name'], run['seed'])):
+        key = tuple(run[name] for name in ('task', 'mode', 'method', 'scale', 'new_pixels'))
+        sorted_runs.setdefault(key, []).append(run)
+    groups, copied = [], set()
+    for (task, mode, method, scale, new_pixels), same in sorted_runs.items():
+        key = {'task': task, 'mode': mode, 'method': method, 'scale': scale}
+        trained = {**key, 'new_pixels': new_pixels}
+        groups.append(_group(trained, same, 'prediction'))
+        if 'best_of_100' in same[0]['evaluation']:
+            groups.append(_group({**trained, 'method': best_of_name(method)}, same, 'best_of_100',
+                                 of=method))
+        for copy in COPIES:
+            if copy in same[0]['evaluation'] and (task, mode, scale, copy) not in copied:
+                copied.add((task, mode, scale, copy))
+                groups.append(_group({**key, 'method': copy}, same[:1], copy))
+    return groups
+
+
+def _group(key, runs, part, of=''):
+    """Stack the scores of runs."""
+    parts = [run['evaluation'][part] for run in runs]
+    names = [name for name in ('min_l1', 'match_step', 'match_fraction', 'changed_l1',
+                              'bottleneck', 'object_mass')
+             if all(name in part for part in parts)]
+    scores = {name: np.array([part[name] for part in parts], float) for name in names}
+    if not np.isfinite(scores.get('bottleneck', np.nan)).any():
+        scores.pop('bottleneck', None)
+    for name in (*SPREADS, 'target_bottleneck') if part == 'prediction' else ():
+        if all(name in run['evaluation'] for run in runs):
+            scores[name] = np.array([run['evaluation'][name] for run in runs], float)
+    command = ' && '.join(run['command'] for run in runs)
+    return Group(key, scores, command, runs[0]['data']['hash'], of)
+
+
+def _over_seeds(statistic):
+    """Make a statistic of (S, ..., N) from one along the last axis: its mean over the seeds."""
+    return lambda array: statistic(array).mean(0)
+
+
+def make_rows(groups):
+    """
+    Compute every number of the results.
+
+    :param groups: of group_runs.
+    :return: list of dicts: task, mode, method, metric, value, ci_low, ci_high, n, seeds, scale,
+        command; new_pixels where something was trained; baseline for numbers that compare, of for
+        the best of 100.
+        Bottlenecks are scored without new pixels only, which have no origin to follow (App. E).
+        min_l1 is the per-pixel mean on [0, 1], match_step counts frames from the start picture
+        (0), bottleneck_frequency and gains are shares, bottleneck_median_px is in pixels. In
+        visible_bottleneck_frequency no object may be left out, see bottleneck.VISIBLE;
+        target_bottleneck_frequency is that of the true frames at a fixed time.
+    """
+    rows = []
+    for group in groups:
+        scores = group.scores
+        for metric in ('min_l1', 'match_step', 'match_fraction'):
+            if metric in scores:
+                rows.append(_row(group, metric, _over_seeds(_mean), scores[metric]))
+        if 'match_step' in scores:
+            rows.append(_row(group, 'match_step_std', _over_seeds(_std), scores['match_step']))
+            share = scores['match_fraction']
+            beside = share < BESIDE
+            if group.key['mode'] == 'bidirectional':
+                beside |= share > 1 - BESIDE
+            rows.append(_row(group, 'match_beside_input', _over_seeds(_mean), beside))
+        for metric in ('changed_l1', *SPREADS):  # not known of every episode
+            known = _known(scores, metric)
+            if known.size:
+                rows.append(_row(group, metric, _over_seeds(_mean), known))
+        if 'bottleneck' in scores and not group.key.get('new_pixels'):
+            defined = np.isfinite(scores['bottleneck']).all(0)
+            placed = scores['bottleneck'][:, defined]
+            visible = scores['object_mass'][:, defined] >= VISIBLE
+            for threshold in THRESHOLDS:
+                rows.append(_row(group, f'bottleneck_frequency_{threshold}px', _over_seeds(_mean),
+                                 placed <= threshold))
+                rows.append(_row(group, f'visible_bottleneck_frequency_{threshold}px',
+                                 _over_seeds(_mean), (placed <= threshold) & visible))
+            rows.append(_row(group, 'bottleneck_median_px', _over_seeds(_median), placed))
+        target = _known(scores, 'target_bottleneck')
+        if target.size and not group.key.get('new_pixels'):
+            rows.append(_row(group, 'target_bottleneck_frequency_2px', _over_seeds(_mean),
+                             target <= 2))
+    return rows + _gain_rows(groups) + _equal_gain_rows(groups)
+
+
+def _known(scores, name):
+    """Return the scores (S, N') of the episodes that have them; N' is 0 where there are none."""
+    values = scores.get(name, np.empty((1, 0)))
+    return values[:, np.isfinite(values).all(0)]
+
+
+def _mean(values):
+    return values.mean(-1)
+
+
+def _std(values):
+    return values.std(-1)
+
+
+def _median(values):
+    return np.median(values, -1)
+
+
+def _row(group, metric, statistic, *arrays, **more):
+    """Make one row."""
+    value, low, high = (
+        round(x, _DIGITS) for x in bootstrap(statistic, *arrays, resamples=RESAMPLES))
+    key = {name: group.key[name] for name in ('task', 'mode', 'method')}
+    return {**key, 'metric': metric, 'value': value, 'ci_low': low, 'ci_high': high,
+            'n': arrays[0].shape[-1], 'seeds': len(arrays[0]), 'scale': group.key['scale'],
+            'command': group.command,
+            **{name: group.key[name] for name in ('new_pixels',) if name in group.key},
+            **({'of': group.of} if group.of else {}), **more}
+
+
+def relative_gain(error, baseline):
+    """
+    Compute by which share the mean error is below the baseline's.
+
+    :param error: (S, ..., N).
+    :param baseline: (S', ..., N).
+    :return: (...), 0.25 is a quarter less.
+    """
+    return 1 - error.mean((0, -1)) / baseline.mean((0, -1))
+
+
+def find_baseline(group, groups):
+    """
+    Find the fixed-time predictor that a method is to be compared with: fix in the same setting.
+
+    A method without GAN is compared with fix-wo-gan where that was run, a variant with fix of that
+    variant.
+
+    :return: Group or None.
+    """
+    name = group.key['method']
+    wo_gan = '-wo-gan' in name or (re.search(r'-vae(?!-gan)', name) and BEST not in name)
+    names = ('fix-wo-gan', 'fix') if wo_gan else ('fix', 'fix-wo-gan')
+    for method in (*(['fix' + variant_of(name)] if variant_of(name) else []), *names):
+        for other in groups:
+            if (other.key == {**group.key, 'new_pixels': group.key.get('new_pixels', True),
+                              'method': method}
+                    and other.data_hash == group.data_hash):
+                return other
+    return None
+
+
+def _gain_rows(groups):
+    """Compare each method with fix: by error, and by how far apart their matches are."""
+    rows = []
+    for group in groups:
+        baseline = find_baseline(group, groups)
+        if baseline is None or group.key['method'].startswith('fix'):
+            continue
+        about = {'baseline': baseline.key['method']}
+        rows.append(_row(group, 'gain_over_fix', relative_gain, group.scores['min_l1'],
+                         baseline.scores['min_l1'], **about))
+        for metric in ('match_step', 'match_fraction'):
+            if metric in group.scores:
+                rows.append(_row(group, f'{metric}_minus_fix', _difference, group.scores[metric],
+                                 baseline.scores[metric], **about))
+    return rows
+
+
+def _difference(values, baseline):
+    return values.mean((0, -1)) - baseline.mean((0, -1))
+
+
+def _equal_gain_rows(groups):
+    """
+    Compare methods with fixed-time ones at the same mean match-step (as Fig. 4 does by eye).
+
+    That of fixed-time prediction is the lower hull of the fix models: what choosing at random
+    between two of them would score. Between start and goal, copying belongs to them: it is the
+    best prediction for the times 0 and 1. A method with a match-step beyond theirs gets no row.
+    """
+    rows = []
+    for group in groups:
+        name, mode = group.key['method'], group.key['mode']
+        if name in COPIES or name.startswith('fix') or 'match_step' not in group.scores:
+            continue
+        same = [other for other in groups if other.data_hash == group.data_hash
+                and all(other.key[part] == group.key[part] for part in ('task', 'mode', 'scale'))
+                and other.key.get('new_pixels') in (None, group.key['new_pixels'])]
+        fixed = [[other for other in same if re.fullmatch(
+            r'fix[\d.]*' + re.escape(variant), other.key['method'])]
+            for variant in (variant_of(name), '')]
+        copies = [other for other in same if other.key['method'] in COPIES]
+        baselines = (fixed[0] or fixed[1]) + (copies if mode == 'bidirectional' else [])
+        if not any(fixed) or len(baselines) < 2:
+            continue
+        row = _row(group, 'gain_over_fix_at_match_step', _gain_at_match_step,
+                   *(g.scores[score] for g in (group, *baselines)
+                     for score in ('match_step', 'min_l1')),
+                   baseline=' '.join(other.key['method'] for other in baselines))
+        if np.isfinite(row['value']):
+            rows.append(row)
+    return rows
+
+
+def _gain_at_match_step(*arrays):
+    """Compute the gain from scores (match_step, min_l1) of a method and then of each fix."""
+    means = np.array([array.mean((0, -1)) for array in arrays])
+    points = list(zip(means[2::2], means[3::2]))
+    return 1 - means[1] / lower_hull(means[0], points)
+
+
+def lower_hull(at, points):
+    """
+    Interpolate linearly between those two points that give the lowest value.
+
+    :param at: (...), positions.
+    :param points: list of (position (...), value (...)).
+    :return: (...), NaN beyond the outermost positions.
+    """
+    lowest = np.full(np.shape(at), np.inf)
+    for x, y in points:
+        for x2, y2 in points:
+            with np.errstate(invalid='ignore', divide='ignore'):
+                share = np.where(x == x2, 0.0, (at - x) / (x2 - x))
+                between = (x <= at) & (at <= x2)
+            lowest = np.where(between, np.fmin(lowest, y + share * (y2 - y)), lowest)
+    return np.where(np.isfinite(lowest), lowest, np.nan)
+
+
+def find(rows, **wanted):
+    """
+    Find a row.
+
+    :param rows: of make_rows.
+    :param wanted: the values of its keys; a row without new_pixels fits any.
+    :return: the first row that fits, or None.
+    """
+    for row in rows:
+        if all(row.get(name, value if name == 'new_pixels' else None) == value
+               for name, value in wanted.items()):
+            return row
+    return None
+
+
+def variant_of(method):
+    """Return which of runs.VARIANTS a method's name stands for; '' for the method as it is."""
+    name = re.sub(r'-r\d+$', '', method)
+    return max((variant for variant in VARIANTS if name.endswith(variant)), key=len)
+
+
+def method_order(method):
+    """
+    Give the place of a method in tables and pictures, as a sort key: copying, fix, min, genmin.
+
+    Forward genmin is ordered by beta from large to small, as its match-steps rise.
+    """
+    if method in COPIES:
+        return (0, 0, COPIES.index(method), False, method)
+    name = method.replace(f'-wo-gan-{BEST}', '').replace(f'-{BEST}', '')
+    name = re.sub(r'-r\d+$', '', name)
+    variant = variant_of(name)
+    parsed = parse_method(name.removesuffix(variant))
+    number = (parsed.fraction if parsed.loss == 'fix' else
+              -parsed.beta if parsed.beta is not None else 0)
+    kind = ('fix', 'min', 'genmin').index(parsed.loss) + 1 + 3 * parsed.vae + 3 * (BEST in method)
+    return (kind, parsed.selection != 'time_preference', number, bool(variant), method)

@@ -1,0 +1,188 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line of Table 2: python -m tap_ros evaluate planning."""
+
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import shlex
+
+from experiments.planning.films import write_films
+from experiments.planning.methods import parse_method
+from experiments.planning.page import make_page
+from experiments.planning.results import load_results, make_rows
+from experiments.planning.runs import Job, run_jobs
+from tap_ros.contract import step_budget
+from tap_ros.errors import ConfigError
+from tap_ros.evaluation import forward
+from tap_ros.files import write_atomically, write_rows
+from tap_ros.planning.hierarchy import SWITCHES
+from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.scenes import FIRST_SCENE, PLANNING_TASKS
+from tap_ros.weights import find_predictor, FORWARD_MODEL
+
+DEFAULT_METHODS = ['nothing', 'direct', 'fix', 'genmin', 'one_object', 'oracle_order',
+                   'true_subgoal', 'true_model']
+TRAINED = 'runs/paper/small/{task}-bidirectional-{name}-warp-s0/predictor.safetensors'
+
+
+def add_arguments(parser):
+    """Add the options of `evaluate planning` to a parser."""
+    add = parser.add_argument
+    add('--tasks', nargs='+', choices=PLANNING_TASKS, default=list(PLANNING_TASKS),
+        metavar='TASK', help='push2, push3 (default: both)')
+    add('--methods', nargs='+', default=DEFAULT_METHODS, metavar='METHOD',
+        help='nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped (the '
+        'shipped predictor) or the name of another one; with options behind colons: half, '
+        'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper (its search '
+        'whatever --preset says), plain_cost, every<n>, for example genmin:half:carried (default: '
+        + ' '.join(DEFAULT_METHODS) + ')')
+    add('--predictor', nargs='+', default=[], metavar='NAME=FILE',
+        help='weights of predictors; {task} in FILE stands for the task (default: what '
+        f'the command paper trained: {TRAINED})')
+    add('--scenes', type=int, default=100, help='how many (default: %(default)s)')
+    add('--seed', type=int, default=FIRST_SCENE,
+        help='of the first scene (default: %(default)s)')
+    add('--jobs', type=int, default=len(os.sched_getaffinity(0)),
+        help='processes, of one thread each (default: one a core, %(default)s)')
+    add('--switch', choices=SWITCHES, default='reached',
+        help='go on from a subgoal when it is reached, or at its share of the budget as in the '
+        'paper (default: %(default)s); for all methods, as the next three')
+    add('--recursion', type=int, default=1, help='subgoals in a row (default: %(default)s)')
+    add('--samples', type=int, default=1,
+        help='subgoals to choose from, for predictors that draw (default: %(default)s)')
+    add('--tracking', choices=('ground_truth', 'carried'), default='ground_truth',
+        help='where object pixels come from (default: %(default)s)')
+    add('--preset', choices=list(PRESETS), default='default',
+        help='settings of the planner (default: %(default)s)')
+    add('--plan-samples', type=int, default=0, metavar='N',
+        help="samples of an iteration of the search; 0: the preset's (default: %(default)s)")
+    add('--plan-iterations', type=int, default=0, metavar='N',
+        help="iterations of the search; 0: the preset's (default: %(default)s)")
+    add('--replan-every', type=int, default=0, metavar='N',
+        help="plan anew at every so many actions; 0: the preset's (default: %(default)s)")
+    add('--step-budget', type=int, default=0,
+        help=f"control periods; 0: the paper's, {step_budget(2)} and {step_budget(3)} "
+        '(default: %(default)s)')
+    add('--forward-weights', metavar='FILE', default=str(FORWARD_MODEL),
+        help='of the forward model (default: the shipped ones)')
+    add('--device', default='cpu', help='of the networks: cpu or cuda (default: %(default)s)')
+    add('--out', default='docs/results', metavar='FOLDER',
+        help='for planning.json, planning.md and the scenes in planning/; an interrupted '
+        'evaluation goes on there (default: %(default)s)')
+    add('--recordings', default='runs/planning', metavar='FOLDER',
+        help='for MCAP files of the best, median and worst scene (default: %(default)s)')
+    add('--no-films', action='store_true', help='leave out film strips and recordings')
+    add('--results-only', action='store_true',
+        help='run nothing, make planning.json and planning.md again from the scenes')
+
+
+def run(args):
+    """Run what is missing; write the numbers, the page and the films."""
+    if min(args.scenes, args.jobs) < 1:
+        raise ConfigError('scenes and jobs must be at least 1')
+    out, films = Path(args.out), {}
+    if not args.results_only:
+        jobs = make_jobs(args)
+        seeds = range(args.seed, args.seed + args.scenes)
+        files = run_jobs(jobs, seeds, out / 'planning', args.jobs)
+        _write_results(out, films)  # first: whatever happens to the films, these stay
+        for job, file in zip(jobs, files):
+            name = f'{job.task}-{job.method.file_name}'
+            if not args.no_films and job.method.base != 'nothing':
+                caption = write_films(job, file.scenes, out / 'planning' / f'{name}.png',
+                                      Path(args.recordings) / f'{name}.mcap')
+                films[job.task, job.method.name] = f'planning/{name}.png', caption
+    rows = _write_results(out, films)
+    for row in rows:
+        if row['metric'] == 'final_distance_cm':
+            print(f'  {row["task"]} {row["method"]:24} {row["value"]:5.1f} cm '
+                  f'[{row["ci_low"]:.1f}, {row["ci_high"]:.1f}], {row["n"]} scenes')
+    print(f'written: {out / "planning.json"}, {out / "planning.md"}')
+
+
+def _write_results(out, films):
+    """Write planning.json and planning.md from the scenes that were run; return the rows."""
+    rows = make_rows(load_results(out / 'planning'))
+    if not rows:
+        raise ConfigError(f'{out / "planning"}: holds no results; run without --results-only')
+    write_rows(out / 'planning.json', rows)
+    maps, findings = out / forward.FILE, out / 'planning_findings.md'
+    write_atomically(out / 'planning.md', make_page(
+        rows, _all_films(out, rows, films),
+        json.loads(maps.read_text()) if maps.exists() else (),
+        findings.read_text() if findings.exists() else ''))
+    return rows
+
+
+def make_jobs(args):
+    """
+    Return a Job for each task and method.
+
+    :raises ConfigError: for a method or predictor that cannot be used.
+    """
+    planner = with_preset(args.preset)
+    if args.plan_samples or args.plan_iterations or args.replan_every:
+        planner = changed(planner, args.plan_samples, args.plan_iterations, args.replan_every)
+    weights = {'shipped': '{task}'}
+    for text in args.predictor:
+        name, found, file = text.partition('=')
+        if not found:
+            raise ConfigError(f'--predictor {text}: expected NAME=FILE')
+        weights[name] = file
+    defaults = {'switch': args.switch, 'recursion': args.recursion, 'samples': args.samples,
+                'tracking': args.tracking}
+    methods = list(dict.fromkeys(parse_method(text, **defaults) for text in args.methods))
+    jobs = []
+    for task in args.tasks:
+        for method in methods:
+            file = ''
+            if method.predicted:
+                file = weights.get(method.base, TRAINED.replace('{name}', method.base))
+                file = str(find_predictor(file.replace('{task}', task)))
+                if not Path(file).is_file():
+                    raise ConfigError(
+                        f'method {method.name!r}: no weights {file}; train them with `python -m '
+                        f'tap_ros paper --only "{task}-bidirectional-{method.base}-warp-s0"`, '
+                        f'name them with --predictor {method.base}=FILE, or leave the method out '
+                        'with --methods')
+            jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
+                            args.step_budget, args.preset, _command(args, task, method)))
+    return jobs
+
+
+def changed(planner, samples, iterations, replan_every):
+    """Return a VisualMPCConfig with what is not 0 changed, its other numbers in proportion."""
+    search = planner.search
+    share = (samples or search.num_samples) / search.num_samples
+    search = replace(
+        search, num_samples=samples or search.num_samples,
+        num_iterations=iterations or search.num_iterations,
+        num_elites=max(2, round(share * search.num_elites)) if samples else search.num_elites)
+    return replace(planner, search=search, proposals=int(share * planner.proposals),
+                   replan_every=replan_every or planner.replan_every)
+
+
+def _all_films(out, rows, films):
+    """Return the strips made now and those made before."""
+    for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
+        name = f'planning/{task}-{parse_method(method).file_name}.png'
+        if (task, method) not in films and (out / name).exists():
+            films[task, method] = name, 'the best, the median and the worst scene'
+    return films
+
+
+def _command(args, task, method):
+    """Return the command that makes the numbers of one method again."""
+    words = ['python -m tap_ros evaluate planning --tasks', task, '--methods', method.name,
+             '--scenes', str(args.scenes)]
+    for option, usual in (('seed', FIRST_SCENE), ('preset', 'default'), ('plan_samples', 0),
+                          ('plan_iterations', 0), ('replan_every', 0), ('step_budget', 0),
+                          ('forward_weights', str(FORWARD_MODEL)), ('device', 'cpu')):
+        value = getattr(args, option)
+        if value != usual:
+            words += ['--' + option.replace('_', '-'), shlex.quote(str(value))]
+    words += [word for text in args.predictor if text.split('=')[0] == method.base
+              for word in ('--predictor', shlex.quote(text))]
+    return ' '.join(words)

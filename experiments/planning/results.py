@@ -1,0 +1,143 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers from result files: means with intervals, and differences between paired scenes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from experiments.planning.methods import BASES, DEFAULTS, parse_method, SUBGOALS_ONLY
+from experiments.planning.runs import read_results
+import numpy as np
+from tap_ros.contract import SUCCESS_DISTANCE
+from tap_ros.evaluation.intervals import mean_interval
+
+# Results are compared where these settings agree; what an option changes is not among them.
+SAME = ('step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
+
+
+def load_results(folder):
+    """
+    Read all result files of a folder.
+
+    :return: dict (task, method name) -> (settings, scenes by seed).
+    :raises ConfigError: if one is damaged.
+    """
+    found = {}
+    for path in sorted(Path(folder).glob('*.json')):
+        settings, scenes = read_results(path)
+        if scenes:
+            found[settings['task'], settings['method']] = settings, scenes
+    return found
+
+
+def make_rows(results):
+    """
+    Turn results into the rows of planning.json.
+
+    A difference is this method minus another, over the scenes that both were run on, so that less
+    than 0 cm, or more than 0 of success, is better; see partners. Intervals are of 95%, by
+    bootstrap over scenes.
+
+    :param results: of load_results.
+    :return: list of dicts.
+    """
+    rows, names = [], {}
+    for task, name in results:
+        names.setdefault(task, set()).add(name)
+    for (task, name), (settings, scenes) in results.items():
+        runs = [scenes[seed] for seed in sorted(scenes)]
+        finals = [run['final_cm'] for run in runs]
+        measured = [
+            ('final_distance_cm', finals, {'standard_error': _short(standard_error(finals))}),
+            ('success_5cm', [_success(run) for run in runs], {}),
+            ('steps', [run['steps'] for run in runs], {}),
+            ('plan_ms', [run['plan_ms'] for run in runs], {}),
+            ('tracking_error_px', [run.get('tracking_error_px') for run in runs], {})]
+        for compares, partner in partners(parse_method(name), names[task]):
+            others, other = results[task, partner]
+            both = sorted(set(scenes) & set(other))
+            if both and comparable(compares, settings, others):
+                about = {'against': partner, 'compares': compares}
+                gaps = [scenes[seed]['final_cm'] - other[seed]['final_cm'] for seed in both]
+                measured.append(('final_distance_difference_cm', gaps, about))
+                gaps = [_success(scenes[seed]) - _success(other[seed]) for seed in both]
+                measured.append(('success_5cm_difference', gaps, about))
+        for metric, values, more in measured:
+            values = np.array([value for value in values if value is not None], float)
+            if len(values):
+                value, low, high = mean_interval(values)
+                rows.append({
+                    'task': task, 'method': name, 'metric': metric, 'value': _short(value),
+                    'ci_low': _short(low), 'ci_high': _short(high), 'n': len(values),
+                    'seeds': 1, 'first_scene': min(scenes), **more, **_how(name, settings),
+                    'command': settings.get('command', '')})
+    return rows
+
+
+def comparable(compares, settings, others):
+    """
+    Say whether two results differ in nothing but what is compared.
+
+    :param compares: of partners.
+    :param settings: of one result; others: of the other.
+    """
+    same = all(settings[key] == others[key] for key in SAME)
+    if compares not in ('search', 'cost', 'replan_every'):  # which are settings of the planner
+        same &= settings['planner'] == others['planner']
+    bases = [parse_method(about['method']).base for about in (settings, others)]
+    if bases[0] == bases[1]:
+        same &= settings['predictor_weights'] == others['predictor_weights']
+    return same
+
+
+def partners(method, names):
+    """
+    Say which methods one is compared with: those that differ in one part only.
+
+    :param method: Method.
+    :param names: of all methods that there are results of.
+    :return: list of (what is compared, name of the other): 'direct' and 'fix' with the same
+        planner (fix with the same switch and recursion, too); for each option the method without
+        it, under the name of Method's field; for true_subgoal every predictor, as 'subgoal'.
+    """
+    if method.base == 'nothing':
+        return []
+    plain = {field: DEFAULTS[field] for field in SUBGOALS_ONLY}
+    once = {field: DEFAULTS[field] for field in ('samples', 'maps')}
+    found = [('direct', replace(method, base='direct', **plain)),
+             ('fix', replace(method, base='fix', **once))]
+    found += [(field, replace(method, **{field: default})) for field, default in DEFAULTS.items()
+              if field != 'base' and getattr(method, field) != default]
+    if method.base == 'true_subgoal':
+        predictors = {parse_method(name).base for name in names} - set(BASES)
+        found += [('subgoal', replace(method, base=base)) for base in sorted(predictors)]
+    return [(what, other.name) for what, other in found
+            if other.name in names and other != method]
+
+
+def _how(name, settings):
+    """Say in what way a method was planned, for its rows."""
+    method, planner = parse_method(name), settings['planner']
+    return {
+        'tracking': settings['object_pixels'], 'switch': method.switch,
+        'recursion': method.recursion, 'samples': method.samples, 'maps': method.maps,
+        'model': method.model, 'cost': method.cost, 'step_budget': settings['step_budget'],
+        'planner_samples': planner['search']['num_samples'],
+        'planner_iterations': planner['search']['num_iterations'],
+        'replan_every': planner['replan_every'], 'preset': settings['preset'],
+        'device': settings['device'], 'precision': settings['precision']}
+
+
+def _success(scene):
+    """Say whether every object ended within SUCCESS_DISTANCE of its goal, as 0 or 1."""
+    return int(max(scene['objects_cm']) < 100 * SUCCESS_DISTANCE)
+
+
+def standard_error(values):
+    """Return the standard error of a mean; 0 for a single value."""
+    values = np.asarray(values, float)
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
+
+
+def _short(value):
+    return round(float(value), 4)

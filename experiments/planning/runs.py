@@ -1,0 +1,226 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run methods on scenes in several processes, a result file for each task and method."""
+
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+import json
+import multiprocessing
+from pathlib import Path
+
+from experiments.planning.episode import run_episode
+from experiments.planning.methods import Method
+from experiments.planning.true_model import TrueModel
+import numpy as np
+from sim_bridge.simulator import Simulator
+from sim_bridge.tasks import get_task
+from tap_ros.contract import GOAL_TOLERANCE, step_budget
+from tap_ros.errors import ConfigError, PlanningError
+from tap_ros.files import write_atomically
+from tap_ros.learning.weights import stored_digest
+from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.prediction.predictor import SubgoalPredictor
+import torch
+from tqdm import tqdm
+
+SPEED_ONLY = ('batch_size', 'threads')  # settings of the planner that change no result
+
+
+@dataclass(frozen=True)
+class Job:
+    """A method on a task, ready to be run on any scene."""
+
+    task: str
+    method: Method
+    planner: VisualMPCConfig
+    forward_weights: str
+    predictor: str = ''  # weights file; '' when nothing is predicted
+    device: str = 'cpu'
+    budget: int = 0  # control periods; 0: the task's
+    preset: str = ''  # name of the planner's settings
+    command: str = ''  # that makes the numbers again
+
+    def steps(self):
+        """Return the step budget."""
+        return self.budget or step_budget(get_task(self.task).num_objects)
+
+    def settings(self):
+        """Return as a dict all that changes results; weights by what is in them."""
+        planner = asdict(self.method.planner(self.planner))
+        settings = {
+            'task': self.task, 'method': self.method.name, 'step_budget': self.steps(),
+            'reached_px': GOAL_TOLERANCE, 'object_pixels': self.method.tracking,
+            'planner': {k: v for k, v in planner.items() if k not in SPEED_ONLY},
+            'preset': self.preset, 'device': self.device,
+            'precision': str(next(_model(
+                self.forward_weights, self.device).push.parameters()).dtype),
+            'forward_weights': digest(self.forward_weights),
+            'predictor_weights': digest(self.predictor) if self.predictor else None}
+        return json.loads(json.dumps(settings))
+
+
+@lru_cache
+def digest(path):
+    """
+    Return the first digits of the SHA-256 of what a weights file holds.
+
+    :raises WeightsError: when it cannot be read, or is damaged.
+    """
+    return stored_digest(path)[:16]
+
+
+class ResultFile:
+    """
+    What one job found in the scenes so far.
+
+    :param folder: of the results; job: Job.
+    :raises ConfigError: if the file there is damaged, or was made with other settings.
+    """
+
+    def __init__(self, folder, job):
+        self.path = Path(folder) / f'{job.task}-{job.method.file_name}.json'
+        self.settings, self.scenes, self._command = job.settings(), {}, job.command
+        if self.path.exists():
+            stored, self.scenes = read_results(self.path)
+            changed = [k for k in self.settings if stored.get(k) != self.settings[k]]
+            if changed:
+                raise ConfigError(
+                    f'{self.path}: was made with other settings ({", ".join(changed)}); name '
+                    'another folder with --out, or remove the file')
+
+    def add(self, scene):
+        """Keep the result of one scene, a dict with its seed; the file is replaced at once."""
+        self.scenes[scene['seed']] = scene
+        lines = [json.dumps(self.scenes[seed]) for seed in sorted(self.scenes)]
+        settings = self.settings | {'command': self._command}
+        text = json.dumps(settings) + ',\n"scenes": [\n ' + ',\n '.join(lines)
+        write_atomically(self.path, '{"settings": ' + text + '\n]}\n')
+
+
+def read_results(path):
+    """
+    Read a result file.
+
+    :return: its settings, and its scenes as a dict by seed.
+    :raises ConfigError: if it is damaged.
+    """
+    try:
+        stored = json.loads(Path(path).read_text())
+        scenes = {scene['seed']: scene for scene in stored['scenes']}
+        for scene in scenes.values():
+            float(scene['final_cm']), list(scene['objects_cm']), int(scene['steps'])
+        return dict(stored['settings']), scenes
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f'{path}: is damaged ({type(error).__name__}: {error}); remove it and '
+                          'its scenes are run again') from error
+
+
+def run_jobs(jobs, seeds, folder, processes=1, progress=True):
+    """
+    Run all jobs on all scenes, and go on where an interrupted evaluation stopped.
+
+    :param jobs: list of Job; seeds: of the scenes.
+    :param folder: of the result files.
+    :param processes: how many scenes are planned in at once, each in one thread.
+    :return: list of ResultFile, one for each job.
+    :raises ConfigError: for result files that are damaged or made with other settings.
+    """
+    files = [ResultFile(folder, job) for job in jobs]
+    # scene by scene, so that what was run so far can be compared
+    todo = [(i, seed) for seed in seeds for i, file in enumerate(files)
+            if seed not in file.scenes]
+    with tqdm(total=len(todo), desc='scenes x methods', disable=not progress) as bar:
+        def finish(i, scene):
+            files[i].add(scene)
+            bar.set_postfix_str(f'{jobs[i].method.name} {scene["final_cm"]:.1f} cm')
+            bar.update()
+        if processes == 1 or len(todo) < 2:
+            for i, seed in todo:
+                finish(i, run_scene(jobs[i], seed))
+            return files
+        pool = ProcessPoolExecutor(
+            processes, multiprocessing.get_context('spawn'), torch.set_num_threads, (1,))
+        with pool:
+            waiting = {pool.submit(run_scene, jobs[i], seed): i for i, seed in todo}
+            try:
+                while waiting:
+                    done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+                    for future in done:
+                        finish(waiting.pop(future), future.result())
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # finish the scenes in progress, no others
+                raise
+    return files
+
+
+def run_scene(job, seed):
+    """
+    Run a job on one scene.
+
+    :return: dict of seed, final_cm (mean over objects), objects_cm, steps, switches, plan_ms
+        (median) and, with carried object pixels, tracking_error_px.
+    :raises PlanningError: if it cannot be planned; the message names task, method and scene.
+    """
+    try:
+        runs, final = plan_scene(job, seed)
+    except PlanningError as error:
+        raise PlanningError(f'{job.task}, {job.method.name}, scene {seed}: {error}') from error
+    times = np.concatenate([run.planning_ms for run in runs])
+    scene = {
+        'seed': int(seed), 'final_cm': round(float(100 * final.mean()), 3),
+        'objects_cm': (100 * final).round(3).tolist(),
+        'steps': int(np.mean([len(run.actions) for run in runs])),
+        'switches': [int(step) for step in runs[0].switches],
+        'plan_ms': round(float(np.median(times)), 1) if len(times) else None}
+    if job.method.tracking == 'carried':
+        scene['tracking_error_px'] = round(float(np.mean([r.tracking_error() for r in runs])), 3)
+    return scene
+
+
+def plan_scene(job, seed):
+    """
+    Run a job on one scene.
+
+    :return: list of PlannedEpisodes, one or, each object alone, K; final distances (K,) metres.
+    """
+    torch.set_num_threads(1)  # with more, the predictor's last digits differ
+    simulator, predictor = _simulator(job.task), None
+    if job.predictor:
+        predictor = _predictor(job.predictor, job.device)
+    subsets = [None]
+    if job.method.base == 'one_object':
+        subsets = [[k] for k in range(simulator.task.num_objects)]
+    runs = []
+    for objects in subsets:
+        mpc = _planner(job.forward_weights, job.device, job.method.planner(job.planner))
+        if job.method.model == 'true':
+            model = TrueModel(_model(job.forward_weights, job.device), simulator, objects)
+            mpc = VisualMPC(model, mpc.config)
+        runs.append(run_episode(simulator, mpc, job.method, job.steps(), seed, predictor,
+                                objects=objects))
+    if subsets == [None]:
+        return runs, runs[0].distances[-1]
+    return runs, np.array([run.distances[-1][k] for k, run in enumerate(runs)])
+
+
+@lru_cache
+def _simulator(task):
+    return Simulator(task)
+
+
+@lru_cache
+def _predictor(path, device):
+    return SubgoalPredictor.load(path, device)
+
+
+@lru_cache
+def _model(path, device):
+    return load_forward_model(path, device)
+
+
+@lru_cache(maxsize=8)
+def _planner(weights, device, config):
+    return VisualMPC(_model(weights, device), replace(config, threads=1))

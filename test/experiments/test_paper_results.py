@@ -1,0 +1,231 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the numbers that are made from the scores of runs."""
+
+import json
+
+from experiments.paper.results import (
+    load_runs,
+    on_same_recordings,
+    told_apart,
+    write_results,
+)
+from experiments.paper.rows import (
+    best_of_name,
+    find,
+    group_runs,
+    lower_hull,
+    make_rows,
+    method_order,
+)
+from made_runs import EPISODES, made_run, save_runs, scores
+import numpy as np
+import pytest
+from tap_ros.errors import ConfigError
+
+KEYS = {'task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n', 'seeds', 'scale',
+        'command'}
+
+
+def rows_of(*runs):
+    return make_rows(group_runs(runs))
+
+
+def test_every_row_has_all_keys_and_lies_in_its_interval():
+    rows = rows_of(made_run('fix', scores(0.02)), made_run('genmin', scores(0.01, seed=1)))
+    assert {row['method'] for row in rows} == {'fix', 'genmin', 'copy-start', 'copy-goal'}
+    for row in rows:
+        assert KEYS <= set(row)
+        assert row['ci_low'] <= row['value'] <= row['ci_high']
+        assert row['n'] == EPISODES
+
+
+def test_seeds_are_averaged_and_do_not_count_as_episodes():
+    first, second = scores(0.02), scores(0.04, seed=1)
+    row = find(rows_of(made_run('fix', first), made_run('fix', second, seed=1)),
+               method='fix', metric='min_l1')
+    both = [np.mean(first['min_l1']), np.mean(second['min_l1'])]
+    assert row['value'] == pytest.approx(np.mean(both), abs=1e-6)
+    assert (row['n'], row['seeds']) == (EPISODES, 2)
+    assert row['command'] == ('make push2-bidirectional-fix-s0 && '
+                              'make push2-bidirectional-fix-s1')
+
+
+def test_gains_are_paired_by_episode():
+    # Errors differ a lot between episodes, but one method's are always half of the other's.
+    errors = np.random.default_rng(0).uniform(0.001, 0.1, EPISODES)
+    rows = rows_of(made_run('fix', scores(errors)), made_run('min', scores(errors / 2)))
+    gain = find(rows, method='min', metric='gain_over_fix')
+    assert (gain['value'], gain['ci_low'], gain['ci_high']) == pytest.approx((0.5,) * 3)
+    assert gain['baseline'] == 'fix'
+    error = find(rows, method='min', metric='min_l1')
+    assert error['ci_high'] - error['ci_low'] > 0.005
+
+
+def test_models_with_and_without_new_pixels_are_kept_apart():
+    rows = rows_of(made_run('fix', scores(0.02)),
+                   made_run('genmin', scores(0.01), new_pixels=False))
+    assert find(rows, method='genmin', new_pixels=False, metric='min_l1')
+    assert not find(rows, method='genmin', new_pixels=True, metric='min_l1')
+    assert not find(rows, method='genmin', metric='gain_over_fix')
+
+
+def test_bottlenecks_are_counted_where_they_are_defined():
+    rows = rows_of(made_run('genmin', scores(
+        0.01, bottleneck=[None] * 20 + [1.0] * 5 + [2.0] * 5 + [9.5] * 10), new_pixels=False))
+    shares = [find(rows, method='genmin', metric=f'bottleneck_frequency_{n}px')
+              for n in range(11)]
+    assert [row['value'] for row in shares] == [0, .25, .5, .5, .5, .5, .5, .5, .5, .5, 1]
+    assert shares[0]['n'] == 20
+    assert not find(rows, method='copy-start', metric='bottleneck_frequency_2px')
+
+
+def test_an_object_that_is_left_out_is_no_visible_bottleneck():
+    rows = rows_of(made_run('genmin', scores(
+        0.01, bottleneck=[1.0] * 20 + [9.0] * 20, mass=[0.1] * 10 + [0.5] * 30),
+        new_pixels=False))
+    shares = [find(rows, method='genmin', metric=metric + 'bottleneck_frequency_2px')['value']
+              for metric in ('', 'visible_')]
+    assert shares == [0.5, 0.25]
+
+
+def test_no_bottlenecks_are_counted_where_pixels_are_painted():
+    rows = rows_of(made_run('genmin', scores(0.01, bottleneck=[1.0] * 40)))
+    assert not find(rows, method='genmin', metric='bottleneck_frequency_2px')
+
+
+def test_every_row_of_the_data_has_a_place_of_its_own():
+    rows = told_apart(rows_of(
+        *(made_run(method, scores(0.01, bottleneck=[1.0] * 40), new_pixels=new_pixels)
+          for method in ('fix', 'genmin') for new_pixels in (True, False))))
+    places = [(row['task'], row['mode'], row['method'], row['metric']) for row in rows]
+    assert len(set(places)) == len(places)
+    painted = find(rows, method='genmin', metric='min_l1')
+    assert painted['new_pixels'] and find(rows, method='genmin', metric='min_l1_warp_only')
+    assert find(rows, method='genmin', metric='bottleneck_frequency_2px')
+    alone = told_apart(rows_of(made_run('fix', scores(0.01), new_pixels=False, task='push3')))
+    assert find(alone, method='fix', metric='min_l1')  # without the others it keeps its name
+
+
+def test_variants_of_a_method_have_names_of_their_own(tmp_path):
+    run = made_run('genmin', scores(0.01)) | {'variant': '+root'}
+    save_runs(tmp_path, [run])
+    assert [run['method'] for run in load_runs(tmp_path / 'runs')] == ['genmin+root']
+    order = ['genmin', 'genmin+root', 'genmin+relative', 'genmin+relative+mean']
+    shuffled = [order[i] for i in (2, 0, 3, 1)]
+    assert sorted(shuffled, key=method_order) == order
+
+
+def test_copying_is_seen_as_beside_an_input():
+    rows = rows_of(made_run('min', scores(0.01, [0.03] * 20 + [0.98] * 10 + [0.5] * 10)))
+    assert find(rows, method='min', metric='match_beside_input')['value'] == 0.75
+    assert find(rows, method='copy-goal', metric='match_beside_input')['value'] > 0.7
+    # In forward prediction the last frame is no input.
+    rows = rows_of(made_run('fix1.00', scores(0.01, [0.03] * 20 + [0.98] * 20), task='grasp',
+                            mode='forward'))
+    assert find(rows, method='fix1.00', metric='match_beside_input')['value'] == 0.5
+
+
+def test_the_papers_best_of_100_is_of_the_model_with_gan():
+    assert best_of_name('genmin-vae-gan') == 'genmin-vae-best-of-100'
+    assert best_of_name('genmin-vae') == 'genmin-vae-wo-gan-best-of-100'
+    assert best_of_name('genmin-vae-gan+relative') == 'genmin-vae-best-of-100+relative'
+    best = {'min_l1': [0.001] * EPISODES}
+    rows = rows_of(made_run('genmin-vae-gan', scores(0.03), best_of_100=best,
+                            sample_spread=[0.25] * EPISODES, sample_spread_px=[None] * EPISODES))
+    row = find(rows, method='genmin-vae-best-of-100', metric='min_l1')
+    assert (row['value'], row['of']) == (0.001, 'genmin-vae-gan')
+    assert find(rows, method='genmin-vae-gan', metric='sample_spread')['value'] == 0.25
+    assert not find(rows, metric='sample_spread_px')
+
+
+def test_the_hull_is_what_choosing_between_two_points_gives():
+    points = [(0.0, 1.0), (4.0, 1.0), (2.0, 5.0), (2.0, 0.0)]
+    at = np.array([-0.1, 0.0, 1.0, 2.0, 4.0, 4.1])
+    np.testing.assert_allclose(lower_hull(at, points), [np.nan, 1, 0.5, 0, 1, np.nan])
+
+
+def test_forward_gains_compare_at_the_same_match_step():
+    def forward(method, l1, at):
+        return made_run(method, scores([l1] * EPISODES, [at] * EPISODES, frames=101),
+                        task='grasp', mode='forward')
+    rows = rows_of(forward('fix0.25', 0.02, 0.2), forward('fix1.00', 0.04, 0.6),
+                   forward('genmin4', 0.015, 0.4), forward('genmin0.5', 0.03, 0.8))
+    metric = 'gain_over_fix_at_match_step'
+    assert find(rows, method='genmin4', metric=metric)['value'] == pytest.approx(0.5)
+    assert not find(rows, method='genmin0.5', metric=metric)
+
+
+def test_between_start_and_goal_copying_is_fixed_time_prediction_too():
+    def constant(l1, at):
+        return scores([l1] * EPISODES, [at] * EPISODES, frames=101)
+
+    def run(method, l1, at):
+        return made_run(method, constant(l1, at), **{
+            'copy-start': constant(0.02, 0.1), 'copy-goal': constant(0.02, 0.9)})
+
+    metric = 'gain_over_fix_at_match_step'
+    # On the line between fix (0.5) and copying the goal (0.9).
+    rows = rows_of(run('fix', 0.04, 0.5), run('genmin', 0.01, 0.7))
+    row = find(rows, method='genmin', metric=metric)
+    assert row['value'] == pytest.approx(1 - 0.01 / 0.02)
+    rows = rows_of(run('fix', 0.01, 0.5), run('genmin', 0.01, 0.7))
+    assert find(rows, method='genmin', metric=metric)['value'] == pytest.approx(1 - 0.01 / 0.015)
+    assert not find(rows, method='copy-goal', metric=metric)
+    assert not find(rows_of(run('genmin', 0.01, 0.7)), metric=metric)  # without any fix
+
+
+def test_more_weight_on_changed_pixels_is_compared_with_fix_of_that_kind():
+    rows = rows_of(*(made_run(method, scores(l1)) for method, l1 in (
+        ('fix', 0.04), ('fix+changed', 0.02), ('genmin', 0.02), ('genmin+changed', 0.01))))
+    for method, baseline in (('genmin', 'fix'), ('genmin+changed', 'fix+changed')):
+        row = find(rows, method=method, metric='gain_over_fix')
+        assert row['baseline'] == baseline and row['value'] == pytest.approx(0.5, abs=0.01)
+
+
+def test_methods_stand_in_the_order_of_the_paper():
+    order = ['copy-start', 'copy-goal', 'fix', 'fix0.75', 'min', 'genmin30', 'genmin2', 'genmin',
+             'genmin+relative', 'genmin-vae-gan', 'genmin-vae-best-of-100']
+    assert sorted(order[4:] + order[:4], key=method_order) == order
+
+
+def test_numbers_of_other_recordings_are_left_out():
+    runs = [made_run('fix', scores(0.02)), made_run('min', scores(0.02)),
+            made_run('genmin', scores(0.01), data_hash='other')]
+    kept, left_out = on_same_recordings(runs)
+    assert [run['method'] for run in kept] == ['fix', 'min']
+    assert [run['method'] for run in left_out] == ['genmin']
+
+
+def test_a_run_trained_for_recursion_is_not_averaged_with_the_plain_one(tmp_path):
+    recursive = made_run('genmin', scores(0.05), task='pick_place')
+    recursive |= {'recursion': 2, 'name': 'pick_place-bidirectional-genmin-r2-s0'}
+    save_runs(tmp_path, [made_run('genmin', scores(0.02), task='pick_place'), recursive])
+    methods = {run['method'] for run in load_runs(tmp_path / 'runs')}
+    assert methods == {'genmin', 'genmin-r2'}
+
+
+def test_a_damaged_file_is_named(tmp_path):
+    save_runs(tmp_path, [made_run('fix', scores(0.02))])
+    path = tmp_path / 'runs' / 'small' / 'broken.json'
+    path.write_text('{"name": ')
+    with pytest.raises(ConfigError, match='broken.json'):
+        load_runs(tmp_path / 'runs')
+    path.write_text('{"name": "x"}')
+    with pytest.raises(ConfigError, match='lacks .*evaluation'):
+        load_runs(tmp_path / 'runs')
+
+
+def test_results_are_the_same_when_made_again(tmp_path):
+    save_runs(tmp_path, [made_run('fix', scores(0.02)), made_run('min', scores(0.01))])
+    rows = write_results(tmp_path, pictures=False)
+    written = {path.name: path.read_bytes() for path in tmp_path.glob('*.*')}
+    assert json.loads(written['prediction.json']) == rows
+    assert {'README.md', 'gains.png'} <= set(written)
+    write_results(tmp_path, pictures=False)
+    assert {path.name: path.read_bytes() for path in tmp_path.glob('*.*')} == written
+
+
+def test_without_runs_the_command_is_named(tmp_path):
+    with pytest.raises(ConfigError, match='tap_ros paper'):
+        write_results(tmp_path)

@@ -1,0 +1,322 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the sweep, with tiny recordings and a few steps of training."""
+
+import argparse
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from experiments.paper import command
+from experiments.paper.job import BUSY, DONE, perform, UNFINISHED
+from experiments.paper.places import (
+    collect_command,
+    is_collected,
+    Places,
+    recording_hash,
+)
+from experiments.paper.runs import paper_runs, PaperRun
+from experiments.paper.shipping import ship
+from experiments.paper.sweep import find_state, sweep
+import numpy as np
+import pytest
+from tap_ros.errors import ConfigError
+from tap_ros.files import locked
+from tap_ros.learning.split import split_episodes
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.episode import Episode
+from tap_ros.recording.writer import EpisodeWriter, write_metadata
+
+ROOT = Path(__file__).parents[2]
+SEEDS = (122, 142, *range(6))  # the first two are held out
+SEEDS_3 = (12, 22, 32, *range(6, 9))  # of three objects the first three
+EPISODES = len(SEEDS)
+RUN = PaperRun('push2', 'bidirectional', 'genmin-wo-gan', new_pixels=False, episodes=EPISODES,
+               steps=2)
+
+
+def make_episode(seed, task='push2', length=7, size=16):
+    """Two squares that move one after the other."""
+    rng = np.random.default_rng(seed)
+    start = rng.uniform(3, size - 9, (2, 2))
+    share = np.linspace(0, 2, length)[:, None]
+    done = np.concatenate([share.clip(0, 1), (share - 1).clip(0, 1)], 1)  # T, K
+    pixels = (start + done[..., None] * 5).astype(np.float32)
+    frames = np.full((length, size, size, 3), 40, np.uint8)
+    for t, k in np.ndindex(length, 2):
+        u, v = np.rint(pixels[t, k]).astype(int)
+        frames[t, v - 1:v + 2, u - 1:u + 2] = (200, 60 + 90 * k, 20)
+    poses = np.zeros((length, 2, 7))
+    return Episode(
+        frames=frames, stamps=np.arange(length) * 250_000_000 + (seed + 1) * 10 ** 11,
+        actions=np.zeros((length, 4), np.float32), grippers=np.zeros((length, 4), np.float32),
+        object_names=('object_0', 'object_1'), object_pixels=pixels, object_poses=poses,
+        goal_frame=frames[-1], goal_pixels=pixels[-1], goal_poses=poses[-1], task=task,
+        seed=seed, outcome='success')
+
+
+def write_bag(folder, seeds):
+    folder.mkdir(parents=True, exist_ok=True)
+    with EpisodeWriter(folder / f'{folder.name}_0.mcap') as writer:
+        for seed in seeds:
+            writer.write(make_episode(seed, folder.name))
+    write_metadata(folder)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    """Keep decoded recordings out of the user's cache; let jobs find the package."""
+    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path_factory.getbasetemp() / 'cache'))
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
+        [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]))
+
+
+@pytest.fixture
+def places(tmp_path):
+    write_bag(tmp_path / 'bags' / 'push2', SEEDS)
+    return Places(*(str(tmp_path / name) for name in ('bags', 'runs', 'results')))
+
+
+def test_a_run_leaves_a_number_for_every_held_out_episode(places):
+    assert find_state(RUN, places).kind == 'missing'
+    assert perform(RUN, places) == DONE
+    state = find_state(RUN, places, {'push2': recording_hash(places.recording('push2'))})
+    assert state.kind == 'done'
+    result = json.loads(places.result(RUN).read_text())
+    assert result == state.result
+    store = open_recordings([str(places.recording('push2'))])
+    held_out = len(split_episodes(store, 0.05)[1])
+    assert held_out == 2
+    assert result['data'] == {
+        'hash': store.data_hash, 'trained_on': store.data_hash, 'episodes': EPISODES - held_out,
+        'held_out': held_out, 'command': ''}
+    scores = result['evaluation']
+    assert (scores['margin'], scores['goal_picture']) == (0, 'last')
+    for method in ('prediction', 'copy-start', 'copy-goal'):
+        assert {name: len(values) for name, values in scores[method].items()} == dict.fromkeys(
+            ('min_l1', 'match_step', 'match_fraction', 'changed_l1', 'bottleneck',
+             'object_mass'), held_out)
+    assert result['training']['steps'] == 2 and result['config']['method'] == RUN.method
+    assert result['name'] == RUN.name and RUN.name in result['command']
+
+
+def test_samples_and_forward_prediction_are_scored(places):
+    vae = replace(RUN, method='genmin-vae', new_pixels=True)
+    forward = replace(RUN, mode='forward', method='genmin2')
+    assert perform(vae, places) == perform(forward, places) == DONE
+    scores = find_state(vae, places).result['evaluation']
+    best, single = scores['best_of_100']['min_l1'], scores['prediction']['min_l1']
+    assert all(a <= b for a, b in zip(best, single))
+    assert all(spread >= 0 for spread in scores['sample_spread'])
+    assert len(scores['sample_spread_near']) == len(scores['sample_spread_elsewhere']) == len(
+        single)
+    assert scores['sample_spread_px'] == [None] * len(single)
+    scores = find_state(forward, places).result['evaluation']
+    assert 'copy-start' in scores and 'copy-goal' not in scores
+
+
+def test_other_settings_or_recordings_are_not_done(places, tmp_path):
+    perform(RUN, places)
+    path, data_hash = places.result(RUN), recording_hash(places.recording('push2'))
+    assert find_state(replace(RUN, steps=3), places).kind == 'other'
+    assert find_state(RUN, places, {'push2': 'of other recordings'}).kind == 'other'
+    # Elsewhere, without the weights or the recordings, the result alone says that it is done.
+    elsewhere = replace(places, runs=str(tmp_path / 'none'), recordings=str(tmp_path / 'none'))
+    assert find_state(RUN, elsewhere).kind == 'done'
+    path.unlink()
+    state = find_state(RUN, places, {'push2': data_hash})
+    assert (state.kind, state.steps) == ('partial', 2)
+    path.write_text('{"torn": ')
+    assert find_state(RUN, places, {'push2': data_hash}).kind == 'partial'
+
+
+def test_a_training_goes_on_where_it_stopped(places):
+    longer = replace(RUN, steps=3)
+    assert perform(longer, places, minutes=1e-9) == UNFINISHED
+    assert find_state(longer, places).steps == 1
+    assert not places.result(longer).exists()
+    assert perform(longer, places) == DONE
+    with pytest.raises(ConfigError, match='steps'):
+        perform(RUN, places)
+    assert perform(RUN, places, fresh=True) == DONE
+
+
+def test_nobody_trains_what_another_process_is_at(places):
+    holder = subprocess.Popen(
+        [sys.executable, '-c', 'import sys; from tap_ros.files import locked\n'
+         f'with locked({str(RUN.folder(places.runs) / "lock")!r}) as mine:\n'
+         '    print(mine, flush=True); sys.stdin.read()'],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert holder.stdout.readline() == b'True\n'
+    assert perform(RUN, places) == BUSY
+    holder.kill()
+    holder.wait()
+    with locked(RUN.folder(places.runs) / 'lock') as mine:
+        assert mine
+
+
+def test_the_hash_is_that_of_the_opened_recording(places):
+    store = open_recordings([str(places.recording('push2'))])
+    assert recording_hash(places.recording('push2')) == store.data_hash
+
+
+def test_a_recording_is_complete_when_all_its_episodes_are_there(places):
+    folder = places.recording('push2')
+    assert is_collected(folder, 10 ** 6)  # not made by collect: taken as it is
+    settings = {'task': 'push2', 'episodes': EPISODES, 'episodes_per_file': 50, 'seed': 3}
+    (folder / 'collection.json').write_text(json.dumps(settings))
+    assert is_collected(folder, EPISODES) and not is_collected(folder, EPISODES + 1)
+    assert collect_command(folder).endswith(f'--out {folder} --episodes {EPISODES} --seed 3')
+    (folder / 'collection.json').write_text(json.dumps(settings | {'episodes': EPISODES + 1}))
+    assert not is_collected(folder, EPISODES)
+    assert not is_collected(places.recording('grasp'), 1)
+
+
+@pytest.mark.slow
+def test_one_failed_run_does_not_stop_the_others(places):
+    write_bag(Path(places.recordings) / 'grasp', [0])  # one episode: none can be held out
+    bad = replace(RUN, task='grasp')
+    calls = []
+    ends = sweep([bad, RUN], places, jobs=2, on_done=lambda: calls.append(1), progress=False)
+    assert {end.name: end.kind for end in ends} == {bad.name: 'failed', RUN.name: 'done'}
+    assert len(calls) == 1
+    failed = next(end for end in ends if end.kind == 'failed')
+    assert failed.reason.startswith('error: ') and 'grasp' in failed.reason
+    assert sweep([RUN], places, progress=False) == []
+
+
+def test_what_cannot_be_collected_fails_and_is_tried_once(places):
+    settings = {'task': 'push3', 'episodes': 1, 'episodes_per_file': 1, 'seed': 5}
+    folder = places.recording('push3')
+    folder.mkdir()
+    (folder / 'collection.json').write_text(json.dumps(settings))
+    runs = [replace(RUN, task='push3', method=method) for method in ('fix', 'min')]
+    ends = sweep(runs, places, progress=False)
+    assert [(end.name, end.kind) for end in ends] == [('push3', 'failed')]
+    assert 'other settings' in ends[0].reason
+
+
+def test_three_objects_begin_with_the_weights_for_two(places):
+    write_bag(Path(places.recordings) / 'push3', SEEDS_3)
+    run = replace(RUN, task='push3')
+    assert [(end.name, end.kind) for end in sweep([run], places, progress=False)] == [
+        (run.name, 'failed')]  # those are not trained
+    ends = sweep([run, run.before], places, jobs=2, progress=False)
+    assert [(end.name, end.kind) for end in ends] == [
+        (RUN.name, 'done'), (run.name, 'done')]
+    result = json.loads(places.result(run).read_text())
+    config, data = result['config'], result['data']
+    # trained on both, scored on their own
+    assert config['recordings'] == [str(places.recording(task)) for task in ('push2', 'push3')]
+    hashes = {task: recording_hash(places.recording(task)) for task in ('push2', 'push3')}
+    assert data['hash'] == hashes['push3'] and data['episodes'] == EPISODES - 2 + 3
+    assert data['held_out'] == len(result['evaluation']['prediction']['min_l1']) == 3
+    both = recording_hash(*(places.recording(task) for task in ('push2', 'push3')))
+    about = json.loads((run.folder(places.runs) / 'run.json').read_text())
+    assert about['data_hash'] == data['trained_on'] == both
+    assert find_state(run, places, hashes).kind == 'done'
+    assert find_state(run, places, {'push3': hashes['push3']}).kind == 'done'
+    kept = places.result(run).read_text()
+    places.result(run).unlink()
+    assert find_state(run, places, hashes).kind == 'partial'  # trained, not scored
+    places.result(run).write_text(kept)
+    write_bag(Path(places.recordings) / 'push2', SEEDS[1:])
+    assert find_state(run, places, hashes).kind == 'other'  # trained on another push2
+    assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
+
+
+def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path):
+    bags = tmp_path / 'bags'
+    write_bag(bags / 'push2', [0])  # one episode: none can be held out
+    write_bag(bags / 'push3', SEEDS_3)
+    run = replace(RUN, task='push3')
+    ends = sweep([run, run.before], Places(str(bags), str(tmp_path / 'runs'), str(
+        tmp_path / 'results')), progress=False)
+    assert [(end.name, end.kind) for end in ends] == [(run.before.name, 'failed')]
+
+
+@pytest.mark.slow
+def test_missing_recordings_are_collected(places):
+    run = replace(RUN, task='grasp', episodes=2)
+    ends = sweep([run], places, jobs=2, collect_only=True, progress=False)
+    assert [(end.name, end.kind) for end in ends] == [('grasp', 'done')]
+    assert is_collected(places.recording('grasp'), 2)
+    assert sweep([run], places, collect_only=True, progress=False) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_sweep_leaves_no_process_and_goes_on(places, number):
+    script = (
+        'import sys; from experiments.paper.places import Places\n'
+        'from experiments.paper.runs import PaperRun\n'
+        'from experiments.paper.sweep import sweep\n'
+        'import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n'
+        f'sweep([PaperRun(**{vars(replace(RUN, steps=10 ** 6))!r})], Places(*sys.argv[1:]),'
+        ' progress=False)\n')
+    process = subprocess.Popen([sys.executable, '-c', script, *vars(places).values()],
+                               stderr=subprocess.PIPE)
+    lock, patience = RUN.folder(places.runs) / 'lock', time.monotonic() + 60
+    while not lock.exists() and time.monotonic() < patience:
+        time.sleep(0.05)
+    process.send_signal(number)
+    assert b'KeyboardInterrupt' in process.communicate(timeout=60)[1]
+    with locked(lock) as mine:
+        assert mine
+    assert find_state(RUN, places).kind in ('missing', 'other')
+
+
+def arguments(places, *options):
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return parser.parse_args([
+        '--recordings', places.recordings, '--runs', places.runs, '--results', places.results,
+        '--episodes', str(EPISODES), '--steps', '2', *options])
+
+
+@pytest.mark.slow
+def test_the_command_lists_and_does_what_fits_the_pattern(places, capsys, monkeypatch):
+    pages = []
+    monkeypatch.setattr(command, '_write_results', lambda places, pictures: pages.append(pictures))
+    run = paper_runs('small', episodes=EPISODES, steps=2)[0]
+    options = ('--only', run.name)
+    assert command.run(arguments(places, *options, '--list')) == 0
+    assert 'missing' in capsys.readouterr().out
+    assert command.run(arguments(places, *options)) == 0
+    assert '1 of 1 runs are done' in capsys.readouterr().out and pages == [False, True]
+    assert command.run(arguments(places, *options, '--list')) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and run.name in lines[1] and 'done' in lines[1]
+    error = np.mean(find_state(run, places).result['evaluation']['prediction']['min_l1'])
+    assert f'{error:.4f}' in lines[1]
+    assert command.run(arguments(places, '--list')) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 1 + len(paper_runs('small'))
+
+
+@pytest.mark.parametrize('options, named', [
+    (['--only', 'nothing-*'], 'nothing-'), (['--jobs', '0'], 'jobs'), (['--limit', '-1'], 'lim')])
+def test_bad_options_are_refused(places, options, named):
+    with pytest.raises(ConfigError, match=named):
+        command.run(arguments(places, *options))
+
+
+def test_shipped_weights_predict_the_same_and_their_card_says_what_they_are(places, tmp_path):
+    assert perform(RUN, places) == DONE
+    file = tmp_path / 'shipped' / 'predictor_push2.safetensors'
+    card = ship(RUN, file, places).read_text()
+    source = RUN.folder(places.runs) / 'predictor.safetensors'
+    assert file.stat().st_size < 0.6 * source.stat().st_size
+    picture = np.random.default_rng(0).integers(0, 256, (16, 16, 3), np.uint8)
+    shipped, trained = (SubgoalPredictor.load(path).predict(picture, picture[::-1].copy())[0]
+                        for path in (file, source))
+    assert np.abs(shipped.image.astype(int) - trained.image).max() <= 1
+    for text in (RUN.command, 'predictor_push2.safetensors', 'copy-start', 'last frame'):
+        assert text in card
+    with pytest.raises(ConfigError, match='is not done'):
+        ship(replace(RUN, seed=7), file, places)

@@ -1,0 +1,241 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of planned episodes, in the real simulator with the shipped weights."""
+
+from dataclasses import replace
+
+from experiments.planning.episode import (
+    as_recording,
+    make_targets,
+    run_episode,
+    true_configuration,
+)
+from experiments.planning.methods import BASES, parse_method
+from experiments.planning.true_model import TrueModel
+import numpy as np
+import pytest
+from sim_bridge.simulator import Simulator
+from sim_bridge.tasks import nearest_first
+from tap_ros.contract import step_budget
+from tap_ros.errors import ConfigError
+from tap_ros.images import to_float
+from tap_ros.planning.cem import CEMConfig
+from tap_ros.planning.mpc_config import LARGE, PAPER, VisualMPCConfig
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.warp import one_hot_maps
+from tap_ros.recording.episode import check_episode
+from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
+import torch
+
+SMALL = VisualMPCConfig(search=CEMConfig(16, 1, 4), proposals=8, batch_size=16, threads=1)
+DIRECT, SHIPPED = parse_method('direct'), parse_method('shipped')
+
+
+@pytest.fixture(scope='module')
+def simulator():
+    simulator = Simulator('push2')
+    yield simulator
+    simulator.close()
+
+
+@pytest.fixture(scope='module')
+def mpc():
+    return VisualMPC.load(FORWARD_MODEL, SMALL)
+
+
+@pytest.fixture(scope='module')
+def predictor():
+    return SubgoalPredictor.load(DEFAULT_PREDICTOR)
+
+
+def test_doing_nothing_ends_20_cm_away(simulator, mpc):
+    run = run_episode(simulator, mpc, parse_method('nothing'), 10, seed=5)
+    np.testing.assert_allclose(run.distances, 0.2, atol=1e-3)
+    assert len(run.frames) == 1 and not len(run.actions)
+
+
+def test_the_same_seed_repeats_an_episode(simulator, mpc):
+    first, second = (run_episode(simulator, mpc, DIRECT, 3, seed=5) for _ in range(2))
+    np.testing.assert_array_equal(first.actions, second.actions)
+    np.testing.assert_array_equal(first.distances, second.distances)
+    assert first.distances.shape == (4, 2) and len(first.frames) == 4
+    check_episode(as_recording(first, 'push2', 5, 'failure'))
+
+
+def test_the_goal_follows_the_subgoal_at_half_the_budget(simulator, mpc, predictor):
+    run = run_episode(simulator, mpc, SHIPPED, 4, 5, predictor)
+    assert run.switches == [2] and len(run.actions) == 4
+    at_once = run_episode(simulator, mpc, SHIPPED, 4, 5, predictor, reached=30.0)
+    assert not len(at_once.actions)  # 20 cm are less than 30 px: already there
+
+
+def test_recursion_gives_one_subgoal_more_and_all_share_the_budget(simulator, mpc, predictor):
+    run = run_episode(simulator, mpc, parse_method('shipped:recursion2:half'), 3, 5, predictor)
+    assert run.switches == [1, 2] and len(run.subgoals) == 2 and len(run.targets) == 3
+
+
+def test_a_missing_predictor_is_named(simulator, mpc):
+    with pytest.raises(ConfigError, match='predictor'):
+        run_episode(simulator, mpc, SHIPPED, 4, seed=5)
+
+
+def test_the_true_subgoal_has_the_nearest_object_at_its_goal(simulator, mpc):
+    seen = simulator.reset(5)
+    goal = simulator.goal()
+    targets, _ = make_targets(simulator, mpc, parse_method('true_subgoal'), seen, goal, None, 5)
+    moved = np.linalg.norm(targets[0].pixels - seen.object_pixels, axis=1) > 1
+    gaps = np.linalg.norm(seen.object_poses[:, :2] - seen.gripper[:2], axis=1)
+    assert moved.tolist() == (gaps == gaps.min()).tolist()
+    np.testing.assert_array_equal(targets[0].pixels[moved], goal.object_pixels[moved])
+    np.testing.assert_array_equal(targets[1].pixels, goal.object_pixels)
+    oracle, _ = make_targets(simulator, mpc, parse_method('oracle_order'), seen, goal, None, 5)
+    assert oracle[0].free.tolist() == (~moved).tolist() and oracle[1].free is None
+
+
+def test_objects_are_taken_from_the_nearest_on():
+    starts = np.array([[3.0, 0], [1, 0], [0.5, 3]])
+    goals = np.array([[3.0, 1], [0.5, 2], [0, 3]])
+    assert nearest_first(np.zeros(2), starts, goals) == [1, 2, 0]
+
+
+def test_a_true_picture_is_recognised(simulator):
+    seen = simulator.reset(5)
+    goal = simulator.goal()
+    for k in (0, 1):
+        poses = seen.object_poses.copy()
+        poses[k] = goal.object_poses[k]
+        shown = simulator.photograph(poses)
+        found = true_configuration(simulator, shown.image, seen, goal)
+        np.testing.assert_allclose(found, shown.object_pixels, atol=0.01)
+
+
+def test_one_object_alone_is_planned_for_alone(simulator, mpc):
+    run = run_episode(simulator, mpc, parse_method('one_object'), 2, 5, objects=[1])
+    assert len(run.targets) == 1 and len(run.targets[0].pixels) == 1
+    assert run.distances.shape == (3, 2)
+
+
+def test_carried_pixels_are_not_the_simulators(simulator, mpc):
+    run = run_episode(simulator, mpc, parse_method('direct:carried'), 2, 5)
+    assert 0 < run.tracking_error() < 1
+
+
+def go_behind(simulator, seed):
+    """Bring the gripper down behind object 0; return what is seen and where to push (2,)."""
+    seen = simulator.reset(seed)
+    target = seen.object_poses[0, :2]
+    along = -target / np.linalg.norm(target)  # towards the middle of the table
+    behind = target - 0.13 * along
+    for _ in range(14):
+        gap = behind - seen.gripper[:2]
+        seen = simulator.step([*gap, 0.13 - seen.gripper[2], 0])
+        if np.abs(gap).max() < 0.005:
+            break
+    return simulator.step([0, 0, 0.012 - seen.gripper[2], 0]), along
+
+
+def test_the_true_model_foresees_what_then_happens(simulator, mpc):
+    seen, along = go_behind(simulator, 30)
+    model = TrueModel(mpc.model, simulator)
+    actions = np.zeros((2, 6, 4), np.float32)
+    actions[0, :, :2] = 0.035 * along
+    actions = torch.from_numpy(actions)
+    start = model.begin(seen.image, seen.gripper)
+    maps = model.seed_maps(torch.from_numpy(seen.object_pixels))
+    *_, pushed = model.carried_maps(start, None, maps, actions, 3)
+    table = model.pixel_table().flatten(0, 1)
+    foreseen = (pushed.flatten(2) @ table).numpy()
+    for action in actions[0].numpy():
+        after = simulator.step(action)
+    assert np.linalg.norm(after.object_pixels - seen.object_pixels, axis=1).max() > 2
+    assert np.abs(foreseen[0] - after.object_pixels).max() < 0.3
+    assert np.abs(foreseen[1] - seen.object_pixels).max() < 0.3
+
+
+def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):
+    method = parse_method('true_model')
+    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(SMALL))
+    runs = [run_episode(simulator, planner, method, 2, 5) for _ in range(2)]
+    np.testing.assert_array_equal(runs[0].actions, runs[1].actions)
+
+
+def test_objects_can_be_followed_by_pictures_while_the_simulator_plans(simulator, mpc):
+    method = parse_method('true_model:carried')
+    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(SMALL))
+    run = run_episode(simulator, planner, method, 2, 5)
+    assert len(run.actions) == 2 and run.tracking_error() < 2
+
+
+@pytest.mark.parametrize('text', [
+    *BASES, 'genmin', 'true_model', 'genmin:half', 'fix0.25:recursion2:samples8:carried',
+    'genmin+relative:true_maps', 'genmin:true_model:more_search', 'direct:every3',
+    'fix:paper', 'true_subgoal:plain_cost',
+    'true_subgoal:half:recursion2'])
+def test_the_name_of_a_method_reads_as_that_method(text):
+    method = parse_method(text)
+    assert parse_method(method.name) == method
+    assert ':' not in method.file_name
+
+
+def test_options_that_a_method_has_no_use_for_change_nothing():
+    assert parse_method('direct', switch='half', recursion=3) == DIRECT
+    assert parse_method('nothing', tracking='carried') == parse_method('nothing')
+    assert parse_method('genmin', switch='half').name == 'genmin:half'
+    assert parse_method('genmin:reached', switch='half') == parse_method('genmin')
+
+
+@pytest.mark.parametrize('text', [
+    'genmin:often', 'genmin:half2', 'genmin:recursion', 'genmin:recursion0', 'a b',
+    'genmin:samples4:true_model'])
+def test_impossible_methods_are_named(text):
+    with pytest.raises(ConfigError, match=text):
+        parse_method(text)
+
+
+def test_options_change_the_planner():
+    more = parse_method('direct:more_search').planner(SMALL)
+    assert more == replace(SMALL, search=LARGE.search, proposals=80, batch_size=50)
+    assert parse_method('fix:half:paper').planner(SMALL) == PAPER
+    assert parse_method('direct:every3').planner(SMALL).replan_every == 3
+    assert parse_method('direct:plain_cost').planner(SMALL) == replace(SMALL, unfinished=0)
+    assert parse_method('direct').planner(SMALL) == SMALL
+
+
+def test_budgets_are_the_papers():
+    assert (step_budget(2), step_budget(3)) == (40, 75)
+
+
+def test_replanning_less_often_carries_the_plan_out(simulator, mpc):
+    seen = simulator.reset(5)
+    goal = simulator.goal().object_pixels
+    planner = VisualMPC(mpc.model, replace(SMALL, replan_every=3))
+    planner.reset(5)
+    plans = []
+    for _ in range(4):
+        plans.append(planner.act(
+            seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal))
+        seen = simulator.step(plans[-1].action)
+    for i in (1, 2):
+        np.testing.assert_allclose(plans[i].action[:2], plans[0].actions[i, :2], atol=1e-6)
+    assert plans[1].cost == plans[0].cost != plans[3].cost
+    planner.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal)
+    moved = planner.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal + 2)
+    assert moved.cost != plans[3].cost  # another goal needs another plan at once
+
+
+def test_shipped_model_foresees_a_push(simulator, mpc):
+    errors, moves = [], []
+    for seed in range(30, 34):
+        seen, along = go_behind(simulator, seed)
+        actions = np.tile(np.append(0.035 * along, [0, 0]), (1, 7, 1)).astype(np.float32)
+        maps = one_hot_maps(torch.from_numpy(seen.object_pixels), (64, 64))[None]
+        predicted = mpc.model.rollout(
+            to_float(seen.image)[None], torch.from_numpy(seen.gripper)[None], maps,
+            torch.from_numpy(actions))[0, -1].numpy()
+        before = seen.object_pixels
+        for action in actions[0]:
+            seen = simulator.step(action)
+        errors.append(np.linalg.norm(predicted[0] - seen.object_pixels[0]))
+        moves.append(np.linalg.norm(before[0] - seen.object_pixels[0]))
+    assert np.mean(moves) > 4 and np.mean(errors) < 0.5 * np.mean(moves)
