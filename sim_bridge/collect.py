@@ -1,22 +1,16 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Collect episodes of the expert on all cores into one recording: a rosbag2 bag split into files.
+Collect episodes of the expert into one recording: a rosbag2 bag split into files.
 
 Episode i has seed + i and goes into file i // episodes_per_file, whichever worker makes it, so the
 files do not depend on the number of workers. A finished file has its final name; an interrupted
 collection goes on with the files that are not there yet.
 """
 
-from concurrent.futures import ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 import json
-import multiprocessing
-from multiprocessing import connection
-import os
 from pathlib import Path
-import threading
 import time
 
 import numpy as np
@@ -24,6 +18,7 @@ from sim_bridge.expert import ExpertConfig, run_episode
 from sim_bridge.grasp_expert import GraspConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task, TASKS
+from tap_ros.engine import add_engine_arguments, engine_of, LOCAL, run_tasks, Task
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.episode import Episode
@@ -47,61 +42,49 @@ class CollectConfig:
     expert: ExpertConfig | GraspConfig | None = None  # None: the default one of the task
 
 
-def collect(folder, config, workers=None, progress=True):
+def collect(folder, config, engine=LOCAL, progress=True):
     """
     Collect a recording, or go on with one that was interrupted.
 
     :param folder: of the recording; made if it is not there.
     :param config: CollectConfig.
-    :param workers: processes; by default one a core.
+    :param engine: Engine; on a cluster the folder is one that all its machines share.
     :param progress: show a progress bar.
     :return: dict of episodes, frames, seconds (wall and by part, summed over workers), success
         rate and mean final distance in metres, of the episodes collected by this call.
     :raises ConfigError: when the folder holds a recording made with other settings.
-    :raises RecordingError: when a worker process was killed.
+    :raises EngineError: when worker processes are killed again and again.
     :raises StorageError: when the disk is full, or another process is collecting there. Files
         that are finished stay.
     """
     default = GraspConfig() if get_task(config.task).gripping else ExpertConfig()
     config = replace(config, expert=config.expert or default)
-    if min(config.episodes, config.episodes_per_file, workers or 1) < 1:
-        raise ConfigError('episodes, episodes_per_file and workers must be at least 1')
+    if min(config.episodes, config.episodes_per_file) < 1:
+        raise ConfigError('episodes and episodes_per_file must be at least 1')
     folder = Path(folder)
     with only_writer(folder), storage_errors(folder):
         _check_settings(folder, config)
         for left in folder.glob('*.part'):  # by a process that was killed
             left.unlink()
-        result = _collect_missing(folder, config, workers, progress)
+        result = _collect_missing(folder, config, engine, progress)
         write_metadata(folder)
     return result
 
 
-def _collect_missing(folder, config, workers, progress):
+def _collect_missing(folder, config, engine, progress):
     """Collect the files that are not there yet; see collect."""
     shards = -(-config.episodes // config.episodes_per_file)
     missing = [i for i in range(shards) if not _is_whole(folder, config, i)]
-    workers = min(workers or len(os.sched_getaffinity(0)), max(len(missing), 1))
-    context = multiprocessing.get_context('spawn')
-    done = context.Value('i', 0)
+    start, stats = time.perf_counter(), []
+    tasks = [Task(_shard_path(folder, i).name, _collect_shard, (str(folder), config, i))
+             for i in missing]
     total = sum(len(_episodes(config, i)) for i in missing)
-    start = time.perf_counter()
-    stats = []
-    with ProcessPoolExecutor(workers, context, _start_worker, (done,)) as pool, \
-            tqdm(total=total, unit='episode', disable=not progress) as bar:
-        waiting = {pool.submit(_collect_shard, str(folder), config, i) for i in missing}
-        try:
-            while waiting:
-                finished, waiting = wait(waiting, timeout=0.5)
-                bar.update(done.value - bar.n)
-                stats += [future.result() for future in finished]
-        except BrokenProcessPool as error:
-            raise RecordingError(
-                f'{escaped(folder)}: a worker process was killed, perhaps for want of memory; '
-                'start again, with fewer --workers: finished files are kept') from error
-        except BaseException:
-            pool.shutdown(cancel_futures=True)  # finish the files in progress, begin no others
-            raise
-    return _summary(stats, time.perf_counter() - start)
+    with tqdm(total=total, unit='episode', disable=not progress) as bar:
+        for _, get in run_tasks(tasks, engine):
+            stats.append(get())
+            bar.update(len(stats[-1]['outcomes']))
+    # In the order of the files, whichever was ready first.
+    return _summary(sorted(stats, key=lambda s: s['shard']), time.perf_counter() - start)
 
 
 def _summary(stats, wall):
@@ -167,24 +150,11 @@ def _episodes(config, shard):
     return range(first, min(first + config.episodes_per_file, config.episodes))
 
 
-def _start_worker(done):
-    """Give a worker process the counter of finished episodes; it ends when its parent does."""
-    global _done
-    _done = done
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent():
-    """Write nothing any more once the process that holds the folder's lock is gone."""
-    connection.wait([multiprocessing.parent_process().sentinel])
-    os._exit(1)
-
-
 def _collect_shard(folder, config, shard):
     """Collect one file; runs in a worker process."""
     simulator = Simulator(config.task, config.image_size)
     stats = {
-        'frames': 0, 'outcomes': [], 'distances': [],
+        'shard': shard, 'frames': 0, 'outcomes': [], 'distances': [],
         'seconds': {'search': 0.0, 'step': 0.0, 'write': 0.0}}
     path = _shard_path(folder, shard)
     with EpisodeWriter(path, camera_matrix=simulator.camera.K) as writer:
@@ -200,8 +170,6 @@ def _collect_shard(folder, config, shard):
             stats['frames'] += len(observations)
             stats['outcomes'].append(outcome)
             stats['distances'].append(simulator.distances())
-            with _done.get_lock():
-                _done.value += 1
     simulator.close()
     return stats
 
@@ -256,7 +224,7 @@ def add_arguments(parser):
     parser.add_argument(
         '--episodes-per-file', type=int, default=default.episodes_per_file,
         help='the bag is split into files of so many (default: %(default)s)')
-    parser.add_argument('--workers', type=int, help='processes (default: one a core)')
+    add_engine_arguments(parser)
 
 
 def run(args):
@@ -264,7 +232,7 @@ def run(args):
     config = CollectConfig(
         task=args.task, episodes=args.episodes, seed=args.seed, image_size=args.image_size,
         episodes_per_file=args.episodes_per_file)
-    result = collect(args.out, config, args.workers)
+    result = collect(args.out, config, engine_of(args))
     if not result['episodes']:
         print(f'{args.out}: all {args.episodes} episodes were there already')
         return

@@ -35,5 +35,9 @@ class SceneError(TapError):
     """A task, seed or scene cannot be set up, or an action cannot be applied."""
 
 
+class EngineError(TapError):
+    """A task could not be run to its end, since its workers were killed."""
+
+
 class PlanningError(TapError):
     """The planner was given states, maps or goals that cannot be planned with."""

@@ -9,13 +9,14 @@ import time
 
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
+from tap_ros.engine import Engine
 
 
 def run(args):
     """Collect into a temporary folder and print where the time went."""
     with tempfile.TemporaryDirectory() as folder:
         config = CollectConfig(task=args.task, episodes=args.episodes, episodes_per_file=5)
-        result = collect(Path(folder) / 'bench', config, workers=args.workers)
+        result = collect(Path(folder) / 'bench', config, Engine(workers=args.workers or 0))
         size = sum(path.stat().st_size for path in Path(folder).rglob('*.mcap'))
     simulator = Simulator(args.task)
     simulator.reset(0)

@@ -4,7 +4,6 @@
 
 from dataclasses import replace
 import json
-import os
 from pathlib import Path
 import shlex
 
@@ -14,6 +13,7 @@ from experiments.planning.page import make_page
 from experiments.planning.results import load_results, make_rows
 from experiments.planning.runs import Job, run_jobs
 from tap_ros.contract import step_budget
+from tap_ros.engine import add_engine_arguments, engine_of
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import forward
 from tap_ros.files import write_atomically, write_rows
@@ -44,8 +44,7 @@ def add_arguments(parser):
     add('--scenes', type=int, default=100, help='how many (default: %(default)s)')
     add('--seed', type=int, default=FIRST_SCENE,
         help='of the first scene (default: %(default)s)')
-    add('--jobs', type=int, default=len(os.sched_getaffinity(0)),
-        help='processes, of one thread each (default: one a core, %(default)s)')
+    add_engine_arguments(parser, '--jobs')
     add('--switch', choices=SWITCHES, default='reached',
         help='go on from a subgoal when it is reached, or at its share of the budget as in the '
         'paper (default: %(default)s); for all methods, as the next three')
@@ -80,13 +79,13 @@ def add_arguments(parser):
 
 def run(args):
     """Run what is missing; write the numbers, the page and the films."""
-    if min(args.scenes, args.jobs) < 1:
-        raise ConfigError('scenes and jobs must be at least 1')
+    if args.scenes < 1:
+        raise ConfigError('scenes must be at least 1')
     out, films = Path(args.out), {}
     if not args.results_only:
         jobs = make_jobs(args)
         seeds = range(args.seed, args.seed + args.scenes)
-        files = run_jobs(jobs, seeds, out / 'planning', args.jobs)
+        files = run_jobs(jobs, seeds, out / 'planning', engine_of(args))
         _write_results(out, films)  # first: whatever happens to the films, these stay
         for job, file in zip(jobs, files):
             name = f'{job.task}-{job.method.file_name}'

@@ -1,12 +1,10 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Run methods on scenes in several processes, a result file for each task and method."""
+"""Run methods on scenes, a result file for each task and method."""
 
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 import json
-import multiprocessing
 from pathlib import Path
 
 from experiments.planning.episode import run_episode
@@ -16,6 +14,7 @@ import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
+from tap_ros.engine import LOCAL, run_tasks, Task
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.files import write_atomically
 from tap_ros.learning.weights import stored_digest
@@ -118,13 +117,13 @@ def read_results(path):
                           'its scenes are run again') from error
 
 
-def run_jobs(jobs, seeds, folder, processes=1, progress=True):
+def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True):
     """
     Run all jobs on all scenes, and go on where an interrupted evaluation stopped.
 
     :param jobs: list of Job; seeds: of the scenes.
     :param folder: of the result files.
-    :param processes: how many scenes are planned in at once, each in one thread.
+    :param engine: Engine; each scene is planned in one thread.
     :return: list of ResultFile, one for each job.
     :raises ConfigError: for result files that are damaged or made with other settings.
     """
@@ -132,27 +131,14 @@ def run_jobs(jobs, seeds, folder, processes=1, progress=True):
     # scene by scene, so that what was run so far can be compared
     todo = [(i, seed) for seed in seeds for i, file in enumerate(files)
             if seed not in file.scenes]
+    tasks = {Task(f'{jobs[i].task}, {jobs[i].method.name}, scene {seed}', run_scene,
+                  (jobs[i], seed)): i for i, seed in todo}
     with tqdm(total=len(todo), desc='scenes x methods', disable=not progress) as bar:
-        def finish(i, scene):
+        for task, get in run_tasks(tasks, engine):
+            i, scene = tasks[task], get()
             files[i].add(scene)
             bar.set_postfix_str(f'{jobs[i].method.name} {scene["final_cm"]:.1f} cm')
             bar.update()
-        if processes == 1 or len(todo) < 2:
-            for i, seed in todo:
-                finish(i, run_scene(jobs[i], seed))
-            return files
-        pool = ProcessPoolExecutor(
-            processes, multiprocessing.get_context('spawn'), torch.set_num_threads, (1,))
-        with pool:
-            waiting = {pool.submit(run_scene, jobs[i], seed): i for i, seed in todo}
-            try:
-                while waiting:
-                    done, _ = wait(waiting, return_when=FIRST_COMPLETED)
-                    for future in done:
-                        finish(waiting.pop(future), future.result())
-            except BaseException:
-                pool.shutdown(cancel_futures=True)  # finish the scenes in progress, no others
-                raise
     return files
 
 

@@ -3,6 +3,7 @@
 """Laws of the expert and of collecting: progress, variety, reproducibility, resuming."""
 
 import json
+import os
 from pathlib import Path
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.expert import run_episode
 from sim_bridge.simulator import Simulator
+from tap_ros.engine import Engine
 from tap_ros.errors import ConfigError, StorageError
 from tap_ros.files import only_writer
 from tap_ros.recording.reader import iter_episodes
@@ -58,7 +60,7 @@ def test_the_order_of_objects_varies(episodes):
 def test_files_do_not_depend_on_the_number_of_workers(tmp_path):
     config = CollectConfig(episodes=4, episodes_per_file=2, seed=11)
     for workers in (1, 2):
-        collect(tmp_path / str(workers) / 'push', config, workers=workers, progress=False)
+        collect(tmp_path / str(workers) / 'push', config, Engine(workers=workers), progress=False)
     for name in ('push_0.mcap', 'push_1.mcap', 'metadata.yaml'):
         a, b = ((tmp_path / w / 'push' / name).read_bytes() for w in '12')
         assert a == b, name
@@ -83,6 +85,32 @@ def test_a_folder_is_never_mixed_with_other_settings(tmp_path):
     with pytest.raises(ConfigError, match='seed'):
         collect(folder, CollectConfig(episodes=1, seed=2), progress=False)
     assert (folder / 'push_0.mcap').read_bytes() == before
+
+
+@pytest.mark.slow
+def test_files_do_not_depend_on_the_engine(tmp_path):
+    pytest.importorskip('ray')
+    config = CollectConfig(episodes=3, episodes_per_file=1, seed=11)
+    for name in ('local', 'ray'):
+        collect(tmp_path / name / 'push', config, Engine(name), progress=False)
+    assert contents(tmp_path / 'ray' / 'push') == contents(tmp_path / 'local' / 'push')
+
+
+def test_the_file_of_a_killed_worker_is_collected_again(tmp_path):
+    config = CollectConfig(episodes=4, episodes_per_file=2, seed=5)
+    collect(tmp_path / 'whole' / 'push', config, progress=False)
+    folder = tmp_path / 'killed' / 'push'
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'tap_ros', 'collect', '--out', str(folder), '--episodes', '4',
+         '--episodes-per-file', '2', '--seed', '5', '--workers', '1'], stderr=subprocess.DEVNULL)
+    while not list(folder.glob('*.part')) and process.poll() is None:
+        time.sleep(0.02)
+    children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
+    worker, = (pid for pid in children
+               if b'spawn_main' in Path(f'/proc/{pid}/cmdline').read_bytes())
+    os.kill(int(worker), signal.SIGKILL)
+    assert process.wait() == 0
+    assert contents(folder) == contents(tmp_path / 'whole' / 'push')
 
 
 def contents(folder):

@@ -159,10 +159,10 @@ def test_the_goal_of_a_recorded_episode_is_its_last_frame(simulator):
 def test_the_same_seed_gives_the_same_bytes_and_another_expert_is_refused(simulator, tmp_path):
     config = CollectConfig(simulator.task.name, episodes=2, episodes_per_file=2, seed=7)
     for name in 'ab':
-        collect(tmp_path / name / 'bag', config, workers=1, progress=False)
+        collect(tmp_path / name / 'bag', config, progress=False)
     a, b = ((tmp_path / name / 'bag' / 'bag_0.mcap').read_bytes() for name in 'ab')
     assert a == b
     other = CollectConfig(simulator.task.name, episodes=2, episodes_per_file=2, seed=7,
                           expert=GraspConfig(explore=0.5))
     with pytest.raises(ConfigError, match='expert'):
-        collect(tmp_path / 'a' / 'bag', other, workers=1, progress=False)
+        collect(tmp_path / 'a' / 'bag', other, progress=False)
