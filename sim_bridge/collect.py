@@ -42,7 +42,7 @@ class CollectConfig:
     expert: ExpertConfig | GraspConfig | None = None  # None: the default one of the task
 
 
-def collect(folder, config, engine=LOCAL, progress=True):
+def collect(folder, config, engine=LOCAL, progress=True, stop=lambda: False):
     """
     Collect a recording, or go on with one that was interrupted.
 
@@ -50,8 +50,10 @@ def collect(folder, config, engine=LOCAL, progress=True):
     :param config: CollectConfig.
     :param engine: Engine; on a cluster the folder is one that all its machines share.
     :param progress: show a progress bar.
+    :param stop: asked before each file; once it says True, no other begins.
     :return: dict of episodes, frames, seconds (wall and by part, summed over workers), success
-        rate and mean final distance in metres, of the episodes collected by this call.
+        rate, mean final distance in metres, of the episodes collected by this call, and whether
+        the recording is whole now.
     :raises ConfigError: when the folder holds a recording made with other settings.
     :raises EngineError: when worker processes are killed again and again.
     :raises StorageError: when the disk is full, or another process is collecting there. Files
@@ -66,12 +68,13 @@ def collect(folder, config, engine=LOCAL, progress=True):
         _check_settings(folder, config)
         for left in folder.glob('*.part'):  # by a process that was killed
             left.unlink()
-        result = _collect_missing(folder, config, engine, progress)
-        write_metadata(folder)
+        result = _collect_missing(folder, config, engine, progress, stop)
+        if result['whole']:
+            write_metadata(folder)
     return result
 
 
-def _collect_missing(folder, config, engine, progress):
+def _collect_missing(folder, config, engine, progress, stop):
     """Collect the files that are not there yet; see collect."""
     shards = -(-config.episodes // config.episodes_per_file)
     missing = [i for i in range(shards) if not _is_whole(folder, config, i)]
@@ -80,11 +83,12 @@ def _collect_missing(folder, config, engine, progress):
              for i in missing]
     total = sum(len(_episodes(config, i)) for i in missing)
     with tqdm(total=total, unit='episode', disable=not progress) as bar:
-        for _, get in run_tasks(tasks, engine):
+        for _, get in run_tasks(tasks, engine, stop):
             stats.append(get())
             bar.update(len(stats[-1]['outcomes']))
     # In the order of the files, whichever was ready first.
-    return _summary(sorted(stats, key=lambda s: s['shard']), time.perf_counter() - start)
+    stats.sort(key=lambda s: s['shard'])
+    return _summary(stats, time.perf_counter() - start) | {'whole': len(stats) == len(missing)}
 
 
 def _summary(stats, wall):

@@ -17,6 +17,7 @@ import multiprocessing
 from multiprocessing import connection
 import os
 from pathlib import Path
+import signal
 import socket
 import sys
 import threading
@@ -74,13 +75,14 @@ class Task:
     args: tuple = ()
 
 
-def run_tasks(tasks, engine=LOCAL, stop=lambda: False):
+def run_tasks(tasks, engine=LOCAL, stop=lambda: False, tick=lambda: None):
     """
     Run tasks, in their order as far as there are workers.
 
     :param tasks: iterable of Task.
     :param engine: Engine.
     :param stop: asked before each task; once it says True, no other begins.
+    :param tick: called about twice a second meanwhile.
     :return: generator of (Task, get), in the order in which they end: get() returns what the
         task returned, or raises what it raised. Tasks in progress are ended where the generator
         is closed or interrupted.
@@ -97,6 +99,7 @@ def run_tasks(tasks, engine=LOCAL, stop=lambda: False):
             if not workers.running:
                 return
             yield from workers.ended()
+            tick()
 
 
 class _LocalWorkers:
@@ -110,7 +113,7 @@ class _LocalWorkers:
 
     def __enter__(self):
         self._pool = ProcessPoolExecutor(
-            self.room, multiprocessing.get_context('spawn'), _end_with_parent)
+            self.room, multiprocessing.get_context('spawn'), _start_worker)
         return self
 
     def __exit__(self, kind, *_):
@@ -258,11 +261,17 @@ def _no_answer(address, error):
                        f'({escaped(error)}); start it with `ray start`, or correct --address')
 
 
-def _end_with_parent():
-    """End a worker whose parent is gone: who holds a folder's lock is the only one to write."""
+def _start_worker():
+    """
+    Let a worker end with its parent alone.
+
+    Who holds the lock of a folder is the only one to write there, so it must not outlive it; what
+    a terminal sends to both is the parent's to handle.
+    """
     def end():
         connection.wait([multiprocessing.parent_process().sentinel])
         os._exit(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end, daemon=True).start()
 
 

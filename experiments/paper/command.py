@@ -8,6 +8,7 @@ from experiments.paper.places import Places
 from experiments.paper.runs import paper_runs, SCALES
 from experiments.paper.sweep import data_hashes, find_state, sweep
 import numpy as np
+from tap_ros.engine import add_engine_arguments, engine_of
 from tap_ros.errors import ConfigError
 
 
@@ -27,8 +28,7 @@ def add_arguments(parser):
     parser.add_argument('--ship', nargs=2, metavar=('RUN', 'FILE'),
                         help='write the weights of a run that is done at half their size, with a '
                         'model card beside them')
-    parser.add_argument('--jobs', type=int, default=1, metavar='N',
-                        help='processes at a time (default: %(default)s)')
+    add_engine_arguments(parser, '--jobs')
     parser.add_argument('--limit', '--slice-minutes', type=float, metavar='MINUTES',
                         help='stop after so many; the next call goes on')
     parser.add_argument('--seeds', type=int, nargs='+', default=[0], metavar='SEED',
@@ -55,8 +55,8 @@ def run(args):
     :return: exit status: 0, or 1 if a run failed.
     :raises ConfigError: if no run fits, or a number makes no sense.
     """
-    if args.jobs < 1 or min(args.episodes, args.steps) < 0 or (args.limit or 1) <= 0:
-        raise ConfigError('jobs, limit, episodes, steps: expected numbers above 0')
+    if min(args.episodes, args.steps) < 0 or (args.limit or 1) <= 0:
+        raise ConfigError('limit, episodes, steps: expected numbers above 0')
     places = Places(args.recordings, args.runs, args.results)
     if args.results_only:
         _write_results(places, pictures=True)
@@ -67,7 +67,7 @@ def run(args):
     if args.list:
         show(runs, places)
         return 0
-    ends = sweep(runs, places, args.jobs, args.limit, args.fresh, args.collect,
+    ends = sweep(runs, places, engine_of(args), args.limit, args.fresh, args.collect,
                  on_done=lambda: _try_results(places, pictures=False))
     failed = [end for end in ends if end.kind == 'failed']
     if not args.collect:
@@ -84,7 +84,7 @@ def run(args):
         if end.kind == 'busy':
             print(f'{end.name}: another sweep is at it')
     for end in failed:
-        print(f'{end.name} failed: {end.reason} (see {end.log})')
+        print(f'{end.name} failed: {end.reason} (see {end.place})')
     if failed and any(state.kind == 'other' for state in states):
         print('--fresh begins runs anew that were begun with other settings or recordings')
     return 1 if failed else 0

@@ -1,51 +1,77 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What one process of a sweep does: collect a recording, or train and score one run.
+What a sweep is made of: collect a recording, or train and score one run.
 
 Each is safe to stop at any moment: recordings and trainings go on from where they were, and the
 result of a run appears when it is complete.
 """
 
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict
 import json
+import math
 from pathlib import Path
-import sys
 import time
+import traceback
 
 from experiments.paper.places import (
     collect_command,
     collected_episodes,
-    Places,
     read_json,
 )
-from experiments.paper.runs import PaperRun
 import numpy as np
+from tap_ros.engine import LOCAL
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.files import locked, write_atomically
 
-DONE, FAILED, BUSY, UNFINISHED = 0, 1, 73, 75  # exit statuses
+DONE, FAILED, BUSY, UNFINISHED = 'done', 'failed', 'busy', 'unfinished'
 _DIGITS = 5
 _LEFT_BY_TRAINING = ('checkpoint.safetensors', 'predictor.safetensors', 'config.json', 'run.json',
                      'scores.json')
 
 
-def collect_task(task, episodes, places, workers=None):
+def collect_task(task, episodes, places, engine=LOCAL, deadline=math.inf,
+                 progress=False):
     """
     Collect the recording of a task, or what it lacks; wait if another sweep is at it.
 
     :param task: of sim_bridge.tasks.
     :param episodes: how many at least.
     :param places: Places.
-    :param workers: processes; None: one a core.
+    :param engine: Engine.
+    :param deadline: time.time() after which no other file begins.
+    :param progress: whether to show a progress bar.
+    :return: DONE, or UNFINISHED if the time was not enough.
     """
     from sim_bridge.collect import collect, CollectConfig
 
     folder = places.recording(task)
     with locked(Path(places.recordings) / f'.{task}.lock', wait=True):
         episodes = max(episodes, collected_episodes(folder))
-        collect(folder, CollectConfig(task=task, episodes=episodes), workers, progress=False)
-    return DONE
+        found = collect(folder, CollectConfig(task=task, episodes=episodes), engine,
+                        progress, stop=lambda: time.time() > deadline)
+    return DONE if found['whole'] else UNFINISHED
+
+
+def logged(run, places, deadline, fresh):
+    """
+    Perform a run; what there is to say goes into its folder's log.txt.
+
+    :param deadline: time.time() at which training stops; it goes on another time.
+    :return: as perform, or FAILED.
+    """
+    log = run.folder(places.runs) / 'log.txt'
+    log.parent.mkdir(parents=True, exist_ok=True)
+    minutes = None if math.isinf(deadline) else max(deadline - time.time(), 1) / 60
+    with open(log, 'w') as file, redirect_stdout(file), redirect_stderr(file):
+        try:
+            return perform(run, places, minutes, fresh)
+        except TapError as error:
+            print(f'error: {error}')
+        except Exception:
+            traceback.print_exc()
+        return FAILED
 
 
 def perform(run, places, minutes=None, fresh=False):
@@ -141,25 +167,6 @@ def score(run, config, weights, places):
         'evaluation': {'margin': 0, 'goal_picture': 'last', 'seconds': seconds, **scores}}
 
 
-def main(argument):
-    """
-    Do one job.
-
-    :param argument: JSON of {'places'}, with {'collect', 'episodes', 'workers'} or with {'run',
-        'minutes', 'fresh'}.
-    :return: exit status.
-    """
-    job = json.loads(argument)
-    places = Places(**job['places'])
-    try:
-        if 'collect' in job:
-            return collect_task(job['collect'], job['episodes'], places, job['workers'])
-        return perform(PaperRun(**job['run']), places, job['minutes'], job['fresh'])
-    except TapError as error:
-        print(f'error: {error}', file=sys.stderr)
-        return FAILED
-
-
 def _rounded(scores):
     """Turn a dataclass of arrays into lists of few digits, None for NaN."""
     return {name: _rounded_list(values) for name, values in vars(scores).items()}
@@ -169,6 +176,3 @@ def _rounded_list(values):
     return [None if np.isnan(x) else round(float(x), _DIGITS) if x % 1 else int(x)
             for x in values]
 
-
-if __name__ == '__main__':
-    sys.exit(main(sys.argv[1]))

@@ -1,34 +1,28 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A resumable sweep over the paper's runs, several processes at a time.
+A resumable sweep over the paper's runs.
 
 What is done is left as it is, what was begun goes on. Recordings are made when the first run needs
 them.
 """
 
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 import json
 import math
-import os
 from pathlib import Path
-import signal
-import subprocess
 import sys
 import time
 
-from experiments.paper.job import BUSY, DONE, UNFINISHED
+from experiments.paper.job import collect_task, DONE, FAILED, logged
 from experiments.paper.places import is_collected, read_json, recording_hash
-from experiments.paper.runs import PaperRun
+from tap_ros.engine import LOCAL, run_tasks, Task
+from tap_ros.errors import EngineError, TapError
 from tap_ros.learning.checkpoints import FREE
 from tap_ros.prediction.training_config import DEFAULTS
 from tqdm import tqdm
 
-_ENDS = {DONE: 'done', BUSY: 'busy', UNFINISHED: 'unfinished', -signal.SIGTERM: 'unfinished'}
-_POLL = 0.5  # s
 _SHOW = (60, 1)  # s between looks of the progress bar, in a file and on a terminal
-_GRACE = 20  # s that a process has to end when asked to
 
 
 @dataclass(frozen=True)
@@ -54,28 +48,14 @@ class End:
 
     :param name: of the run, or of the task that was to be collected.
     :param kind: 'done', 'unfinished', 'busy' (another sweep is at it) or 'failed'.
-    :param log: Path of what it printed.
+    :param reason: the last line of what it printed.
+    :param place: the file with all of that, or the folder of the recording.
     """
 
     name: str
     kind: str
-    log: Path
-
-    @property
-    def reason(self):
-        """The last line of the log."""
-        lines = self.log.read_text(errors='replace').strip().splitlines()
-        return lines[-1] if lines else 'it printed nothing'
-
-
-@dataclass(frozen=True)
-class _Job:
-    """A process that is running; run is None where it collects."""
-
-    task: str
-    run: PaperRun | None
-    process: subprocess.Popen
-    log: Path
+    reason: str
+    place: str
 
 
 def find_state(run, places, hashes=None):
@@ -162,14 +142,14 @@ def data_hashes(runs, places):
             if is_collected(places.recording(task), episodes)}
 
 
-def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, on_done=None,
-          progress=True):
+def sweep(runs, places, engine=LOCAL, minutes=None, fresh=False, collect_only=False,
+          on_done=lambda: None, progress=True):
     """
-    Do all runs that are not done.
+    Do all runs that are not done: collect what they need, train and score.
 
     :param runs: PaperRuns, the most important first.
-    :param places: Places.
-    :param jobs: processes at a time.
+    :param places: Places; on a cluster, folders that all its machines share.
+    :param engine: Engine.
     :param minutes: begin nothing after so many, and let trainings stop then; None: never.
     :param fresh: begin runs anew that were begun with other settings or recordings.
     :param collect_only: make the recordings only.
@@ -177,143 +157,77 @@ def sweep(runs, places, jobs=1, minutes=None, fresh=False, collect_only=False, o
     :param progress: whether to show a progress bar.
     :return: list of Ends of all that was tried.
     """
-    deadline = time.monotonic() + 60 * (minutes or math.inf)
+    deadline = time.time() + 60 * (minutes or math.inf)
     hashes = data_hashes(runs, places)
     states = {run: find_state(run, places, hashes) for run in runs}
-    waiting = [run for run in runs if states[run].kind != 'done']
-    if collect_only:
-        waiting = list(runs)
-    active, ends, failed, undone = [], [], set(), set()
-    bar = tqdm(desc='paper', unit='step', total=sum(run.num_steps for run in waiting),
-               initial=sum(states[run].steps for run in waiting),
-               disable=not progress or collect_only)
-
-    def begin():
-        """Start the first job that can be; return whether there was one."""
-        collecting = {job.task for job in active if job.run is None}
-        for run in list(waiting):
-            missing = [task for task in run.training_tasks if task not in hashes]
-            if (not failed.isdisjoint(run.training_tasks) or run.before in undone
-                    or (collect_only and not missing)):
-                waiting.remove(run)
-            elif run.before in [*waiting, *(job.run for job in active if job.run)] and (
-                    not collect_only):
-                continue
-            elif not missing:
-                waiting.remove(run)
-                active.append(_start_run(
-                    run, places, deadline, fresh and states[run].kind != 'partial'))
-                return True
-            elif not collecting.issuperset(missing):
-                task = next(task for task in missing if task not in collecting)
-                active.append(_start_collecting(task, runs, places, jobs))
-                return True
-        return False
-
-    def end(job, status):
-        """Take note of how a job ended."""
-        active.remove(job)
-        kind = _ENDS.get(status, 'failed')
-        ends.append(End(job.run.name if job.run else job.task, kind, job.log))
-        if progress:
-            bar.write(f'{ends[-1].name}: {kind}')
-            _show(bar, states, [job], places)
-        if job.run is None and kind == 'done':
-            hashes[job.task] = recording_hash(places.recording(job.task))
-        elif job.run is None:
-            failed.add(job.task)
-        elif kind != 'done':
-            undone.add(job.run)  # what begins with its weights has to wait for another sweep
-        elif on_done:
-            on_done()
-
-    shown = -math.inf
-    with _stoppable(active), bar:
-        while True:
-            while len(active) < jobs and time.monotonic() < deadline and begin():
-                pass
-            if not active:
-                return ends
-            time.sleep(_POLL)
-            for job in list(active):
-                if job.run is None and time.monotonic() > deadline:
-                    _signal_group(job.process, signal.SIGTERM)  # it goes on file by file
-                status = job.process.poll()
-                if status is not None:
-                    end(job, status)
-            if progress and time.monotonic() > shown + _SHOW[sys.stderr.isatty()]:
-                shown = time.monotonic()
-                _show(bar, states, active, places)
+    waiting = [run for run in runs if collect_only or states[run].kind != 'done']
+    ends = _collect_missing(waiting, runs, places, hashes, engine, deadline, progress)
+    missing = {end.name for end in ends if end.kind != 'done'}
+    waiting = [] if collect_only else [
+        run for run in waiting if missing.isdisjoint(run.training_tasks)]
+    with tqdm(desc='paper', unit='step', total=sum(run.num_steps for run in waiting),
+              initial=sum(states[run].steps for run in waiting), disable=not progress) as bar:
+        # Those that begin with the weights of others come when these are done.
+        for later in (False, True):
+            undone = {end.name for end in ends if end.kind != 'done'}
+            chosen = {run.name: run for run in waiting if later == (run.before in waiting)
+                      and (run.before is None or run.before.name not in undone)}
+            tasks = [Task(run.name, logged, (run, places, deadline, fresh
+                                             and states[run].kind != 'partial'))
+                     for run in chosen.values()]
+            for task, get in run_tasks(
+                    tasks, engine, lambda: time.time() > deadline,
+                    _Shower(bar, states, chosen.values(), places) if progress else lambda: None):
+                ends.append(_end(task.name, get, chosen[task.name].folder(places.runs)))
+                if progress:
+                    bar.write(f'{task.name}: {ends[-1].kind}')
+                if ends[-1].kind == DONE:
+                    on_done()
+    return ends
 
 
-def _start_run(run, places, deadline, fresh):
-    """Start a process that trains and scores."""
-    left = deadline - time.monotonic()
-    job = {'run': asdict(run), 'minutes': None if math.isinf(left) else max(left, 1) / 60,
-           'fresh': fresh}
-    return _Job(run.task, run, *_start(job, places, run.folder(places.runs) / 'log.txt'))
+def _collect_missing(waiting, runs, places, hashes, engine, deadline, progress):
+    """Collect the recordings that runs wait for, and note their hashes; return the Ends."""
+    ends = []
+    for task in dict.fromkeys(task for run in waiting for task in run.training_tasks):
+        if task in hashes or time.time() > deadline:
+            continue
+        episodes = max(replace(run, task=task).num_episodes
+                       for run in runs if task in run.training_tasks)
+        try:
+            kind = collect_task(task, episodes, places, engine, deadline, progress)
+            reason = ''
+        except TapError as error:
+            kind, reason = FAILED, f'error: {error}'
+        ends.append(End(task, kind, reason, str(places.recording(task))))
+        if kind == DONE:
+            hashes[task] = recording_hash(places.recording(task))
+    return ends
 
 
-def _start_collecting(task, runs, places, jobs):
-    """Start a process that collects the recording of a task, for all runs that need it."""
-    episodes = max(replace(run, task=task).num_episodes
-                   for run in runs if task in run.training_tasks)
-    job = {'collect': task, 'episodes': episodes,
-           'workers': max(1, len(os.sched_getaffinity(0)) // jobs)}
-    return _Job(task, None, *_start(job, places, Path(places.runs) / f'collect-{task}.txt'))
-
-
-def _start(job, places, log):
-    """Start a process of its own group; return (Popen, log)."""
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with open(log, 'w') as file:
-        process = subprocess.Popen(
-            [sys.executable, '-m', 'experiments.paper.job',
-             json.dumps({'places': asdict(places), **job})],
-            stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True)
-    return process, log
-
-
-@contextmanager
-def _stoppable(active):
-    """End all processes when this one is interrupted, told to end, or fails."""
-    def interrupt(*_):
-        raise KeyboardInterrupt
-    signals = [number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-               if signal.getsignal(number) != signal.SIG_IGN]  # as under nohup
-    before = {number: signal.signal(number, interrupt) for number in signals}
+def _end(name, get, folder):
+    """Return the End of a run whose task has ended."""
+    log = folder / 'log.txt'
     try:
-        yield
-    finally:
-        for number in signals:
-            signal.signal(number, signal.SIG_IGN)
-        for job in active:
-            _signal_group(job.process, signal.SIGTERM)
-        patience = time.monotonic() + _GRACE
-        for job in active:
-            try:
-                job.process.wait(max(0, patience - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                _signal_group(job.process, signal.SIGKILL)
-                job.process.wait()
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        kind = get()
+        lines = log.read_text(errors='replace').strip().splitlines()
+    except (EngineError, OSError) as error:
+        kind, lines = FAILED, [f'error: {error}']
+    return End(name, kind, lines[-1] if lines else 'it printed nothing', str(log))
 
 
-def _signal_group(process, number):
-    """Send a signal to a process and its children, as far as they are alive."""
-    try:
-        os.killpg(process.pid, number)
-    except ProcessLookupError:
-        pass
+class _Shower:
+    """Brings the progress bar up to date now and then, from what trainings leave."""
 
+    def __init__(self, bar, states, runs, places):
+        self._bar, self._runs, self._places = bar, list(runs), places
+        self._states, self._shown = states, -math.inf
 
-def _show(bar, states, active, places):
-    """Bring the progress bar up to date."""
-    for job in active:
-        if job.run is not None:
-            about = read_json(job.run.folder(places.runs) / 'run.json') or {'steps': 0}
-            bar.n += max(0, about['steps'] - states[job.run].steps)
-            states[job.run] = State('partial', max(about['steps'], states[job.run].steps))
-    bar.set_postfix_str(', '.join(job.run.name if job.run else f'collecting {job.task}'
-                                  for job in active))
+    def __call__(self):
+        if time.monotonic() < self._shown + _SHOW[sys.stderr.isatty()]:
+            return
+        self._shown = time.monotonic()
+        for run in self._runs:
+            about = read_json(run.folder(self._places.runs) / 'run.json') or {'steps': 0}
+            self._bar.update(max(0, about['steps'] - self._states[run].steps))
+            self._states[run] = State('partial', max(about['steps'], self._states[run].steps))

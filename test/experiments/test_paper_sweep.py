@@ -25,6 +25,7 @@ from experiments.paper.shipping import ship
 from experiments.paper.sweep import find_state, sweep
 import numpy as np
 import pytest
+from tap_ros.engine import Engine
 from tap_ros.errors import ConfigError
 from tap_ros.files import locked
 from tap_ros.learning.split import split_episodes
@@ -183,7 +184,8 @@ def test_one_failed_run_does_not_stop_the_others(places):
     write_bag(Path(places.recordings) / 'grasp', [0])  # one episode: none can be held out
     bad = replace(RUN, task='grasp')
     calls = []
-    ends = sweep([bad, RUN], places, jobs=2, on_done=lambda: calls.append(1), progress=False)
+    ends = sweep([bad, RUN], places, Engine(workers=2), on_done=lambda: calls.append(1),
+                 progress=False)
     assert {end.name: end.kind for end in ends} == {bad.name: 'failed', RUN.name: 'done'}
     assert len(calls) == 1
     failed = next(end for end in ends if end.kind == 'failed')
@@ -207,7 +209,7 @@ def test_three_objects_begin_with_the_weights_for_two(places):
     run = replace(RUN, task='push3')
     assert [(end.name, end.kind) for end in sweep([run], places, progress=False)] == [
         (run.name, 'failed')]  # those are not trained
-    ends = sweep([run, run.before], places, jobs=2, progress=False)
+    ends = sweep([run, run.before], places, engine=Engine(workers=2), progress=False)
     assert [(end.name, end.kind) for end in ends] == [
         (RUN.name, 'done'), (run.name, 'done')]
     result = json.loads(places.result(run).read_text())
@@ -244,7 +246,7 @@ def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path):
 @pytest.mark.slow
 def test_missing_recordings_are_collected(places):
     run = replace(RUN, task='grasp', episodes=2)
-    ends = sweep([run], places, jobs=2, collect_only=True, progress=False)
+    ends = sweep([run], places, engine=Engine(workers=2), collect_only=True, progress=False)
     assert [(end.name, end.kind) for end in ends] == [('grasp', 'done')]
     assert is_collected(places.recording('grasp'), 2)
     assert sweep([run], places, collect_only=True, progress=False) == []
@@ -266,8 +268,9 @@ def test_an_interrupted_sweep_leaves_no_process_and_goes_on(places, number):
     while not lock.exists() and time.monotonic() < patience:
         time.sleep(0.05)
     process.send_signal(number)
-    assert b'KeyboardInterrupt' in process.communicate(timeout=60)[1]
-    with locked(lock) as mine:
+    assert (b'KeyboardInterrupt' in process.communicate(timeout=60)[1]) == (
+        number == signal.SIGINT)
+    with locked(lock, wait=True) as mine:  # the worker ends soon
         assert mine
     assert find_state(RUN, places).kind in ('missing', 'other')
 
@@ -300,7 +303,8 @@ def test_the_command_lists_and_does_what_fits_the_pattern(places, capsys, monkey
 
 
 @pytest.mark.parametrize('options, named', [
-    (['--only', 'nothing-*'], 'nothing-'), (['--jobs', '0'], 'jobs'), (['--limit', '-1'], 'lim')])
+    (['--only', 'nothing-*'], 'nothing-'), (['--jobs', '-1'], 'workers'),
+    (['--limit', '-1'], 'lim')])
 def test_bad_options_are_refused(places, options, named):
     with pytest.raises(ConfigError, match=named):
         command.run(arguments(places, *options))
