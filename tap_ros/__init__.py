@@ -1,10 +1,37 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Time-agnostic prediction as a subgoal service for robots, with ROS 2."""
+"""
+Time-agnostic prediction as a subgoal service for robots, with ROS 2.
 
+The names of __all__ can be imported from here: `from tap_ros import SubgoalPredictor`.
+"""
+
+from importlib import import_module
 import os
 
 # By default an idle thread of libgomp spins for milliseconds before it sleeps. On cores that are
 # busy with something else that makes small networks 10 times slower; a fifth of it costs nothing.
 if 'OMP_WAIT_POLICY' not in os.environ:
     os.environ.setdefault('GOMP_SPINCOUNT', '60000')
+
+# What most users need; each is imported when it is asked for, so that nodes stay light.
+_EXPORTS = {
+    'EpisodeWriter': 'tap_ros.recording.writer',
+    'iter_episodes': 'tap_ros.recording.reader',
+    'open_recordings': 'tap_ros.recording.cache',
+    'Simulator': 'sim_bridge.simulator',
+    'SubgoalPredictor': 'tap_ros.prediction.predictor',
+    'TapError': 'tap_ros.errors',
+    'VisualMPC': 'tap_ros.planning.visual_mpc',
+}
+__all__ = list(_EXPORTS)
+
+
+def __getattr__(name):
+    if name not in _EXPORTS:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(import_module(_EXPORTS[name]), name)
+
+
+def __dir__():
+    return [*globals(), *_EXPORTS]

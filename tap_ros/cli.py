@@ -32,6 +32,7 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo'),
     'bench': ('measure speed; without a name, all of it', {
         'collect': 'experiments.bench.collect',
+        'engine': 'experiments.bench.engine',
         'recording': 'experiments.bench.recording',
         'training': 'experiments.bench.training',
         'planning': 'experiments.bench.planning',

@@ -134,3 +134,14 @@ def test_threads_do_not_spin_for_long_unless_the_user_wants_it(chosen, found):
         [sys.executable, '-c', 'import os, tap_ros; print(os.environ.get("GOMP_SPINCOUNT"))'],
         cwd=ROOT, env=kept | chosen, capture_output=True, text=True, check=True).stdout
     assert output.strip() == found
+
+
+def test_what_is_exported_is_there_and_is_loaded_only_when_asked_for():
+    script = ('import sys, tap_ros; assert not {"torch", "mujoco", "mcap"} & set(sys.modules)\n'
+              'assert set(tap_ros.__all__) <= set(dir(tap_ros))\n'
+              'for name in tap_ros.__all__: assert getattr(tap_ros, name).__name__ == name\n'
+              'try: tap_ros.nothing\n'
+              'except AttributeError as error: print(error)')
+    run = subprocess.run([sys.executable, '-c', script], cwd=ROOT, text=True, capture_output=True)
+    assert (run.returncode, run.stdout) == (0, "module 'tap_ros' has no attribute 'nothing'\n"), (
+        run.stderr)

@@ -129,7 +129,8 @@ def test_nothing_is_required_that_nobody_imports():
 
 def test_requirements_and_constraints_agree():
     pinned = requirements('constraints.txt')
-    for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-ros.txt'):
+    for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-ray.txt',
+                 'requirements-ros.txt'):
         for distribution, version in requirements(name).items():
             assert pinned[distribution] == version, f'{name}: {distribution}'
 
