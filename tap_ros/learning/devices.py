@@ -5,6 +5,7 @@
 from functools import partial
 
 from tap_ros.errors import ConfigError
+from tap_ros.learning.parallel import local_rank
 import torch
 
 
@@ -12,12 +13,15 @@ def pick_device(name):
     """
     Choose the device to train on.
 
-    :param name: 'auto', 'cpu', 'cuda' or 'cuda:1'.
+    :param name: 'auto', 'cpu', 'cuda' or 'cuda:1'. Each process that torchrun started has a GPU of
+        its own where no number says which.
     :return: torch device.
     :raises ConfigError: if it is not there.
     """
     if name == 'auto':
-        return torch.device('cuda' if torch.cuda.is_available() else 'cpu')
+        name = 'cuda' if torch.cuda.is_available() else 'cpu'
+    if name == 'cuda' and local_rank():
+        name = f'cuda:{local_rank()}'
     try:
         torch.empty(1, device=name)
     except (RuntimeError, AssertionError) as error:

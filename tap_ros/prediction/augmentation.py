@@ -42,6 +42,10 @@ class Augmentation:
         return cls(torch.from_numpy(flips), torch.from_numpy(order),
                    torch.from_numpy(gain.astype(np.float32)))
 
+    def part(self, part):
+        """Return that of a slice of the episodes."""
+        return Augmentation(self.flip[part], self.order[part], self.gain[part])
+
     def to(self, device):
         """Copy everything to a device."""
         return Augmentation(self.flip.to(device), self.order.to(device), self.gain.to(device))

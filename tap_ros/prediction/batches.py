@@ -136,7 +136,7 @@ def fixed_time(fraction, end, first, last):
     return int(np.clip(int(fraction * end + 0.5), first, last))
 
 
-def make_batch(store, episodes, sampling=Sampling(), frames=None, rng=None):
+def make_batch(store, episodes, sampling=Sampling(), frames=None, rng=None, part=slice(None)):
     """
     Gather context pictures and targets.
 
@@ -145,11 +145,15 @@ def make_batch(store, episodes, sampling=Sampling(), frames=None, rng=None):
     :param sampling: Sampling; by default all frames between the first and the last.
     :param frames: where the pictures come from, see learning/frames.py; None: the store.
     :param rng: numpy Generator; needed only where something is drawn.
+    :param part: slice of the episodes whose pictures are gathered; the others only count for what
+        is drawn and for T.
     :return: Batch.
     """
     rng = rng or np.random.default_rng(0)
     rows = [_choose(store, i, sampling, rng) for i in episodes]
-    B, T = len(rows), max(len(row.times) for row in rows)
+    T = max(len(row.times) for row in rows)
+    rows, episodes = rows[part], episodes[part]
+    B = len(rows)
     times, shown = np.zeros((B, T), np.int64), np.zeros((B, T), np.int64)
     valid = np.zeros((B, T), bool)
     for b, row in enumerate(rows):

@@ -6,6 +6,7 @@ import contextlib
 from dataclasses import dataclass, replace
 
 from tap_ros.images import to_float
+from tap_ros.learning.parallel import ALONE
 from tap_ros.prediction.discriminator import discriminator_loss, generator_loss
 from tap_ros.prediction.losses import (
     fixed_time_loss,
@@ -53,14 +54,24 @@ class Draws:
     other: torch.Tensor
 
     @classmethod
-    def make(cls, batch, latent_size, seed, step):
-        """Draw those of a step, on the batch's device, the same ones whenever asked."""
+    def make(cls, batch, latent_size, seed, step, processes=ALONE):
+        """
+        Draw those of a step, on the batch's device, the same ones whenever asked.
+
+        :param batch: batches.Batch, this process's part of it.
+        :param latent_size: of z.
+        :param seed: of the training; step: number of the step.
+        :param processes: Processes that share the batch.
+        :return: Draws.
+        """
         generator = torch.Generator().manual_seed((seed << 32) + step)
         B, T = batch.times.shape
+        B *= processes.count
         draws = (torch.randn(B, T, latent_size, generator=generator),
                  torch.randn(B, latent_size, generator=generator),
                  torch.rand(B, T, generator=generator))
-        return cls(*(draw.to(batch.times.device) for draw in draws))
+        part = processes.part(B)
+        return cls(*(draw[part].to(batch.times.device) for draw in draws))
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import argparse
 from dataclasses import fields, MISSING
 import re
 
+from tap_ros.learning.parallel import local_rank
 from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import (
@@ -51,7 +52,9 @@ def run(args):
     """
     values = {field.name: getattr(args, field.name) for field in fields(TrainingConfig)}
     values['recordings'] = tuple(values['recordings'])
-    print(train(TrainingConfig(**values)))
+    weights = train(TrainingConfig(**values))
+    if not local_rank():
+        print(weights)
     return 0
 
 

@@ -3,6 +3,7 @@
 """Training the predictor on recordings (section 3, appendix C)."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 import math
@@ -15,6 +16,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start
 from tap_ros.learning.devices import make_autocast, pick_device
 from tap_ros.learning.frames import MappedFrames, ResidentFrames
+from tap_ros.learning.parallel import joined, share_batch_norm
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
 from tap_ros.learning.schedule import learning_rate
 from tap_ros.learning.split import split_episodes
@@ -65,61 +67,75 @@ def train(config, stop_at=None, minutes=None, progress=True):
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
     deadline = time.monotonic() + 60 * (minutes or math.inf)
-    store = open_recordings(list(config.recordings), progress=progress)
-    with run_folder(config.out):
-        _train(config, device, store, stop_at, deadline, progress)
+    with joined(device) as processes:
+        progress = progress and processes.first
+        store = open_recordings(list(config.recordings), progress=progress)
+        with run_folder(config.out) if processes.first else nullcontext():
+            _train(config, device, processes, store, stop_at, deadline, progress)
     return str(Path(config.out) / 'predictor.safetensors')
 
 
-def _train(config, device, store, stop_at, deadline, progress):
-    """Train as the only process in the folder; see train."""
+def _train(config, device, processes, store, stop_at, deadline, progress):
+    """Train as the only run in the folder; see train."""
     training, held_out = split_episodes(store, config.test_fraction)
     torch.manual_seed(config.seed)
     network = Predictor(network_config(config, store.image_size))
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
     if config.initial_weights and not checkpoint.exists():
         _begin_with(network, config.initial_weights)
-    state = start(network, config.learning_rate, device, _helpers(config, network.config, store))
+    helpers = _helpers(config, network.config, store)
+    for module in (network, *helpers.values()):
+        share_batch_norm(module, processes)
+    state = start(network, config.learning_rate, device, helpers)
     load_checkpoint(checkpoint, state, asdict(config), store.data_hash, DEFAULTS)
     autocast = make_autocast(config.precision, device)
     # Decoding and copying would be most of the time of a step on a GPU.
     frames = (ResidentFrames(store, device, progress) if device.type == 'cuda'
               else MappedFrames(store))
-    if config.pretrain_steps and not checkpoint.exists():
+    begun = checkpoint.exists()
+    processes.wait()  # before the first one writes a checkpoint
+    if config.pretrain_steps and not begun:
         pretrain_decoders(state.network, partial(_single_frames, store, frames, training, config),
                           config.pretrain_steps, seed=config.seed, autocast=autocast,
                           progress=progress)
         state.average.load_state_dict(state.network.state_dict())
-        save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+        if processes.first:
+            save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
     compiled = torch.compile if config.compile else lambda module: module
     networks = Networks(compiled(state.network), **{
         name: compiled(helper) for name, helper in state.helpers.items()})
     last = min(config.steps, stop_at or config.steps)
+    writes = processes.first
     report = partial(_report, config=config, store=store, frames=frames, training=training,
                      held_out=held_out, autocast=autocast)
     bar = tqdm(total=config.steps, initial=state.step, desc=config.method, unit='step',
                disable=not progress)
-    with SummaryWriter(config.out, purge_step=state.step) as curves, bar:
+    curves = SummaryWriter(config.out, purge_step=state.step) if writes else nullcontext()
+    with curves, bar:
         began = time.monotonic() - state.seconds
         for step, batch, augmentation in _batches(
-                store, frames, training, config, state.step, last):
+                store, frames, training, config, processes, state.step, last):
             for optimizer, highest in zip(
                     state.optimizers, (config.learning_rate, config.discriminator_rate)):
                 for group in optimizer.param_groups:
                     group['lr'] = learning_rate(
                         step, config.steps, config.warmup, highest)
             batch, augmentation = batch.to(device), augmentation.to(device)
-            draws = Draws.make(batch, config.latent_size, config.seed, step)
-            outcome, norm = _step(state, networks, batch, augmentation, draws, config, autocast)
+            draws = Draws.make(batch, config.latent_size, config.seed, step, processes)
+            outcome, norm = _step(state, networks, batch, augmentation, draws, config, processes,
+                                  autocast)
             state.update_average(config.average_decay)
             state.step = step + 1
             # Tell and save.
             bar.update()
             if state.step % config.log_every == 0:
-                _log(curves, bar, state.step, outcome, batch, norm,
-                     state.optimizers[0].param_groups[0]['lr'])
-            late = time.monotonic() > deadline
-            if state.step % config.save_every == 0 or state.step == last or late:
+                values = _values(outcome, batch, processes)
+                if writes:
+                    _log(curves, bar, state.step, values, norm,
+                         state.optimizers[0].param_groups[0]['lr'])
+            late = math.isfinite(deadline) and processes.agree(
+                time.monotonic() > deadline, device)
+            if writes and (state.step % config.save_every == 0 or state.step == last or late):
                 state.seconds = time.monotonic() - began
                 report(state, curves)  # first: a run that is stopped in between reports again
                 save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
@@ -157,7 +173,7 @@ def _begin_with(network, weights):
     network.load_state_dict(other.state_dict())
 
 
-def _step(state, networks, batch, augmentation, draws, config, autocast):
+def _step(state, networks, batch, augmentation, draws, config, processes, autocast):
     """Do one step of the predictor, then one of the discriminators; return (Outcome, norm)."""
     state.network.train()
     state.helpers.train()
@@ -168,6 +184,7 @@ def _step(state, networks, batch, augmentation, draws, config, autocast):
     outcome = predictor_loss(networks, batch, augmentation, config, draws, autocast)
     state.optimizers[0].zero_grad()
     outcome.loss.backward()
+    processes.average_gradients(state.optimizers[0].param_groups[0]['params'])
     norm = torch.nn.utils.clip_grad_norm_(
         state.optimizers[0].param_groups[0]['params'], config.gradient_clip or math.inf)
     state.optimizers[0].step()
@@ -177,6 +194,7 @@ def _step(state, networks, batch, augmentation, draws, config, autocast):
         loss = discriminators_loss(outcome.judged, autocast)
         state.optimizers[1].zero_grad()
         loss.backward()
+        processes.average_gradients(state.optimizers[1].param_groups[0]['params'])
         state.optimizers[1].step()
         outcome.parts['discriminators'] = loss.detach()
     return outcome, norm
@@ -204,7 +222,7 @@ def _single_frames(store, frames, episodes, config, step):
     return frames(chosen, rng.integers(store.lengths[chosen])[:, None])[:, 0]
 
 
-def _batches(store, frames, episodes, config, first, last):
+def _batches(store, frames, episodes, config, processes, first, last):
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
     whole = config.chosen.vae and config.posterior == 'video'
     sampling = Sampling(
@@ -212,12 +230,15 @@ def _batches(store, frames, episodes, config, first, last):
         config.goal_picture, config.forward, config.chosen.fraction, int(config.chosen.gan),
         config.video_frames if whole else 0)
 
+    part = processes.part(config.batch_size)
+
     def make(step):
         rng = np.random.default_rng([config.seed, 2, step])
         chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
-        batch = make_batch(store, chosen, sampling, frames, rng)
-        return step, batch, Augmentation.draw(
+        batch = make_batch(store, chosen, sampling, frames, rng, part)
+        augmentation = Augmentation.draw(
             len(chosen), config.flip, config.colour, config.brightness, rng)
+        return step, batch, augmentation.part(part)
 
     with ThreadPoolExecutor(1) as pool:
         ahead = [pool.submit(make, step) for step in range(first, min(first + 2, last))]
@@ -227,17 +248,23 @@ def _batches(store, frames, episodes, config, first, last):
             yield ahead.pop(0).result()
 
 
-def _log(curves, bar, step, outcome, batch, norm, rate):
-    """Add a point to the curves and to the progress bar."""
+def _values(outcome, batch, processes):
+    """Return what the curves show of a step, by name: means over the whole batch."""
     fraction = batch.times.gather(1, outcome.match[:, None]) / batch.end
-    loss = outcome.loss.item()
-    for name, value in (('loss', loss), ('gradient_norm', norm.item()), ('learning_rate', rate),
-                        ('match_fraction', fraction.mean().item()),
-                        ('match_fraction_std', fraction.std(correction=0).item())):
+    values = {'loss': outcome.loss, 'match_fraction': fraction.mean(),
+              'match_fraction_square': fraction.square().mean(),
+              **{f'loss_{name}': value for name, value in outcome.parts.items()}}
+    means = processes.mean(torch.stack([value.detach().float() for value in values.values()]))
+    values = dict(zip(values, means.tolist()))
+    variance = values.pop('match_fraction_square') - values['match_fraction'] ** 2
+    return values | {'match_fraction_std': math.sqrt(max(variance, 0))}
+
+
+def _log(curves, bar, step, values, norm, rate):
+    """Add a point to the curves and to the progress bar."""
+    for name, value in {**values, 'gradient_norm': norm.item(), 'learning_rate': rate}.items():
         curves.add_scalar(f'train/{name}', value, step)
-    for name, value in outcome.parts.items():
-        curves.add_scalar(f'train/loss_{name}', value.item(), step)
-    bar.set_postfix(loss=f'{loss:.4f}', match=f'{fraction.mean().item():.2f}')
+    bar.set_postfix(loss=f'{values["loss"]:.4f}', match=f'{values["match_fraction"]:.2f}')
 
 
 def _report(state, curves, config, store, frames, training, held_out, autocast):

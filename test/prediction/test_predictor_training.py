@@ -3,16 +3,20 @@
 """Laws of training the predictor."""
 
 import argparse
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 import json
+import os
 from pathlib import Path
 import resource
+import subprocess
+import sys
 
 import pytest
 from tap_ros.errors import ConfigError, StorageError, WeightsError
 from tap_ros.files import only_writer
 from tap_ros.images import to_float
+from tap_ros.learning.parallel import Processes
 from tap_ros.learning.schedule import learning_rate
 from tap_ros.learning.weights import load_tensors, load_weights, save_tensors
 from tap_ros.prediction.batches import make_batch
@@ -21,7 +25,10 @@ from tap_ros.prediction.train_command import add_arguments, run
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -106,6 +113,38 @@ def test_a_compiled_discriminator_is_trained(config, monkeypatch):
     monkeypatch.setattr(torch, 'compile', partial(torch.compile, backend='eager'))
     path = train(replace(config, method='genmin', compile=True, steps=1), progress=False)
     assert load_network(path)[1]['steps'] == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('method', ['genmin-wo-gan+relative', 'genmin-vae-gan'])
+def test_two_processes_learn_what_one_does_from_the_whole_batch(config, tmp_path, method):
+    config = replace(config, method=method, new_pixels=True, steps=3, average_decay=0.0)
+    train(config, progress=False)
+    both = replace(config, out=str(tmp_path / 'both'))
+    script = tmp_path / 'script.py'
+    script.write_text(
+        'from tap_ros.prediction.training import train\n'
+        'from tap_ros.prediction.training_config import TrainingConfig\n'
+        f'train(TrainingConfig(**{asdict(both)!r}))\n')
+    subprocess.run(
+        [sys.executable, '-m', 'torch.distributed.run', '--nproc-per-node', '2', '--standalone',
+         script], cwd=ROOT, check=True, env=os.environ | {'PYTHONPATH': os.pathsep.join(
+             [str(ROOT), os.environ.get('PYTHONPATH', '')])})
+    one, two = (EventAccumulator(folder).Reload() for folder in (config.out, both.out))
+    losses = [tag for tag in one.Tags()['scalars'] if tag.startswith('train/')]
+    assert 'train/loss' in losses and 'train/match_fraction_std' in losses
+    for tag in losses:
+        values = [[point.value for point in curves.Scalars(tag)] for curves in (one, two)]
+        assert len(values[0]) == 3
+        assert values[1][0] == pytest.approx(values[0][0], rel=1e-3, abs=1e-6), tag
+        # Adam makes much of the last digits of small gradients.
+        assert values[1] == pytest.approx(values[0], rel=1e-2), tag
+
+
+def test_a_batch_that_cannot_be_divided_is_refused():
+    with pytest.raises(ConfigError, match='batch_size: 5 episodes cannot be divided among 2'):
+        Processes(0, 2).part(5)
+    assert [Processes(rank, 2).part(6) for rank in (0, 1)] == [slice(0, 3), slice(3, 6)]
 
 
 def test_a_run_leaves_what_is_needed_to_repeat_it(config):
