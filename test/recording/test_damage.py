@@ -16,11 +16,11 @@ import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.recording import chunks
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.codec import encode
+from tap_ros.recording.messages import encode
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.recording.schemas import schema_text
+from tap_ros.recording.messages import schema_text
 from tap_ros.recording.writer import BagWriter, EpisodeWriter
 import zstandard
 
@@ -214,7 +214,7 @@ def test_other_ways_to_write_mcap(tmp_path, long_file, options):
 KILLED = """
 import sys, time
 import numpy as np
-from tap_ros.recording.codec import encode
+from tap_ros.recording.messages import encode
 from tap_ros.recording.writer import BagWriter
 writer = BagWriter(sys.argv[1], flush_seconds=0.0)
 for t in range(10**6):

@@ -9,7 +9,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.codec import encode
+from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.topics import resolve
 from tap_ros.recording.writer import BagWriter, EpisodeWriter
