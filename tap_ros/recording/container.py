@@ -17,11 +17,11 @@ import stat
 import struct
 
 from mcap.opcode import Opcode
-from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema
 from tap_ros.errors import RecordingError
 from tap_ros.recording.chunks import read_chunk, read_record, unpack
 from tap_ros.recording.losses import FAR, Loss, NOTHING
+from tap_ros.recording.records import in_order, OTHERS, Records, TOPIC_RECORDS
 from tap_ros.recording.summary import MAGIC, read_summary, RECORD
 from tap_ros.text import escaped
 
@@ -29,9 +29,6 @@ from tap_ros.text import escaped
 FREE_BYTES, BYTES_PER_BYTE = 2**28, 1024
 FREE_RECORDS, BYTES_PER_RECORD = 2**18, 4
 _MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log time, publish time
-_TOPIC_RECORDS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelRecord}
-_OTHERS = 0x80  # opcodes from here on belong to others, and are skipped
-_RUN_BYTES = 2**20  # of messages outside of chunks that are taken together
 
 
 @dataclass(frozen=True)
@@ -62,7 +59,6 @@ class McapFile:
         self._newest = None  # log time so far
         self._unpacked = self._records = 0
         self._counts = Counter()  # channel -> messages read
-        self._cut_off = None  # the byte where an unfinished file ends
         try:
             mode = os.stat(path).st_mode  # opening a FIFO would wait for its writer
             if not stat.S_ISREG(mode):
@@ -82,7 +78,6 @@ class McapFile:
             self._define(record)
         if not all(channel.type_name for channel in self.channels.values()):
             self.channels = {}  # the summary has channels without their types
-        self._missing = set(self._summary.chunks if self._summary else ())  # not found so far
         self._most_bytes = FREE_BYTES + BYTES_PER_BYTE * len(self.data)
         self._most_records = FREE_RECORDS + len(self.data) // BYTES_PER_RECORD
 
@@ -110,7 +105,8 @@ class McapFile:
         :return: iterator over (topic, log time in ns, memoryview of its data).
         """
         summary = self._summary
-        for kind, start, end, entry in self._parts():
+        records = Records(self.data, summary, self._read_topic, self._lose)
+        for kind, start, end, entry in records.parts(indexed=bool(self.channels)):
             try:
                 data = self.data[start:end]
                 if kind == Opcode.CHUNK:
@@ -132,79 +128,7 @@ class McapFile:
         for loss in self._pending:
             self.losses.append(Loss(*loss, self._newest, self._newest))
         self._pending = []
-        self._compare(wanted)
-
-    def _parts(self):
-        """
-        Yield (opcode, start, end, entry) of chunks and of runs of messages outside of them.
-
-        start and end are those of a chunk's content, or of a run's records; entry is what the
-        summary says of the chunk, or None.
-        """
-        summary = self._summary
-        if not (summary and summary.placed and summary.chunks and self.channels):
-            yield from self._walk()
-            return
-        for entry in _in_order(self._missing):
-            if (RECORD.size <= entry.length
-                    and len(MAGIC) <= entry.offset <= summary.start - entry.length):
-                kind, length = RECORD.unpack_from(self.data, entry.offset)
-                if kind == Opcode.CHUNK or length == entry.length - RECORD.size:  # one may be bad
-                    self._missing.remove(entry)
-                    end = entry.offset + entry.length
-                    yield Opcode.CHUNK, entry.offset + RECORD.size, end, entry
-
-    def _walk(self):
-        """Yield the same by going over the records one by one."""
-        position, run, entries = len(MAGIC), None, {}
-        for entry in _in_order(self._missing):
-            entries.setdefault((entry.length, entry.start, entry.end), []).append(entry)
-        limit = self._summary.start if self._summary else len(self.data)
-        while True:
-            kind, length = (RECORD.unpack_from(self.data, position)
-                            if position + RECORD.size <= limit else (0, 0))
-            start, end = position + RECORD.size, position + RECORD.size + length
-            broken = kind == 0 or end > limit  # zeros were never written
-            if run is not None and (broken or kind != Opcode.MESSAGE or end - run > _RUN_BYTES):
-                yield Opcode.MESSAGE, run, position, None
-                run = None
-            if broken:
-                if not self._summary:
-                    self._cut_off = position
-                elif position < limit:
-                    self._lose('it is not understood', 'record', position)
-                return
-            if kind == Opcode.DATA_END and length == 4:
-                return
-            if kind == Opcode.MESSAGE:
-                run = position if run is None else run
-            elif kind == Opcode.CHUNK:
-                entry = self._find(start, end, entries)
-                self._missing.discard(entry)
-                yield kind, start, end, entry
-            elif kind in _TOPIC_RECORDS:
-                try:
-                    self._define(read_record(_TOPIC_RECORDS[kind], self.data[start:end], True))
-                except RecordingError as error:
-                    self._lose(str(error), 'record', position)
-            elif not self._is_other(kind, start, end):
-                self._lose('it is not understood', 'record', position)
-            position = end
-
-    def _is_other(self, kind, start, end):
-        """Tell whether a record is one of those that hold no messages."""
-        if kind == Opcode.MESSAGE_INDEX:  # a damaged chunk may look like one
-            return end - start >= 6 and struct.unpack_from(
-                '<I', self.data, start + 2)[0] == end - start - 6
-        return kind in (Opcode.HEADER, Opcode.ATTACHMENT, Opcode.METADATA) or kind >= _OTHERS
-
-    def _find(self, start, end, entries):
-        """Take the entry of a chunk out of those of the summary; return None without one."""
-        if end - start < 16:
-            return None
-        first, last = struct.unpack_from('<QQ', self.data, start)
-        same = entries.get((end - start + RECORD.size, min(first, FAR), min(last, FAR)))
-        return same.pop(0) if same else None
+        self._compare(records, wanted)
 
     def _scan(self, data):
         """Check records, take notice of topics, and return where messages start, array of int."""
@@ -226,10 +150,9 @@ class McapFile:
                     counts[number] += 1
                     first, last = logs.get(number, (log, log))
                     logs[number] = min(first, log), max(last, log)
-                elif kind in _TOPIC_RECORDS:
-                    self._define(read_record(
-                        _TOPIC_RECORDS[kind], data[position + RECORD.size:end], True))
-                elif kind < _OTHERS:
+                elif kind in TOPIC_RECORDS:
+                    self._read_topic(kind, data[position + RECORD.size:end])
+                elif kind < OTHERS:
                     raise RecordingError(f'it holds a damaged record: opcode {kind}')
                 position = end
         except struct.error as error:
@@ -245,6 +168,10 @@ class McapFile:
                  min(first, FAR), min(last, FAR))
             for number, (first, last) in logs.items() if number not in self.channels]
         return places
+
+    def _read_topic(self, kind, content):
+        """Take notice of the content of a schema or channel record."""
+        self._define(read_record(TOPIC_RECORDS[kind], content, whole=True))
 
     def _define(self, record):
         """Take notice of a schema or channel; the first of a number holds."""
@@ -279,10 +206,10 @@ class McapFile:
         self._pending = []
         self._newest = last if self._newest is None else max(last, self._newest)
 
-    def _compare(self, wanted):
+    def _compare(self, records, wanted):
         """Compare what was read with the summary."""
         counts = self._summary.counts if self._summary else None
-        for entry in _in_order(self._missing):
+        for entry in in_order(records.missing):
             self._lose('it is not where the summary says', 'chunk', entry.offset, entry)
         missing = {} if counts is None else {
             number: (count - self._counts[number], count)
@@ -297,13 +224,9 @@ class McapFile:
             self.losses.append(Loss(f'messages are missing: {", ".join(lines)}', cuts=NOTHING))
         if self._complaint:
             self.losses.append(Loss(self._complaint, cuts=NOTHING))
-        if self._cut_off is not None:
+        if records.cut_off is not None:
             end = self._newest
             self.losses.append(Loss(
-                f'the file is cut off at byte {self._cut_off} of {len(self.data)}; '
+                f'the file is cut off at byte {records.cut_off} of {len(self.data)}; '
                 'all that was written completely before is used',
                 start=None if end is None else end + 1, end=end))
-
-
-def _in_order(entries):
-    return sorted(entries, key=lambda entry: entry.offset)

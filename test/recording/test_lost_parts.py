@@ -16,11 +16,10 @@ from tap_ros.errors import RecordingError
 from tap_ros.evaluation import inspect_files
 from tap_ros.recording import writer as writer_module
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.messages import encode
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.file_writer import FileWriter
+from tap_ros.recording.messages import encode, schema_text
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.recording.messages import schema_text
 from tap_ros.recording.writer import BagWriter, EpisodeWriter
 
 IMAGE = 'sensor_msgs/msg/Image'
