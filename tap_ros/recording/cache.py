@@ -147,8 +147,8 @@ def _built(jobs):
     if (workers > 1 and sum(job.size for job in left) > _ALONE_BYTES
             and not multiprocessing.current_process().daemon):  # which may not have children
         with ProcessPoolExecutor(workers, multiprocessing.get_context('spawn')) as pool:
-            tasks = {pool.submit(_build, job): job for job in left}
             try:
+                tasks = {pool.submit(_build, job): job for job in left}
                 for task in as_completed(tasks):
                     task.result()
                     left.remove(tasks[task])

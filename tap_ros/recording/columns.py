@@ -125,13 +125,13 @@ class _Decoder:
     def take(self, topic, log, data):
         """Take a message; note it when it cannot be used."""
         for name, decoder in self.decoders[topic]:
-            kind = topics.TYPES[name]
-            if kind != topics.TYPES[topics.IMAGE]:
+            state = name not in (topics.IMAGE, topics.GOAL_IMAGE)
+            if state:
                 self._charge(len(data))
             try:
-                if kind != topics.TYPES[topics.IMAGE] and len(data) > _MAX_STATE:
-                    raise RecordingError(f'{kind} of more than {_MAX_STATE} bytes')
-                decoder(log, decode(kind, data))
+                if state and len(data) > _MAX_STATE:
+                    raise RecordingError(f'a message of more than {_MAX_STATE} bytes')
+                decoder(log, decode(topics.TYPES[name], data))
             except RecordingError as error:
                 self._lose(name, log, error)
                 if name == topics.GOAL_IMAGE:  # what was said before holds no more

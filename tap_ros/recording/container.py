@@ -27,7 +27,7 @@ from tap_ros.text import escaped
 
 # Bounds on what a file may unpack to, far above what recordings of its size hold.
 FREE_BYTES, BYTES_PER_BYTE = 2**28, 1024
-FREE_RECORDS, BYTES_PER_RECORD = 2**18, 4
+FREE_RECORDS, BYTES_PER_RECORD = 2**17, 4
 _MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log time, publish time
 
 

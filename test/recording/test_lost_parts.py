@@ -21,6 +21,7 @@ from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode, schema_text
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import BagWriter, EpisodeWriter
+import zstandard
 
 IMAGE = 'sensor_msgs/msg/Image'
 SECOND = 10**9
@@ -127,6 +128,20 @@ def test_flips_between_chunks_lose_nothing(chunked):
             damaged[start + byte] ^= 1 << bit
             path.write_bytes(damaged)
             assert_all_equal(read(path)[0], episodes)
+
+
+def test_without_a_summary_a_chunk_that_looks_like_another_record_is_named(chunked):
+    path, episodes = chunked
+    data = path.read_bytes()
+    found = records(data)
+    chunks = [start for kind, start, _ in found if kind == CHUNK]
+    data = bytearray(data[:found[-1][1]])
+    for bit in range(7):
+        damaged, start = data.copy(), chunks[len(chunks) // 2]
+        damaged[start] ^= 1 << bit
+        path.write_bytes(damaged)
+        assert check_damaged(path, episodes) == 'part'
+        assert any(f'record at byte {start}, log time ' in text for text in read(path)[1])
 
 
 @pytest.mark.parametrize('hole', ['cut out', 'zeros'])
@@ -296,6 +311,19 @@ def test_tiny_messages_by_the_hundred_thousand_are_left_out(tmp_path):
     assert path.stat().st_size < 50000
     with pytest.raises(RecordingError, match='a.mcap: chunk .* holds more than .* records'):
         open_recordings(tmp_path)
+
+
+def test_chunks_that_unpack_to_gigabytes_in_all_are_left_out(tmp_path):
+    path = tmp_path / 'a.mcap'
+    bomb(path, [image(1, 1)[:3]])
+    content = bytes([0x90]) + struct.pack('<Q', 2**27 - 9) + bytes(2**27 - 9)  # is skipped
+    packed = zstandard.compress(content)
+    record = struct.pack('<QQQII', 0, 0, len(content), 0, 4) + b'zstd' + struct.pack(
+        '<Q', len(packed)) + packed
+    with open(path, 'ab') as stream:
+        stream.write((struct.pack('<BQ', CHUNK, len(record)) + record) * 3)
+    with pytest.warns(RecordingWarning, match='chunk.* not unpacked: more than .* in all'):
+        list(iter_episodes(path))
 
 
 def test_states_that_would_take_minutes_to_decode_are_refused(tmp_path):
