@@ -248,9 +248,7 @@ class _Decoder:
         self._add('command', log, (message.data,))
 
     def _joints(self, log, message):
-        known = {}
-        for name, position in zip(message.name, message.position.tolist(), strict=False):
-            known.setdefault(name, position)
+        known = dict(zip(message.name, message.position.tolist(), strict=False))
         if known.keys() & set(GRIPPER_JOINTS):
             self._add('joint', log, [known.get(name, np.nan) for name in GRIPPER_JOINTS],
                       stamp=_stamp(message))

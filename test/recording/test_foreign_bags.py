@@ -232,6 +232,23 @@ def test_states_are_those_nearest_to_the_frame(tmp_path):
     assert np.isnan(episode.grippers[3]).all()
 
 
+def test_states_of_other_joints_are_no_gripper_states(tmp_path):
+    def state(t, name, log):
+        return ('/joint_states', 'sensor_msgs/msg/JointState',
+                joints(round(t * SECOND), [name], [0.5]), round(log * SECOND))
+    record(tmp_path / 'bag', [
+        camera(1), state(1.01, 'gripper_x', 1.01), state(1, 'wheel', 1.02), camera(2)])
+    (episode,) = iter_episodes(tmp_path / 'bag')
+    assert episode.grippers[0, 0] == 0.5
+
+
+def test_commands_logged_out_of_order_are_put_in_order(tmp_path):
+    record(tmp_path / 'bag', [
+        camera(1), camera(2), camera(3), gripper(2.5, 0.5), gripper(1.5, 0.25)])
+    (episode,) = iter_episodes(tmp_path / 'bag')
+    assert episode.actions[:, 3].tolist() == [0.25, 0.5, 0]
+
+
 def test_objects_are_matched_by_name(tmp_path):
     def objects(t, **us):
         data = encode('tap_msgs/msg/ObjectStates', {

@@ -130,6 +130,16 @@ def test_flips_between_chunks_lose_nothing(chunked):
             assert_all_equal(read(path)[0], episodes)
 
 
+def test_a_strange_record_between_chunks_loses_nothing(chunked):
+    path, episodes = chunked
+    data = path.read_bytes()
+    _, start, _ = [record for record in records(data) if record[0] == CHUNK][3]
+    path.write_bytes(data[:start] + struct.pack('<BQ', 0x33, 5) + bytes(5) + data[start:])
+    found, texts = read(path)
+    assert_all_equal(found, episodes)
+    assert not texts
+
+
 def test_without_a_summary_a_chunk_that_looks_like_another_record_is_named(chunked):
     path, episodes = chunked
     data = path.read_bytes()
@@ -253,6 +263,18 @@ def test_a_goal_that_cannot_be_used_takes_back_the_one_before(tmp_path):
         assert first.goal_frame[0, 0, 0] == 50
         assert second.goal_frame is None
         assert caught or changes == BAD['empty']  # an empty one says that there is no goal
+
+
+def test_goal_objects_that_cannot_be_used_take_back_those_before(tmp_path):
+    kind = 'tap_msgs/msg/ObjectStates'
+    data = encode(kind, {'header': {'stamp': {'sec': 1}}, 'objects': [{'name': 'a', 'u': 5}]})
+    folder = record(tmp_path / 'bag', [
+        mark(1, 0), ('/goal/objects', kind, data, SECOND), image(1, 1), mark(1, 1), mark(3, 0),
+        ('/goal/objects', kind, data[:-9], 3 * SECOND), image(3, 3), mark(3, 1)])
+    with pytest.warns(RecordingWarning, match='topic /goal/objects: 1 message cannot be used'):
+        first, second = iter_episodes(folder)
+    assert first.object_names == ('a',) and first.goal_pixels.tolist() == [[5, 0]]
+    assert second.object_names == ()
 
 
 @pytest.mark.parametrize('text', [
