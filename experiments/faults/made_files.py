@@ -99,7 +99,7 @@ def chunk_bomb(claimed, content):
 
 def message_bomb(messages, data=b''):
     """Return a small file with a great number of tiny messages on the picture topic."""
-    from tap_ros.recording.schemas import schema_text
+    from tap_ros.recording.messages import schema_text
     out = BytesIO()
     writer = Writer(out, chunk_size=2**26, index_types=IndexType.NONE,
                     compression=CompressionType.ZSTD)

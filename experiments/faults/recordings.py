@@ -15,7 +15,7 @@ from experiments.faults.made_files import (
     rewrite,
     write_recording,
 )
-from tap_ros.recording.codec import encode
+from tap_ros.recording.messages import encode
 from tap_ros.recording.writer import write_metadata
 
 SLOW_S = 5.0  # for files of some kilobytes

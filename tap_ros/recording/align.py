@@ -202,7 +202,11 @@ def _join(parts):
         marks += part.marks
         for key, value in arrays.items():
             data[key].append(value)
-    objects = pad_objects(data['object'] + data['goal_object'])
+    objects = data['object'] + data['goal_object']
+    rows = [len(part) for part in objects]
+    objects = np.split(pad_objects(
+        np.concatenate([part.reshape(-1, 9) for part in objects]),
+        np.repeat([part.shape[1] for part in objects], rows)), np.cumsum(rows)[:-1])
     data['object'], data['goal_object'] = objects[:len(parts)], objects[len(parts):]
     return {key: np.concatenate(value) for key, value in data.items()}, list(numbers), marks
 

@@ -10,8 +10,8 @@ from tap_ros.recording import topics
 from tap_ros.recording.container import McapFile
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.losses import describe
+from tap_ros.recording.messages import check_schema
 from tap_ros.recording.metadata import bag_files, FILE_NAME
-from tap_ros.recording.schemas import check_schema
 from tap_ros.text import escaped
 
 

@@ -7,9 +7,12 @@ Each MCAP file has a folder in the cache, named after the SHA-256 of its content
 as one uint8 array and all else as columns. Any number of processes may build and read it at once.
 """
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import as_completed, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 import hashlib
 import json
+import multiprocessing
 import os
 from pathlib import Path
 import shutil
@@ -23,12 +26,11 @@ from tap_ros.errors import RecordingError
 from tap_ros.recording.align import assemble, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_paths, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
-from tap_ros.recording.container import McapFile
 from tqdm import tqdm
 
 FORMAT = 2  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
-_MAX_BUFFERS = 1024  # of one writev
+_ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
 _NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
 _PARSING = threading.Lock()
 
@@ -80,32 +82,85 @@ def open_recordings(paths, cache_dir=None, progress=True, image_topic=None):
     paths = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     bags = [bag for path in paths for bag in find_bags(path)]
     cache_dir = Path(cache_dir or os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
-    total = sum(file.stat().st_size for bag in bags for file in bag)
-    with tqdm(total=total, desc='opening recordings', unit='B', unit_scale=True,
-              disable=not progress, delay=1) as bar, ThreadPoolExecutor(_workers()) as pool:
-        found = [find_topics(bag, image_topic) for bag in bags]
-        jobs = [
-            [pool.submit(_open_file, file, names, cache_dir, bar) for file in bag]
-            for bag, names in zip(bags, found, strict=True)]
-        try:
-            loaded = [[job.result() for job in bag] for bag in jobs]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    columns = [[part for part, _ in bag] for bag in loaded]
+    with tqdm(total=sum(file.stat().st_size for bag in bags for file in bag),
+              desc='opening recordings', unit='B', unit_scale=True, disable=not progress,
+              delay=1) as bar:
+        jobs = _jobs(bags, [find_topics(bag, image_topic) for bag in bags], cache_dir)
+        loaded = {job: _load(job.folder, job.path) for bag in jobs for job in bag}
+        bar.update(sum(job.size for job, part in loaded.items() if part is not None))
+        missing = [job for job, part in loaded.items() if part is None]
+        for job in _built(missing):
+            bar.update(job.size)
+        loaded |= {job: _load(job.folder, job.path) for job in missing}
+    unread = next((job.folder for job, part in loaded.items() if part is None), None)
+    if unread is not None:
+        raise RecordingError(f'{unread}: the cache cannot be read back; is the disk full?')
+    columns = [[loaded[job] for job in bag] for bag in jobs]
     check_sizes([part for bag in columns for part in bag])
     for part in (part for bag in columns for part in bag):
         warn_of_damage(part)
     tables = [assemble(run) for bag in columns for run in _runs(bag)]
-    store = EpisodeStore(tables, [digest for bag in loaded for _, digest in bag])
+    store = EpisodeStore(tables, [job.digest for bag in jobs for job in bag])
     if not len(store):
         raise RecordingError(f'{list_paths(paths)}: no camera image lies within an episode')
     return store
 
 
+@dataclass(frozen=True)
+class _Job:
+    """A file to be opened."""
+
+    path: Path
+    size: int
+    digest: str
+    found: tuple  # pairs of a name in topics and the file's topic
+    folder: Path  # of the cache
+
+
+def _jobs(bags, found, cache_dir):
+    """Return a list of _Job for each bag."""
+    def job(path, names):
+        with open(path, 'rb') as stream:
+            digest = hashlib.file_digest(stream, 'sha256').hexdigest()
+        key = hashlib.sha256(json.dumps([FORMAT, sorted(names.items())]).encode()).hexdigest()[:8]
+        return _Job(path, path.stat().st_size, digest, tuple(names.items()),
+                    cache_dir / f'{digest}-{key}')
+    with ThreadPoolExecutor(_workers()) as pool:
+        waiting = [[pool.submit(job, path, names) for path in bag]
+                   for bag, names in zip(bags, found, strict=True)]
+        return [[task.result() for task in bag] for bag in waiting]
+
+
 def _workers():
     """Return the number of files decoded at once."""
     return len(os.sched_getaffinity(0))
+
+
+def _built(jobs):
+    """
+    Decode files into their cache folders; yield the jobs that are done.
+
+    Decoding is Python and holds its lock, so that processes do it where there is much to do.
+    """
+    left = list(jobs)
+    workers = min(_workers(), len(left))
+    if (workers > 1 and sum(job.size for job in left) > _ALONE_BYTES
+            and not multiprocessing.current_process().daemon):  # which may not have children
+        with ProcessPoolExecutor(workers, multiprocessing.get_context('spawn')) as pool:
+            try:
+                tasks = {pool.submit(_build, job): job for job in left}
+                for task in as_completed(tasks):
+                    task.result()
+                    left.remove(tasks[task])
+                    yield tasks[task]
+            except BrokenProcessPool:  # one was killed, or cannot import the user's script
+                pass
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    for job in left:
+        _build(job)
+        yield job
 
 
 def _runs(parts):
@@ -119,23 +174,9 @@ def _runs(parts):
     return runs
 
 
-def _open_file(path, found, cache_dir, bar):
-    """Return (Columns with mapped frames, digest) of one file, from the cache or decoded."""
-    digest = hashlib.sha256(McapFile(path).data).hexdigest()
-    key = hashlib.sha256(json.dumps([FORMAT, sorted(found.items())]).encode()).hexdigest()[:8]
-    folder = cache_dir / f'{digest}-{key}'
-    columns = _load(folder, path)
-    if columns is None:
-        _build(path, found, folder)
-        columns = _load(folder, path)
-        if columns is None:
-            raise RecordingError(f'{folder}: the cache cannot be read back; is the disk full?')
-    bar.update(path.stat().st_size)
-    return columns, digest
-
-
-def _build(path, found, folder):
-    """Decode a file into a cache folder, which appears complete or not at all."""
+def _build(job):
+    """Decode a file into its cache folder, which appears complete or not at all."""
+    path, folder = job.path, job.folder
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=folder.name + '.', dir=folder.parent))
@@ -144,11 +185,9 @@ def _build(path, found, folder):
             f'{folder.parent}: the cache cannot be written ({error.strerror}); set {ENVIRONMENT} '
             'to a folder that can') from error
     try:
-        with open(part / 'frames.npy', 'wb', buffering=0) as stream:
+        with open(part / 'frames.npy', 'wb') as stream:
             _empty(stream)
-            columns = decode_file(
-                path, found, lambda buffers: _write_all(stream, buffers),
-                lambda: _empty(stream))
+            columns = decode_file(path, dict(job.found), stream.write, lambda: _empty(stream))
             _write_header(stream, columns)
         _sort_frames(part / 'frames.npy', columns.arrays)
         arrays = {k: np.ascontiguousarray(a) for k, a in columns.arrays.items()}
@@ -183,17 +222,6 @@ def _empty(stream):
     stream.seek(0)
     stream.truncate()
     stream.write(bytes(_NPY_HEADER))
-
-
-def _write_all(stream, buffers):
-    """Write many buffers with few calls of the system and without copying them together."""
-    waiting = [memoryview(buffer).cast('B') for buffer in buffers]
-    while waiting:
-        written = os.writev(stream.fileno(), waiting[:_MAX_BUFFERS])
-        while waiting and written >= len(waiting[0]):
-            written -= len(waiting.pop(0))
-        if written:
-            waiting[0] = waiting[0][written:]
 
 
 def _write_header(stream, columns):

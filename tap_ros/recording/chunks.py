@@ -1,72 +1,87 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Unpack the chunks of MCAP files, and never into more memory than is sane."""
+"""The records of MCAP files, read by the mcap package, and chunks unpacked within limits."""
 
+from io import BytesIO
 import struct
 import zlib
 
-import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.records import Chunk
 from tap_ros.errors import RecordingError
 import zstandard
 
 MAX_CHUNK_BYTES = 256 * 2**20  # a chunk that claims to unpack to more is refused
-_CHUNK_START = struct.Struct('<QQQII')  # start, end, unpacked size, crc, length of compression
+DAMAGE = (McapError, struct.error, ValueError, OverflowError)  # what mcap raises for damaged bytes
 
 
-def claimed_size(view):
-    """Return the number of bytes that the content of a chunk record claims to unpack to."""
-    return _CHUNK_START.unpack_from(view)[2] if len(view) >= _CHUNK_START.size else 0
-
-
-def unpack(view, buffer):
+def read_record(kind, content, whole=False):
     """
-    Return the checked bytes of a chunk.
+    Read the content of a record.
 
-    :param view: memoryview of the content of a chunk record.
-    :param buffer: uint8 array to unpack into; one of our own takes its place when it is too small.
-    :return: (bytes as a uint8 array, the buffer for the next chunk).
-    :raises RecordingError: when its checksum is wrong, it does not unpack, or claims to unpack to
-        more than MAX_CHUNK_BYTES.
+    :param kind: the class in mcap.records.
+    :param content: bytes-like.
+    :param whole: whether nothing may stand behind what is read.
+    :return: of that class.
+    :raises RecordingError: when it is damaged.
     """
+    stream = ReadDataStream(BytesIO(content))
     try:
-        _, _, size, crc, length = _CHUNK_START.unpack_from(view)
-        compression = bytes(view[_CHUNK_START.size:_CHUNK_START.size + length]).decode()
-        (packed,) = struct.unpack_from('<Q', view, _CHUNK_START.size + length)
-    except (struct.error, UnicodeDecodeError) as error:
-        raise RecordingError(f'it is damaged: {error}') from error
-    body = view[_CHUNK_START.size + length + 8:]
-    if len(body) != packed:
-        raise RecordingError(f'it has {len(body)} of {packed} bytes')
-    if size > MAX_CHUNK_BYTES:
+        record = kind.read(stream)
+    except DAMAGE as error:
+        raise RecordingError(f'damaged {kind.__name__.lower()} record') from error
+    if whole and stream.count != len(content):
+        raise RecordingError(f'damaged {kind.__name__.lower()} record: wrong length')
+    return record
+
+
+def read_chunk(content):
+    """
+    Read the content of a chunk record without unpacking it.
+
+    :param content: bytes-like.
+    :return: mcap.records.Chunk.
+    :raises RecordingError: when it is damaged, or claims to unpack to more than MAX_CHUNK_BYTES.
+    """
+    if len(content) > MAX_CHUNK_BYTES:
         raise RecordingError(
-            f'it claims to unpack to {size} bytes; at most {MAX_CHUNK_BYTES} are accepted')
-    if compression == '':
-        data = np.frombuffer(body, np.uint8)
-    else:
-        if len(buffer) < size:
-            buffer = np.empty(size + size // 8, np.uint8)
-        data = buffer[:_decompress(compression, body, memoryview(buffer)[:size])]
-    if len(data) != size or (crc and zlib.crc32(data) != crc):
-        raise RecordingError('its checksum or size is wrong; restore the file from a copy')
-    return data, buffer
+            f'it has {len(content)} bytes; at most {MAX_CHUNK_BYTES} are accepted')
+    chunk = read_record(Chunk, content)
+    if chunk.uncompressed_size > MAX_CHUNK_BYTES:
+        raise RecordingError(
+            f'it claims to unpack to {chunk.uncompressed_size} bytes; at most {MAX_CHUNK_BYTES} '
+            'are accepted')
+    return chunk
 
 
-def _decompress(compression, body, out):
-    """Unpack a chunk into a buffer; return the number of bytes, never more than fit."""
+def unpack(chunk):
+    """
+    Return the checked bytes of a chunk, which never take more memory than it claims.
+
+    :param chunk: as read_chunk returns it.
+    :raises RecordingError: when its checksum or size is wrong, or it does not unpack.
+    """
     try:
-        if compression == 'zstd':
-            with zstandard.ZstdDecompressor().stream_reader(
-                    body, read_size=max(len(body), 1)) as reader:
-                size = reader.readinto(out) if len(out) else 0
-                if reader.read(1):
-                    raise RecordingError('it unpacks to more than it claims')
-            return size
-        if compression == 'lz4':
-            import lz4.frame  # comes with mcap; few recordings need it
-            data = lz4.frame.LZ4FrameDecompressor().decompress(body, max_length=len(out))
-            out[:len(data)] = data
-            return len(data)
+        data = _decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
     except (zstandard.ZstdError, RuntimeError) as error:
         raise RecordingError(f'it does not unpack: {error}') from error
+    crc = chunk.uncompressed_crc
+    if len(data) != chunk.uncompressed_size or (crc and zlib.crc32(data) != crc):
+        raise RecordingError('its checksum or size is wrong; restore the file from a copy')
+    return data
+
+
+def _decompress(compression, data, size):
+    if compression == '':
+        return data
+    if compression == 'zstd':
+        # What the frame says about its size counts more for the decompressor than our limit.
+        if zstandard.frame_content_size(data) not in (-1, size):
+            raise RecordingError('it unpacks to more than it claims, or to less')
+        return zstandard.ZstdDecompressor().decompress(data, size)
+    if compression == 'lz4':
+        import lz4.frame  # comes with mcap; few recordings need it
+        return lz4.frame.LZ4FrameDecompressor().decompress(data, size)
     raise RecordingError(
         f'it is compressed as {compression[:40]!r}; zstd, lz4 and none can be read')

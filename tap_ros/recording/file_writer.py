@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
 from tap_ros.recording import metadata, topics
-from tap_ros.recording.schemas import schema_text, type_hash
+from tap_ros.recording.messages import schema_text, type_hash
 
 LIBRARY = 'tap_ros 1'
 CHUNK_BYTES = 786432  # rosbag2's default

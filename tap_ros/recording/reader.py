@@ -45,7 +45,7 @@ def _decode(file, found):
     """Return the Columns of a file, frames in memory."""
     pieces = []
     part = decode_file(
-        file, found, lambda buffers: pieces.append(b''.join(buffers)), pieces.clear)
+        file, found, lambda pixels: pieces.append(pixels.tobytes()), pieces.clear)
     order = part.arrays.pop('frame_order', None)
     if pieces:
         frames = np.frombuffer(b''.join(pieces), np.uint8).reshape(-1, *part.image_size, 3)

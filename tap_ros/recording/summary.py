@@ -3,16 +3,19 @@
 """The summary of an MCAP file: what its writer says the file holds."""
 
 from dataclasses import dataclass
+from io import BytesIO
 import struct
 import zlib
 
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC as MAGIC
+from tap_ros.recording.chunks import DAMAGE
 from tap_ros.recording.losses import FAR
 
-MAGIC = b'\x89MCAP0\r\n'
 RECORD = struct.Struct('<BQ')  # opcode, length of what follows
-SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15
-_FOOTER, _CHUNK_INDEX, _STATISTICS = 2, 8, 11
-_FOOTER_RECORD = struct.Struct('<BQQQI')  # header, summary start, summary offsets start, crc
+_FOOTER = struct.Struct('<BQQQI')  # opcode, length, summary start, summary offsets start, crc
 DAMAGED = 'its summary is damaged, so that nothing tells whether all messages are there'
 
 
@@ -32,7 +35,7 @@ class Summary:
 
     start: int  # where it begins in the file
     placed: bool  # whether that is where it should, so that offsets hold
-    topics: list  # of (opcode, content) of its schema and channel records
+    topics: list  # its schemas and channels, of mcap.records
     chunks: list  # of ChunkEntry, empty when it lists none
     counts: dict | None  # channel -> number of messages; None when it does not say
 
@@ -46,13 +49,13 @@ def read_summary(data):
         the file is cut off).
     """
     data = memoryview(data)
-    footer = len(data) - _FOOTER_RECORD.size - len(MAGIC)
+    footer = len(data) - _FOOTER.size - len(MAGIC)
     if footer < len(MAGIC):
         return None, ''
-    kind, length, start, _, crc = _FOOTER_RECORD.unpack_from(data, footer)
+    kind, length, start, _, crc = _FOOTER.unpack_from(data, footer)
     sound = (
-        data[-len(MAGIC):] == MAGIC and kind == _FOOTER
-        and length == _FOOTER_RECORD.size - RECORD.size)
+        data[-len(MAGIC):] == MAGIC and kind == Opcode.FOOTER
+        and length == _FOOTER.size - RECORD.size)
     if sound and start == 0:
         return None, ''
     placed = sound and _holds(data, start, footer, crc)
@@ -63,8 +66,8 @@ def read_summary(data):
         if not sound or not _holds(data, start, footer, crc):
             return None, DAMAGED
     try:
-        return _parse(data, start, footer, placed), ''
-    except struct.error:
+        return _parse(data[start:], start, placed), ''
+    except DAMAGE:
         return None, DAMAGED
 
 
@@ -73,7 +76,7 @@ def _holds(data, start, footer, crc):
     if not len(MAGIC) < start <= footer:
         return False
     if crc:
-        return zlib.crc32(data[start:footer + _FOOTER_RECORD.size - 4]) == crc
+        return zlib.crc32(data[start:footer + _FOOTER.size - 4]) == crc
     position = start
     while position < footer:
         position += RECORD.size + RECORD.unpack_from(data, position)[1]
@@ -86,23 +89,20 @@ def _data_end(data):
     while position + RECORD.size <= len(data):
         kind, length = RECORD.unpack_from(data, position)
         position += RECORD.size + length
-        if kind == DATA_END and length == 4:
+        if kind == Opcode.DATA_END and length == 4:
             return position
     return None
 
 
-def _parse(data, start, footer, placed):
-    topics, chunks, counts, position = [], [], None, start
-    while position + RECORD.size <= footer:
-        kind, length = RECORD.unpack_from(data, position)
-        body = data[position + RECORD.size:min(position + RECORD.size + length, footer)]
-        position += RECORD.size + length
-        if kind in (SCHEMA, CHANNEL):
-            topics.append((kind, body))
-        elif kind == _CHUNK_INDEX:
-            first, last, offset, size = struct.unpack_from('<QQQQ', body)
-            chunks.append(ChunkEntry(offset, size, min(first, FAR), min(last, FAR)))
-        elif kind == _STATISTICS:
-            (size,) = struct.unpack_from('<I', body, 42)
-            counts = dict(struct.iter_unpack('<HQ', body[46:46 + size]))
+def _parse(data, start, placed):
+    topics, chunks, counts = [], [], None
+    for record in StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records:
+        if isinstance(record, (Schema, Channel)):
+            topics.append(record)
+        elif isinstance(record, ChunkIndex):
+            chunks.append(ChunkEntry(
+                record.chunk_start_offset, record.chunk_length,
+                min(record.message_start_time, FAR), min(record.message_end_time, FAR)))
+        elif isinstance(record, Statistics):
+            counts = record.channel_message_counts
     return Summary(start, placed, topics, chunks, counts)

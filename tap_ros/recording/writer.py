@@ -19,9 +19,9 @@ from tap_ros.contract import CAMERA_FRAME, GRIPPER_JOINTS, PICTURE_ENCODING, WOR
 from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
 from tap_ros.recording import metadata, topics
-from tap_ros.recording.codec import encode
 from tap_ros.recording.episode import check_episode
 from tap_ros.recording.file_writer import FileWriter
+from tap_ros.recording.messages import encode, typestore
 from tap_ros.text import escaped
 
 EPISODE_GAP_NS = 10**9  # between episodes whose stamps do not follow each other
@@ -51,6 +51,7 @@ class BagWriter:
         self._flush_seconds = flush_seconds
         self._split_bytes = split_bytes
         self._finished = []
+        typestore()  # takes a moment, which no message should wait for
         self._file = self._open()
 
     def write_raw(self, topic, type_name, data, log_time_ns, publish_time_ns=None, qos=None):

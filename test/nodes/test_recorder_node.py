@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
-from tap_ros.recording.codec import decode
+from tap_ros.recording.messages import decode
 from tap_ros.recording.reader import iter_episodes
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -106,11 +106,11 @@ def test_messages_come_back_as_they_were_sent(client, record, tmp_path):
     assert process.end() == 0, process.text
     found = read(tmp_path / 'bag')
     assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
-    pictures = [m['data'].tobytes() for topic, _, m in found if topic == '/camera/image_raw']
+    pictures = [m.data.tobytes() for topic, _, m in found if topic == '/camera/image_raw']
     assert pictures == [bytes(image.data) for image in sent]
-    assert [m['data'] for topic, _, m in found if topic == '/gripper/command'] \
+    assert [m.data for topic, _, m in found if topic == '/gripper/command'] \
         == [index / 10 for index in range(10)]
-    assert [m['data'].tobytes() for topic, _, m in found if topic == '/goal/image'] \
+    assert [m.data.tobytes() for topic, _, m in found if topic == '/goal/image'] \
         == [bytes(random_image(1).data)]
 
 
@@ -140,7 +140,7 @@ def test_topics_of_any_type_can_be_recorded(client, record, tmp_path):
     assert process.end() == 0, process.text
     (topic, kind, message), = read(tmp_path / 'bag')
     assert (topic, kind) == ('/elsewhere/joints', 'sensor_msgs/msg/JointState')
-    assert message['name'] == ['a'] and message['position'].tolist() == [1.5]
+    assert message.name == ['a'] and message.position.tolist() == [1.5]
 
 
 def test_a_full_disk_is_told_and_the_node_stays_up(client, record, tmp_path):

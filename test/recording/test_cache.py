@@ -100,6 +100,30 @@ def test_many_processes_may_build_at_once(bag, cache):
     assert len(list(cache.iterdir())) == 2
 
 
+def test_large_recordings_are_decoded_in_other_processes(tmp_path, bag, episodes, monkeypatch):
+    monkeypatch.setattr(cache_module, '_ALONE_BYTES', 0)
+    monkeypatch.setattr(cache_module, 'decode_file', None)  # here, not there
+    assert_all_equal(open_recordings(bag), episodes)
+    with EpisodeWriter(bag / 'push2_1.mcap') as writer:
+        writer.write(make_episode(size=(8, 8)))
+        writer.write(make_episode(size=(4, 16)))
+    with EpisodeWriter(bag / 'push2_0.mcap') as writer:
+        writer.write(make_episode(seed=99))
+    with pytest.raises(RecordingError, match='push2_1.mcap: .* images of different sizes'):
+        open_recordings(bag)
+
+
+def test_a_script_that_other_processes_cannot_import_gets_its_episodes(tmp_path, bag, episodes):
+    script = tmp_path / 'script.py'
+    script.write_text(
+        'import sys\nfrom tap_ros.recording import cache\ncache._ALONE_BYTES = 0\n'
+        'print(len(cache.open_recordings(sys.argv[1], progress=False)))\n')
+    run = subprocess.run([sys.executable, script, bag], capture_output=True, text=True,
+                         env=os.environ | {'PYTHONPATH': os.getcwd()})
+    assert 'bootstrapping phase' in run.stderr  # they say what to do about it
+    assert run.stdout.split() == [str(len(episodes))]
+
+
 def test_a_failed_build_leaves_nothing(tmp_path, bag, cache):
     path = bag / 'both.mcap'
     with EpisodeWriter(path) as writer:  # of two sizes, refused when all is decoded

@@ -16,11 +16,10 @@ import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.recording import chunks
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.codec import encode
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.file_writer import FileWriter
+from tap_ros.recording.messages import encode, schema_text
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.recording.schemas import schema_text
 from tap_ros.recording.writer import BagWriter, EpisodeWriter
 import zstandard
 
@@ -187,18 +186,11 @@ def test_a_wrong_index_does_no_harm(long_file):
     assert_all_equal(iter_episodes(path), episodes)
 
 
-@pytest.mark.parametrize('options', [
-    {'use_chunking': False}, {'index_types': IndexType.NONE},
-    {'compression': CompressionType.NONE, 'enable_crcs': False},
-    {'repeat_channels': False, 'repeat_schemas': False, 'use_statistics': False}],
-    ids=lambda options: ','.join(options))
-def test_other_ways_to_write_mcap(tmp_path, long_file, options):
-    path, episodes = long_file
-    out = open(tmp_path / 'other.mcap', 'wb')
-    writer = Writer(out, **options)
-    writer.start('ros2')
-    ids = {}
-    with open(path, 'rb') as stream:
+def rewrite(path, other, **options):
+    """Copy the messages of a file as another writer would write them."""
+    with open(other, 'wb') as out, open(path, 'rb') as stream:
+        writer, ids = Writer(out, **options), {}
+        writer.start('ros2')
         for schema, channel, message in NonSeekingReader(stream).iter_messages(
                 log_time_order=False):
             if channel.topic not in ids:
@@ -206,15 +198,62 @@ def test_other_ways_to_write_mcap(tmp_path, long_file, options):
                 ids[channel.topic] = writer.register_channel(channel.topic, 'cdr', number)
             writer.add_message(
                 ids[channel.topic], message.log_time, message.data, message.publish_time)
-    writer.finish()
-    out.close()
+        writer.finish()
+
+
+@pytest.mark.parametrize('options', [
+    {'use_chunking': False}, {'index_types': IndexType.NONE},
+    {'compression': CompressionType.NONE, 'enable_crcs': False}, {'repeat_schemas': False},
+    {'repeat_channels': False, 'repeat_schemas': False, 'use_statistics': False}],
+    ids=lambda options: ','.join(options))
+def test_other_ways_to_write_mcap(tmp_path, long_file, options):
+    path, episodes = long_file
+    rewrite(path, tmp_path / 'other.mcap', **options)
     assert_all_equal(iter_episodes(tmp_path / 'other.mcap'), episodes)
+
+
+@pytest.mark.parametrize('kind, length, words', [
+    (5, 21, 'too short'), (5, 2**40, 'wrong length'), (0x33, None, 'opcode 51')])
+def test_damage_that_no_checksum_shows_costs_its_chunk(tmp_path, long_file, kind, length, words):
+    path, episodes = long_file
+    other = tmp_path / 'other.mcap'
+    rewrite(
+        path, other, chunk_size=2**18, compression=CompressionType.NONE, enable_crcs=False)
+    data = bytearray(other.read_bytes())
+    where = data.index(episodes[10].frames[4].tobytes())
+    start = data.rindex(b'camera\0', 0, where) - 47  # of the record: 31 + 16 bytes before
+    assert data[start] == 5
+    data[start] = kind
+    if length is not None:
+        data[start + 1:start + 9] = struct.pack('<Q', length)
+    other.write_bytes(data)
+    with pytest.warns(RecordingWarning, match=f'chunk at byte .*it holds a damaged .*{words}'):
+        found = list(iter_episodes(other))
+    assert_all_equal(found[:5], episodes[:5])
+    assert_all_equal(found[-5:], episodes[-5:])
+
+
+def test_messages_that_nothing_describes_are_named(tmp_path):
+    with open(tmp_path / 'a.mcap', 'wb') as stream:
+        writer = Writer(stream)
+        writer.start('ros2')
+        schema = writer.register_schema(IMAGE, 'ros2msg', schema_text(IMAGE).encode())
+        number = writer.register_channel('/camera/image_raw', 'cdr', schema)
+        for t in range(1, 6):
+            data = encode(IMAGE, {
+                'header': {'stamp': {'sec': t}}, 'height': 1, 'width': 1, 'encoding': 'mono8',
+                'step': 1, 'data': b'\7'})
+            writer.add_message(99 if t == 3 else number, t * 10**9, data, t * 10**9)
+        writer.finish()
+    with pytest.warns(RecordingWarning, match='log time 3.000000000 s: messages of channel 99,'):
+        found = list(iter_episodes(tmp_path))
+    assert [len(episode) for episode in found] == [2, 2]
 
 
 KILLED = """
 import sys, time
 import numpy as np
-from tap_ros.recording.codec import encode
+from tap_ros.recording.messages import encode
 from tap_ros.recording.writer import BagWriter
 writer = BagWriter(sys.argv[1], flush_seconds=0.0)
 for t in range(10**6):

@@ -9,7 +9,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.codec import encode
+from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.topics import resolve
 from tap_ros.recording.writer import BagWriter, EpisodeWriter
@@ -230,6 +230,23 @@ def test_states_are_those_nearest_to_the_frame(tmp_path):
     np.testing.assert_allclose(episode.grippers[:3, :3], [[0.1, 0.2, 0.3]] * 3, rtol=1e-6)
     np.testing.assert_allclose(episode.grippers[:3, 3], [4.9, 7.9, 11.0], rtol=1e-6)
     assert np.isnan(episode.grippers[3]).all()
+
+
+def test_states_of_other_joints_are_no_gripper_states(tmp_path):
+    def state(t, name, log):
+        return ('/joint_states', 'sensor_msgs/msg/JointState',
+                joints(round(t * SECOND), [name], [0.5]), round(log * SECOND))
+    record(tmp_path / 'bag', [
+        camera(1), state(1.01, 'gripper_x', 1.01), state(1, 'wheel', 1.02), camera(2)])
+    (episode,) = iter_episodes(tmp_path / 'bag')
+    assert episode.grippers[0, 0] == 0.5
+
+
+def test_commands_logged_out_of_order_are_put_in_order(tmp_path):
+    record(tmp_path / 'bag', [
+        camera(1), camera(2), camera(3), gripper(2.5, 0.5), gripper(1.5, 0.25)])
+    (episode,) = iter_episodes(tmp_path / 'bag')
+    assert episode.actions[:, 3].tolist() == [0.25, 0.5, 0]
 
 
 def test_objects_are_matched_by_name(tmp_path):

@@ -1,0 +1,202 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+ROS messages without ROS: their definitions and their bytes (CDR), by rosbags.
+
+rosbags knows the types of Jazzy; ours stand here, so that recordings are written and read where
+tap_msgs is not installed. Others are looked up in the ROS installation, as rosbag2 does.
+"""
+
+from functools import cache
+import os
+from pathlib import Path
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores, TypesysError
+from tap_ros.errors import RecordingError
+
+DEFINITIONS = {
+    'tap_msgs/msg/CommandRefused': 'std_msgs/Header header\nstring message\n',
+    'tap_msgs/msg/Episode': """
+uint8 START=0
+uint8 END=1
+std_msgs/Header header
+uint8 event
+string task
+uint64 seed
+string outcome
+""",
+    'tap_msgs/msg/ObjectState': """
+string name
+float64 u
+float64 v
+geometry_msgs/Pose pose
+""",
+    'tap_msgs/msg/ObjectStates': """
+string SOURCE_GROUND_TRUTH="ground_truth"
+string SOURCE_TRACKED="tracked"
+std_msgs/Header header
+string source
+ObjectState[] objects
+""",
+    'tap_msgs/msg/Subgoal': """
+std_msgs/Header header
+sensor_msgs/Image image
+string[] object_names
+sensor_msgs/Image[] object_maps
+geometry_msgs/Point[] expected_pixels
+""",
+}
+_MAX_SCHEMA = 2**16  # characters of a recorded definition; the longest in use have some thousands
+_UNREADABLE = (TypesysError, AssertionError, ValueError, LookupError)  # definitions
+_NUMBERS = {'bool': np.bool_, 'byte': np.uint8, 'char': np.uint8}  # else the name is numpy's
+
+
+@cache
+def typestore():
+    """Return rosbags' type store with the types of Jazzy and ours; takes 0.1 s the first time."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = {}
+    for name, text in DEFINITIONS.items():
+        types |= get_types_from_msg(text, name)
+    store.register(types)
+    return store
+
+
+def encode(type_name, message):
+    """
+    Serialize a message.
+
+    :param type_name: for example 'sensor_msgs/msg/JointState'.
+    :param message: dict by field name, nested; what is left out is 0, '' or empty.
+    :return: bytes (CDR) with the 4-byte encapsulation header.
+    :raises TypeError: for a field that the type does not have.
+    """
+    return bytes(typestore().serialize_cdr(_build(type_name, message), type_name))
+
+
+def decode(type_name, data):
+    """
+    Read one message.
+
+    :param type_name: for example 'sensor_msgs/msg/JointState'.
+    :param data: bytes-like, with the encapsulation header.
+    :return: the message, its fields as attributes; arrays of numbers are views of the data.
+    :raises RecordingError: when the bytes are not such a message.
+    """
+    try:
+        return typestore().deserialize_cdr(data, type_name)
+    except SerdeError as error:
+        raise RecordingError(f'damaged message: {error}') from error
+
+
+@cache
+def schema_text(type_name):
+    """
+    Return the ros2msg schema of a message type: its definition and those of all types within.
+
+    :param type_name: for example 'sensor_msgs/msg/Image'.
+    :raises RecordingError: when a definition is neither built in nor in the ROS installation.
+    """
+    _look_up(type_name)
+    return typestore().generate_msgdef(type_name, ros_version=2)[0]
+
+
+@cache
+def type_hash(type_name):
+    """
+    Return ROS 2's hash (REP 2011) of a message type.
+
+    :param type_name: for example 'sensor_msgs/msg/Image'.
+    :raises RecordingError: as schema_text.
+    """
+    _look_up(type_name)
+    return typestore().hash_rihs01(type_name)
+
+
+@cache
+def check_schema(type_name, text):
+    """
+    Accept the schema of a recording if its messages can be read with our definitions.
+
+    :param type_name: for example 'tap_msgs/msg/Episode'.
+    :param text: ros2msg, as schema_text gives it; with comments or without.
+    :raises RecordingError: when fields differ; it names the type and both lists of fields.
+    """
+    try:
+        if len(text) > _MAX_SCHEMA:
+            raise ValueError(f'more than {_MAX_SCHEMA} characters')
+        types = get_types_from_msg(text.replace('\r\n', '\n'), type_name)
+    except _UNREADABLE as error:
+        raise RecordingError(
+            f'message type {type_name}: its recorded definition cannot be read') from error
+    known = typestore().fielddefs
+    for name, (_, theirs) in types.items():
+        if name in known and list(theirs) != list(known[name][1]):
+            theirs, ours = (
+                ', '.join(field for field, _ in fields) for fields in (theirs, known[name][1]))
+            raise RecordingError(
+                f'message type {name}: recorded with the fields {theirs}; expected {ours}')
+
+
+def _look_up(type_name):
+    """Read definitions that rosbags does not know from the ROS installation."""
+    store, found, waiting = typestore(), {}, [type_name]
+    while waiting:
+        name = waiting.pop()
+        if name in store.fielddefs or name in found:
+            continue
+        path = _find_in_ros(name)
+        if path is None:
+            raise RecordingError(
+                f'message type {name}: no definition found; built in are those of ROS 2 Jazzy '
+                f'and {", ".join(sorted(DEFINITIONS))}. For others source the ROS 2 workspace '
+                'that has it (AMENT_PREFIX_PATH)')
+        try:
+            found |= get_types_from_msg(path.read_text(), name)
+        except _UNREADABLE as error:
+            raise RecordingError(f'message type {name}: {path} cannot be read') from error
+        for _, (kind, detail) in found[name][1]:
+            if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                kind, detail = detail[0]
+            if kind == Nodetype.NAME:
+                waiting.append(detail)
+    if found:
+        store.register(found)
+
+
+def _find_in_ros(type_name):
+    """Return the path of a definition in the ROS installation, or None."""
+    package, _, name = type_name.partition('/msg/')
+    for prefix in filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)):
+        path = Path(prefix, 'share', package, 'msg', f'{name}.msg')
+        if path.is_file():
+            return path
+    return None
+
+
+def _build(type_name, values):
+    """Return a message of rosbags' from a nested dict."""
+    store = typestore()
+    known = {name: _value(*kind, values.get(name))
+             for name, kind in store.fielddefs[type_name][1]}
+    return store.types[type_name](**(values | known))
+
+
+def _value(kind, detail, value):
+    """Return the value of a field, 0, '' or empty for None."""
+    if kind == Nodetype.NAME:
+        return _build(detail, value or {})
+    if kind == Nodetype.BASE:
+        return value if value is not None else '' if detail[0] == 'string' else 0
+    array, ((kind, detail), count) = kind, detail
+    count = count if array == Nodetype.ARRAY else 0
+    if kind == Nodetype.NAME or detail[0] == 'string':
+        return [_value(kind, detail, one) for one in ([None] * count if value is None else value)]
+    if isinstance(value, bytes):
+        return np.frombuffer(value, np.uint8)
+    if value is None:
+        value = np.zeros(count)
+    return np.ascontiguousarray(value, _NUMBERS.get(detail[0], detail[0])).reshape(-1)

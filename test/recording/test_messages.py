@@ -1,0 +1,165 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages and their definitions are those of everybody."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import get_types_from_msg
+from tap_ros.errors import RecordingError
+from tap_ros.recording import topics
+from tap_ros.recording.messages import (
+    check_schema,
+    decode,
+    DEFINITIONS,
+    encode,
+    schema_text,
+    type_hash,
+    typestore,
+)
+
+MSG_FOLDER = Path(__file__).parents[2] / 'tap_msgs' / 'msg'
+NAMES = sorted({*topics.TYPES.values(), *DEFINITIONS})
+
+
+def random_message(type_name, random):
+    """Fill a message with random values; sequences get 0 to 3 elements."""
+    def value(kind, detail):
+        if kind == Nodetype.NAME:
+            return random_message(detail, random)
+        if kind == Nodetype.BASE:
+            return ''.join(random.choice(list('abcd'), random.integers(0, 6))) \
+                if detail[0] == 'string' else int(random.integers(0, 2))
+        element, count = detail
+        count = count if kind == Nodetype.ARRAY else random.integers(0, 4)
+        return [value(*element) for _ in range(count)]
+    return {name: value(*kind) for name, kind in typestore().fielddefs[type_name][1]}
+
+
+def assert_holds(message, expected):
+    """Compare a message with a nested dict or list."""
+    if isinstance(expected, dict):
+        for name, value in expected.items():
+            assert_holds(getattr(message, name), value)
+    elif isinstance(expected, list):
+        assert len(message) == len(expected)
+        for one, value in zip(message, expected, strict=True):
+            assert_holds(one, value)
+    else:
+        assert message == expected
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_round_trip(name):
+    for seed in range(4):
+        message = random_message(name, np.random.default_rng(seed))
+        assert_holds(decode(name, encode(name, message)), message)
+
+
+def test_reads_big_endian():
+    name, store = 'sensor_msgs/msg/JointState', typestore()
+    message = random_message(name, np.random.default_rng(5)) | {'position': [1.5, -2.5]}
+    data = store.serialize_cdr(decode(name, encode(name, message)), name, little_endian=False)
+    assert bytes(data) != encode(name, message)
+    assert_holds(decode(name, data), message)
+
+
+def test_left_out_fields_are_zero_or_empty():
+    message = decode('sensor_msgs/msg/CameraInfo', encode('sensor_msgs/msg/CameraInfo', {}))
+    assert message.header.frame_id == message.distortion_model == ''
+    assert (message.height, message.roi.do_rectify) == (0, False)
+    assert message.k.tolist() == [0] * 9 and message.d.tolist() == []
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_cut_off_messages_are_refused(name):
+    data = encode(name, random_message(name, np.random.default_rng(1)))
+    for length in range(len(data)):
+        with pytest.raises(RecordingError, match='damaged message'):
+            decode(name, data[:length])
+
+
+def test_huge_counts_are_refused():
+    data = bytearray(encode('tap_msgs/msg/ObjectStates', {'objects': [{'name': 'a'}]}))
+    where = data.rindex(b'\1\0\0\0', 0, data.index(b'a\0'))
+    data[where:where + 4] = b'\xff\xff\xff\x7f'
+    with pytest.raises(RecordingError, match='damaged message'):
+        decode('tap_msgs/msg/ObjectStates', bytes(data))
+
+
+def test_unknown_fields_are_refused():
+    with pytest.raises(TypeError, match='nonsense'):
+        encode('sensor_msgs/msg/Image', {'nonsense': 1})
+
+
+def lines(text):
+    """Return a definition line by line, without comments."""
+    stripped = [' '.join(line.split('#')[0].split()) for line in text.splitlines()]
+    return [line for line in stripped if line]
+
+
+def test_our_definitions_are_the_msg_files():
+    files = {f'tap_msgs/msg/{path.stem}': path.read_text() for path in MSG_FOLDER.glob('*.msg')}
+    assert {name: lines(text) for name, text in DEFINITIONS.items()} == {
+        name: lines(text) for name, text in files.items()}
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_a_schema_holds_all_that_is_within(name):
+    found, waiting = get_types_from_msg(schema_text(name), name), [name]
+    for current in waiting:
+        fields = typestore().fielddefs[current][1]
+        assert found[current][1] == fields
+        details = [d[0][1] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else d
+                   for _, (kind, d) in fields]
+        waiting += [detail for detail in details if isinstance(detail, str)]
+    assert set(found) == set(waiting)
+
+
+@pytest.mark.ros
+def test_type_hashes_are_those_of_the_ros_installation():
+    expected = {}
+    for prefix in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep):
+        for path in Path(prefix, 'share').glob('*/msg/*.json'):
+            for entry in json.loads(path.read_text())['type_hashes']:
+                expected[entry['type_name']] = entry['hash_string']
+    assert {name: type_hash(name) for name in NAMES} == {name: expected[name] for name in NAMES}
+
+
+def test_other_types_come_from_the_ros_installation(tmp_path, monkeypatch):
+    folder = tmp_path / 'share' / 'my_msgs' / 'msg'
+    folder.mkdir(parents=True)
+    (folder / 'Wheel.msg').write_text(
+        '# a wheel\nint32 MAX=3\nuint8[<=4] teeth\nHub hub  # in it\n')
+    (folder / 'Hub.msg').write_text('string<=10 label "x"\ngeometry_msgs/Point[2] ends\n')
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'/nowhere:{tmp_path}')
+    text = schema_text('my_msgs/msg/Wheel')
+    assert lines(text)[:3] == ['int32 MAX=3', 'uint8[<=4] teeth', 'my_msgs/Hub hub']
+    assert 'MSG: my_msgs/Hub\n' in text and 'MSG: geometry_msgs/Point\n' in text
+    assert type_hash('my_msgs/msg/Wheel').startswith('RIHS01_')
+
+
+def test_unknown_types_are_named(tmp_path, monkeypatch):
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    with pytest.raises(RecordingError, match='message type no_msgs/msg/Thing: no definition'):
+        schema_text('no_msgs/msg/Thing')
+    folder = tmp_path / 'share' / 'no_msgs' / 'msg'
+    folder.mkdir(parents=True)
+    (folder / 'Thing.msg').write_text('= = =\n')
+    with pytest.raises(RecordingError, match='no_msgs/msg/Thing: .*Thing.msg cannot be read'):
+        schema_text('no_msgs/msg/Thing')
+
+
+def test_a_schema_with_comments_is_accepted_and_another_is_not():
+    name = 'tap_msgs/msg/ObjectStates'
+    text = schema_text(name)
+    check_schema(name, '# words\r\n' + text.replace('\n', '  # more words\r\n', 1))
+    with pytest.raises(RecordingError, match='ObjectState: recorded .* name, u, pose;'):
+        check_schema(name, text.replace('float64 v\n', ''))
+    for text in ('Ärger\n', 'float64 x\n' * 10**6, '=' * 80, 'MSG: a/b'):
+        with pytest.raises(RecordingError, match='ObjectStates: its recorded definition cannot'):
+            check_schema(name, text)
