@@ -19,6 +19,7 @@ from tap_ros.errors import PlanningError
 from tap_ros.evaluation.planning.scenes import FIRST_SCENE
 from tap_ros.evaluation.speed import matrix_rate, matrix_side
 from tap_ros.images import to_float
+from tap_ros.planning.action_sequences import FIRST_STD, HORIZON
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.weights import FORWARD_MODEL
@@ -48,9 +49,9 @@ def run(args):
     goal = simulator.goal().object_pixels
     cores = len(os.sched_getaffinity(0))
     large = with_preset('large')
-    search, horizon = large.search, large.segments * large.repeat
+    search = large.search
     print(f'one plan: {search.num_samples} samples x {search.num_iterations} iterations x '
-          f'horizon {horizon}, two objects, {args.device}'
+          f'horizon {HORIZON}, two objects, {args.device}'
           + (f', {cores} cores' if args.device == 'cpu' else ''))
     planners = {name: VisualMPC.load(args.weights, with_preset(name), args.device)
                 for name in PRESETS}
@@ -115,7 +116,7 @@ def time_plans(mpc, seen, goal, count, warm=False):
 @torch.inference_mode()
 def time_naively(mpc, seen, count):
     """Return the ms of one sample that is predicted alone, every frame decoded."""
-    model, config = mpc.model, mpc.config
+    model = mpc.model
     image, gripper = _inputs(mpc, seen)
     actions = random_actions(mpc, count + 1)
     times = []
@@ -125,7 +126,7 @@ def time_naively(mpc, seen, count):
         arm = model.draw_arm(gripper)
         scene = model.look(image, arm[:, 3:])
         flow, hand = model.still(1), gripper
-        for t in range(config.segments * config.repeat):
+        for t in range(HORIZON):
             flow, hand, _ = model.advance(scene.features, flow, hand, sample[:, t])
             picture, _ = model.picture(scene, flow, model.draw_arm(hand))
             carried = model.carry(maps, flow)
@@ -161,10 +162,9 @@ def count_operations(mpc, seen):
 
 def random_actions(mpc, count):
     """Return sequences (count, horizon, 4) that push all the time, the dearest to predict."""
-    config = mpc.config
     rng = np.random.default_rng(0)
-    actions = np.zeros((count, config.segments * config.repeat, 4), np.float32)
-    actions[..., :2] = rng.normal(0, config.std_move / 2, (*actions.shape[:2], 2))
+    actions = np.zeros((count, HORIZON, 4), np.float32)
+    actions[..., :2] = rng.normal(0, FIRST_STD / 2, (*actions.shape[:2], 2))
     return torch.from_numpy(actions).to(mpc.model.grid.device)
 
 

@@ -8,6 +8,7 @@ object pixels and goal pixels, brought to the table by the model's homography.
 """
 
 import numpy as np
+from tap_ros.planning.action_sequences import REPEAT
 
 PACE = 0.9  # of the limits is used, so that the search can still add to it
 
@@ -60,7 +61,7 @@ def _go_and_push(shape, gripper, start, end, target, along):
     start = start if lifted else here
     needed = np.linalg.norm(end - start) / (PACE * shape.push_limit)
     if not lifted and shape.phase is None:
-        phase = int(-np.ceil(needed) % shape.repeat)  # so that it ends with a segment
+        phase = int(-np.ceil(needed) % REPEAT)  # so that it ends with a segment
     periods = _moving_periods(shape, gripper, lifted, phase)
     moves = np.zeros((shape.num_moves, 2))
     moves[:lifted] = (start - here) / max(1, periods[:lifted].sum())

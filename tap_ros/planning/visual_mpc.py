@@ -14,10 +14,10 @@ import os
 import time
 
 import numpy as np
-from tap_ros.contract import LOW
+from tap_ros.contract import CLIMB_LIMIT, LOW, MOVE_LIMIT
 from tap_ros.errors import PlanningError
 from tap_ros.images import to_float
-from tap_ros.planning.action_sequences import SequenceShape
+from tap_ros.planning.action_sequences import HORIZON, SequenceShape
 from tap_ros.planning.cem import cem
 from tap_ros.planning.expected_distance import distances_to_places
 from tap_ros.planning.forward_model import load_forward_model
@@ -27,6 +27,9 @@ from tap_ros.planning.proposals import push_proposals
 import torch
 
 NEAR = 3.0  # px
+LAST_WEIGHT = 10.0  # of the horizon's last step in the cost, as in the paper; the others have 1
+WARM_STD = 0.5  # share of the first deviation that a warm-started search begins with
+RECHECK_STD = 0.01  # m, from the gripper to where the elites are judged once more
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class VisualMPC:
         self.model, config = model, config or VisualMPCConfig()
         if model.grid.device.type != 'cpu':  # a GPU predicts all samples at once
             config = replace(config, batch_size=config.search.num_samples)
-        self.config = self._own_config = config
+        self.config, self._limits = config, (MOVE_LIMIT, CLIMB_LIMIT)
         # Each thread predicts whole batches: operators split among threads would wait for each
         # other at every one of some thousand small steps, and for anything else that runs.
         threads = self.config.threads or len(os.sched_getaffinity(0))
@@ -81,9 +84,10 @@ class VisualMPC:
         """Forget the last plan and start the random numbers anew."""
         config = self.config
         self._seed, self._count, self._age = seed, 0, 0
+        move, climb = self._limits
         self._first_shape = self._shape = SequenceShape(
-            config.segments, config.repeat, None if config.free_phase else 0, config.move_limit,
-            config.max_lift, config.push_limit, config.upright, config.climb_limit)
+            None if config.free_phase else 0, move, min(move, config.push_limit), config.upright,
+            climb)
         self._last = self._plan = self._goal = None  # _last: parameters of what is left of _plan
 
     @property
@@ -99,13 +103,10 @@ class VisualMPC:
         """
         Plan within limits, from the next reset on.
 
-        :param move: m per control period, |x| and |y|; climb: m, |z|; above the configuration's
-            own limits they change nothing.
+        :param move: m per control period, |x| and |y|; climb: m, |z|; above the contract's
+            limits they change nothing.
         """
-        own = self._own_config
-        self.config = replace(
-            own, move_limit=min(move, own.move_limit), push_limit=min(move, own.push_limit),
-            climb_limit=min(climb, own.climb_limit))
+        self._limits = min(move, MOVE_LIMIT), min(climb, CLIMB_LIMIT)
 
     @torch.inference_mode()
     def act(self, image, gripper, object_pixels, goal_maps=None, goal_pixels=None):
@@ -164,14 +165,14 @@ class VisualMPC:
 
         aside = np.random.default_rng([self._seed, self._count, 1])  # rng draws the same without
         starts = np.tile(gripper, (max(1, config.recheck), 1))
-        starts[1:, :2] += aside.normal(0, config.recheck_std, starts[1:, :2].shape)
+        starts[1:, :2] += aside.normal(0, RECHECK_STD, starts[1:, :2].shape)
         recheck = partial(cost, starts=torch.from_numpy(starts).to(device))
         mean, std = self._first_gaussian(shape)
         proposals = self._propose(shape, gripper, here, distance, rng)
         if config.warm_start and self._last is not None:
             proposals = np.concatenate([proposals, self._last[None]])
         clip = partial(shape.clip, least_lift=shape.least_lift(gripper[2]))
-        best, best_cost, _ = cem(cost, mean, std, config.search, rng, clip, proposals,
+        best, best_cost = cem(cost, mean, std, config.search, rng, clip, proposals,
                                  recheck if config.recheck else None)
         actions = shape.actions(best[None], gripper[2])
         _, ends = self._cost(features, state, maps, distance, actions)
@@ -180,9 +181,9 @@ class VisualMPC:
     def _first_gaussian(self, shape):
         """Return mean and deviation (D,): fresh, or around the last plan."""
         config = self.config
-        mean, std = shape.first_gaussian(config.std_move)
+        mean, std = shape.first_gaussian()
         if config.warm_start and self._last is not None:
-            mean, std = self._last, std * config.warm_std
+            mean, std = self._last, std * WARM_STD
         return mean, std
 
     def _propose(self, shape, gripper, here, distance, rng):
@@ -224,9 +225,8 @@ class VisualMPC:
                 last = torch.einsum('nkc,kc->nk', carried, distance)
                 last = last + (1 - carried.sum(2)) * worst  # a lost object is as far as can be
                 total, seen = total + last.sum(1), seen + 1
-            steps = config.segments * config.repeat
-            total = (total - last.sum(1)) * (steps - 1) / max(1, seen - 1)
-            return (total + config.last_weight * last.sum(1))[:count], last.mean(1)[:count]
+            total = (total - last.sum(1)) * (HORIZON - 1) / max(1, seen - 1)
+            return (total + LAST_WEIGHT * last.sum(1))[:count], last.mean(1)[:count]
 
         # together with others that come down as late: up there, nothing needs to be predicted
         order = np.argsort((actions[..., 2].cumsum(1) + gripper[0, 2].item() > LOW + 0.01).sum(1),

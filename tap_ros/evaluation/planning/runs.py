@@ -104,7 +104,8 @@ def read_results(path):
     """
     Read a result file.
 
-    :return: its settings, and its scenes as a dict by seed.
+    :return: its settings, and its scenes as a dict by seed. Settings of the planner that no longer
+        exist are left out: each had but the one value that now is a constant.
     :raises ConfigError: if it is damaged.
     """
     try:
@@ -112,10 +113,19 @@ def read_results(path):
         scenes = {scene['seed']: scene for scene in stored['scenes']}
         for scene in scenes.values():
             float(scene['final_cm']), list(scene['objects_cm']), int(scene['steps'])
-        return dict(stored['settings']), scenes
-    except (ValueError, KeyError, TypeError) as error:
+        settings = dict(stored['settings'])
+        if 'planner' in settings:
+            settings['planner'] = known(settings['planner'], asdict(VisualMPCConfig()))
+        return settings, scenes
+    except (AttributeError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f'{path}: is damaged ({type(error).__name__}: {error}); remove it and '
                           'its scenes are run again') from error
+
+
+def known(stored, names):
+    """Return a dict without what is not in another one, likewise the dicts in it."""
+    return {name: known(value, names[name]) if isinstance(value, dict) else value
+            for name, value in stored.items() if name in names}
 
 
 def run_jobs(jobs, seeds, folder, processes=1, progress=True):
