@@ -21,7 +21,8 @@ from tap_ros.evaluation.speed import matrix_rate, matrix_side
 from tap_ros.images import to_float
 from tap_ros.planning.action_sequences import FIRST_STD, HORIZON
 from tap_ros.planning.mpc_config import PRESETS, with_preset
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 import torch
 from torch.utils.flop_counter import FlopCounterMode
@@ -88,11 +89,10 @@ def run(args):
 
 def push_until_low(simulator, mpc, goal, most=30):
     """Carry out plans until the gripper is low; return what is then seen."""
-    seen = simulator.reset(FIRST_SCENE)
-    mpc.reset(0)
+    seen, goal, memory = simulator.reset(FIRST_SCENE), mpc.goal(goal), Memory()
     for _ in range(most):
-        seen = simulator.step(mpc.act(
-            seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal).action)
+        plan = mpc.plan(as_scene(seen), goal, memory)
+        seen, memory = simulator.step(plan.action), plan.memory
         if seen.gripper[2] < CLEAR / 2:
             return seen
     raise PlanningError(f'the gripper did not come down within {most} steps')
@@ -104,13 +104,17 @@ def time_plans(mpc, seen, goal, count, warm=False):
 
     :param warm: every plan but the first begins with the one before.
     """
-    times = []
+    times, scene, goal, memory = [], as_scene(seen), mpc.goal(goal), Memory()
     for seed in range(count + 1):
-        if not warm or seed == 0:
-            mpc.reset(seed)
-        times.append(mpc.act(
-            seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal).planning_ms)
+        plan = mpc.plan(scene, goal, memory if warm else Memory(seed))
+        memory = plan.memory
+        times.append(plan.planning_ms)
     return np.array(times[1:])
+
+
+def as_scene(seen):
+    """Return an Observation of the simulator as the planner's Scene."""
+    return Scene(seen.image, seen.gripper, seen.object_pixels)
 
 
 @torch.inference_mode()
@@ -144,7 +148,7 @@ def count_operations(mpc, seen):
     """
     image, gripper = _inputs(mpc, seen)
     maps = mpc.model.seed_maps(torch.from_numpy(seen.object_pixels).to(image.device))
-    actions = random_actions(mpc, mpc.config.batch_size)
+    actions = random_actions(mpc, mpc.rollouts.batch_size)
 
     def bilinear(*_, out_shape=None, **__):
         return BILINEAR * int(np.prod(out_shape))
@@ -165,11 +169,11 @@ def random_actions(mpc, count):
     rng = np.random.default_rng(0)
     actions = np.zeros((count, HORIZON, 4), np.float32)
     actions[..., :2] = rng.normal(0, FIRST_STD / 2, (*actions.shape[:2], 2))
-    return torch.from_numpy(actions).to(mpc.model.grid.device)
+    return torch.from_numpy(actions).to(mpc.model.device)
 
 
 def _inputs(mpc, seen):
     """Return the picture (1, 3, H, W), and the gripper (1, 4) brought down to push."""
-    device = mpc.model.grid.device
+    device = mpc.model.device
     gripper = torch.from_numpy(np.append(seen.gripper[:2], [LOW, 0]).astype(np.float32))
     return to_float(seen.image)[None].to(device), gripper[None].to(device)

@@ -26,6 +26,17 @@ VERTICAL = 0.06  # m, a change of height beyond which the arm does not move side
 
 
 @dataclass(frozen=True)
+class Limits:
+    """How far the arm may move in one control period, m; the contract's limits hold anyway."""
+
+    move: float = MOVE_LIMIT  # |x| and |y|
+    climb: float = CLIMB_LIMIT  # |z|
+
+
+FULL = Limits()
+
+
+@dataclass(frozen=True)
 class SequenceShape:
     """
     How parameters become actions.

@@ -4,7 +4,7 @@
 
 from dataclasses import dataclass, replace
 
-from tap_ros.contract import MOVE_LIMIT
+from tap_ros.contract import CLIMB_LIMIT, MOVE_LIMIT
 from tap_ros.errors import ConfigError
 from tap_ros.planning.action_sequences import HORIZON, SequenceShape
 from tap_ros.planning.cem import CEMConfig
@@ -65,6 +65,16 @@ class VisualMPCConfig:
         if not 0 <= self.proposals <= self.search.num_samples:
             raise ConfigError(f'proposals: expected 0..{self.search.num_samples} '
                               f'(num_samples), got {self.proposals}')
+
+    def shape(self, limits, phase):
+        """
+        Return the SequenceShape that is searched.
+
+        :param limits: Limits; phase: periods that the first segment is shorter, unless searched.
+        """
+        move = min(limits.move, MOVE_LIMIT)
+        return SequenceShape(None if self.free_phase else phase, move, min(move, self.push_limit),
+                             self.upright, min(limits.climb, CLIMB_LIMIT))
 
 
 # The paper's numbers of samples: more than twice as slow, without a clear gain.

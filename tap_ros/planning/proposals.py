@@ -13,7 +13,7 @@ from tap_ros.planning.action_sequences import REPEAT
 PACE = 0.9  # of the limits is used, so that the search can still add to it
 
 
-def push_proposals(shape, gripper, objects, goals, count, rng, weights=None):
+def push_proposals(shape, gripper, objects, goals, count, rng):
     """
     Propose pushes.
 
@@ -22,13 +22,12 @@ def push_proposals(shape, gripper, objects, goals, count, rng, weights=None):
     :param objects: (K, 2) metres on the table; goals (K, 2).
     :param count: P, how many.
     :param rng: numpy Generator.
-    :param weights: (K,) how often each object is chosen; default: by its distance to its goal.
-    :return: (P, D) parameters, P = 0 when every object is at its goal.
+    :return: (P, D) parameters, none when every object is at its goal.
     """
     gaps = goals - objects
     distances = np.linalg.norm(gaps, axis=1)
-    weights = np.where(distances > 0.01, distances, 0) if weights is None else weights
-    if weights.sum() <= 0:
+    weights = np.where(distances > 0.01, distances, 0)  # how often each object is chosen
+    if not count or weights.sum() <= 0:
         return np.zeros((0, shape.size))
     proposals = []
     for k in rng.choice(len(objects), count, p=weights / weights.sum()):

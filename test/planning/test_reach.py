@@ -67,7 +67,6 @@ def test_the_default_budget_is_the_papers():
     pixels = np.zeros((3, 2), np.float32)
     for count, budget in ((2, 40), (3, 75)):
         reach = Reach(None, ReachConfig(reached=0.0))
-        reach._mpc = type('Counts', (), {'reset': lambda *_: None, 'memory': None})()
         reach.step(look(0))
         reach.head_for([Target(pixels[:count])])
         assert reach._budget == budget

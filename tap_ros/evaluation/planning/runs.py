@@ -16,7 +16,6 @@ from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.evaluation.planning.episode import run_episode
 from tap_ros.evaluation.planning.methods import Method
-from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.files import write_atomically
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import VisualMPCConfig
@@ -204,11 +203,8 @@ def plan_scene(job, seed):
     if job.method.base == 'one_object':
         subsets = [[k] for k in range(simulator.task.num_objects)]
     runs = []
+    mpc = _planner(job.forward_weights, job.device, job.method.planner(job.planner))
     for objects in subsets:
-        mpc = _planner(job.forward_weights, job.device, job.method.planner(job.planner))
-        if job.method.model == 'true':
-            model = TrueModel(_model(job.forward_weights, job.device), simulator, objects)
-            mpc = VisualMPC(model, mpc.config)
         runs.append(run_episode(simulator, mpc, job.method, job.steps(), seed, predictor,
                                 objects=objects))
     if subsets == [None]:
