@@ -3,6 +3,7 @@
 """Laws of planned episodes, in the real simulator with the shipped weights."""
 
 from dataclasses import replace
+import inspect
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.images import to_float
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.cem import CEMConfig
+from tap_ros.planning.map_model import MapModel
 from tap_ros.planning.mpc_config import LARGE, PAPER, VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
@@ -153,6 +155,16 @@ def test_the_true_model_foresees_what_then_happens(simulator, mpc):
     assert np.linalg.norm(after.object_pixels - seen.object_pixels, axis=1).max() > 2
     assert np.abs(foreseen[0] - after.object_pixels).max() < 0.3
     assert np.abs(foreseen[1] - seen.object_pixels).max() < 0.3
+
+
+@pytest.mark.parametrize('kind', ['learned', 'true'])
+def test_both_models_are_what_the_planner_asks_for(simulator, mpc, kind):
+    model = mpc.model if kind == 'learned' else TrueModel(mpc.model, simulator)
+    assert isinstance(model, MapModel) and model.image_size == (64, 64)
+    for name in ('begin', 'carried_maps', 'seed_maps', 'gripper_after'):
+        asked = list(inspect.signature(getattr(MapModel, name)).parameters.values())[1:]
+        offered = list(inspect.signature(getattr(model, name)).parameters.values())
+        assert [(p.kind, p.default) for p in offered] == [(p.kind, p.default) for p in asked]
 
 
 def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
@@ -161,6 +162,30 @@ def test_another_scene_ends_the_goal_even_if_nothing_else_is_new(mpc, changes, w
     end = reach.step(look(0, **changes))
     assert isinstance(end, End) and end.outcome == 'aborted' and words in end.message
     assert isinstance(reach.step(look(1)), Command)
+
+
+def test_a_goal_is_tabulated_once_unless_objects_are_free(mpc, monkeypatch):
+    asked, goal = [], mpc.goal
+    monkeypatch.setattr(mpc, 'goal', lambda **given: asked.append(given) or goal(**given))
+    reach = begun(mpc)
+    for t in range(3):
+        act(reach, t)
+    assert len(asked) == 1
+    free = Target(GOAL.pixels, free=np.array([True, False]))
+    reach = Reach(mpc, ReachConfig(10), 3)
+    reach.step(look(0))
+    reach.head_for([free, GOAL])
+    for t in range(3):
+        reach.step(look(t, START + t))
+        reach.sent()
+    assert [given['pixels'][0].tolist() for given in asked[1:]] == (START[0] + [
+        [0, 0], [1, 1], [2, 2]]).tolist()  # it shall stay wherever it is
+
+
+def test_limits_hold_for_every_command_of_a_goal(mpc):
+    reach = begun(mpc, ReachConfig(10, limits=Limits(0.01, 0.02)))
+    moves = np.abs([act(reach, t) for t in range(4)])
+    assert moves.any() and moves[:, :2].max() <= 0.01 + 1e-6 and moves[:, 2].max() <= 0.02 + 1e-6
 
 
 def test_names_in_another_order_are_the_same_scene(mpc):
