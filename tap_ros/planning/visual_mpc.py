@@ -41,11 +41,11 @@ class Found:
     """What a search found, or what is left of it some actions later."""
 
     shape: SequenceShape
-    parameters: np.ndarray  # (D,) of the sequence
-    expected_distance: float
-    cost: float
-    goal: Goal
-    limits: Limits
+    parameters: np.ndarray  # (D,) of the sequence, for shape
+    expected_distance: float  # px, see Plan
+    cost: float  # px, see Plan
+    goal: Goal  # that it was searched for
+    limits: Limits  # within which it was searched
     age: int = 0  # actions that have passed since the search
 
     def following(self):
@@ -147,25 +147,27 @@ class VisualMPC:
         """
         config, gripper, device = self.config, scene.gripper, maps.device
         last = memory.found if config.warm_start else None
+        # look once, from where all sequences begin
         shape = config.shape(limits, last.shape.phase if last else 0)
         start = self.model.begin(to_float(scene.image)[None].to(device),
                                  torch.from_numpy(gripper)[None].to(device), config.arm_hidden)
         judge = partial(self.rollouts.judge, start, maps)
         price = prices(goal.distances, config.unfinished)
 
-        def cost(samples, grippers=gripper[None]):
+        def cost(samples, grippers=gripper[None]):  # mean over where the gripper begins
             actions = shape.actions(samples, gripper[2])
             clash = landing_clash(shape.landings(actions, gripper), here, config.clearance)
             costs, _ = judge(price, actions.repeat(len(grippers), 0),
                              np.tile(grippers, (len(samples), 1)), config.cost_every)
             return costs.reshape(len(samples), -1).mean(1) + clash
 
-        def recheck(samples):
+        def recheck(samples):  # from here and from a little beside
             aside = np.random.default_rng([memory.seed, memory.count, 1])
             grippers = np.tile(gripper, (config.recheck, 1))
             grippers[1:, :2] += aside.normal(0, RECHECK_STD, (config.recheck - 1, 2))
             return cost(samples, grippers)
 
+        # search, first of all where pushes are likely and where the last plan led
         rng = np.random.default_rng([memory.seed, memory.count])
         mean, std = shape.first_gaussian()
         proposals = push_proposals(shape, gripper, here, goal.places, config.proposals, rng)
