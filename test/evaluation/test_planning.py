@@ -20,12 +20,10 @@ from tap_ros.evaluation.planning.episode import (
 from tap_ros.evaluation.planning.methods import BASES, parse_method
 from tap_ros.evaluation.planning.true_model import TrueModel
 from tap_ros.images import to_float
-from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.map_model import MapModel
 from tap_ros.planning.mpc_config import LARGE, PAPER, VisualMPCConfig
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.recording.episode import check_episode
@@ -218,26 +216,6 @@ def test_options_change_the_planner():
 
 def test_budgets_are_the_papers():
     assert (step_budget(2), step_budget(3)) == (40, 75)
-
-
-def test_replanning_less_often_carries_the_plan_out(simulator, mpc):
-    seen = simulator.reset(5)
-    pixels = simulator.goal().object_pixels
-    planner = VisualMPC(mpc.model, replace(SMALL, replan_every=3))
-    goal, memory, plans = planner.goal(pixels), Memory(5), []
-    for _ in range(4):
-        plans.append(planner.plan(
-            Scene(seen.image, seen.gripper, seen.object_pixels), goal, memory))
-        seen, memory = simulator.step(plans[-1].action), plans[-1].memory
-    for i in (1, 2):
-        np.testing.assert_allclose(plans[i].action[:2], plans[0].actions[i, :2], atol=1e-6)
-    assert plans[1].cost == plans[0].cost != plans[3].cost
-    scene = Scene(seen.image, seen.gripper, seen.object_pixels)
-    same, moved = (planner.plan(scene, planner.goal(goal), plans[-1].memory)
-                   for goal in (pixels.copy(), pixels + 2))
-    assert same.cost == plans[3].cost != moved.cost  # another goal needs another plan at once
-    limited = planner.plan(scene, goal, plans[-1].memory, Limits(0.02, 0.02))
-    assert np.abs(limited.actions[:, :3]).max() <= 0.02 + 1e-6  # and so do other limits
 
 
 def test_shipped_model_foresees_a_push(simulator, mpc):

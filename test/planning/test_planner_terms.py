@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.contract import LIFTED, LOW
-from tap_ros.planning.action_sequences import HORIZON
+from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
@@ -55,9 +55,10 @@ class Puppets:
             yield carried.view(len(actions), -1, *carried.shape[1:])
 
 
-def plan(puppets, config=PLAIN, gripper=GRIPPER, pixels=GOALS - 9.0, memory=NEW):
+def plan(puppets, config=PLAIN, gripper=GRIPPER, pixels=GOALS - 9.0, memory=NEW, goals=GOALS,
+         limits=FULL):
     mpc = VisualMPC(puppets, config)
-    return mpc.plan(Scene(IMAGE, gripper, pixels), mpc.goal(GOALS), memory)
+    return mpc.plan(Scene(IMAGE, gripper, pixels), mpc.goal(goals), memory, limits)
 
 
 def away(*distances):
@@ -248,6 +249,24 @@ def test_every_plan_draws_candidates_of_its_own(model):
     assert not np.array_equal(first.actions, second.actions)
     assert not np.array_equal(first.actions, other.actions)
     assert second.memory.count == 2 and second.memory.seed == 0
+
+
+def test_between_two_searches_the_plan_is_carried_out_unless_goal_or_limits_change(model):
+    puppets, every3 = steady(model, away(5, 5)), replace(PLAIN, replan_every=3)
+    plans, hand = [plan(puppets, every3)], GRIPPER
+    for _ in range(3):
+        hand = hand + np.append(plans[-1].action[:3], 0)
+        plans.append(plan(puppets, every3, hand, memory=plans[-1].memory))
+    for i in (1, 2):
+        np.testing.assert_allclose(plans[i].actions[:-i], plans[0].actions[i:], atol=1e-6)
+    assert not np.allclose(plans[3].actions[:-3], plans[0].actions[3:], atol=1e-3)
+    after, searched = plans[3].memory, len(puppets.judged)
+    plan(puppets, every3, memory=after, goals=GOALS.copy())
+    assert len(puppets.judged) == searched
+    plan(puppets, every3, memory=after, goals=GOALS + 0.5)
+    assert len(puppets.judged) > searched
+    limited = np.abs(plan(puppets, every3, memory=after, limits=Limits(0.02, 0.03)).actions)
+    assert limited[:, :2].max() <= 0.02 + 1e-6 and limited[:, 2].max() <= 0.03 + 1e-6
 
 
 def candidates(model, height=LOW, **changes):
