@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the cross-entropy method."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
@@ -41,6 +43,23 @@ def test_best_proposal_wins_when_nothing_is_better():
     best, cost = search(CEMConfig(num_iterations=2), proposals=proposals)
     np.testing.assert_array_equal(best, TARGET)
     assert cost == 0
+
+
+def test_proposals_are_the_last_samples_of_the_first_iteration_only():
+    judged, proposals = [], np.stack([TARGET + 1, TARGET + 2])
+
+    def cost(samples):
+        judged.append(samples)
+        return quadratic(samples)
+
+    config = CEMConfig(num_samples=6, num_iterations=2, num_elites=3)
+    search(config, cost=cost, proposals=proposals)
+    search(config, cost=cost)
+    np.testing.assert_array_equal(judged[0][-2:], proposals)
+    np.testing.assert_array_equal(judged[0][:-2], judged[2][:-2])  # the others are drawn as ever
+    assert not np.isin(proposals, judged[1]).any()
+    search(replace(config, num_samples=3), cost=cost, proposals=np.arange(12.0).reshape(4, 3))
+    np.testing.assert_array_equal(judged[4], np.arange(3.0, 12.0).reshape(3, 3))  # the last count
 
 
 def test_only_repaired_samples_are_judged_and_returned():

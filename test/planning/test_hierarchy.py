@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
+from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import (
     choose_sample,
@@ -15,7 +16,7 @@ from tap_ros.planning.hierarchy import (
 )
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.prediction.predictor import Subgoal
 from tap_ros.prediction.warp import one_hot_maps
 import torch
@@ -130,6 +131,25 @@ def test_the_subgoal_on_the_way_is_chosen_and_the_first_of_equals(model):
     assert best == 1 and costs[1] == costs[2] < costs[0]
     again, _ = choose_subgoals(mpc, scene(start), goal, chains[::-1])
     assert again == 0
+
+
+def test_samples_are_judged_by_plans_with_the_seed_and_the_limits_that_are_given(model):
+    mpc, chains = small_planner(model), [[subgoal(PLACES + 2.0)]] * 2
+
+    def costs(*given):
+        return choose_subgoals(mpc, scene(PLACES), PLACES + 4.0, chains, *given)[1]
+
+    def cost(seed, limits):
+        goal = mpc.goal(maps=chains[0][0].object_maps)
+        first = mpc.plan(scene(PLACES), goal, Memory(seed), limits)
+        hand = model.gripper_after(np.zeros(4, np.float32), first.actions)
+        seen = Scene(chains[0][0].image, hand, PLACES + 2.0)
+        return first.cost + mpc.plan(seen, mpc.goal(PLACES + 4.0), Memory(seed), limits).cost
+
+    slow = Limits(0.01, 0.02)
+    for seed, limits in ((0, FULL), (1, FULL), (0, slow)):
+        assert (costs(seed, limits) == cost(seed, limits)).all()
+    assert len({cost(0, FULL), cost(1, FULL), cost(0, slow)}) == 3
 
 
 def test_subgoals_are_divided_by_their_sample_and_one_sample_needs_no_plan(model):

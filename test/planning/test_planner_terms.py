@@ -269,13 +269,21 @@ def test_between_two_searches_the_plan_is_carried_out_unless_goal_or_limits_chan
     assert limited[:, :2].max() <= 0.02 + 1e-6 and limited[:, 2].max() <= 0.03 + 1e-6
 
 
-def candidates(model, height=LOW, **changes):
+def candidates(model, height=LOW, limits=FULL, **changes):
     """Return the actions (N, T, 4) that are judged, and the heights (N, T) at their ends."""
     puppets = steady(model, away(5, 5))
     gripper = np.array([0, 0, height, 0], np.float32)
-    plan(puppets, replace(PLAIN, **changes), gripper)
+    plan(puppets, replace(PLAIN, **changes), gripper, limits=limits)
     actions = puppets.judged[0]
     return actions, height + actions[..., 2].cumsum(1)
+
+
+def test_candidates_keep_to_the_limits_and_use_them(model):
+    for move, climb in ((0.03, 0.04), (0.06, 0.1)):
+        actions, _ = candidates(model, limits=Limits(move, climb))
+        extent = np.abs(actions).max((0, 1))
+        np.testing.assert_allclose(extent, [move, move, climb, 0], atol=1e-6)
+    assert PLAIN.shape(Limits(1.0, 1.0), 0) == PLAIN.shape(FULL, 0)  # the contract's hold anyway
 
 
 @pytest.mark.parametrize('upright', [True, False])
