@@ -150,6 +150,12 @@ def test_samples_are_judged_by_plans_with_the_seed_and_the_limits_that_are_given
     for seed, limits in ((0, FULL), (1, FULL), (0, slow)):
         assert (costs(seed, limits) == cost(seed, limits)).all()
     assert len({cost(0, FULL), cost(1, FULL), cost(0, slow)}) == 3
+    given = []
+    mpc.plan = lambda seen, goal, *rest: given.append(rest) or VisualMPC.plan(
+        mpc, seen, goal, *rest)
+    samples = [subgoal(PLACES, 0), subgoal(PLACES, 1)]
+    choose_sample(mpc, scene(PLACES), PLACES + 4.0, samples, 7, slow)
+    assert given == 4 * [(Memory(7), slow)]
 
 
 def test_subgoals_are_divided_by_their_sample_and_one_sample_needs_no_plan(model):

@@ -10,8 +10,9 @@ from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig, Seen, Wait
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from toy_world import SIZE
 
 SECOND = 10**9
@@ -162,6 +163,17 @@ def test_another_scene_ends_the_goal_even_if_nothing_else_is_new(mpc, changes, w
     end = reach.step(look(0, **changes))
     assert isinstance(end, End) and end.outcome == 'aborted' and words in end.message
     assert isinstance(reach.step(look(1)), Command)
+
+
+@pytest.mark.parametrize('seed', [0, 3])
+def test_each_command_is_planned_from_what_the_one_before_left(mpc, seed):
+    reach, goal, memory = begun(mpc, seed=seed), mpc.goal(GOAL.pixels), Memory(seed)
+    for t in range(3):
+        seen = look(t)
+        plan = mpc.plan(Scene(seen.image, seen.gripper, seen.pixels), goal, memory)
+        memory = plan.memory
+        np.testing.assert_array_equal(reach.step(seen).plan.actions, plan.actions)
+        reach.sent()
 
 
 def test_a_goal_is_tabulated_once_unless_objects_are_free(mpc, monkeypatch):
