@@ -14,6 +14,7 @@ from sim_bridge.scene import HALF_HEIGHT
 from sim_bridge.simulator import clip_action, ramp_controls, Simulator
 from sim_bridge.tasks import nearest_first, TASKS
 from tap_ros import contract
+from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import PRESETS
 from tap_ros.planning.scenes import PLANNING_TASKS
@@ -122,9 +123,10 @@ def test_what_an_expert_commands_is_what_the_arm_does(simulator):
 
 @pytest.mark.parametrize('preset', PRESETS)
 def test_no_preset_plans_more_than_the_arm_does(preset):
-    config = PRESETS[preset]
-    assert config.push_limit <= config.move_limit <= contract.MOVE_LIMIT
-    assert config.climb_limit <= contract.CLIMB_LIMIT
+    for limits in (Limits(), Limits(1.0, 1.0)):
+        shape = PRESETS[preset].shape(limits, 0)
+        assert shape.push_limit <= shape.move_limit == contract.MOVE_LIMIT
+        assert shape.climb_limit == contract.CLIMB_LIMIT
 
 
 def test_a_goal_may_take_as_long_as_an_episode():

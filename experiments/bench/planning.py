@@ -18,9 +18,11 @@ from sim_bridge.simulator import Simulator
 from tap_ros.contract import CLEAR, LOW
 from tap_ros.errors import PlanningError
 from tap_ros.images import to_float
+from tap_ros.planning.action_sequences import FIRST_STD, HORIZON
 from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.scenes import FIRST_SCENE
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 import torch
 from torch.utils.flop_counter import FlopCounterMode
@@ -48,9 +50,9 @@ def run(args):
     goal = simulator.goal().object_pixels
     cores = len(os.sched_getaffinity(0))
     large = with_preset('large')
-    search, horizon = large.search, large.segments * large.repeat
+    search = large.search
     print(f'one plan: {search.num_samples} samples x {search.num_iterations} iterations x '
-          f'horizon {horizon}, two objects, {args.device}'
+          f'horizon {HORIZON}, two objects, {args.device}'
           + (f', {cores} cores' if args.device == 'cpu' else ''))
     planners = {name: VisualMPC.load(args.weights, with_preset(name), args.device)
                 for name in PRESETS}
@@ -87,11 +89,10 @@ def run(args):
 
 def push_until_low(simulator, mpc, goal, most=30):
     """Carry out plans until the gripper is low; return what is then seen."""
-    seen = simulator.reset(FIRST_SCENE)
-    mpc.reset(0)
+    seen, goal, memory = simulator.reset(FIRST_SCENE), mpc.goal(goal), Memory()
     for _ in range(most):
-        seen = simulator.step(mpc.act(
-            seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal).action)
+        plan = mpc.plan(as_scene(seen), goal, memory)
+        seen, memory = simulator.step(plan.action), plan.memory
         if seen.gripper[2] < CLEAR / 2:
             return seen
     raise PlanningError(f'the gripper did not come down within {most} steps')
@@ -103,19 +104,23 @@ def time_plans(mpc, seen, goal, count, warm=False):
 
     :param warm: every plan but the first begins with the one before.
     """
-    times = []
+    times, scene, goal, memory = [], as_scene(seen), mpc.goal(goal), Memory()
     for seed in range(count + 1):
-        if not warm or seed == 0:
-            mpc.reset(seed)
-        times.append(mpc.act(
-            seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal).planning_ms)
+        plan = mpc.plan(scene, goal, memory if warm else Memory(seed))
+        memory = plan.memory
+        times.append(plan.planning_ms)
     return np.array(times[1:])
+
+
+def as_scene(seen):
+    """Return an Observation of the simulator as the planner's Scene."""
+    return Scene(seen.image, seen.gripper, seen.object_pixels)
 
 
 @torch.inference_mode()
 def time_naively(mpc, seen, count):
     """Return the ms of one sample that is predicted alone, every frame decoded."""
-    model, config = mpc.model, mpc.config
+    model = mpc.model
     image, gripper = _inputs(mpc, seen)
     actions = random_actions(mpc, count + 1)
     times = []
@@ -125,7 +130,7 @@ def time_naively(mpc, seen, count):
         arm = model.draw_arm(gripper)
         scene = model.look(image, arm[:, 3:])
         flow, hand = model.still(1), gripper
-        for t in range(config.segments * config.repeat):
+        for t in range(HORIZON):
             flow, hand, _ = model.advance(scene.features, flow, hand, sample[:, t])
             picture, _ = model.picture(scene, flow, model.draw_arm(hand))
             carried = model.carry(maps, flow)
@@ -143,7 +148,7 @@ def count_operations(mpc, seen):
     """
     image, gripper = _inputs(mpc, seen)
     maps = mpc.model.seed_maps(torch.from_numpy(seen.object_pixels).to(image.device))
-    actions = random_actions(mpc, mpc.config.batch_size)
+    actions = random_actions(mpc, mpc.rollouts.batch_size)
 
     def bilinear(*_, out_shape=None, **__):
         return BILINEAR * int(np.prod(out_shape))
@@ -161,15 +166,14 @@ def count_operations(mpc, seen):
 
 def random_actions(mpc, count):
     """Return sequences (count, horizon, 4) that push all the time, the dearest to predict."""
-    config = mpc.config
     rng = np.random.default_rng(0)
-    actions = np.zeros((count, config.segments * config.repeat, 4), np.float32)
-    actions[..., :2] = rng.normal(0, config.std_move / 2, (*actions.shape[:2], 2))
-    return torch.from_numpy(actions).to(mpc.model.grid.device)
+    actions = np.zeros((count, HORIZON, 4), np.float32)
+    actions[..., :2] = rng.normal(0, FIRST_STD / 2, (*actions.shape[:2], 2))
+    return torch.from_numpy(actions).to(mpc.model.device)
 
 
 def _inputs(mpc, seen):
     """Return the picture (1, 3, H, W), and the gripper (1, 4) brought down to push."""
-    device = mpc.model.grid.device
+    device = mpc.model.device
     gripper = torch.from_numpy(np.append(seen.gripper[:2], [LOW, 0]).astype(np.float32))
     return to_float(seen.image)[None].to(device), gripper[None].to(device)

@@ -10,12 +10,15 @@ same.
 from dataclasses import dataclass
 from itertools import product
 
+from experiments.planning.true_model import TrueModel
 import numpy as np
 from sim_bridge.tasks import nearest_first
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
+from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.recording.episode import Episode
 
 
@@ -50,7 +53,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     Push the objects of one scene.
 
     :param simulator: Simulator; reset here.
-    :param mpc: VisualMPC; reset here.
+    :param mpc: VisualMPC with a learned model; the method may put the simulator in its place.
     :param method: methods.Method.
     :param step_budget: control periods at most.
     :param seed: of the scene, the planner and the predictor.
@@ -68,8 +71,11 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     if objects is not None:
         objects = tuple(objects)
         targets = [Target(goal.object_pixels[list(objects)])]
-    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, method.tracking,
-                                   objects=objects), seed)
+    follower = mpc.model if method.tracking == 'carried' else None
+    if method.model == 'true':
+        mpc = VisualMPC(TrueModel(mpc.model, simulator, objects), mpc.config)
+    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, follower, objects=objects),
+                  seed)
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
     tracked = []
     while method.base != 'nothing':
@@ -109,7 +115,8 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed):
         found = predictor.predict(
             seen.image, goal.image, start, end, num_samples=method.samples,
             recursion_depth=method.recursion, seed=seed)
-        subgoals = choose_sample(mpc, seen.image, seen.gripper, start, end, found, seed)
+        subgoals = choose_sample(
+            mpc, Scene(seen.image, seen.gripper, start), end, found, seed)
         if method.maps == 'true':
             return [*(Target(true_configuration(simulator, s.image, seen, goal))
                       for s in subgoals), last], subgoals

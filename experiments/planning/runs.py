@@ -9,7 +9,6 @@ from pathlib import Path
 
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import Method
-from experiments.planning.true_model import TrueModel
 import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task
@@ -103,7 +102,8 @@ def read_results(path):
     """
     Read a result file.
 
-    :return: its settings, and its scenes as a dict by seed.
+    :return: its settings, and its scenes as a dict by seed. Settings of the planner that no longer
+        exist are left out: each had but the one value that now is a constant.
     :raises ConfigError: if it is damaged.
     """
     try:
@@ -111,10 +111,19 @@ def read_results(path):
         scenes = {scene['seed']: scene for scene in stored['scenes']}
         for scene in scenes.values():
             float(scene['final_cm']), list(scene['objects_cm']), int(scene['steps'])
-        return dict(stored['settings']), scenes
-    except (ValueError, KeyError, TypeError) as error:
+        settings = dict(stored['settings'])
+        if 'planner' in settings:
+            settings['planner'] = known(settings['planner'], asdict(VisualMPCConfig()))
+        return settings, scenes
+    except (AttributeError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f'{path}: is damaged ({type(error).__name__}: {error}); remove it and '
                           'its scenes are run again') from error
+
+
+def known(stored, names):
+    """Return a dict without what is not in another one, likewise the dicts in it."""
+    return {name: known(value, names[name]) if isinstance(value, dict) else value
+            for name, value in stored.items() if name in names}
 
 
 def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True):
@@ -180,11 +189,8 @@ def plan_scene(job, seed):
     if job.method.base == 'one_object':
         subsets = [[k] for k in range(simulator.task.num_objects)]
     runs = []
+    mpc = _planner(job.forward_weights, job.device, job.method.planner(job.planner))
     for objects in subsets:
-        mpc = _planner(job.forward_weights, job.device, job.method.planner(job.planner))
-        if job.method.model == 'true':
-            model = TrueModel(_model(job.forward_weights, job.device), simulator, objects)
-            mpc = VisualMPC(model, mpc.config)
         runs.append(run_episode(simulator, mpc, job.method, job.steps(), seed, predictor,
                                 objects=objects))
     if subsets == [None]:

@@ -11,7 +11,7 @@ import torch
 
 class TrueModel:
     """
-    Carries object maps by the true physics, from the state that the simulator is in.
+    A MapModel that carries maps by the true physics, from the state that the simulator is in.
 
     The planner sees no difference: a map is put on the table grid where the object truly gets to.
 
@@ -21,11 +21,10 @@ class TrueModel:
     """
 
     def __init__(self, model, simulator, objects=None):
-        self.config, self.grid = model.config, model.grid
-        self.pixel_table, self.seed_maps = model.pixel_table, model.seed_maps
-        self.objects = objects
-        self.learned = model  # for what looks at pictures
-        self._simulator = simulator
+        self.image_size, self.device = model.image_size, model.device
+        self.table_points, self.pixel_table = model.table_points, model.pixel_table
+        self.seed_maps, self.gripper_after = model.seed_maps, model.gripper_after
+        self._objects, self._simulator = objects, simulator
         self._rollout = mujoco.rollout.Rollout(nthread=0)
 
     def begin(self, image, gripper, arm_hidden=False):
@@ -33,7 +32,7 @@ class TrueModel:
         simulator = self._simulator
         return simulator.model, simulator.state(), simulator.target.copy()
 
-    def carried_maps(self, start, gripper, maps, actions, every=1):
+    def carried_maps(self, start, gripper, maps, actions, /, every=1):
         """
         Yield the maps (N, K, n, n) after every so many steps, as ForwardModel does.
 
@@ -50,8 +49,8 @@ class TrueModel:
         for t in range(every, steps.shape[1] + 1, every):
             poses = states[:, t * SUBSTEPS - 1, 1 + OBJECT_QPOS_START:1 + model.nq]
             places = poses.reshape(len(steps), -1, 7)[..., :3]
-            if self.objects is not None:
-                places = places[:, self.objects]
+            if self._objects is not None:
+                places = places[:, self._objects]
             pixels = self._simulator.camera.project(places).astype(np.float32)  # (N, K, 2)
-            reached = self.seed_maps(torch.from_numpy(pixels).to(self.grid.device).view(-1, 2))
+            reached = self.seed_maps(torch.from_numpy(pixels).to(self.device).view(-1, 2))
             yield reached.view(*pixels.shape[:2], *maps.shape[-2:])[same]

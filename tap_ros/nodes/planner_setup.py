@@ -15,6 +15,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 
@@ -91,9 +92,8 @@ def load_planner(parameters):
     mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
-    mpc.reset(0)
-    mpc.act(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels,
-            goal_maps=None, goal_pixels=pixels)
+    mpc.plan(Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels),
+             mpc.goal(pixels))
     return mpc
 
 

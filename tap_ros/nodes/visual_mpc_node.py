@@ -33,7 +33,9 @@ from tap_ros.nodes.sight import Sight
 from tap_ros.nodes.sight import TOPICS as SENSORS
 from tap_ros.nodes.subgoal_messages import decode_subgoals
 from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
+from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.hierarchy import choose_sample, targets_by
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig
 from tap_ros.text import escaped
 
@@ -147,7 +149,6 @@ class VisualMpcNode(Node):
         mode = check_request(request)
         self._goal.begin(needed_topics(request, mode))
         self._sight.begin(accepted)
-        self._mpc.limit(self.params['max_step_xy'], self.params['max_step_z'])
         self._refusals.clear()
         config, num_subgoals = self._config(request), 0
         reach = Reach(self._mpc, config, request.seed, accepted)
@@ -157,7 +158,7 @@ class VisualMpcNode(Node):
             while self._refusals:
                 reach.refused(*self._refusals.popleft())
             # Objects that are carried need to be seen once only.
-            topics = (('image', 'joints') if config.tracking == 'carried' and reach.aimed
+            topics = (('image', 'joints') if config.follower and reach.aimed
                       else tuple(SENSORS))
             seen, lacking = self._sight.look(topics)
             if self._goal.changed(accepted):
@@ -170,7 +171,7 @@ class VisualMpcNode(Node):
                 result.success, result.message = answer.outcome == 'reached', answer.message
                 return
             if isinstance(answer, Aim):
-                targets = self._aim(handle, mode, seen)
+                targets = self._aim(handle, mode, seen, config.limits)
                 num_subgoals = len(targets) - 1
                 reach.head_for(targets, time.monotonic())
                 continue
@@ -191,8 +192,10 @@ class VisualMpcNode(Node):
     def _config(self, request):
         """Return the settings of a goal."""
         params = self.params
+        follower = self._mpc.model if params['tracking'] == 'carried' else None
+        limits = Limits(params['max_step_xy'], params['max_step_z'])
         return ReachConfig(request.step_budget, params['switch'], params['goal_tolerance'],
-                           params['tracking'], params['max_age'], params['image_timeout'])
+                           follower, limits, params['max_age'], params['image_timeout'])
 
     def _cancelled_or_ending(self, handle):
         return self._cancelled is handle or self._ending
@@ -203,7 +206,7 @@ class VisualMpcNode(Node):
 
     # Where to go
 
-    def _aim(self, handle, mode, seen):
+    def _aim(self, handle, mode, seen, limits):
         """Return the Targets of a goal, asking for subgoals if it is to go by any."""
         if not seen.names:
             raise PlanningError('objects: none are seen, so there is nothing to push; publish '
@@ -218,8 +221,8 @@ class VisualMpcNode(Node):
         if mode == 'subgoal':
             found = self._ask_for_subgoals(handle, goal, seen.names)
             subgoals = choose_sample(
-                self._mpc, seen.image, seen.gripper, seen.pixels, goal_pixels, found,
-                request.seed, lambda: self._go_on(handle))
+                self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found,
+                request.seed, limits, lambda: self._go_on(handle))
         return targets_by(subgoals, goal_pixels)
 
     def _ask_for_subgoals(self, handle, goal, names):

@@ -3,7 +3,7 @@
 """
 What the search varies: a few displacements, each repeated, and for how long the gripper is lifted.
 
-A sequence of `horizon` actions is made of segments of `repeat` control periods. Parameters (D,)
+A sequence of HORIZON actions is made of segments of REPEAT control periods. Parameters (D,)
 are x, y of every segment in metres per control period, the number of segments to stay lifted and,
 where it is searched, how much shorter the first segment is: so a way may take any number of
 periods, not just whole segments. Like the expert that was recorded, the arm goes up and down on
@@ -17,7 +17,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tap_ros.contract import CLIMB_LIMIT, LIFTED, LOW, MOVE_LIMIT
 
+SEGMENTS = 5  # displacements within the horizon
+REPEAT = 3  # control periods of each
+HORIZON = SEGMENTS * REPEAT  # control periods
+MAX_LIFT = 4  # segments, at most, that the gripper travels lifted before it goes down
+FIRST_STD = 0.04  # m per control period, of x and y in the first Gaussian
 VERTICAL = 0.06  # m, a change of height beyond which the arm does not move sideways meanwhile
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How far the arm may move in one control period, m; the contract's limits hold anyway."""
+
+    move: float = MOVE_LIMIT  # |x| and |y|
+    climb: float = CLIMB_LIMIT  # |z|
+
+
+FULL = Limits()
 
 
 @dataclass(frozen=True)
@@ -25,32 +41,24 @@ class SequenceShape:
     """
     How parameters become actions.
 
-    :param segments: displacements within the horizon; repeat: control periods of each.
-    :param phase: periods that the first segment is shorter, 0..repeat-1; None: the last parameter
+    :param phase: periods that the first segment is shorter, 0..REPEAT-1; None: the last parameter
         of a sequence says it.
-    :param move_limit: m per control period, |x| and |y|; max_lift: segments.
+    :param move_limit: m per control period, |x| and |y|.
     :param push_limit: m per control period, length of a displacement while the gripper is low.
     :param upright: go up and down without moving sideways.
     :param climb_limit: m per control period, up and down.
     """
 
-    segments: int = 5
-    repeat: int = 3
     phase: int | None = 0
     move_limit: float = MOVE_LIMIT
-    max_lift: int = 4
     push_limit: float = 0.05
     upright: bool = True
     climb_limit: float = CLIMB_LIMIT
 
     @property
-    def horizon(self):
-        return self.segments * self.repeat
-
-    @property
     def num_moves(self):
         """Number of displacements that the horizon touches."""
-        return self.segments + (self.phase != 0)
+        return SEGMENTS + (self.phase != 0)
 
     @property
     def size(self):
@@ -72,11 +80,11 @@ class SequenceShape:
         parameters[2 * self.num_moves:] = [lifted, phase][:1 + (self.phase is None)]
         return parameters
 
-    def first_gaussian(self, std_move):
+    def first_gaussian(self):
         """Return mean and deviation (D,) to begin a search with."""
-        counts = np.array([self.max_lift, self.repeat - 1][:1 + (self.phase is None)]) / 2
+        counts = np.array([MAX_LIFT, REPEAT - 1][:1 + (self.phase is None)]) / 2
         still = np.zeros(2 * self.num_moves)
-        return np.append(still, counts), np.append(still + std_move, counts)
+        return np.append(still, counts), np.append(still + FIRST_STD, counts)
 
     def clip(self, parameters, least_lift=0):
         """
@@ -85,7 +93,7 @@ class SequenceShape:
         :param least_lift: segments to stay lifted at least.
         """
         moves, counts = np.split(parameters, [2 * self.num_moves], axis=1)
-        lowest, highest = [least_lift, 0], [self.max_lift, self.repeat - 1]
+        lowest, highest = [least_lift, 0], [MAX_LIFT, REPEAT - 1]
         counts = np.clip(np.rint(counts), lowest[:counts.shape[1]], highest[:counts.shape[1]])
         return np.hstack([np.clip(moves, -self.move_limit, self.move_limit), counts])
 
@@ -101,26 +109,25 @@ class SequenceShape:
 
     def lifts(self):
         """Return the ways to be lifted, as (segments, phase), the shortest first."""
-        phases = range(self.repeat) if self.phase is None else [self.phase]
-        ways = [(n, phase) for n in range(1, min(self.max_lift, self.num_moves - 1) + 1)
-                for phase in phases]
-        return sorted(ways, key=lambda way: self.repeat * way[0] - way[1])
+        phases = range(REPEAT) if self.phase is None else [self.phase]
+        ways = [(n, phase) for n in range(1, MAX_LIFT + 1) for phase in phases]
+        return sorted(ways, key=lambda way: REPEAT * way[0] - way[1])
 
     def segment(self, phase):
-        """Return the segment (N, horizon) of each control period, for phases (N,)."""
-        return (np.arange(self.horizon) + np.asarray(phase)[:, None]) // self.repeat
+        """Return the segment (N, HORIZON) of each control period, for phases (N,)."""
+        return (np.arange(HORIZON) + np.asarray(phase)[:, None]) // REPEAT
 
     def climbs(self, lifted, phase, height):
         """
         Plan the heights.
 
         :param lifted: (N,) segments; phase: (N,); height: of the gripper now, m.
-        :return: climb (N, horizon) m per control period, and whether the arm may move sideways.
+        :return: climb (N, HORIZON) m per control period, and whether the arm may move sideways.
         """
         heights = np.where(self.segment(phase) < lifted[:, None], LIFTED, LOW)
         missing, climb = np.empty(heights.shape), np.empty(heights.shape)
         now = np.full(len(lifted), height, float)
-        for t in range(self.horizon):
+        for t in range(HORIZON):
             missing[:, t] = heights[:, t] - now
             climb[:, t] = np.clip(missing[:, t], -self.climb_limit, self.climb_limit)
             now = now + climb[:, t]
@@ -132,12 +139,12 @@ class SequenceShape:
         Expand parameters.
 
         :param parameters: (N, D); height: of the gripper now, m.
-        :return: (N, horizon, 4) float32: metres per control period, gripper closed (0).
+        :return: (N, HORIZON, 4) float32: metres per control period, gripper closed (0).
         """
         moves, lifted, phase = self.split(parameters)
         climb, sideways = self.climbs(lifted, phase, height)
         segment = self.segment(phase)
-        actions = np.zeros((len(parameters), self.horizon, 4), np.float32)
+        actions = np.zeros((len(parameters), HORIZON, 4), np.float32)
         actions[..., :2] = moves[np.arange(len(moves))[:, None], segment] * sideways[..., None]
         actions[..., 2] = climb
         length = np.linalg.norm(actions[..., :2], axis=-1)
@@ -150,10 +157,10 @@ class SequenceShape:
         """
         Find where the gripper comes down: passes LOW + VERTICAL.
 
-        :param actions: (N, horizon, 4); gripper: (4,).
+        :param actions: (N, HORIZON, 4); gripper: (4,).
         :return: (N, 2) metres; NaN for sequences that stay up or low.
         """
-        path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, horizon, 3)
+        path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, HORIZON, 3)
         before = path[..., 2] - actions[..., 2]
         down = (before > LOW + VERTICAL) & (path[..., 2] <= LOW + VERTICAL)
         first = down.argmax(1)
@@ -164,7 +171,7 @@ class SequenceShape:
         """Return the shape one control period later."""
         if self.phase is None:
             return self
-        return replace(self, phase=(self.phase + 1) % self.repeat)
+        return replace(self, phase=(self.phase + 1) % REPEAT)
 
     def shift(self, parameters):
         """
@@ -173,7 +180,7 @@ class SequenceShape:
         :return: (D',) for `following()`: new segments at the end stand still.
         """
         (moves,), (lifted,), (phase,) = self.split(parameters[None])
-        phase = (phase + 1) % self.repeat
+        phase = (phase + 1) % REPEAT
         if phase == 0:  # the first segment is over
             moves, lifted = moves[1:], max(lifted - 1, 0)
         return self.following().join(moves, lifted, phase)

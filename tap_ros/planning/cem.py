@@ -14,17 +14,11 @@ class CEMConfig:
     Settings of the search.
 
     :param num_samples: per iteration; num_iterations; num_elites: that the next Gaussian fits.
-    :param smoothing: share of the old mean and deviation kept at each refit, 0..1.
-    :param min_std: floor of the deviation, as a share of the initial one.
-    :param keep_elites: how many elites of one iteration are judged again among the next's samples.
     """
 
     num_samples: int = 200
     num_iterations: int = 3
     num_elites: int = 10
-    smoothing: float = 0.0
-    min_std: float = 0.0
-    keep_elites: int = 0
 
     def __post_init__(self):
         if not 1 <= self.num_elites <= self.num_samples:
@@ -32,12 +26,6 @@ class CEMConfig:
                               f'got {self.num_elites}')
         if self.num_iterations < 1:
             raise ConfigError(f'num_iterations: expected at least 1, got {self.num_iterations}')
-        if not 0 <= self.keep_elites <= self.num_elites:
-            raise ConfigError(f'keep_elites: expected 0..{self.num_elites} (num_elites), '
-                              f'got {self.keep_elites}')
-        for name in ('smoothing', 'min_std'):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ConfigError(f'{name}: expected 0..1, got {getattr(self, name)}')
 
 
 def cem(cost, mean, std, config, rng, repair=None, proposals=None, recheck=None):
@@ -58,33 +46,25 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None, recheck=None)
         num_samples, else the last count.
     :param recheck: cost that the best num_elites of all iterations are judged by once more, with
         the same convention; of many noisy costs the least is an illusion.
-    :return: best sample (D,), its cost (not the one by recheck), and the last mean (D,).
+    :return: best sample (D,) and its cost, not the one by recheck.
     """
-    mean, std = np.array(mean, np.float64), np.array(std, np.float64)
-    floor, kept = config.min_std * std, np.empty((0, len(mean)))
     best, best_costs = np.empty((0, len(mean))), np.empty(0)
     for iteration in range(config.num_iterations):
         # draw
         samples = mean + std * rng.standard_normal((config.num_samples, len(mean)))
         if iteration == 0 and proposals is not None and len(proposals):
             samples[-len(proposals):] = proposals[-config.num_samples:]
-        samples[:len(kept)] = kept
         samples = samples if repair is None else repair(samples)
         # judge
         costs = _finite(cost(samples))
-        order = np.argsort(costs, kind='stable')
-        best = np.concatenate([best, samples[len(kept):]])  # kept ones were judged before
-        best_costs = np.concatenate([best_costs, costs[len(kept):]])
+        elites = samples[np.argsort(costs, kind='stable')[:config.num_elites]]
+        best, best_costs = np.concatenate([best, samples]), np.concatenate([best_costs, costs])
         first = np.argsort(best_costs, kind='stable')[:config.num_elites]
         best, best_costs = best[first], best_costs[first]
         # refit
-        elites = samples[order[:config.num_elites]]
-        mean = config.smoothing * mean + (1 - config.smoothing) * elites.mean(0)
-        std = np.maximum(
-            config.smoothing * std + (1 - config.smoothing) * elites.std(0), floor)
-        kept = elites[:config.keep_elites]
+        mean, std = elites.mean(0), elites.std(0)
     winner = 0 if recheck is None else int(np.argmin(_finite(recheck(best))))
-    return best[winner], float(best_costs[winner]), mean
+    return best[winner], float(best_costs[winner])
 
 
 def _finite(costs):

@@ -87,7 +87,7 @@ class ForwardModelConfig:
 
 
 @dataclass
-class Scene:
+class Look:
     """What one look at a picture gives; B pictures."""
 
     features: torch.Tensor  # (B, C, n, n) on the table grid
@@ -126,9 +126,14 @@ class ForwardModel(nn.Module):
         constant('move_limit', torch.tensor(ACTION_LIMIT))
 
     @property
-    def learned(self):
-        """Return the model that looks at pictures: this one. See evaluation's TrueModel."""
-        return self
+    def image_size(self):
+        """Return (height, width) of the pictures it takes."""
+        return self.config.image_size, self.config.image_size
+
+    @property
+    def device(self):
+        """Return where its tensors are."""
+        return self.grid.device
 
     def _constant(self, name, value):
         self.register_buffer(name, value, persistent=False)
@@ -157,20 +162,20 @@ class ForwardModel(nn.Module):
         :param image: (B, 3, H, W) in [-1, 1].
         :param arm_mask: (B, 1, H, W) from draw_arm; zeros where the arm is hidden.
         :param homography: (B, 3, 3) where it differs from the model's.
-        :return: Scene.
+        :return: Look.
         """
         if homography is None:
             homography = self.homography.expand(len(image), 3, 3)
         features, objects, background = self.encoder(image, arm_mask)
-        at = self._points().expand(len(image), -1, -1)
+        at = self.table_points().expand(len(image), -1, -1)
         at = project(homography, at).unflatten(1, self.grid.shape[:2])
-        return Scene(sample_picture(features, at), objects, background)
+        return Look(sample_picture(features, at), objects, background)
 
     def still(self, count):
         """Return the flow (count, n, n, 2) of a scene in which nothing has moved."""
         return torch.zeros_like(self.grid).expand(count, -1, -1, -1)
 
-    def _points(self):
+    def table_points(self):
         """Return the table's cells (n n, 2) in metres."""
         return self.grid.flatten(0, 1) * self.config.table_half
 
@@ -196,7 +201,7 @@ class ForwardModel(nn.Module):
         """
         Predict one control period.
 
-        :param features: (N, C, n, n) of the Scene, expanded to the samples.
+        :param features: (N, C, n, n) of the Look, expanded to the samples.
         :param flow: (N, n, n, 2) backward flow from now to the first picture, table units.
         :param gripper: (N, 4) metres; action: (N, 4) metres and opening.
         :return: flow and gripper after the step, and the step's masks (N, 3, h, w), see PushNet.
@@ -265,7 +270,7 @@ class ForwardModel(nn.Module):
         """
         Compose the picture that the flow leads to, for training and for people.
 
-        :param scene: Scene of B first pictures; flow (B, n, n, 2); arm (B, 4, H, W) as drawn.
+        :param scene: Look of B first pictures; flow (B, n, n, 2); arm (B, 4, H, W) as drawn.
         :return: picture (B, 3, H, W) and masks (B, 3, 1, H, W) of arm, objects and background.
         """
         if homography is None:
@@ -285,7 +290,7 @@ class ForwardModel(nn.Module):
 
     def pixel_table(self):
         """Return the pixel (n, n, 2) of every cell of the table grid."""
-        return project(self.homography, self._points()).view_as(self.grid)
+        return project(self.homography, self.table_points()).view_as(self.grid)
 
     def seed_maps(self, pixels):
         """
@@ -326,7 +331,7 @@ class ForwardModel(nn.Module):
         arm_mask = self.draw_arm(gripper)[:, 3:]
         return self.look(image, torch.zeros_like(arm_mask) if arm_hidden else arm_mask).features
 
-    def carried_maps(self, features, gripper, maps, actions, every=1):
+    def carried_maps(self, features, gripper, maps, actions, /, every=1):
         """
         Yield the maps (N, K, n, n) after every so many steps of N action sequences.
 

@@ -14,7 +14,10 @@ import cv2
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
+from tap_ros.planning.action_sequences import FULL
 from tap_ros.planning.expected_distance import distances_to_all_pixels
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.visual_mpc import Memory
 
 SWITCHES = ('reached', 'half')
 
@@ -58,12 +61,12 @@ class Target:
         return tables - tables.min((1, 2), keepdims=True)
 
     def goal(self, pixels):
-        """Return the keyword arguments of VisualMPC.act, for objects that are at pixels (K, 2)."""
+        """Return the arguments of VisualMPC.goal, for objects that are at pixels (K, 2)."""
         if self.maps is not None:
-            return {'goal_maps': self.maps}
+            return {'maps': self.maps}
         if self.free is None:
-            return {'goal_pixels': self.pixels}
-        return {'goal_pixels': np.where(self.free[:, None], pixels, self.pixels)}
+            return {'pixels': self.pixels}
+        return {'pixels': np.where(self.free[:, None], pixels, self.pixels)}
 
 
 class Itinerary:
@@ -115,7 +118,7 @@ def targets_by(subgoals, goal_pixels):
     return [*(Target(s.expected_pixels, s.object_maps) for s in subgoals), Target(goal_pixels)]
 
 
-def choose_sample(mpc, image, gripper, pixels, goal_pixels, subgoals, seed=0, before_plan=None):
+def choose_sample(mpc, scene, goal_pixels, subgoals, seed=0, limits=FULL, before_plan=None):
     """
     Take the predicted subgoals of one sample; of several samples by choose_subgoals.
 
@@ -128,12 +131,11 @@ def choose_sample(mpc, image, gripper, pixels, goal_pixels, subgoals, seed=0, be
     chains = list(samples.values())
     if len(chains) == 1:
         return chains[0]
-    best, _ = choose_subgoals(
-        mpc, image, gripper, pixels, goal_pixels, chains, seed, before_plan)
+    best, _ = choose_subgoals(mpc, scene, goal_pixels, chains, seed, limits, before_plan)
     return chains[best]
 
 
-def choose_subgoals(mpc, image, gripper, pixels, goal_pixels, candidates, seed=0,
+def choose_subgoals(mpc, scene, goal_pixels, candidates, seed=0, limits=FULL,
                     before_plan=None):
     """
     Choose among sampled subgoals by what the planner itself expects them to cost.
@@ -142,27 +144,25 @@ def choose_subgoals(mpc, image, gripper, pixels, goal_pixels, candidates, seed=0
     first subgoal from what is seen, then from each predicted picture to the next target, the arm
     standing where the plan before left it.
 
-    :param mpc: VisualMPC; reset here before every plan.
-    :param image: (H, W, 3) uint8; gripper (4,); pixels (K, 2), what is seen now.
+    :param mpc: VisualMPC.
+    :param scene: mpc_inputs.Scene, what is seen now.
     :param goal_pixels: (K, 2).
     :param candidates: list of lists of prediction.predictor.Subgoal, earliest first.
-    :param seed: of the planner.
+    :param seed: of the planner; limits: of its actions.
     :param before_plan: called before every plan; what it raises ends the choice.
     :return: index of the candidate of least cost, the first of equals; costs (N,).
     """
-    costs = []
+    costs, goal = [], mpc.goal(goal_pixels)
     for chain in candidates:
-        seen, hand, places, total = image, np.asarray(gripper, np.float32), pixels, 0.0
-        legs = [{'goal_maps': subgoal.object_maps} for subgoal in chain]
-        for leg, subgoal in zip([*legs, {'goal_pixels': goal_pixels}], [*chain, None]):
+        seen, total = scene, 0.0
+        for subgoal in [*chain, None]:
             if before_plan is not None:
                 before_plan()
-            mpc.reset(seed)
-            plan = mpc.act(seen, hand, places, **leg)
+            target = goal if subgoal is None else mpc.goal(maps=subgoal.object_maps)
+            plan = mpc.plan(seen, target, Memory(seed), limits)
             total += plan.cost
             if subgoal is not None:
-                seen, places = subgoal.image, subgoal.expected_pixels
-                hand = mpc.model.gripper_after(hand, plan.actions)
+                hand = mpc.model.gripper_after(np.float32(seen.gripper), plan.actions)
+                seen = Scene(subgoal.image, hand, subgoal.expected_pixels)
         costs.append(total)
-    mpc.reset(seed)
     return int(np.argmin(costs)), np.array(costs)

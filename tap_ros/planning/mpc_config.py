@@ -4,9 +4,9 @@
 
 from dataclasses import dataclass, replace
 
-from tap_ros.contract import MOVE_LIMIT
+from tap_ros.contract import CLIMB_LIMIT, MOVE_LIMIT
 from tap_ros.errors import ConfigError
-from tap_ros.planning.action_sequences import SequenceShape
+from tap_ros.planning.action_sequences import HORIZON, SequenceShape
 from tap_ros.planning.cem import CEMConfig
 
 
@@ -16,24 +16,18 @@ class VisualMPCConfig:
     Settings of the planner. The default does as well as larger ones; PAPER is the paper's.
 
     :param search: settings of the search.
-    :param segments: displacements of a sequence; repeat: control periods of each.
-    :param free_phase: search, too, for how many periods, 1..repeat, the first displacement lasts:
+    :param free_phase: search, too, for how many periods, 1..REPEAT, the first displacement lasts:
         a way need not take whole segments.
-    :param std_move: m per control period, of x and y in the first Gaussian; move_limit their clip.
     :param push_limit: m per control period while the gripper is low, so that pushes are like the
         recorded ones; upright: go up and down without moving sideways, like them.
-    :param climb_limit: m per control period, up and down.
     :param clearance: m from any object's pixel to where the gripper may come down.
-    :param max_lift: segments, at most, that the gripper travels lifted before it goes down.
-    :param last_weight: weight of the horizon's last step in the cost; the others have 1.
     :param unfinished: px, extra cost of an object that is not yet within 3 px of its goal, so
         that one is brought home before the next is begun: each change costs a long way.
-    :param warm_start: begin with the last plan, carried on by one control period.
-    :param warm_std: share of std_move that the warm-started search begins with.
+    :param warm_start: begin with the last plan, carried on by one control period, and near it.
     :param proposals: how many first samples are pushes aimed at the objects, see proposals.py.
-    :param recheck: from how many places, where the gripper is and others about recheck_std, m,
-        beside it, the elites are judged once more: a push that succeeds from one place only would
-        slip. 0: they are not.
+    :param recheck: from how many places, where the gripper is and others about 1 cm beside it,
+        the elites are judged once more: a push that succeeds from one place only would slip. 0:
+        they are not.
     :param arm_hidden: the arm is not in the pictures.
     :param cost_every: the cost looks at every so many steps; 1: at all of them.
     :param replan_every: search anew at every so many actions, or when the goal changes; between
@@ -43,23 +37,14 @@ class VisualMPCConfig:
     """
 
     search: CEMConfig = CEMConfig(num_samples=64, num_iterations=2, num_elites=8)
-    segments: int = SequenceShape.segments
-    repeat: int = SequenceShape.repeat
     free_phase: bool = True
-    std_move: float = 0.04
-    move_limit: float = SequenceShape.move_limit
     push_limit: float = SequenceShape.push_limit
     upright: bool = SequenceShape.upright
-    climb_limit: float = SequenceShape.climb_limit
     clearance: float = 0.1
-    max_lift: int = SequenceShape.max_lift
-    last_weight: float = 10.0
     unfinished: float = 4.0
     warm_start: bool = True
-    warm_std: float = 0.5
     proposals: int = 32
     recheck: int = 6
-    recheck_std: float = 0.01
     arm_hidden: bool = False
     cost_every: int = 3
     replan_every: int = 1
@@ -67,24 +52,29 @@ class VisualMPCConfig:
     threads: int = 0  # 0: as many as there are cores
 
     def __post_init__(self):
-        for name in ('segments', 'repeat', 'batch_size', 'replan_every'):
-            if getattr(self, name) < 1:
-                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
-        if self.cost_every < 1 or self.segments * self.repeat % self.cost_every:
-            raise ConfigError(f'cost_every: expected a divisor of the horizon '
-                              f'{self.segments * self.repeat}, got {self.cost_every}')
-        if self.replan_every > self.segments * self.repeat:
-            raise ConfigError(f'replan_every: expected at most the horizon '
-                              f'{self.segments * self.repeat}, got {self.replan_every}')
-        if self.recheck < 0 or self.recheck_std < 0:
-            raise ConfigError(f'recheck, recheck_std: expected at least 0, got {self.recheck}, '
-                              f'{self.recheck_std}')
-        if not 0 <= self.max_lift < self.segments:
-            raise ConfigError(
-                f'max_lift: expected 0..{self.segments - 1} (segments - 1), got {self.max_lift}')
+        if self.batch_size < 1:
+            raise ConfigError(f'batch_size: expected at least 1, got {self.batch_size}')
+        if self.cost_every < 1 or HORIZON % self.cost_every:
+            raise ConfigError(f'cost_every: expected a divisor of the horizon {HORIZON}, '
+                              f'got {self.cost_every}')
+        if not 1 <= self.replan_every <= HORIZON:
+            raise ConfigError(f'replan_every: expected 1..{HORIZON} (the horizon), '
+                              f'got {self.replan_every}')
+        if self.recheck < 0:
+            raise ConfigError(f'recheck: expected at least 0, got {self.recheck}')
         if not 0 <= self.proposals <= self.search.num_samples:
             raise ConfigError(f'proposals: expected 0..{self.search.num_samples} '
                               f'(num_samples), got {self.proposals}')
+
+    def shape(self, limits, phase):
+        """
+        Return the SequenceShape that is searched.
+
+        :param limits: Limits; phase: periods that the first segment is shorter, unless searched.
+        """
+        move = min(limits.move, MOVE_LIMIT)
+        return SequenceShape(None if self.free_phase else phase, move, min(move, self.push_limit),
+                             self.upright, min(limits.climb, CLIMB_LIMIT))
 
 
 # The paper's numbers of samples: more than twice as slow, without a clear gain.

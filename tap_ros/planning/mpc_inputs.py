@@ -3,6 +3,7 @@
 """What the planner is given: checks that name what is wrong."""
 
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 from tap_ros.errors import ImageError, PlanningError
@@ -15,20 +16,29 @@ GRIPPER_HIGH = np.array([1.0, 1.0, 1.0, 1.1], np.float32)
 GRIPPER_PARTS = ('x', 'y', 'z', 'opening')
 
 
-def check_scene(image, gripper, object_pixels, size):
+@dataclass(frozen=True)
+class Scene:
+    """What the robot sees."""
+
+    image: np.ndarray  # (H, W, 3) uint8
+    gripper: np.ndarray  # (4,) metres and opening
+    object_pixels: np.ndarray  # (K, 2) as (u, v), where the objects are
+
+
+def check_scene(scene, size):
     """
     Check what the robot sees.
 
-    :param image: (H, W, 3) uint8; gripper (4,); object_pixels (K, 2); size: (height, width).
-    :return: gripper (4,) and object pixels (K, 2) as float32.
-    :raises PlanningError: for inputs that cannot be planned with.
+    :param scene: Scene; size: (height, width) of its picture.
+    :return: the same Scene, numbers as float32.
+    :raises PlanningError: for what cannot be planned with.
     """
     with _as_planning_error():
-        check_image(image, 'image', size)
-        pixels = check_pixels(object_pixels, 'object_pixels')
+        check_image(scene.image, 'image', size)
+        pixels = check_pixels(scene.object_pixels, 'object_pixels')
     if not len(pixels):
         raise PlanningError('object_pixels: no objects; give the position of one at least')
-    gripper = np.asarray(gripper, np.float32)
+    gripper = np.asarray(scene.gripper, np.float32)
     if gripper.shape != (4,) or not np.isfinite(gripper).all():
         raise PlanningError(
             f'gripper: expected 4 finite numbers (x, y, z in m, opening), got {gripper}')
@@ -38,37 +48,34 @@ def check_scene(image, gripper, object_pixels, size):
         raise PlanningError(
             f'gripper: {GRIPPER_PARTS[at]} is {gripper[at]:g}; expected {GRIPPER_LOW[at]:g} to '
             f'{GRIPPER_HIGH[at]:g} (metres from the middle of the table, opening 0 to 1)')
-    return gripper, pixels
+    return Scene(scene.image, gripper, pixels)
 
 
-def check_goal_pixels(pixels, count, size):
+def check_goal_pixels(pixels, size):
     """
     Check goal pixels (K, 2); return them as float32.
 
-    :param count: K; size: (height, width) of the picture that they have to lie in.
+    :param size: (height, width) of the picture that they have to lie in.
     :raises PlanningError: for another shape, or positions that are unknown or outside.
     """
     with _as_planning_error():
         pixels = check_pixels(pixels, 'goal_pixels')
-    if len(pixels) != count:
-        raise PlanningError(f'goal_pixels: {len(pixels)} goals for {count} objects; '
-                            'give one for each object, in the same order')
     outside = pixels[~in_picture(pixels, size)].tolist()
     if outside:
         raise PlanningError(f'goal_pixels: {outside} outside the {size[1]}x{size[0]} picture')
     return pixels
 
 
-def check_maps(maps, count, size):
+def check_goal_maps(maps, size):
     """
     Check goal maps (K, H, W); return them as float32.
 
     :raises PlanningError: for a wrong shape, negative or not finite values, or an empty map.
     """
     maps = np.asarray(maps, np.float32)
-    if maps.shape != (count, *size):
-        raise PlanningError(f'goal_maps: expected shape {(count, *size)} (one map for each '
-                            f'object), got {maps.shape}')
+    if maps.ndim != 3 or maps.shape[1:] != tuple(size):
+        raise PlanningError(f'goal_maps: expected shape (K, {size[0]}, {size[1]}), one map for '
+                            f'each object, got {maps.shape}')
     mass = maps.sum((1, 2))
     if not np.isfinite(maps).all() or (maps < 0).any() or (mass <= 0).any():
         raise PlanningError('goal_maps: expected finite values of at least 0 and a positive sum '

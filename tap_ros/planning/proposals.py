@@ -8,11 +8,12 @@ object pixels and goal pixels, brought to the table by the model's homography.
 """
 
 import numpy as np
+from tap_ros.planning.action_sequences import REPEAT
 
 PACE = 0.9  # of the limits is used, so that the search can still add to it
 
 
-def push_proposals(shape, gripper, objects, goals, count, rng, weights=None):
+def push_proposals(shape, gripper, objects, goals, count, rng):
     """
     Propose pushes.
 
@@ -21,13 +22,12 @@ def push_proposals(shape, gripper, objects, goals, count, rng, weights=None):
     :param objects: (K, 2) metres on the table; goals (K, 2).
     :param count: P, how many.
     :param rng: numpy Generator.
-    :param weights: (K,) how often each object is chosen; default: by its distance to its goal.
-    :return: (P, D) parameters, P = 0 when every object is at its goal.
+    :return: (P, D) parameters, none when every object is at its goal.
     """
     gaps = goals - objects
     distances = np.linalg.norm(gaps, axis=1)
-    weights = np.where(distances > 0.01, distances, 0) if weights is None else weights
-    if weights.sum() <= 0:
+    weights = np.where(distances > 0.01, distances, 0)  # how often each object is chosen
+    if not count or weights.sum() <= 0:
         return np.zeros((0, shape.size))
     proposals = []
     for k in rng.choice(len(objects), count, p=weights / weights.sum()):
@@ -60,7 +60,7 @@ def _go_and_push(shape, gripper, start, end, target, along):
     start = start if lifted else here
     needed = np.linalg.norm(end - start) / (PACE * shape.push_limit)
     if not lifted and shape.phase is None:
-        phase = int(-np.ceil(needed) % shape.repeat)  # so that it ends with a segment
+        phase = int(-np.ceil(needed) % REPEAT)  # so that it ends with a segment
     periods = _moving_periods(shape, gripper, lifted, phase)
     moves = np.zeros((shape.num_moves, 2))
     moves[:lifted] = (start - here) / max(1, periods[:lifted].sum())

@@ -20,8 +20,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
+from tap_ros.planning.action_sequences import FULL, Limits
+from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.hierarchy import Itinerary
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.tracking import ObjectTracker
+from tap_ros.planning.visual_mpc import Memory
 from tap_ros.text import listing
 
 
@@ -47,8 +51,9 @@ class ReachConfig:
     :param step_budget: commands at most; 0: contract.step_budget.
     :param switch: when to go on from a subgoal, see hierarchy.Itinerary.
     :param reached: px, mean distance of the objects; nearer than this is there. 0: never.
-    :param tracking: 'ground_truth': Seen.pixels at every step; 'carried': those of the first step,
-        then followed by tracking.ObjectTracker.
+    :param follower: ForwardModel that follows the objects (tracking.ObjectTracker) from where they
+        are first seen; None: Seen.pixels at every step.
+    :param limits: action_sequences.Limits of the actions.
     :param max_age: s; nothing is planned from what was received longer ago.
     :param timeout: s without a command, planning apart, after which the goal ends.
     :param objects: indices of the objects that are planned for; None: all.
@@ -57,7 +62,8 @@ class ReachConfig:
     step_budget: int = 0
     switch: str = 'reached'
     reached: float = GOAL_TOLERANCE
-    tracking: str = 'ground_truth'
+    follower: ForwardModel | None = None
+    limits: Limits = FULL
     max_age: float = float('inf')
     timeout: float = float('inf')
     objects: tuple | None = None
@@ -102,7 +108,7 @@ class Reach:
     once `sent` has been called, so it may be called any number of times in between. A picture is
     planned from once.
 
-    :param mpc: VisualMPC; reset here.
+    :param mpc: VisualMPC.
     :param config: ReachConfig.
     :param seed: of the planner.
     :param now: s, on any clock that does not go back; 0.0 throughout if time does not matter.
@@ -115,6 +121,7 @@ class Reach:
     def __init__(self, mpc, config, seed=0, now=0.0):
         self._mpc, self._config, self._seed = mpc, config, seed
         self._targets = self._itinerary = self._tracker = None
+        self._tabulated = None, None  # a Target, and the planner's Goal for it
         self._first = self._planned = self._answered = None  # Seen, Command, Command
         self._after_ns = -1  # pictures count that are stamped later than this
         self._kept = self._before = None  # memories: after the last command, and before it
@@ -186,12 +193,11 @@ class Reach:
         self._targets = list(targets)
         self._budget = config.step_budget or step_budget(len(targets[-1].pixels))
         self._itinerary = Itinerary(targets, self._budget, config.switch, config.reached)
-        if config.tracking == 'carried':
+        if config.follower is not None:
             first = self._first
             self._tracker = ObjectTracker(
-                self._mpc.model.learned, first.image, first.gripper, first.pixels)
-        self._mpc.reset(self._seed)
-        self._kept, self._sent_at = self._memory(), now
+                config.follower, first.image, first.gripper, first.pixels)
+        self._kept, self._sent_at = self._memory(Memory(self._seed)), now
 
     def sent(self, after_ns=None, now=0.0):
         """
@@ -204,7 +210,7 @@ class Reach:
         command, self._planned = self._planned, None
         self._before = self._kept, self._answered, self._sent_at
         self._sent_at = now
-        self._kept, self._answered = self._memory(), command
+        self._kept, self._answered = self._memory(command.plan.memory), command
         self._after_ns = command.seen.stamp_ns if after_ns is None else after_ns
         self.steps += 1
         self._refusal = ''
@@ -243,7 +249,7 @@ class Reach:
     def _plan(self, seen):
         """Plan the next command from a new picture."""
         config = self._config
-        self._recall(self._kept)
+        memory = self._recall(self._kept)
         self.pixels = self._find_objects(seen)
         chosen = self.pixels if config.objects is None else self.pixels[list(config.objects)]
         self.distance = self._targets[-1].distance(chosen)
@@ -254,9 +260,16 @@ class Reach:
                                 f'step budget of {self._budget} spent')
         target = self._itinerary.target(self.steps, chosen)
         limit = np.array(seen.image.shape[1::-1]) - 1
-        plan = self._mpc.act(seen.image, seen.gripper, chosen,
-                             **target.goal(np.clip(chosen, 0, limit)))
+        goal = self._goal(target, np.clip(chosen, 0, limit))
+        plan = self._mpc.plan(
+            Scene(seen.image, seen.gripper, chosen), goal, memory, config.limits)
         return Command(plan, len(self._itinerary.switches), seen)
+
+    def _goal(self, target, pixels):
+        """Return the planner's Goal for a target, tabulated once unless objects are free."""
+        if self._tabulated[0] is not target or target.free is not None:
+            self._tabulated = target, self._mpc.goal(**target.goal(pixels))
+        return self._tabulated[1]
 
     def _find_objects(self, seen):
         """Return where the objects are, (K, 2)."""
@@ -268,16 +281,18 @@ class Reach:
         return self._tracker.update(
             before.seen.image, before.seen.gripper, before.plan.action, seen.image, seen.gripper)
 
-    def _memory(self):
-        """Return all that a plan changes."""
-        return (self._mpc.memory, list(self._itinerary.switches),
+    def _memory(self, planned):
+        """Return all that a plan changes: the planner's Memory, and what is set back."""
+        return (planned, list(self._itinerary.switches),
                 None if self._tracker is None else self._tracker.memory)
 
     def _recall(self, memory):
-        self._mpc.memory, switches, tracked = memory
+        """Set back what a plan has changed; return the planner's Memory."""
+        planned, switches, tracked = memory
         self._itinerary.switches = list(switches)
         if self._tracker is not None:
             self._tracker.memory = tracked
+        return planned
 
 
 def scene_change(first, seen):

@@ -4,29 +4,63 @@
 Visual MPC: choose the next action by searching through the forward model (App. F of the paper).
 
 At every control period: put each object's map at its pixel, predict where many action sequences
-carry the maps, take the one that brings them closest to their goals, execute its first action.
+carry the maps, take the one that brings them closest to their goals, execute its first action:
+
+    goal, memory = mpc.goal(pixels=goal_pixels), Memory(seed)
+    while not there:
+        plan = mpc.plan(Scene(image, gripper, object_pixels), goal, memory)
+        carry_out(plan.action)
+        memory = plan.memory
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-import os
 import time
 
 import numpy as np
-from tap_ros.contract import LOW
 from tap_ros.errors import PlanningError
 from tap_ros.images import to_float
-from tap_ros.planning.action_sequences import SequenceShape
+from tap_ros.planning.action_sequences import FULL, HORIZON, Limits, SequenceShape
 from tap_ros.planning.cem import cem
-from tap_ros.planning.expected_distance import distances_to_places
 from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.goals import Goal, tabulate
+from tap_ros.planning.map_model import MapModel
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.mpc_inputs import check_goal_pixels, check_maps, check_scene
+from tap_ros.planning.mpc_inputs import check_scene, Scene
+from tap_ros.planning.plan_cost import landing_clash, prices
 from tap_ros.planning.proposals import push_proposals
+from tap_ros.planning.rollouts import Rollouts, to_numpy
 import torch
 
-NEAR = 3.0  # px
+WARM_STD = 0.5  # share of the first deviation that a search around the last plan begins with
+RECHECK_STD = 0.01  # m, from the gripper to the places from which elites are judged once more
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search found, or what is left of it some actions later."""
+
+    shape: SequenceShape
+    parameters: np.ndarray  # (D,) of the sequence, for shape
+    expected_distance: float  # px, see Plan
+    cost: float  # px, see Plan
+    goal: Goal  # that it was searched for
+    limits: Limits  # within which it was searched
+    age: int = 0  # actions that have passed since the search
+
+    def following(self):
+        """Return what is left one action later."""
+        return replace(self, shape=self.shape.following(), age=self.age + 1,
+                       parameters=self.shape.shift(self.parameters))
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What one plan leaves to the next; a planner that has not planned yet has Memory(seed)."""
+
+    seed: int = 0
+    count: int = 0  # plans so far
+    found: Found | None = None
 
 
 @dataclass(frozen=True)
@@ -37,30 +71,26 @@ class Plan:
     expected_distance: float  # px, mean over objects, where the plan is predicted to end
     current_distance: float  # px, mean over objects, before it
     planning_ms: float
-    actions: np.ndarray  # (horizon, 4) the whole sequence
+    actions: np.ndarray  # (HORIZON, 4) the whole sequence
     cost: float  # what the search minimised: px, summed over objects and time
+    memory: Memory  # for the next plan
 
 
 class VisualMPC:
     """
-    The planner. Deterministic: the same seed and inputs give the same actions.
+    The planner. It keeps nothing: the same scene, goal and memory give the same plan.
 
-    :param model: ForwardModel, or what carries object maps as it does.
+    :param model: MapModel.
     :param config: VisualMPCConfig.
     """
 
-    def __init__(self, model, config=None):
-        self.model, config = model, config or VisualMPCConfig()
-        if model.grid.device.type != 'cpu':  # a GPU predicts all samples at once
-            config = replace(config, batch_size=config.search.num_samples)
-        self.config = self._own_config = config
-        # Each thread predicts whole batches: operators split among threads would wait for each
-        # other at every one of some thousand small steps, and for anything else that runs.
-        threads = self.config.threads or len(os.sched_getaffinity(0))
-        self._pool = ThreadPoolExecutor(
-            threads if model.grid.device.type == 'cpu' else 1,
-            initializer=torch.set_num_threads, initargs=(1,))
-        self.reset(0)
+    def __init__(self, model: MapModel, config: VisualMPCConfig | None = None):
+        self.model, self.config = model, config or VisualMPCConfig()
+        on_cpu = model.device.type == 'cpu'  # a GPU predicts all samples at once
+        self.rollouts = Rollouts(
+            model, self.config.batch_size if on_cpu else self.config.search.num_samples,
+            self.config.threads)
+        self._points = model.table_points().cpu().numpy()
 
     @classmethod
     def load(cls, path, config=None, device='cpu'):
@@ -75,198 +105,78 @@ class VisualMPC:
     @property
     def image_size(self):
         """Return (height, width) of the pictures it takes."""
-        return self.model.config.image_size, self.model.config.image_size
-
-    def reset(self, seed=0):
-        """Forget the last plan and start the random numbers anew."""
-        config = self.config
-        self._seed, self._count, self._age = seed, 0, 0
-        self._first_shape = self._shape = SequenceShape(
-            config.segments, config.repeat, None if config.free_phase else 0, config.move_limit,
-            config.max_lift, config.push_limit, config.upright, config.climb_limit)
-        self._last = self._plan = self._goal = None  # _last: parameters of what is left of _plan
-
-    @property
-    def memory(self):
-        """Return what one plan leaves to the next; it may be set back, and then gives the same."""
-        return self._count, self._age, self._shape, self._last, self._plan, self._goal
-
-    @memory.setter
-    def memory(self, memory):
-        self._count, self._age, self._shape, self._last, self._plan, self._goal = memory
-
-    def limit(self, move, climb):
-        """
-        Plan within limits, from the next reset on.
-
-        :param move: m per control period, |x| and |y|; climb: m, |z|; above the configuration's
-            own limits they change nothing.
-        """
-        own = self._own_config
-        self.config = replace(
-            own, move_limit=min(move, own.move_limit), push_limit=min(move, own.push_limit),
-            climb_limit=min(climb, own.climb_limit))
+        return self.model.image_size
 
     @torch.inference_mode()
-    def act(self, image, gripper, object_pixels, goal_maps=None, goal_pixels=None):
+    def goal(self, pixels=None, maps=None) -> Goal:
+        """Tabulate a goal, given as pixels (K, 2) or as maps (K, H, W), see goals.tabulate."""
+        return tabulate(self.model, pixels, maps)
+
+    @torch.inference_mode()
+    def plan(self, scene: Scene, goal: Goal, memory: Memory = Memory(),
+             limits: Limits = FULL) -> Plan:
         """
         Choose the next action.
 
-        :param image: (H, W, 3) uint8.
-        :param gripper: (4,) metres and opening.
-        :param object_pixels: (K, 2) as (u, v), where the objects are now.
-        :param goal_maps: (K, H, W), where they should be, each of positive mass; or
-        :param goal_pixels: (K, 2). Exactly one of the two.
-        :return: Plan.
-        :raises PlanningError: for inputs that cannot be planned with.
+        :param memory: of the plan before.
+        :param limits: of the actions.
+        :raises PlanningError: for a scene that cannot be planned in.
         """
-        begin = time.perf_counter()
-        gripper, objects = check_scene(image, gripper, object_pixels, self.image_size)
-        distance = self._goal_distance(goal_maps, goal_pixels, len(objects))  # (K, n n)
-        maps = self.model.seed_maps(torch.from_numpy(objects).to(distance.device))
-        current = float((maps.flatten(1) * distance).sum(1).mean())
-        unchanged = self._goal is not None and torch.equal(self._goal, distance)
-        if unchanged and self._age < self.config.replan_every:
-            shape, best = self._shape, self._last
-            actions = shape.actions(best[None], gripper[2])[0]
-            expected, cost = self._plan.expected_distance, self._plan.cost
-        else:
-            shape = self._shape if self.config.warm_start else self._first_shape
-            best, actions, expected, cost = self._search(shape, image, gripper, maps, distance)
-            self._age = 0
-        self._count, self._age = self._count + 1, self._age + 1
-        self._last, self._shape, self._goal = shape.shift(best), shape.following(), distance
-        self._plan = Plan(
-            actions[0], expected, current, 1000 * (time.perf_counter() - begin), actions, cost)
-        return self._plan
+        begin, scene = time.perf_counter(), check_scene(scene, self.image_size)
+        if len(goal) != len(scene.object_pixels):
+            raise PlanningError(f'goal: {len(goal)} goals for {len(scene.object_pixels)} objects; '
+                                'give one for each object, in the same order')
+        maps = self.model.seed_maps(torch.from_numpy(scene.object_pixels).to(self.model.device))
+        current = (maps.flatten(1) * goal.distances).sum(1).mean()
+        current, weights = to_numpy(current, maps.flatten(1))
+        found = memory.found
+        if (found is None or found.age >= self.config.replan_every or found.limits != limits
+                or not found.goal.equals(goal)):
+            found = self._search(scene, maps, weights @ self._points, goal, memory, limits)
+        actions, = found.shape.actions(found.parameters[None], scene.gripper[2])
+        milliseconds = 1000 * (time.perf_counter() - begin)
+        return Plan(actions[0], found.expected_distance, float(current), milliseconds, actions,
+                    found.cost, Memory(memory.seed, memory.count + 1, found.following()))
 
-    def _search(self, shape, image, gripper, maps, distance):
+    def _search(self, scene, maps, here, goal, memory, limits):
         """
         Search the best sequence of actions.
 
-        :param shape: SequenceShape; maps (K, n, n) of the objects on the table grid.
-        :param distance: (K, n n) px from each table cell to the goals.
-        :return: its parameters (D,), actions (horizon, 4), expected distance at its end, cost.
+        :param maps: (K, n, n), of the objects on the table; here: (K, 2) m, where they are.
+        :return: Found.
         """
-        device, config = distance.device, self.config
-        rng = np.random.default_rng([self._seed, self._count])
-        price = distance + config.unfinished * (distance / NEAR).clamp(max=1)
-        state = torch.from_numpy(gripper)[None].to(device)
-        features = self.model.begin(to_float(image)[None].to(device), state, config.arm_hidden)
-        here = maps.flatten(1).cpu().numpy() @ self._table_points()  # (K, 2) metres
+        config, gripper, device = self.config, scene.gripper, maps.device
+        last = memory.found if config.warm_start else None
+        # look once, from where all sequences begin
+        shape = config.shape(limits, last.shape.phase if last else 0)
+        start = self.model.begin(to_float(scene.image)[None].to(device),
+                                 torch.from_numpy(gripper)[None].to(device), config.arm_hidden)
+        judge = partial(self.rollouts.judge, start, maps)
+        price = prices(goal.distances, config.unfinished)
 
-        def cost(samples, starts=state):
+        def cost(samples, grippers=gripper[None]):  # mean over where the gripper begins
             actions = shape.actions(samples, gripper[2])
             clash = landing_clash(shape.landings(actions, gripper), here, config.clearance)
-            costs, _ = self._cost(features, starts.repeat(len(samples), 1), maps, price,
-                                  actions.repeat(len(starts), 0))
-            return costs.reshape(len(samples), len(starts)).mean(1) + clash
+            costs, _ = judge(price, actions.repeat(len(grippers), 0),
+                             np.tile(grippers, (len(samples), 1)), config.cost_every)
+            return costs.reshape(len(samples), -1).mean(1) + clash
 
-        aside = np.random.default_rng([self._seed, self._count, 1])  # rng draws the same without
-        starts = np.tile(gripper, (max(1, config.recheck), 1))
-        starts[1:, :2] += aside.normal(0, config.recheck_std, starts[1:, :2].shape)
-        recheck = partial(cost, starts=torch.from_numpy(starts).to(device))
-        mean, std = self._first_gaussian(shape)
-        proposals = self._propose(shape, gripper, here, distance, rng)
-        if config.warm_start and self._last is not None:
-            proposals = np.concatenate([proposals, self._last[None]])
+        def recheck(samples):  # from here and from a little beside
+            aside = np.random.default_rng([memory.seed, memory.count, 1])
+            grippers = np.tile(gripper, (config.recheck, 1))
+            grippers[1:, :2] += aside.normal(0, RECHECK_STD, (config.recheck - 1, 2))
+            return cost(samples, grippers)
+
+        # search, first of all where pushes are likely and where the last plan led
+        rng = np.random.default_rng([memory.seed, memory.count])
+        mean, std = shape.first_gaussian()
+        proposals = push_proposals(shape, gripper, here, goal.places, config.proposals, rng)
+        if last:
+            mean, std = last.parameters, WARM_STD * std
+            proposals = np.concatenate([proposals, mean[None]])
         clip = partial(shape.clip, least_lift=shape.least_lift(gripper[2]))
-        best, best_cost, _ = cem(cost, mean, std, config.search, rng, clip, proposals,
-                                 recheck if config.recheck else None)
+        best, best_cost = cem(cost, mean, std, config.search, rng, clip, proposals,
+                              recheck if config.recheck else None)
         actions = shape.actions(best[None], gripper[2])
-        _, ends = self._cost(features, state, maps, distance, actions)
-        return best, actions[0], float(ends[0]), best_cost
-
-    def _first_gaussian(self, shape):
-        """Return mean and deviation (D,): fresh, or around the last plan."""
-        config = self.config
-        mean, std = shape.first_gaussian(config.std_move)
-        if config.warm_start and self._last is not None:
-            mean, std = self._last, std * config.warm_std
-        return mean, std
-
-    def _propose(self, shape, gripper, here, distance, rng):
-        """Return proposals (P, D) from where objects are (K, 2) to their goals' nearest cells."""
-        if not self.config.proposals:
-            return np.zeros((0, shape.size))
-        goals = self._table_points()[distance.argmin(1).cpu().numpy()]
-        return push_proposals(shape, gripper, here, goals, self.config.proposals, rng)
-
-    def _table_points(self):
-        """Return the table's cells (n n, 2) in metres."""
-        model = self.model
-        return (model.grid.flatten(0, 1) * model.config.table_half).cpu().numpy()
-
-    def _cost(self, features, gripper, maps, distance, actions):
-        """
-        Judge action sequences.
-
-        Cost: each object's expected distance to its goal, summed over objects and over the
-        horizon, the last step with its own weight (10, as the authors' planner has).
-
-        :param gripper: (N, 4), where each sequence begins, or (1, 4).
-        :param distance: (K, n n) pixels, what each object costs in every table cell.
-        :param actions: (N, horizon, 4).
-        :return: costs (N,) numpy; expected distance at the horizon's end, px, mean over objects.
-        """
-        config, worst = self.config, distance.amax(1)
-        size = -(-len(actions) // -(-len(actions) // config.batch_size))  # as even as can be
-
-        @torch.inference_mode()
-        def judge(part, begin):
-            count, total, seen = len(part), 0, 0
-            missing = size - count  # the last part is filled up: all go the same way
-            part, begin = (torch.cat([t, t[-1:].expand(missing, *t.shape[1:])])
-                           for t in (part, begin))
-            for carried in self.model.carried_maps(
-                    features, begin, maps, part, config.cost_every):
-                carried = carried.flatten(2)
-                last = torch.einsum('nkc,kc->nk', carried, distance)
-                last = last + (1 - carried.sum(2)) * worst  # a lost object is as far as can be
-                total, seen = total + last.sum(1), seen + 1
-            steps = config.segments * config.repeat
-            total = (total - last.sum(1)) * (steps - 1) / max(1, seen - 1)
-            return (total + config.last_weight * last.sum(1))[:count], last.mean(1)[:count]
-
-        # together with others that come down as late: up there, nothing needs to be predicted
-        order = np.argsort((actions[..., 2].cumsum(1) + gripper[0, 2].item() > LOW + 0.01).sum(1),
-                           kind='stable')
-        begins = gripper.expand(len(actions), -1)[torch.from_numpy(order).to(gripper.device)]
-        parts = [t.split(size) for t in (
-            torch.from_numpy(actions[order]).to(distance.device), begins)]
-        costs, ends = map(torch.cat, zip(*self._pool.map(judge, *parts)))
-        back = np.argsort(order)
-        costs, ends = costs.cpu().double().numpy()[back], ends.cpu().numpy()[back]
-        # rounded so that the batch size, which moves the last bits, cannot change the ranking
-        return costs.round(2), ends
-
-    def _goal_distance(self, goal_maps, goal_pixels, count):
-        """
-        Tabulate the distance of every table cell to each goal.
-
-        For a goal map q it is the expected distance, so that an object map p costs that between
-        the two, E_{p,q}|x - y|.
-
-        :return: (K, n n) pixels.
-        """
-        if (goal_maps is None) == (goal_pixels is None):
-            raise PlanningError('goal: give exactly one of goal_maps and goal_pixels')
-        cells = self.model.pixel_table().flatten(0, 1)  # (n n, 2)
-        if goal_pixels is not None:
-            goals = check_goal_pixels(goal_pixels, count, self.image_size)
-            return torch.cdist(torch.from_numpy(goals).to(cells.device), cells)
-        maps = check_maps(goal_maps, count, self.image_size)
-        return distances_to_places(torch.from_numpy(maps).to(cells.device), cells)
-
-
-def landing_clash(landings, objects, clearance):
-    """
-    Cost of coming down upon an object, which recordings of good pushes do not show.
-
-    :param landings: (N, 2) metres, NaN for none; objects: (K, 2); clearance: m.
-    :return: (N,) pixels: 0, or more than any push can gain.
-    """
-    if not clearance:
-        return np.zeros(len(landings))
-    gap = np.linalg.norm(landings[:, None] - objects, axis=-1).min(1)  # (N,)
-    return np.where(gap < clearance, 100 + 1000 * (clearance - gap), 0)
+        _, ends = judge(goal.distances, actions, gripper[None], HORIZON)
+        return Found(shape, best, float(ends[0]), best_cost, goal, limits)

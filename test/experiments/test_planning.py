@@ -3,6 +3,7 @@
 """Laws of planned episodes, in the real simulator with the shipped weights."""
 
 from dataclasses import replace
+import inspect
 
 from experiments.planning.episode import (
     as_recording,
@@ -20,6 +21,7 @@ from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError
 from tap_ros.images import to_float
 from tap_ros.planning.cem import CEMConfig
+from tap_ros.planning.map_model import MapModel
 from tap_ros.planning.mpc_config import LARGE, PAPER, VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
@@ -153,16 +155,26 @@ def test_the_true_model_foresees_what_then_happens(simulator, mpc):
     assert np.abs(foreseen[1] - seen.object_pixels).max() < 0.3
 
 
+@pytest.mark.parametrize('kind', ['learned', 'true'])
+def test_both_models_are_what_the_planner_asks_for(simulator, mpc, kind):
+    model = mpc.model if kind == 'learned' else TrueModel(mpc.model, simulator)
+    assert isinstance(model, MapModel) and model.image_size == (64, 64)
+    for name in ('begin', 'carried_maps', 'seed_maps', 'gripper_after'):
+        asked = list(inspect.signature(getattr(MapModel, name)).parameters.values())[1:]
+        offered = list(inspect.signature(getattr(model, name)).parameters.values())
+        assert [(p.kind, p.default) for p in offered] == [(p.kind, p.default) for p in asked]
+
+
 def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):
     method = parse_method('true_model')
-    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(SMALL))
+    planner = VisualMPC(mpc.model, method.planner(SMALL))
     runs = [run_episode(simulator, planner, method, 2, 5) for _ in range(2)]
     np.testing.assert_array_equal(runs[0].actions, runs[1].actions)
 
 
 def test_objects_can_be_followed_by_pictures_while_the_simulator_plans(simulator, mpc):
     method = parse_method('true_model:carried')
-    planner = VisualMPC(TrueModel(mpc.model, simulator), method.planner(SMALL))
+    planner = VisualMPC(mpc.model, method.planner(SMALL))
     run = run_episode(simulator, planner, method, 2, 5)
     assert len(run.actions) == 2 and run.tracking_error() < 2
 
@@ -204,24 +216,6 @@ def test_options_change_the_planner():
 
 def test_budgets_are_the_papers():
     assert (step_budget(2), step_budget(3)) == (40, 75)
-
-
-def test_replanning_less_often_carries_the_plan_out(simulator, mpc):
-    seen = simulator.reset(5)
-    goal = simulator.goal().object_pixels
-    planner = VisualMPC(mpc.model, replace(SMALL, replan_every=3))
-    planner.reset(5)
-    plans = []
-    for _ in range(4):
-        plans.append(planner.act(
-            seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal))
-        seen = simulator.step(plans[-1].action)
-    for i in (1, 2):
-        np.testing.assert_allclose(plans[i].action[:2], plans[0].actions[i, :2], atol=1e-6)
-    assert plans[1].cost == plans[0].cost != plans[3].cost
-    planner.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal)
-    moved = planner.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goal + 2)
-    assert moved.cost != plans[3].cost  # another goal needs another plan at once
 
 
 def test_shipped_model_foresees_a_push(simulator, mpc):

@@ -10,17 +10,24 @@ from experiments.planning.films import pick_scenes
 from experiments.planning.methods import parse_method
 from experiments.planning.page import make_page
 from experiments.planning.results import make_rows, partners
-from experiments.planning.runs import Job, read_results, ResultFile, run_jobs
+from experiments.planning.runs import (
+    Job,
+    read_results,
+    ResultFile,
+    run_jobs,
+    SPEED_ONLY,
+)
 import pytest
 from tap_ros.cli import main
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import forward
 from tap_ros.planning.cem import CEMConfig
-from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_config import VisualMPCConfig, with_preset
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
 SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
+PUBLISHED = Path(__file__).parents[2] / 'docs' / 'results' / 'planning'
 SMALL = VisualMPCConfig(search=CEMConfig(8, 1, 4), proposals=4, batch_size=8, threads=1)
 
 
@@ -53,6 +60,15 @@ def test_other_settings_are_refused_and_speed_is_none(tmp_path):
     faster = Job('push2', parse_method('direct'), VisualMPCConfig(
         search=SMALL.search, proposals=4, batch_size=3, threads=2), str(FORWARD_MODEL), budget=1)
     assert ResultFile(tmp_path, faster).scenes
+
+
+@pytest.mark.parametrize('path', sorted(PUBLISHED.glob('*.json')), ids=lambda path: path.stem)
+def test_published_results_were_made_with_the_planner_of_today(path):
+    settings, scenes = read_results(path)
+    method = parse_method(settings['method'])
+    planner = asdict(method.planner(with_preset(settings['preset'])))
+    assert settings['planner'] == {k: v for k, v in planner.items() if k not in SPEED_ONLY}
+    assert scenes
 
 
 @pytest.mark.parametrize('damage', [
@@ -116,7 +132,7 @@ def test_results_of_other_settings_are_not_subtracted():
     results = dict([stored('direct', [9.0]), stored('genmin', [4.0])])
     results['push2', 'direct'][0]['preset'] = 'large'
     assert not any('against' in row for row in make_rows(results))
-    results['push2', 'direct'][0].update(preset='', planner={**asdict(SMALL), 'segments': 4})
+    results['push2', 'direct'][0].update(preset='', planner={**asdict(SMALL), 'clearance': 0.2})
     assert not any('against' in row for row in make_rows(results))
     results = dict([stored('genmin', [9.0]), stored('genmin:true_maps', [4.0])])
     assert any('against' in row for row in make_rows(results))

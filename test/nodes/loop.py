@@ -169,8 +169,8 @@ def acts_like(loop, method, weights, **fields):
     sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    plans, act = [], mpc.act
-    mpc.act = lambda *args, **goal: plans.append(act(*args, **goal)) or plans[-1]
+    plans, plan = [], mpc.plan
+    mpc.plan = lambda *args: plans.append(plan(*args)) or plans[-1]
     try:
         run = run_episode(sim, mpc, parse_method(method), fields['step_budget'], SEED,
                           SubgoalPredictor.load(weights))

@@ -17,7 +17,9 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.srv import ResetScene
 from tap_ros.learning.weights import save_weights
 from tap_ros.nodes.clients import call, CallError, cancel_goal, send_goal, wait_for_result
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.action_sequences import Limits
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
@@ -34,11 +36,10 @@ def test_the_nodes_act_as_the_same_classes_do_in_one_process(loop):
     sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
     try:
         seen = sim.reset(SEED)
-        goals = sim.goal().object_pixels
-        mpc.reset(5)
-        actions = []
+        goal, memory, actions = mpc.goal(sim.goal().object_pixels), Memory(5), []
         for _ in range(3):
-            plan = mpc.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goals)
+            plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels), goal, memory)
+            memory = plan.memory
             actions.append(plan.action[:3])
             seen = sim.step(plan.action)
     finally:
@@ -235,10 +236,9 @@ def test_the_planner_keeps_within_the_limits_of_the_parameters(loop):
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
     try:
-        seen, goals = sim.reset(SEED), sim.goal().object_pixels
-        mpc.limit(0.02, 0.04)
-        mpc.reset(5)
-        plan = mpc.act(seen.image, seen.gripper, seen.object_pixels, goal_pixels=goals)
+        seen, goal = sim.reset(SEED), mpc.goal(sim.goal().object_pixels)
+        plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels), goal, Memory(5),
+                        Limits(0.02, 0.04))
     finally:
         sim.close()
     moves = loop.moves().astype(np.float32)

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
+from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import (
     choose_sample,
@@ -14,7 +15,8 @@ from tap_ros.planning.hierarchy import (
     targets_by,
 )
 from tap_ros.planning.mpc_config import VisualMPCConfig
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.prediction.predictor import Subgoal
 from tap_ros.prediction.warp import one_hot_maps
 import torch
@@ -60,12 +62,12 @@ def test_free_objects_count_for_nothing_and_shall_stay_where_they_are():
     target = Target(PLACES, free=np.array([False, True]))
     now = np.array([[8.0, 11.0], [50.0, 50.0]])
     assert target.distance(now) == 3
-    np.testing.assert_array_equal(target.goal(now)['goal_pixels'], [PLACES[0], now[1]])
+    np.testing.assert_array_equal(target.goal(now)['pixels'], [PLACES[0], now[1]])
 
 
 def test_maps_go_before_their_means():
     maps = np.ones((2, 32, 32))
-    assert Target(PLACES, maps).goal(PLACES) == {'goal_maps': maps}
+    assert Target(PLACES, maps).goal(PLACES) == {'maps': maps}
 
 
 def test_a_map_is_reached_where_its_expected_distance_is_least():
@@ -111,6 +113,10 @@ def subgoal(pixels, sample=0, level=1):
                    sample, level)
 
 
+def scene(pixels):
+    return Scene(np.full((32, 32, 3), 90, np.uint8), np.zeros(4, np.float32), pixels)
+
+
 def small_planner(model):
     return VisualMPC(model, VisualMPCConfig(
         search=CEMConfig(16, 1, 4), proposals=4, batch_size=16, threads=1))
@@ -118,35 +124,57 @@ def small_planner(model):
 
 def test_the_subgoal_on_the_way_is_chosen_and_the_first_of_equals(model):
     mpc = small_planner(model)
-    image, gripper = np.full((32, 32, 3), 90, np.uint8), np.zeros(4, np.float32)
     start, goal = PLACES, PLACES + [4.0, 0.0]
     between, astray = start + [2.0, 0.0], np.array([[28.0, 28.0], [3.0, 3.0]])
     chains = [[subgoal(astray)], [subgoal(between)], [subgoal(between)]]
-    best, costs = choose_subgoals(mpc, image, gripper, start, goal, chains)
+    best, costs = choose_subgoals(mpc, scene(start), goal, chains)
     assert best == 1 and costs[1] == costs[2] < costs[0]
-    again, _ = choose_subgoals(mpc, image, gripper, start, goal, chains[::-1])
+    again, _ = choose_subgoals(mpc, scene(start), goal, chains[::-1])
     assert again == 0
 
 
+def test_samples_are_judged_by_plans_with_the_seed_and_the_limits_that_are_given(model):
+    mpc, chains = small_planner(model), [[subgoal(PLACES + 2.0)]] * 2
+
+    def costs(*given):
+        return choose_subgoals(mpc, scene(PLACES), PLACES + 4.0, chains, *given)[1]
+
+    def cost(seed, limits):
+        goal = mpc.goal(maps=chains[0][0].object_maps)
+        first = mpc.plan(scene(PLACES), goal, Memory(seed), limits)
+        hand = model.gripper_after(np.zeros(4, np.float32), first.actions)
+        seen = Scene(chains[0][0].image, hand, PLACES + 2.0)
+        return first.cost + mpc.plan(seen, mpc.goal(PLACES + 4.0), Memory(seed), limits).cost
+
+    slow = Limits(0.01, 0.02)
+    for seed, limits in ((0, FULL), (1, FULL), (0, slow)):
+        assert (costs(seed, limits) == cost(seed, limits)).all()
+    assert len({cost(0, FULL), cost(1, FULL), cost(0, slow)}) == 3
+    given = []
+    mpc.plan = lambda seen, goal, *rest: given.append(rest) or VisualMPC.plan(
+        mpc, seen, goal, *rest)
+    samples = [subgoal(PLACES, 0), subgoal(PLACES, 1)]
+    choose_sample(mpc, scene(PLACES), PLACES + 4.0, samples, 7, slow)
+    assert given == 4 * [(Memory(7), slow)]
+
+
 def test_subgoals_are_divided_by_their_sample_and_one_sample_needs_no_plan(model):
-    image, gripper = np.full((32, 32, 3), 90, np.uint8), np.zeros(4, np.float32)
     start, goal = PLACES, PLACES + [6.0, 0.0]
     astray = np.array([[28.0, 28.0], [3.0, 3.0]])
     between = [start + [2.0, 0.0], start + [4.0, 0.0]]
     found = [subgoal(astray, 0, 2), subgoal(astray, 0, 1),
              subgoal(between[0], 1, 2), subgoal(between[1], 1, 1)]
     plans = []
-    taken = choose_sample(small_planner(model), image, gripper, start, goal, found,
+    taken = choose_sample(small_planner(model), scene(start), goal, found,
                           before_plan=lambda: plans.append(0))
     assert taken == found[2:] and len(plans) == 6  # two legs and the last, for two samples
-    assert choose_sample(None, image, gripper, start, goal, found[:2]) == found[:2]
+    assert choose_sample(None, scene(start), goal, found[:2]) == found[:2]
     way = targets_by(taken, goal)
     np.testing.assert_array_equal([target.pixels for target in way], [*between, goal])
     assert [target.maps is None for target in way] == [False, False, True]
 
 
 def test_a_choice_can_be_broken_off_between_two_plans(model):
-    image, gripper = np.full((32, 32, 3), 90, np.uint8), np.zeros(4, np.float32)
     chains, plans = [[subgoal(PLACES)]] * 5, []
 
     def before_plan():
@@ -155,6 +183,6 @@ def test_a_choice_can_be_broken_off_between_two_plans(model):
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        choose_subgoals(small_planner(model), image, gripper, PLACES, PLACES + 4, chains,
+        choose_subgoals(small_planner(model), scene(PLACES), PLACES + 4, chains,
                         before_plan=before_plan)
     assert len(plans) == 3

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig, Seen, Wait
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from toy_world import SIZE
 
 SECOND = 10**9
@@ -67,7 +69,6 @@ def test_the_default_budget_is_the_papers():
     pixels = np.zeros((3, 2), np.float32)
     for count, budget in ((2, 40), (3, 75)):
         reach = Reach(None, ReachConfig(reached=0.0))
-        reach._mpc = type('Counts', (), {'reset': lambda *_: None, 'memory': None})()
         reach.step(look(0))
         reach.head_for([Target(pixels[:count])])
         assert reach._budget == budget
@@ -162,6 +163,46 @@ def test_another_scene_ends_the_goal_even_if_nothing_else_is_new(mpc, changes, w
     end = reach.step(look(0, **changes))
     assert isinstance(end, End) and end.outcome == 'aborted' and words in end.message
     assert isinstance(reach.step(look(1)), Command)
+
+
+@pytest.mark.parametrize('seed', [0, 3])
+def test_each_command_is_planned_from_what_the_one_before_left(mpc, seed):
+    reach, goal, memory = begun(mpc, seed=seed), mpc.goal(GOAL.pixels), Memory(seed)
+    for t in range(3):
+        seen = look(t)
+        plan = mpc.plan(Scene(seen.image, seen.gripper, seen.pixels), goal, memory)
+        memory = plan.memory
+        np.testing.assert_array_equal(reach.step(seen).plan.actions, plan.actions)
+        reach.sent()
+
+
+def test_a_goal_is_tabulated_once_unless_objects_are_free(mpc, monkeypatch):
+    asked, goal = [], mpc.goal
+    monkeypatch.setattr(mpc, 'goal', lambda **given: asked.append(given) or goal(**given))
+    reach = Reach(mpc, ReachConfig(10), 3)
+    reach.step(look(0))
+    reach.head_for([Target(START + 2), GOAL])  # the subgoal is reached at step 2
+    for t in range(4):
+        reach.step(look(t, START + t))
+        reach.sent()
+    assert [given['pixels'].tolist() for given in asked] == [
+        (START + 2).tolist(), GOAL.pixels.tolist()]
+    asked.clear()
+    free = Target(GOAL.pixels, free=np.array([True, False]))
+    reach = Reach(mpc, ReachConfig(10), 3)
+    reach.step(look(0))
+    reach.head_for([free, GOAL])
+    for t in range(3):
+        reach.step(look(t, START + t))
+        reach.sent()
+    assert [given['pixels'][0].tolist() for given in asked] == (START[0] + [
+        [0, 0], [1, 1], [2, 2]]).tolist()  # it shall stay wherever it is
+
+
+def test_limits_hold_for_every_command_of_a_goal(mpc):
+    reach = begun(mpc, ReachConfig(10, limits=Limits(0.01, 0.02)))
+    moves = np.abs([act(reach, t) for t in range(4)])
+    assert moves.any() and moves[:, :2].max() <= 0.01 + 1e-6 and moves[:, 2].max() <= 0.02 + 1e-6
 
 
 def test_names_in_another_order_are_the_same_scene(mpc):

@@ -8,9 +8,14 @@ import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.images import to_float
+from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
 from tap_ros.planning.cem import CEMConfig
+from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig, with_preset
-from tap_ros.planning.visual_mpc import landing_clash, VisualMPC
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.plan_cost import LAST_WEIGHT
+from tap_ros.planning.rollouts import Rollouts
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.weights import FORWARD_MODEL
 import torch
@@ -23,11 +28,29 @@ DISTANCE = np.random.default_rng(1).uniform(0, 30, (2, 44 * 44))  # px, of each 
 GOALS = np.array([[24.0, 15.0], [9.0, 14.0]])
 
 
-def plans(model, config=SMALL, seed=0, steps=3, **goal):
-    mpc = VisualMPC(model, config)
-    mpc.reset(seed)
-    goal = goal or {'goal_pixels': GOALS}
-    return [mpc.act(IMAGE, GRIPPER, PIXELS, **goal) for _ in range(steps)]
+@pytest.fixture(scope='module')
+def trained():
+    return load_forward_model(FORWARD_MODEL)
+
+
+def plans(model, config=SMALL, seed=0, steps=3, limits=FULL, scale=1, **goal):
+    """Return plans in a row in a scene that stays as it is, `scale` times as large."""
+    mpc, memory, found = VisualMPC(model, config), Memory(seed), []
+    scene = Scene(IMAGE.repeat(scale, 0).repeat(scale, 1), GRIPPER, scale * PIXELS)
+    goal = mpc.goal(**(goal or {'pixels': scale * GOALS}))
+    for _ in range(steps):
+        found.append(mpc.plan(scene, goal, memory, limits))
+        memory = found[-1].memory
+    return found
+
+
+def judge(model, actions, batch_size):
+    """Judge sequences that begin at the middle of the table."""
+    start = model.begin(to_float(IMAGE)[None], torch.zeros(1, 4))
+    maps = model.seed_maps(torch.tensor(PIXELS).float())
+    prices = torch.from_numpy(DISTANCE).float()
+    grippers = np.zeros((len(actions), 4), np.float32)
+    return Rollouts(model, batch_size).judge(start, maps, prices, actions, grippers, every=1)
 
 
 def same(first, second):
@@ -50,12 +73,15 @@ def test_same_seed_same_plans_and_another_seed_others(model):
     assert not same(plans(model), plans(model, seed=1))
 
 
-def test_reset_forgets_the_last_plan(model):
-    mpc = VisualMPC(model, SMALL)
-    first = mpc.act(IMAGE, GRIPPER, PIXELS, goal_pixels=GOALS)
-    mpc.act(IMAGE, GRIPPER, PIXELS, goal_pixels=GOALS)
-    mpc.reset(0)
-    assert same([first], [mpc.act(IMAGE, GRIPPER, PIXELS, goal_pixels=GOALS)])
+def test_the_same_scene_goal_and_memory_give_the_same_plan_whatever_came_between(model):
+    mpc, scene, memories, found = VisualMPC(model, SMALL), Scene(IMAGE, GRIPPER, PIXELS), [], []
+    goal, memory = mpc.goal(GOALS), Memory()
+    for _ in range(3):
+        memories.append(memory)
+        found.append(mpc.plan(scene, goal, memory))
+        memory = found[-1].memory
+    assert same(found[::-1], [mpc.plan(scene, goal, memory) for memory in memories[::-1]])
+    assert not same(found[:1], found[1:2])
 
 
 @pytest.mark.parametrize('changes', [{'batch_size': 5}, {'batch_size': 50}, {'threads': 2}])
@@ -63,49 +89,19 @@ def test_batch_size_and_threads_change_nothing(model, changes):
     assert same(plans(model), plans(model, replace(SMALL, **changes)))
 
 
-def test_elites_judged_again_from_the_same_place_rank_as_before():
-    def chosen(**changes):
-        mpc = VisualMPC.load(FORWARD_MODEL, replace(SMALL, **changes))
-        image = IMAGE.repeat(2, 0).repeat(2, 1)
-        return [mpc.act(image, GRIPPER, 2 * PIXELS, goal_pixels=2 * GOALS) for _ in range(4)]
-
-    assert same(chosen(recheck=0), chosen(recheck=1))
-    assert same(chosen(recheck=0)[:1], chosen(recheck=3, recheck_std=0.0)[:1])
-    assert not same(chosen(recheck=0), chosen(recheck=4, recheck_std=0.02))
-
-
 @pytest.mark.parametrize('batch_size', [32, 50])
-def test_trained_weights_plan_the_same_in_any_batch(batch_size):
-    image = IMAGE.repeat(2, 0).repeat(2, 1)
-
+def test_trained_weights_plan_the_same_in_any_batch(trained, batch_size):
     def chosen(batch_size):
-        mpc = VisualMPC.load(FORWARD_MODEL, with_preset('default', batch_size=batch_size))
-        return mpc.act(image, GRIPPER, 2 * PIXELS, goal_pixels=2 * GOALS)
+        return plans(trained, with_preset('default', batch_size=batch_size), steps=1, scale=2)
 
-    assert same([chosen(64)], [chosen(batch_size)])
+    assert same(chosen(64), chosen(batch_size))
 
 
-def test_the_planner_stays_within_limits_that_are_set(model):
-    mpc = VisualMPC(model, SMALL)
-    mpc.limit(0.02, 0.05)
-    mpc.reset(0)
-    actions = np.concatenate([
-        mpc.act(IMAGE, GRIPPER, PIXELS, goal_pixels=GOALS).actions for _ in range(3)])
+def test_the_planner_stays_within_limits_that_are_given(model):
+    actions = np.concatenate([plan.actions for plan in plans(model, limits=Limits(0.02, 0.05))])
     assert 0.01 < np.abs(actions[:, :2]).max() <= 0.02 + 1e-6
     assert np.abs(actions[:, 2]).max() <= 0.05 + 1e-6
-    mpc.limit(1.0, 1.0)
-    mpc.reset(0)
-    assert same(plans(model), [mpc.act(IMAGE, GRIPPER, PIXELS, goal_pixels=GOALS)
-                               for _ in range(3)])
-
-
-def test_an_object_that_the_flow_loses_is_dear(model):
-    mpc = VisualMPC(model, SMALL)
-    lost = torch.zeros(24, 2, 44, 44)
-    model.carried_maps = lambda *_: iter([lost])
-    costs, _ = mpc._cost(None, torch.zeros(1, 4), None, torch.from_numpy(DISTANCE).float(),
-                         np.zeros((24, 15, 4), np.float32))
-    assert (costs >= 10 * DISTANCE.max(1).sum() - 0.1).all()
+    assert same(plans(model), plans(model, limits=Limits(1.0, 1.0)))
 
 
 @pytest.mark.parametrize('count, lengths', [(48, {24}), (64, {32}), (33, {17}), (1, {1})])
@@ -117,23 +113,15 @@ def test_sequences_are_predicted_in_even_batches(model, monkeypatch, count, leng
         return carried_maps(features, begin, maps, actions, *rest)
 
     monkeypatch.setattr(model, 'carried_maps', spy)
-    mpc = VisualMPC(model, replace(SMALL, batch_size=32))
-    costs, _ = mpc._cost(
-        model.begin(to_float(IMAGE)[None], torch.zeros(1, 4)), torch.zeros(1, 4),
-        model.seed_maps(torch.tensor(PIXELS).float()), torch.from_numpy(DISTANCE).float(),
-        np.zeros((count, 15, 4), np.float32))
+    costs, _ = judge(model, np.zeros((count, 15, 4), np.float32), 32)
     assert len(costs) == count and set(seen) == lengths
 
 
 def test_equal_sequences_cost_the_same_in_any_batch(model):
     costs, actions = {}, np.zeros((40, 15, 4), np.float32)
     actions[..., :2] = np.random.default_rng(0).normal(0, 0.05, (5, 15, 2)).repeat(8, 0)
-    features = model.begin(to_float(IMAGE)[None], torch.zeros(1, 4))
-    maps = model.seed_maps(torch.tensor(PIXELS).float())
     for size in (1, 3, 7, 40):
-        mpc = VisualMPC(model, replace(SMALL, batch_size=size))
-        costs[size], _ = mpc._cost(features, torch.zeros(1, 4), maps,
-                                   torch.from_numpy(DISTANCE).float(), actions)
+        costs[size], _ = judge(model, actions, size)
         assert (costs[size].reshape(5, 8) == costs[size][::8, None]).all()
     assert len({values.tobytes() for values in costs.values()}) == 1
     assert len(set(costs[40])) == 5
@@ -146,23 +134,9 @@ def test_current_distance_is_that_of_the_pixels(model):
 
 def test_a_goal_map_at_one_pixel_is_that_goal_pixel(model):
     maps = one_hot_maps(torch.tensor(GOALS), (32, 32)).numpy()
-    by_map, by_pixel = plans(model, goal_maps=3 * maps), plans(model)
+    by_map, by_pixel = plans(model, maps=3 * maps), plans(model)
     assert same(by_map, by_pixel)
     assert by_map[0].expected_distance == pytest.approx(by_pixel[0].expected_distance, abs=0.01)
-
-
-def test_more_samples_never_plan_worse_on_average(model):
-    few = replace(SMALL, search=CEMConfig(8, 1, 2))
-    worse = [plans(model, few, seed, 1)[0].expected_distance for seed in range(4)]
-    better = [plans(model, seed=seed, steps=1)[0].expected_distance for seed in range(4)]
-    assert np.mean(better) <= np.mean(worse)
-
-
-def test_coming_down_upon_an_object_costs_more_than_any_push():
-    landings = np.array([[0.0, 0.0], [0.3, 0.0], [np.nan, np.nan]])
-    cost = landing_clash(landings, np.array([[0.02, 0.0], [-0.3, 0]]), 0.08)
-    assert cost[0] > 64 and not cost[1:].any()
-    assert not landing_clash(landings, np.zeros((1, 2)), 0.0).any()
 
 
 def nan(values):
@@ -182,21 +156,31 @@ def nan(values):
     ({'object_pixels': nan(PIXELS)}, r'object_pixels.*\[0\]'),
     ({'object_pixels': PIXELS[0]}, 'object_pixels'),
     ({'object_pixels': PIXELS[:0]}, 'object_pixels'),
-    ({'goal_pixels': GOALS[:1]}, '1 goals for 2 objects'),
-    ({'goal_pixels': GOALS + 30}, 'outside the 32x32 picture'),
-    ({'goal_pixels': None}, 'goal_maps and goal_pixels'),
-    ({'goal_pixels': None, 'goal_maps': np.ones((1, 32, 32))}, 'goal_maps.*(2, 32, 32)'),
-    ({'goal_pixels': None, 'goal_maps': np.zeros((2, 32, 32))}, 'goal_maps'),
-    ({'goal_pixels': None, 'goal_maps': nan(np.ones((2, 32, 32)))}, 'goal_maps'),
+    ({'object_pixels': PIXELS[:1]}, '2 goals for 1 objects'),
 ])
-def test_bad_input_is_named(model, wrong, name):
-    inputs = {'image': IMAGE, 'gripper': GRIPPER, 'object_pixels': PIXELS, 'goal_pixels': GOALS}
-    with pytest.raises(PlanningError, match=name.replace('(2, 32, 32)', '')):
-        VisualMPC(model, SMALL).act(**(inputs | wrong))
+def test_a_bad_scene_is_named(model, wrong, name):
+    mpc, scene = VisualMPC(model, SMALL), Scene(IMAGE, GRIPPER, PIXELS)
+    with pytest.raises(PlanningError, match=name):
+        mpc.plan(replace(scene, **wrong), mpc.goal(GOALS))
 
 
 @pytest.mark.parametrize('wrong, name', [
-    ({'cost_every': 4}, 'cost_every'), ({'max_lift': 5}, 'max_lift'),
+    ({'pixels': GOALS + 30}, 'outside the 32x32 picture'),
+    ({'pixels': nan(GOALS)}, r'goal_pixels.*\[0\]'),
+    ({}, 'one of pixels and maps'),
+    ({'pixels': GOALS, 'maps': np.ones((2, 32, 32))}, 'one of pixels and maps'),
+    ({'maps': np.ones((32, 32))}, r'goal_maps.*\(K, 32, 32\)'),
+    ({'maps': np.ones((2, 16, 32))}, r'goal_maps.*\(K, 32, 32\)'),
+    ({'maps': np.zeros((2, 32, 32))}, 'goal_maps'),
+    ({'maps': nan(np.ones((2, 32, 32)))}, 'goal_maps'),
+])
+def test_a_bad_goal_is_named(model, wrong, name):
+    with pytest.raises(PlanningError, match=name):
+        VisualMPC(model, SMALL).goal(**wrong)
+
+
+@pytest.mark.parametrize('wrong, name', [
+    ({'cost_every': 4}, 'cost_every'),
     ({'proposals': 500}, 'proposals'), ({'replan_every': 0}, 'replan_every'),
     ({'replan_every': 16}, 'replan_every'), ({'recheck': -1}, 'recheck'),
     ({'batch_size': 0}, 'batch_size')])
@@ -209,7 +193,7 @@ def test_paper_preset_has_the_papers_numbers():
     paper = with_preset('paper')
     assert (paper.search.num_samples, paper.search.num_iterations, paper.search.num_elites) == (
         200, 3, 10)
-    assert paper.segments * paper.repeat == 15 and paper.last_weight == 10
+    assert HORIZON == 15 and LAST_WEIGHT == 10
     assert not paper.warm_start and not paper.proposals
     assert not paper.free_phase and not paper.recheck
     with pytest.raises(ConfigError, match='default, large, paper'):

@@ -1,0 +1,320 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Each term of the planner changes its choice where it should, and only there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tap_ros.contract import LIFTED, LOW
+from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
+from tap_ros.planning.cem import CEMConfig
+from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
+import torch
+from toy_world import SIZE, to_pixels
+
+# every term left out
+PLAIN = VisualMPCConfig(
+    search=CEMConfig(40, 1, 5), proposals=0, recheck=0, unfinished=0.0, clearance=0.0,
+    warm_start=False, cost_every=1, batch_size=40, threads=1)
+IMAGE = np.zeros((SIZE, SIZE, 3), np.uint8)
+NEW = Memory()
+GRIPPER = np.array([0.0, 0.0, LOW, 0.0], np.float32)
+PLACES = 1.1 / 43 * np.array([[14, 21], [25, 14]]) - 0.55  # m, of two objects: table cells
+GOALS = to_pixels(PLACES)
+
+
+class Puppets:
+    """
+    A forward model whose objects go where a test says.
+
+    :param model: ForwardModel; its geometry is used.
+    :param outcome: function of actions (N, T, 4) and of grippers (N, 4), where these begin, to
+        pixels (N, T, K, 2); NaN: nobody knows where the object is.
+    :ivar judged: actions (N, T, 4) of every batch, in turn.
+    """
+
+    def __init__(self, model, outcome):
+        self.image_size, self.device = model.image_size, model.device
+        self.table_points, self.pixel_table = model.table_points, model.pixel_table
+        self.seed_maps, self.gripper_after = model.seed_maps, model.gripper_after
+        self._outcome, self.judged = outcome, []
+
+    def begin(self, image, gripper, arm_hidden=False):
+        self.arm_hidden = arm_hidden
+
+    def carried_maps(self, start, gripper, maps, actions, /, every=1):
+        self.judged.append(actions.numpy())
+        pixels = np.asarray(self._outcome(actions.numpy(), gripper.numpy()), np.float32)
+        for t in range(every - 1, actions.shape[1], every):
+            at = pixels[:, t].reshape(-1, 2)
+            lost = torch.from_numpy(np.isnan(at).any(1))[:, None, None]
+            carried = self.seed_maps(torch.from_numpy(np.nan_to_num(at))).where(~lost, 0.0)
+            yield carried.view(len(actions), -1, *carried.shape[1:])
+
+
+def plan(puppets, config=PLAIN, gripper=GRIPPER, pixels=GOALS - 9.0, memory=NEW, goals=GOALS,
+         limits=FULL):
+    mpc = VisualMPC(puppets, config)
+    return mpc.plan(Scene(IMAGE, gripper, pixels), mpc.goal(goals), memory, limits)
+
+
+def away(*distances):
+    """Return pixels (T, K, 2) at distances from the goals, numbers or (T,), of each object."""
+    distances = np.stack([np.broadcast_to(d, HORIZON) for d in distances], 1)
+    return GOALS + distances[..., None] * [1.0, 0.0]
+
+
+def steady(model, pixels):
+    """Return Puppets that go to pixels (T, K, 2) whatever the gripper does."""
+    return Puppets(model, lambda actions, _: np.tile(pixels, (len(actions), 1, 1, 1)))
+
+
+def goes_right(model, right, left, **changes):
+    """
+    Tell whether the planner goes right.
+
+    :param right: pixels (T, K, 2) of the objects if it does; left: if it goes left.
+    """
+    def outcome(actions, _):
+        return np.where((actions[..., 0].sum(1) > 0)[:, None, None, None], right, left)
+
+    return plan(Puppets(model, outcome), replace(PLAIN, **changes)).actions[:, 0].sum() > 0
+
+
+def test_the_planner_goes_where_the_objects_come_nearer_to_their_goals(model):
+    assert goes_right(model, away(3, 5), away(4, 5)) and goes_right(model, away(4, 2), away(4, 5))
+    assert not goes_right(model, away(4, 5), away(3, 5))
+
+
+def test_one_object_is_brought_home_before_both_come_nearer(model):
+    home, even = away(0, 10), away(4.5, 4.5)
+    assert goes_right(model, home, even, unfinished=4.0) and goes_right(model, even, home)
+    far, even = away(4, 14), away(8.5, 8.5)  # where none is brought home it changes nothing
+    assert goes_right(model, even, far, unfinished=4.0) and goes_right(model, even, far)
+
+
+def test_the_end_counts_ten_times_as_much_as_a_step_on_the_way(model):
+    def mid_end(mid, end):
+        return away(np.where(np.arange(HORIZON) < HORIZON - 1, mid, end), 0)
+
+    assert goes_right(model, mid_end(7, 4), mid_end(5, 8))
+    assert goes_right(model, mid_end(4, 8), mid_end(8, 5))  # 14 times 4 px against 10 times 3
+    assert goes_right(model, mid_end(3, 6), mid_end(4, 6))
+    seen = plan(steady(model, away(6, 2)))
+    assert seen.cost == pytest.approx((14 + 10) * (6 + 2), rel=0.05)
+
+
+def test_steps_that_the_cost_does_not_look_at_change_nothing(model):
+    seen = (np.arange(HORIZON) + 1) % 3 == 0
+    dodging = away(np.where(seen, 2.0, 12.0), 0)
+    assert goes_right(model, dodging, away(6, 0), cost_every=3)
+    assert not goes_right(model, dodging, away(6, 0), cost_every=1)
+    costs = [plan(steady(model, away(6, 2)), replace(PLAIN, cost_every=n)).cost for n in (1, 3, 5)]
+    assert costs == pytest.approx(costs[:1] * 3, abs=0.05)
+
+
+def test_an_object_that_is_lost_is_as_far_as_can_be(model):
+    assert not goes_right(model, away(np.nan, 0), away(12, 0))
+    assert goes_right(model, away(9, np.nan), away(12, np.nan))
+    lost = plan(steady(model, away(np.nan, np.nan)))
+    farthest = np.linalg.norm(
+        GOALS[:, None] - model.pixel_table().flatten(0, 1).numpy(), axis=2).max(1).mean()
+    assert lost.expected_distance == pytest.approx(farthest, abs=0.01)
+
+
+def test_expected_distance_is_in_pixels_whatever_the_cost_adds(model):
+    for config in (PLAIN, replace(PLAIN, unfinished=4.0)):
+        found = plan(steady(model, away(6, 2)), config)
+        assert found.expected_distance == pytest.approx(4, abs=0.2)
+
+
+def dives(actions, _):
+    """Bring the objects nearer only by coming down at once."""
+    down = (actions[:, 0, 2] < 0)[:, None, None, None]
+    return np.where(down, away(6, 6), away(7, 7))
+
+
+@pytest.mark.parametrize('clearance, down', [(0.0, True), (0.1, False)])
+def test_the_gripper_does_not_come_down_upon_an_object(model, clearance, down):
+    above = np.append(PLACES[1] + [0.03, 0.0], [LIFTED, 0]).astype(np.float32)
+    config = replace(PLAIN, clearance=clearance)
+    found = plan(Puppets(model, dives), config, above, GOALS)
+    assert (found.action[2] < 0) == down
+    beside = above + np.float32([0.12, 0, 0, 0])  # where there is room it changes nothing
+    clear, careless = (plan(Puppets(model, dives), c, beside, GOALS) for c in (config, PLAIN))
+    assert clear.action[2] < 0 and np.array_equal(clear.actions, careless.actions)
+    assert clear.cost == careless.cost
+
+
+def sticks(actions, grippers):
+    """Carry the second object along wherever the gripper is low and upon it."""
+    hand = np.tile(grippers[:, :3], 1).astype(float)
+    place, path = np.tile(PLACES[1] - [0.15, 0.1], (len(actions), 1)), []
+    for action in actions.transpose(1, 0, 2):
+        touched = (hand[:, 2] < 0.05) & (np.linalg.norm(hand[:, :2] - place, axis=1) < 0.13)
+        hand = hand + action[:, :3]
+        place = place + np.where(touched[:, None], action[:, :2], 0)
+        path.append(np.stack([np.tile(PLACES[0], (len(actions), 1)), place], 1))
+    return to_pixels(np.stack(path, 1))
+
+
+def test_proposals_find_an_object_that_chance_does_not(model):
+    gripper = np.array([0.3, 0.3, LIFTED, 0], np.float32)
+    seen = to_pixels(PLACES - [[0.0, 0.0], [0.15, 0.1]])
+    proposing = replace(PLAIN, proposals=20)
+    blind, aimed = (plan(Puppets(model, sticks), config, gripper, seen)
+                    for config in (PLAIN, proposing))
+    assert aimed.expected_distance < 0.6 * aimed.current_distance < blind.expected_distance
+    at_home = [plan(Puppets(model, sticks), config, gripper, GOALS)
+               for config in (PLAIN, proposing)]
+    assert np.array_equal(at_home[0].actions, at_home[1].actions)
+
+
+def test_the_last_plan_carried_on_is_among_the_first_candidates(model):
+    first = plan(steady(model, away(5, 5)))
+
+    def only_that(actions, _):
+        same = np.abs(actions[:, :-1] - first.actions[1:]).max((1, 2)) < 1e-6
+        return np.where(same[:, None, None, None], away(0, 0), away(5, 5))
+
+    after = GRIPPER + np.append(first.action[:3], 0)
+    warm, cold = (plan(Puppets(model, only_that), replace(PLAIN, warm_start=start), after,
+                       memory=first.memory) for start in (True, False))
+    assert np.allclose(warm.actions[:-1], first.actions[1:], atol=1e-6)
+    assert warm.expected_distance < 1 and cold.expected_distance > 4
+
+
+def test_a_search_after_a_plan_looks_near_it_half_as_widely(model):
+    def chosen(actions, _):  # a push to the right and away
+        miss = np.linalg.norm(actions[:, :, :2].mean(1) - [0.03, 0.03], axis=1)
+        return GOALS + 200 * miss[:, None, None, None] * np.ones((1, HORIZON, 2, 1))
+
+    wide = replace(PLAIN, search=CEMConfig(200, 2, 5), batch_size=200, cost_every=HORIZON,
+                   upright=False, free_phase=False, push_limit=0.08)
+    first, middles, spreads = plan(Puppets(model, chosen), wide), {}, {}
+    for warm in (True, False):
+        puppets = Puppets(model, chosen)
+        plan(puppets, replace(wide, warm_start=warm), memory=first.memory)
+        moves = puppets.judged[0][:, 6, :2]
+        middles[warm], spreads[warm] = moves.mean(0), moves.std(0)
+    assert np.abs(middles[True] - first.actions[7, :2]).max() < 0.007
+    assert np.abs(middles[False]).max() < 0.007 < 0.02 < np.abs(first.actions[7, :2]).max()
+    np.testing.assert_allclose(spreads[True], 0.5 * spreads[False], rtol=0.2)
+    begins = [plan(Puppets(model, chosen), replace(wide, warm_start=warm))
+              for warm in (True, False)]
+    assert np.array_equal(begins[0].actions, begins[1].actions)  # nothing was planned before
+
+
+def slips(actions, grippers):
+    """Push home to the right, from GRIPPER only; nearly home to the left from anywhere."""
+    exact = np.linalg.norm(grippers[:, :2] - GRIPPER[:2], axis=1) < 1e-4
+    right = actions[..., 0].sum(1) > 0
+    return np.where(
+        (right & exact)[:, None, None, None], away(0, 0),
+        np.where(right[:, None, None, None], away(9, 9), away(2, 2)))
+
+
+def test_a_push_that_succeeds_from_one_place_only_is_not_taken(model):
+    search = CEMConfig(40, 1, 40)  # so that elites go both ways
+    plans = {n: plan(Puppets(model, slips), replace(PLAIN, search=search, recheck=n))
+             for n in (0, 1, 6)}
+    right = {n: found.actions[:, 0].sum() > 0 for n, found in plans.items()}
+    assert right == {0: True, 1: True, 6: False}  # judged again from the same place: no change
+
+    def robust(actions, grippers):
+        return slips(actions, np.tile(GRIPPER, (len(grippers), 1)))
+
+    sure = [plan(Puppets(model, robust), replace(PLAIN, search=search, recheck=n)) for n in (0, 6)]
+    assert np.array_equal(sure[0].actions, sure[1].actions) and sure[0].cost == sure[1].cost
+
+
+def test_the_best_of_all_that_were_judged_is_taken(model):
+    def miss(actions):
+        return 20 * np.abs(actions[..., 0].sum(1) - 0.2) + 4 * np.abs(actions[..., 2]).sum(1)
+
+    puppets = Puppets(model, lambda actions, _: GOALS + miss(actions)[:, None, None, None]
+                      * np.ones((1, HORIZON, 2, 1)))
+    found = plan(puppets, replace(PLAIN, search=CEMConfig(60, 3, 6), batch_size=7))
+    judged = np.concatenate(puppets.judged)
+    assert len(judged) > 180 and miss(found.actions[None])[0] <= miss(judged).min() + 0.01
+
+
+def test_every_plan_draws_candidates_of_its_own(model):
+    puppets = steady(model, away(5, 5))
+    first = plan(puppets)
+    second, other = plan(puppets, memory=first.memory), plan(puppets, memory=Memory(1))
+    assert not np.array_equal(first.actions, second.actions)
+    assert not np.array_equal(first.actions, other.actions)
+    assert second.memory.count == 2 and second.memory.seed == 0
+
+
+def test_between_two_searches_the_plan_is_carried_out_unless_goal_or_limits_change(model):
+    puppets, every3 = steady(model, away(5, 5)), replace(PLAIN, replan_every=3)
+    plans, hand = [plan(puppets, every3)], GRIPPER
+    for _ in range(3):
+        hand = hand + np.append(plans[-1].action[:3], 0)
+        plans.append(plan(puppets, every3, hand, memory=plans[-1].memory))
+    for i in (1, 2):
+        np.testing.assert_allclose(plans[i].actions[:-i], plans[0].actions[i:], atol=1e-6)
+    assert not np.allclose(plans[3].actions[:-3], plans[0].actions[3:], atol=1e-3)
+    after, searched = plans[3].memory, len(puppets.judged)
+    plan(puppets, every3, memory=after, goals=GOALS.copy())
+    assert len(puppets.judged) == searched
+    plan(puppets, every3, memory=after, goals=GOALS + 0.5)
+    assert len(puppets.judged) > searched
+    limited = np.abs(plan(puppets, every3, memory=after, limits=Limits(0.02, 0.03)).actions)
+    assert limited[:, :2].max() <= 0.02 + 1e-6 and limited[:, 2].max() <= 0.03 + 1e-6
+
+
+def candidates(model, height=LOW, limits=FULL, **changes):
+    """Return the actions (N, T, 4) that are judged, and the heights (N, T) at their ends."""
+    puppets = steady(model, away(5, 5))
+    gripper = np.array([0, 0, height, 0], np.float32)
+    plan(puppets, replace(PLAIN, **changes), gripper, limits=limits)
+    actions = puppets.judged[0]
+    return actions, height + actions[..., 2].cumsum(1)
+
+
+def test_candidates_keep_to_the_limits_and_use_them(model):
+    for move, climb in ((0.03, 0.04), (0.06, 0.1)):
+        actions, _ = candidates(model, limits=Limits(move, climb))
+        extent = np.abs(actions).max((0, 1))
+        np.testing.assert_allclose(extent, [move, move, climb, 0], atol=1e-6)
+    assert PLAIN.shape(Limits(1.0, 1.0), 0) == PLAIN.shape(FULL, 0)  # the contract's hold anyway
+
+
+@pytest.mark.parametrize('upright', [True, False])
+def test_upright_says_whether_the_arm_climbs_on_the_spot(model, upright):
+    actions, _ = candidates(model, upright=upright)
+    climbing = np.abs(actions[..., 2]) > 0.06
+    assert climbing.any() and actions[climbing][:, :2].any() != upright
+
+
+@pytest.mark.parametrize('limit', [0.02, 0.05])
+def test_push_limit_holds_where_the_gripper_is_low_and_only_there(model, limit):
+    actions, heights = candidates(model, push_limit=limit)
+    length, low = np.linalg.norm(actions[..., :2], axis=2), heights < 0.05
+    assert length[low].max() == pytest.approx(limit, abs=1e-6) and length[~low].max() > limit
+
+
+@pytest.mark.parametrize('free', [True, False])
+def test_free_phase_says_whether_a_way_takes_whole_segments(model, free):
+    _, heights = candidates(model, free_phase=free)
+    lifted = (heights > 0.1).sum(1)
+    assert lifted.any() and (lifted % 3 != 0).any() == free
+
+
+@pytest.mark.parametrize('height, first', [(0.06, 1), (LOW, 0), (LIFTED, 0)])
+def test_a_gripper_that_stands_upon_something_goes_up_before_it_pushes(model, height, first):
+    _, heights = candidates(model, height)
+    assert (heights[:, 0] > 0.1).all() == bool(first)
+
+
+@pytest.mark.parametrize('hidden', [True, False])
+def test_the_model_is_told_whether_the_arm_is_hidden(model, hidden):
+    puppets = Puppets(model, dives)
+    plan(puppets, replace(PLAIN, arm_hidden=hidden))
+    assert puppets.arm_hidden is hidden
