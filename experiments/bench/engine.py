@@ -24,8 +24,8 @@ engine itself costs; real work would share the cores.
 |---|---|---|---|---|
 {rows}
 
-Sleeping tasks of {sleep:g} s: their time divided by the ideal, from the first end on. With Ray it has
-the start of the other workers in it.
+Sleeping tasks of {sleep:g} s: their time divided by the ideal, from the first end on. With Ray the
+start of the other workers is in it.
 
 **What that means for {episodes} episodes on {machines} machines of {cores} cores.** `collect` has
 {files} tasks of {per_file} episodes, about {task_s:.1f} s each ({episode_s:g} s an episode, from
