@@ -55,14 +55,14 @@ class Loop:
     def start(self, name, **parameters):
         self.processes[name] = NodeProcess(name, self.folder / f'{name}.log', parameters)
 
-    def reset(self, seed=SEED):
-        """Start a scene, and wait for what is published at its start."""
+    def reset(self, seed=SEED, patience=30.0):
+        """Start a scene, and wait so many seconds for what is published at its start."""
         before = to_nanoseconds(self.image.wait(30).header.stamp)  # in lock-step one always comes
         response = call(self.reset_client, ResetScene.Request(task='push2', seed=seed), 30)
         assert response.success, response.message
         image = self.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > before)
         for topic in (self.objects, self.joints, self.goal_image, self.goal_objects):
-            topic.wait(30, lambda m: m.header.stamp == image.header.stamp)
+            topic.wait(patience, lambda m: m.header.stamp == image.header.stamp)
         self.twists.clear()
 
     @contextmanager
