@@ -55,7 +55,7 @@ def main(arguments=None):
         args = build_parser(arguments).parse_args(arguments)
         return args.run(args) or 0
     except TapError as error:
-        print(f'error: {error}', file=sys.stderr)
+        print(f'error: {escaped(error, 2000)}', file=sys.stderr)
         return 1
     except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush

@@ -59,3 +59,12 @@ def test_the_sample_recording_is_readable():
     episodes = list(iter_episodes(SAMPLE))
     assert len(episodes) == 20
     assert all(episode.task == 'push2' and len(episode.frames) <= 40 for episode in episodes)
+
+
+def test_names_of_files_do_not_reach_the_terminal_raw(tmp_path, capsys):
+    forged = tmp_path / 'a\n\x1b[31mFORGED.mcap'
+    forged.write_bytes(b'nothing')
+    assert main(['inspect', str(forged)]) == 1
+    output = ''.join(capsys.readouterr())
+    assert r'a\n\x1b[31mFORGED.mcap' in output and '\x1b' not in output
+    assert len(output.splitlines()) == 1

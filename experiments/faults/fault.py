@@ -113,7 +113,7 @@ class Job:
 
     def why_not(self):
         """Return the most frequent reasons why the promise did not hold, in one line."""
-        common = [f'{count} x {self._examples[why]}' if count > 1 else self._examples[why]
+        common = [f'{count} times: {self._examples[why]}' if count > 1 else self._examples[why]
                   for why, count in self.reasons.most_common(MAX_REASONS)]
         left = len(self.reasons) - len(common)
         return '; '.join([*common, *([f'and {left} other reasons'] if left > 0 else [])])

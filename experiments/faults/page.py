@@ -11,11 +11,12 @@ PAGE = 'faults.md'
 INTRODUCTION = f"""\
 # What happens when something goes wrong
 
-Made by `{COMMAND}` (`make faults`), never typed; as data: [{FILE}]({FILE}).
+Made by `{COMMAND}` (`make faults`); as data: [{FILE}]({FILE}). What else the machine did,
+and which rows are older than a change of what they test, was noted by hand.
 
 Each row is a fault that was injected into real nodes, processes of their own that talk over DDS,
 or into real files. *Held* counts the trials in which the promise was kept. A row that falls short
-stands here as it is, with the reason below the table.
+stands here as it is, with the reason below the table; *commit* is the code that was tried.
 """
 
 
@@ -59,14 +60,16 @@ def make_page(rows, groups):
 
 
 def _table(faults, rows):
-    lines = ['| what goes wrong | tried | held | measured | |', '|---|---:|---:|---:|---|']
+    lines = ['| what goes wrong | tried | held | measured | | commit |',
+             '|---|---:|---:|---:|---|---|']
     for fault in faults:
         row = rows[fault.name]
         held = f'{row["held"]}' if row['held'] == row['tried'] else f'**{row["held"]}**'
         figure = '' if row['figure'] is None else f'{row["figure"]} {row["unit"]}'
         words = '; '.join(part for part in (
             f'{fault.figure}, {fault.summary}' if figure else '', row.get('note')) if part)
-        lines.append(f'| {fault.title} | {row["tried"]} | {held} | {figure} | {words} |')
+        lines.append(f'| {fault.title} | {row["tried"]} | {held} | {figure} | {words} '
+                     f'| {row["commit"] or "unknown"} |')
     return '\n'.join(lines) + '\n'
 
 

@@ -32,7 +32,7 @@ def run(args):
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})
-    print(f'{args.path}: {len(episodes)} episodes, {lengths.sum()} frames of '
+    print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     print(f'length      {lengths.min()} to {lengths.max()} frames, median {np.median(lengths):g}')
     print(f'objects     {", ".join(map(str, objects))}')
@@ -45,4 +45,4 @@ def run(args):
     if args.picture:
         strips = [film_strip(e.frames) for e in episodes[:args.episodes]]
         write_atomically(args.picture, png_bytes(grid(strips, scale=2)))
-        print(f'picture     {args.picture}')
+        print(f'picture     {escaped(args.picture)}')

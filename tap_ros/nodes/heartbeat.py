@@ -9,6 +9,7 @@ from rclpy.duration import Duration
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 from tap_ros.nodes.observations import reception_time
+from tap_ros.text import escaped
 
 BEAT_S = 0.1
 LEASE_S = 0.4  # of the topic's liveliness, for other programs that watch it
@@ -42,7 +43,11 @@ class Heartbeat:
 
     def _run(self):
         while not self._ended.wait(BEAT_S):
-            self._publisher.publish(Header(stamp=self._node.get_clock().now().to_msg()))
+            try:
+                self._publisher.publish(Header(stamp=self._node.get_clock().now().to_msg()))
+            except Exception as error:  # a thread that ends would make a living node look dead
+                self._node.get_logger().error(
+                    f'heartbeat: {escaped(error)}', throttle_duration_sec=1.0)
 
 
 class Liveness:

@@ -17,6 +17,7 @@ from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.text import escaped
 from tap_ros.weights import FORWARD_MODEL
 
 MODES = ('subgoal', 'direct')
@@ -107,7 +108,7 @@ def check_request(request):
         raise ConfigError(f'seed is {request.seed}; expected 0 or more')
     mode = request.mode or 'subgoal'
     if mode not in MODES:
-        raise ConfigError(f'mode is {mode!r}; valid modes: {", ".join(MODES)}')
+        raise ConfigError(f'mode is {escaped(repr(mode), 60)}; valid modes: {", ".join(MODES)}')
     if request.step_budget > MAX_BUDGET:
         raise ConfigError(f'step_budget is {request.step_budget}; expected 1 to {MAX_BUDGET}, or '
                           f'0 for {step_budget(2)}, with three objects {step_budget(3)}')

@@ -137,13 +137,14 @@ class PredictorNode(Node):
             if isinstance(found, Exception):
                 raise found
             response = encode_answer(task, *found)
+            # Where to go first: the earliest subgoal of the first sample.
+            shown = task, found[0][0], response.subgoals[0]
         except Exception as error:
             self._send(send, self._refusal(error))
             return
         self._send(send, response)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
-        # Where to go first: the earliest subgoal of the first sample.
-        self._unshown.append((task, found[0][0], response.subgoals[0]))
+        self._unshown.append(shown)
 
     # In either
 

@@ -62,10 +62,10 @@ def run_node(make_node, name, args=None, num_threads=1):
         code = 1
     finally:
         _handle_signals(lambda *_: None)  # it is ending already
+        if node is not None:
+            code = _close(node) or code  # first of all: it stops the arm
         if heartbeat is not None:
             heartbeat.end()
-        if node is not None:
-            code = _close(node) or code
         if executor is not None:
             executor.shutdown(timeout_sec=2.0)
         if node is not None:

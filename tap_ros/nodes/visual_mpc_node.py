@@ -243,7 +243,8 @@ class VisualMpcNode(Node):
             raise
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'predict_subgoal')
         if not response.success:
-            raise PlanningError(f'service {self._predict.service_name}: {response.message}')
+            raise PlanningError(f'service {self._predict.service_name}: '
+                                f'{escaped(response.message, 1000)}')
         return decode_subgoals(response, names, self._mpc.image_size)
 
     def _send(self, handle, accepted, reach, command, topics):

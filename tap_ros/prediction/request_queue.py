@@ -5,6 +5,7 @@
 from collections import deque
 from concurrent.futures import Future
 import threading
+import traceback
 
 from tap_ros.errors import TapError
 
@@ -51,7 +52,7 @@ class RequestQueue:
 
         :param request: what `work` takes.
         :param answer: called once, in another thread, with what `work` returned for the request,
-            or with the exception that it raised.
+            or with the exception that it raised. What it raises itself is printed.
         :raises Busy: when it cannot wait; `answer` is not called then.
         """
         with self._changed:
@@ -92,7 +93,10 @@ class RequestQueue:
                     return
                 batch = self._take()
             for (_, answer), found in zip(batch, self._answers([one for one, _ in batch])):
-                answer(found)
+                try:
+                    answer(found)
+                except Exception:  # else all that wait would wait for ever
+                    traceback.print_exc()
 
     def _take(self):
         """Take the oldest requests, as many as go together."""

@@ -92,7 +92,7 @@ def check_sizes(parts):
 def warn_of_damage(part):
     """Say what could not be used of a file, in one warning a cause."""
     for line in part.damage:
-        warnings.warn(f'{part.source}: {line}', RecordingWarning, stacklevel=3)
+        warnings.warn(f'{escaped(part.source)}: {line}', RecordingWarning, stacklevel=3)
 
 
 def _is_bag(path):

@@ -37,3 +37,18 @@ def test_a_fault_is_borne(name, rig, tmp_path):
     row, = run_faults(GROUPS, tmp_path, [name], FEW[name] / count, rig=rig, progress=False,
                       patience=8.0)  # other tests, and other programs, run meanwhile
     assert row['held'] == row['tried'] > 0, row['why_not']
+
+
+def test_a_crash_is_not_taken_for_an_interpreter_that_was_interrupted(tmp_path, monkeypatch):
+    from experiments.faults.nodes import start_stop
+
+    class Crashes(start_stop.Attacked):
+        """Dies of another signal than it was sent."""
+
+        def end(self, number, patience):
+            self.process.kill()
+            return self.process.wait()
+
+    monkeypatch.setattr(start_stop, 'Attacked', Crashes)
+    why, _ = start_stop._one(tmp_path, 'sim_node', 1, 0.0, 0.0)
+    assert 'SIGKILL' in why

@@ -188,15 +188,15 @@ MEANING = ('A whole team, or a program with many threads, asks one predictor at 
            f'has a queue of {SERVICE_QOS.depth}, since DDS brings it the answers to all of them.')
 FAULTS = [
     *[Fault(f'clients-{count}', f'{count} clients at once', MEANING, ANSWERED, 10 * count, 0.03,
-            partial(many, clients=count), 'answers a second', '1/s')
+            partial(many, clients=count), 'answers a second', '1/s', 'least')
       for count in (12, 16, 64)],
     Fault('clients-16-default', f'16 clients at once with the default queue of {DEFAULT_DEPTH}',
           'As clients-16, without the deep queue that one client of many needs: where a busy '
           'machine keeps a client from taking what comes, DDS drops its answer.',
           ANSWERED, 1600, 0.03, partial(many, clients=16, depth=DEFAULT_DEPTH),
-          'answers a second', '1/s'),
+          'answers a second', '1/s', 'least'),
     Fault('clients-16-long', '16 clients for 10 min', MEANING, ANSWERED, 30_000, 0.02, for_long,
-          'answers a second', '1/s'),
+          'answers a second', '1/s', 'least'),
     Fault('clients-throughput', 'answers a second of 16 clients against one', 'Requests that wait '
           'are predicted together, so that many clients get more answers than one.',
           'At least 1.5 times as many.', 3, 32.0, throughput, 'ratio', '', 'median'),

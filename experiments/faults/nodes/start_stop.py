@@ -56,12 +56,12 @@ def _one(folder, name, trial, early_s, late_s):
     shutil.rmtree(bag, ignore_errors=True)
     if code is None:
         return f'did not end within {END_S:g} s of {number.name}', seconds
-    if not began and 'run_node' not in node.text and code is not None and (
-            code < 0 or 'KeyboardInterrupt' in node.text):
+    if not began and 'run_node' not in node.text and (
+            code == -number or 'KeyboardInterrupt' in node.text):
         return EARLY, seconds
     if 'Traceback' in node.text:
         return f'a traceback after {number.name}: {node.last_line()}', seconds
-    if code != 0 and (began or code > 0):
+    if code != 0:
         return f'{describe_exit(code)} after {number.name}', seconds
     return '', seconds
 
