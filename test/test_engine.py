@@ -140,7 +140,10 @@ def test_the_tasks_of_a_node_that_dies_run_on_another(cluster, tmp_path):
     tasks = [Task(str(i), write_slowly, (tmp_path / f'file{i}', 3.0)) for i in range(4)]
     for _, get in run_tasks(tasks, engine):
         get()
-        if len(cluster.workers) == 2:  # each has begun another task
+        if len(cluster.workers) == 2:
+            patience = time.monotonic() + 60
+            while len(list(tmp_path.glob('*.*'))) < 4 and time.monotonic() < patience:
+                time.sleep(0.02)  # until each node has begun another task
             cluster.remove_node(cluster.workers.pop(), allow_graceful=False)
     files = {path.name: path.read_text() for path in tmp_path.iterdir() if not path.suffix}
     assert files == {f'file{i}': f'file{i}' for i in range(4)}

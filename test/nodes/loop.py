@@ -100,8 +100,8 @@ class Loop:
             threading.Event().wait(0.1)
         raise AssertionError(response.message)
 
-    def predict(self, **fields):
-        return call(self.predict_client, PredictSubgoal.Request(**fields), 60)
+    def predict(self, timeout_s=60.0, **fields):
+        return call(self.predict_client, PredictSubgoal.Request(**fields), timeout_s)
 
     def reach(self, on_feedback=None, **fields):
         """Send a goal and wait for its end."""
