@@ -116,6 +116,7 @@ def cluster():
     """Start Ray with two nodes beside the head, which runs no task."""
     ray = pytest.importorskip('ray')
     from ray.cluster_utils import Cluster
+    before = os.environ.get('PYTHONPATH')
     os.environ['PYTHONPATH'] = os.pathsep.join([str(ROOT), str(ROOT / 'test')])
     cluster = Cluster(initialize_head=True, head_node_args={'num_cpus': 0})
     cluster.workers = [cluster.add_node(num_cpus=1) for _ in range(2)]
@@ -123,6 +124,9 @@ def cluster():
     yield cluster
     ray.shutdown()
     cluster.shutdown()
+    os.environ.pop('PYTHONPATH')
+    if before is not None:
+        os.environ['PYTHONPATH'] = before
 
 
 @pytest.mark.slow
