@@ -4,7 +4,9 @@
 
 from collections import deque
 import math
+import os
 import sys
+import threading
 import time
 import traceback
 
@@ -28,7 +30,7 @@ from tap_ros.nodes.predictor_setup import (
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import LATCHED
 from tap_ros.pictures import overlay
-from tap_ros.prediction.request_queue import Busy, RequestQueue
+from tap_ros.prediction.request_queue import Busy, RequestQueue, THREAD_NAME
 from tap_ros.text import escaped
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
@@ -176,7 +178,12 @@ class PredictorNode(Node):
 
 def main(args=None):
     """Run the node; the answer is the exit code of the process."""
-    return run_node(PredictorNode, 'predictor_node', args)
+    code = run_node(PredictorNode, 'predictor_node', args)
+    if any(thread.name == THREAD_NAME for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)  # Python would abort if it ended while that thread is in C++
+    return code
 
 
 if __name__ == '__main__':

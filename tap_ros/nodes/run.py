@@ -20,6 +20,10 @@ from tap_ros.nodes.middleware import configure_fast_dds
 from tap_ros.text import escaped
 
 
+class _Ended(BaseException):
+    """A signal came while the node started."""
+
+
 def run_node(make_node, name, args=None, num_threads=1):
     """
     Run one node until SIGINT, SIGTERM, or its terminal is closed.
@@ -39,7 +43,7 @@ def run_node(make_node, name, args=None, num_threads=1):
     node = executor = heartbeat = None
     code = 0
     try:
-        _handle_signals(signal.default_int_handler)
+        _handle_signals(_end)
         configure_fast_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
@@ -50,7 +54,7 @@ def run_node(make_node, name, args=None, num_threads=1):
         heartbeat = Heartbeat(node)
         while rclpy.ok() and not stop.is_set():
             _spin_once(executor, node)
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except (_Ended, KeyboardInterrupt, ExternalShutdownException):
         pass
     except TapError as error:
         rclpy.logging.get_logger(name).fatal(escaped(error, 1000))
@@ -92,6 +96,12 @@ def answering(node, callback):
                 message=f'internal error: {type(error).__name__}: {escaped(error)}')
 
     return answer
+
+
+def _end(*_):
+    # Not KeyboardInterrupt: after one that leaves an exec(), as in making a dataclass, Python ends
+    # by SIGINT even where it was caught.
+    raise _Ended
 
 
 def _handle_signals(handler):

@@ -7,6 +7,7 @@ import time
 
 from sensor_msgs.msg import Image, JointState
 from tap_msgs.msg import Episode, ObjectStates
+from tap_ros.errors import PlanningError
 from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
 from tap_ros.nodes.observations import JUMP_NS, Observations
@@ -40,6 +41,7 @@ class Sight:
     def begin(self, since):
         """Begin a goal: only what is received from this monotonic time on is seen."""
         self._since, self._seen, self.messages = since, None, {}
+        self._publishers = self._count_publishers()
 
     def look(self, topics):
         """
@@ -49,6 +51,7 @@ class Sight:
         :return: Seen, or None when nothing was; which sensors are silent, '' if none is.
         :raises TapError: for messages that cannot be used.
         """
+        self._check_publishers()
         moment = self.sensors.moment(topics, since=self._since)
         lacking = self._lacking(topics)
         if moment is None:
@@ -97,6 +100,17 @@ class Sight:
         ages = self.sensors.ages(topics, time.monotonic())
         silent = [topic for topic in topics if ages[topic] > self._params['max_silence']]
         return f'nothing new has come on {self._names(silent)}' if silent else ''
+
+    def _count_publishers(self):
+        return {topic: self._node.count_publishers(name) for topic, (_, name) in TOPICS.items()}
+
+    def _check_publishers(self):
+        """Refuse to go on by two cameras that take turns; their stamps need not differ."""
+        for topic, count in self._count_publishers().items():
+            if count > max(self._publishers[topic], 1):
+                raise PlanningError(
+                    f'the scene has changed: {count} nodes publish on {self._names([topic])} '
+                    'now; leave one, and send the goal again')
 
     def _names(self, topics):
         return ', '.join(self._node.resolve_topic_name(TOPICS[topic][1]) for topic in topics)

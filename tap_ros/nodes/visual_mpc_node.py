@@ -119,7 +119,7 @@ class VisualMpcNode(Node):
             handle.succeed()
         except Cancelled as error:
             result.message = str(error)
-            if self._cancelled is handle and cancel_is_known(handle):
+            if self._is_cancelled(handle) and cancel_is_known(handle):
                 handle.canceled()
             else:
                 handle.abort()
@@ -197,12 +197,15 @@ class VisualMpcNode(Node):
         return ReachConfig(request.step_budget, params['switch'], params['goal_tolerance'],
                            follower, limits, params['max_age'], params['image_timeout'])
 
+    def _is_cancelled(self, handle):
+        return self._cancelled is handle or handle.is_cancel_requested
+
     def _cancelled_or_ending(self, handle):
-        return self._cancelled is handle or self._ending
+        return self._is_cancelled(handle) or self._ending
 
     def _go_on(self, handle):
         if self._cancelled_or_ending(handle):
-            raise Cancelled('cancelled' if self._cancelled is handle else 'the node is ending')
+            raise Cancelled('cancelled' if self._is_cancelled(handle) else 'the node is ending')
 
     # Where to go
 

@@ -9,6 +9,7 @@ import traceback
 
 from tap_ros.errors import TapError
 
+THREAD_NAME = 'request queue'
 PREPARE_TIMEOUT = 8.0  # s that an interrupted start waits for what it was preparing
 
 
@@ -40,7 +41,7 @@ class RequestQueue:
         self._ending = False
         prepared = Future()
         self._thread = threading.Thread(
-            target=self._run, args=(prepare, prepared), name='request queue', daemon=True)
+            target=self._run, args=(prepare, prepared), name=THREAD_NAME, daemon=True)
         try:
             self._thread.start()
             prepared.result()

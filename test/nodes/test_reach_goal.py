@@ -18,6 +18,7 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.srv import ResetScene
 from tap_ros.learning.weights import save_weights
 from tap_ros.nodes.clients import call, CallError, cancel_goal, send_goal, wait_for_result
+from tap_ros.nodes.topics import STREAM
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
@@ -104,7 +105,7 @@ def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
     ({'step_budget': 100_000}, ['step_budget', '100000', '1000']),
     ({'seed': -1}, ['seed', '-1']),
     ({'recursion_depth': 99}, ['/predict_subgoal', 'recursion_depth', '99', '1 to 8']),
-    ({'num_samples': 1000}, ['/predict_subgoal', 'num_samples', '1000', '1 to 100']),
+    ({'num_samples': 1000}, ['num_samples', '1000', 'at most 64']),
     ({'goal_image': Image(width=64, height=64, encoding='nope')}, ['goal', 'nope', 'rgb8']),
 ])
 def test_a_bad_goal_is_aborted_with_the_reason_and_moves_nothing(loop, fields, words):
@@ -143,6 +144,22 @@ def test_a_reset_during_a_goal_aborts_it(loop):
     call(loop.reset_client, ResetScene.Request(task='push2', seed=SEED + 1), 30)
     status, result = wait_for_result(handle, 60)
     assert status == GoalStatus.STATUS_ABORTED and 'the scene has changed' in result.message
+    assert loop.stopped()
+
+
+def test_a_second_camera_during_a_goal_aborts_it(loop):
+    loop.reset()
+    moving = threading.Event()
+    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
+                       lambda feedback: moving.set())
+    assert moving.wait(120)
+    publisher = loop.node.create_publisher(Image, 'camera/image_raw', STREAM)
+    try:
+        status, result = wait_for_result(handle, 60)
+    finally:
+        loop.node.destroy_publisher(publisher)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert '2 nodes publish on /camera/image_raw' in result.message
     assert loop.stopped()
 
 
@@ -199,6 +216,7 @@ def test_when_the_predictor_dies_the_arm_stays_and_the_planner_lives(loop):
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     loop.start('predictor_node')
     loop.processes['predictor_node'].wait_for('ready', 120)
+    assert loop.predictor_alive.wait_until_alive(30)
     loop.wait_until_seen()
 
 
