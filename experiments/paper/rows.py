@@ -12,6 +12,7 @@ import re
 
 from experiments.paper.runs import VARIANTS
 import numpy as np
+import pandas as pd
 from tap_ros.evaluation.bottleneck import THRESHOLDS, VISIBLE
 from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.prediction.methods import parse_method
@@ -23,6 +24,8 @@ SPREADS = ('sample_spread', 'sample_spread_near', 'sample_spread_elsewhere', 'sa
 RESAMPLES = 1000
 BESIDE = 0.1  # a match within this share of the episode from an input lies beside it
 _DIGITS = 6
+COLUMNS = ['task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n', 'seeds', 'scale',
+           'command', 'new_pixels', 'of', 'baseline']
 
 
 @dataclass(frozen=True)
@@ -295,19 +298,38 @@ def lower_hull(at, points):
     return np.where(np.isfinite(lowest), lowest, np.nan)
 
 
+def as_frame(rows):
+    """
+    Make a table of rows, for the functions below and for all that shows them.
+
+    :param rows: of make_rows.
+    :return: DataFrame; new_pixels is NA for copying.
+    """
+    return pd.DataFrame(rows, columns=COLUMNS).astype({'new_pixels': 'boolean'})
+
+
+def select(rows, task, mode, new_pixels=True):
+    """Choose the rows (of as_frame) of one setting; those of copying belong to both variants."""
+    return rows[(rows['task'] == task) & (rows['mode'] == mode)
+                & (rows['new_pixels'] == new_pixels).fillna(True)]
+
+
+def of_metric(rows, metric, methods):
+    """Return a line of a metric for each method, indexed by it; lines of NaN where none is."""
+    return rows[rows['metric'] == metric].set_index('method').reindex(methods)
+
+
 def find(rows, **wanted):
     """
     Find a row.
 
-    :param rows: of make_rows.
+    :param rows: of as_frame.
     :param wanted: the values of its keys; a row without new_pixels fits any.
-    :return: the first row that fits, or None.
+    :return: dict, the first row that fits, or None.
     """
-    for row in rows:
-        if all(row.get(name, value if name == 'new_pixels' else None) == value
-               for name, value in wanted.items()):
-            return row
-    return None
+    for name, value in wanted.items():
+        rows = rows[(rows[name] == value).fillna(name == 'new_pixels')]
+    return None if rows.empty else rows.iloc[0].dropna().to_dict()
 
 
 def variant_of(method):
