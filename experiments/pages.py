@@ -45,7 +45,8 @@ def number(values, digits=4, unit=1, sign=''):
     :param sign: '+' to write that, too.
     :return: Series of strings.
     """
-    return (values * unit).map(f'{{:{sign}.{digits}f}}'.format, na_action='ignore').astype('str')
+    texts = (values * unit).map(f'{{:{sign}.{digits}f}}'.format, na_action='ignore')
+    return texts.astype('string')
 
 
 def interval(rows, digits=4, unit=1, sign='', after='', form='{}{} ({} to {})'):

@@ -85,10 +85,9 @@ def _maps(rows):
     """Tabulate the errors of the forward model's maps; empty without rows."""
     if rows.empty:
         return rows
-    cells = _interval(rows, digits=2) + ', n = ' + rows['n'].astype('str')
-    table = rows.assign(cell=cells, step='step ' + rows['step'].astype('str'))
-    table = table.set_index(['task', 'method', 'step'])['cell'].unstack(sort=False)
-    return table.rename_axis(index=['recording', '']).reset_index()
+    rows = rows.assign(cell=_interval(rows, digits=2) + ', n = ' + rows['n'].astype('string'))
+    table = rows.pivot(index=['task', 'method'], columns='step', values='cell')
+    return table.add_prefix('step ').rename_axis(index=['recording', '']).reset_index()
 
 
 def _rank(method):
