@@ -23,6 +23,8 @@ from experiments.paper.tables import (
 import pandas as pd
 from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.evaluation.bottleneck import MIN_MOTION
+from tap_ros.evaluation.samples import NEAR
+from tap_ros.prediction.losses import CHANGED
 
 SETTINGS = ('margin', 'outer_power', 'goal_picture', 'learning_rate', 'gan_weight', 'kl_weight',
             'pretrain_steps')  # may differ between the methods of a scale, see runs.py
@@ -51,7 +53,7 @@ def make_page(rows, runs, left_out, scales, pictures, findings=''):
              for scale in scales]
     return render('paper/templates/results.md.j2', scales=parts, left_out=left_out,
                   findings=findings.strip(), equal=EQUAL, min_motion=MIN_MOTION,
-                  published=BOTTLENECK_2PX)
+                  published=BOTTLENECK_2PX, changed=CHANGED, near=NEAR)
 
 
 def _of_scale(scale, rows, runs, pictures, scales):
@@ -154,7 +156,7 @@ def _verdicts(rows):
         if best and other:
             yield title, ('below' if best['ci_high'] < other['ci_low'] else
                           'above' if best['ci_low'] > other['ci_high'] else
-                          'not clearly apart from'), other['method']
+                          'not significantly different from'), other['method']
 
 
 def _grids(scale, scales, pictures):

@@ -8,6 +8,7 @@ from experiments.pages import interval, number, render
 from experiments.paper.published import PLANNING_BOUNDS, TABLE_2
 from experiments.planning.methods import BOUNDS
 import pandas as pd
+from tap_ros.planning.forward_scores import MOVED_PIXELS
 
 TITLES = {'push2': 'Two objects', 'push3': 'Three objects'}
 PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward model',
@@ -37,7 +38,7 @@ def make_page(rows, strips, maps=(), findings=''):
         'strips': [(method, *strip) for (of, method), strip in strips.items() if of == task],
     } for task, own in rows.groupby('task', sort=False)]
     return render('planning/templates/planning.md.j2', tasks=tasks, findings=findings,
-                  commands=rows['command'].unique(), map_table=_maps(maps),
+                  commands=rows['command'].unique(), map_table=_maps(maps), moved=MOVED_PIXELS,
                   map_commands=[] if maps.empty else maps['command'].unique())
 
 
