@@ -4,20 +4,14 @@
 
 import io
 
+from experiments.paper.names import COPIES, method_order, variant_of
 from experiments.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
     GAINS,
     TITLES,
 )
-from experiments.paper.rows import (
-    COPIES,
-    find,
-    lower_hull,
-    method_order,
-    select,
-    variant_of,
-)
+from experiments.paper.rows import find, lower_hull, select
 from matplotlib.figure import Figure
 import numpy as np
 from tap_ros.contract import EPISODE_FRAMES

@@ -8,8 +8,9 @@ Sentences that judge depend on the numbers; what a person has to say stands in f
 
 from experiments.pages import render
 from experiments.paper.figures import file_name
+from experiments.paper.names import BEST, method_order
 from experiments.paper.published import BOTTLENECK_2PX, TITLES
-from experiments.paper.rows import BEST, find, method_order
+from experiments.paper.rows import find
 from experiments.paper.runs import paper_runs
 from experiments.paper.tables import (
     best_table,

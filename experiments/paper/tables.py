@@ -7,6 +7,7 @@ Their rows are those of rows.as_frame, of one scale.
 """
 
 from experiments.pages import interval, number
+from experiments.paper.names import BEST, best_of_name, COPIES, method_order
 from experiments.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
@@ -14,14 +15,7 @@ from experiments.paper.published import (
     TABLE_1,
     TITLES,
 )
-from experiments.paper.rows import (
-    BEST,
-    best_of_name,
-    COPIES,
-    method_order,
-    of_metric,
-    select,
-)
+from experiments.paper.rows import of_metric, select
 from experiments.paper.runs import paper_runs
 import pandas as pd
 from tap_ros.evaluation.bottleneck import THRESHOLDS

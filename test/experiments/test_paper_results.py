@@ -4,6 +4,7 @@
 
 import json
 
+from experiments.paper.names import best_of_name, method_order
 from experiments.paper.results import (
     load_runs,
     on_same_recordings,
@@ -12,13 +13,11 @@ from experiments.paper.results import (
 )
 from experiments.paper.rows import (
     as_frame,
-    best_of_name,
     COLUMNS,
     find,
     group_runs,
     lower_hull,
     make_rows,
-    method_order,
 )
 from made_runs import EPISODES, made_run, save_runs, scores
 import numpy as np
