@@ -23,6 +23,7 @@ from tap_ros.errors import TapError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
+from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
@@ -113,7 +114,7 @@ class SimNode(Node):
             return
         self._opening = min(max(message.data, 0.0), 1.0)
 
-    def _on_twist(self, message):
+    def _on_twist(self, message, info):
         self._diagnostics.received('arm/delta_twist_cmds')
         stamp_ns = to_nanoseconds(message.header.stamp)
         move = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
@@ -135,7 +136,8 @@ class SimNode(Node):
             self._step(move)
         else:
             self._twist = move
-            self._valid_until = time.monotonic() + self._timeout / self.params['real_time_factor']
+            self._valid_until = (reception_time(info)
+                                 + self._timeout / self.params['real_time_factor'])
 
     def _on_timeout(self, message):
         if not 0 < message.data <= MAX_TIMEOUT:
