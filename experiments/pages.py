@@ -21,16 +21,18 @@ def render(template, **values):
     return re.sub(r'\n{3,}', '\n\n', text.strip('\n')) + '\n'
 
 
-def markdown(table, left=1, missing='-'):
+def markdown(table, left=1, missing='-', also_left=()):
     """
     Write a table.
 
     :param table: DataFrame; its index is not shown.
     :param left: so many columns are aligned to the left, the others to the right.
     :param missing: stands in cells that have nothing.
+    :param also_left: names of further columns that are aligned to the left.
     """
     cells = table.astype(object).where(table.notna(), missing)
-    rule = ['---'] * left + ['---:'] * (table.shape[1] - left)
+    rule = ['---' if i < left or name in also_left else '---:'
+            for i, name in enumerate(table.columns)]
     return '\n'.join(f'| {" | ".join(map(str, line))} |'
                      for line in [table.columns, rule, *cells.to_numpy()])
 
