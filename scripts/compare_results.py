@@ -20,7 +20,10 @@ import subprocess
 import sys
 import tempfile
 
+from geometry_msgs.msg import TwistStamped
 from mcap.reader import make_reader
+import numpy as np
+from rclpy.serialization import deserialize_message
 from safetensors.numpy import load_file
 from tqdm import tqdm
 
@@ -72,7 +75,12 @@ def digest(out):
         if path.suffix == '.mcap':
             with path.open('rb') as file:
                 for _, channel, message in make_reader(file).iter_messages():
-                    parts.update(f'{channel.topic} {message.log_time}'.encode() + message.data)
+                    data = message.data
+                    if channel.topic.endswith('twist_cmds'):
+                        linear = deserialize_message(data, TwistStamped).twist.linear
+                        # 0.0 and -0.0 are the same command
+                        data = np.array([linear.x, linear.y, linear.z]) + 0.0
+                    parts.update(f'{channel.topic} {message.log_time}'.encode() + bytes(data))
         elif path.suffix == '.safetensors':
             for name, tensor in sorted(load_file(path).items()):
                 parts.update(name.encode() + tensor.tobytes())

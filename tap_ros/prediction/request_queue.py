@@ -9,6 +9,8 @@ import traceback
 
 from tap_ros.errors import TapError
 
+PREPARE_TIMEOUT = 8.0  # s that an interrupted start waits for what it was preparing
+
 
 class Busy(TapError):
     """A request cannot wait: too many do already, or nobody answers any more."""
@@ -39,8 +41,16 @@ class RequestQueue:
         prepared = Future()
         self._thread = threading.Thread(
             target=self._run, args=(prepare, prepared), name='request queue', daemon=True)
-        self._thread.start()
-        prepared.result()
+        try:
+            self._thread.start()
+            prepared.result()
+        except BaseException:
+            # Interrupted: Python would abort if it ended while this thread is in C++.
+            with self._changed:
+                self._ending = True
+            if self._thread.is_alive():
+                self._thread.join(PREPARE_TIMEOUT)
+            raise
 
     def __len__(self):
         """Return how many requests wait."""
