@@ -41,6 +41,7 @@ COMMANDS = {  # command: (one line of help, module or {what: module})
                 'tap_ros.evaluation.inspect_files'),
 }
 TRAIN_DEFAULT = 'predictor'
+EXTRAS = ('jinja2', 'pandas')  # what only experiments/ needs
 
 
 def main(arguments=None):
@@ -56,6 +57,13 @@ def main(arguments=None):
         return args.run(args) or 0
     except TapError as error:
         print(f'error: {escaped(error, 2000)}', file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        print(f'error: {error.name} is not installed; type `pip install -r '
+              'requirements-experiments.txt` (`make build` has done it), or, with ROS 2 from apt, '
+              f'`sudo apt install python3-{error.name}`', file=sys.stderr)
         return 1
     except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush

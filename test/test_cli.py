@@ -3,9 +3,10 @@
 """The command line: help, errors, and what needs no ROS."""
 
 from pathlib import Path
+import sys
 
 import pytest
-from tap_ros.cli import main
+from tap_ros.cli import COMMANDS, main
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
@@ -68,3 +69,14 @@ def test_names_of_files_do_not_reach_the_terminal_raw(tmp_path, capsys):
     output = ''.join(capsys.readouterr())
     assert r'a\n\x1b[31mFORGED.mcap' in output and '\x1b' not in output
     assert len(output.splitlines()) == 1
+
+
+def test_a_missing_package_of_the_experiments_is_named_and_others_are_not_hidden(
+        capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pandas', None)
+    for name in ('pandas', 'no_such_module'):
+        monkeypatch.setitem(COMMANDS, name, ('', name))
+    assert main(['pandas']) == 1
+    assert 'requirements-experiments.txt' in capsys.readouterr().err
+    with pytest.raises(ModuleNotFoundError):
+        main(['no_such_module'])

@@ -8,6 +8,8 @@ from pathlib import Path
 import platform
 import time
 
+from experiments.pages import number, render
+import pandas as pd
 from tap_ros.engine import Engine, ENGINES, run_tasks, Task
 from tap_ros.files import write_atomically, write_rows
 
@@ -15,24 +17,6 @@ FEW, MANY = 50, 1050  # tasks that do nothing
 SLEEP_S = 0.1
 SLEEPS = 20  # tasks that sleep, for each worker
 MACHINES, CORES, EPISODES, PER_FILE, EPISODE_S = 100, 2, 10_000, 25, 0.23
-PAGE = """# Engines
-
-`python -m tap_ros bench engine --write`; {machine}. Rows with more workers than cores say what the
-engine itself costs; real work would share the cores.
-
-| engine | workers | a task that does nothing | start to the first end | sleeping tasks |
-|---|---|---|---|---|
-{rows}
-
-Sleeping tasks of {sleep:g} s: their time divided by the ideal, from the first end on. With Ray the
-start of the other workers is in it.
-
-**What that means for {episodes} episodes on {machines} machines of {cores} cores.** `collect` has
-{files} tasks of {per_file} episodes, about {task_s:.1f} s each ({episode_s:g} s an episode, from
-`bench collect`), so each of {workers} workers has {rounds} at most. With the figures of the last
-row the work takes {work_s:.0f} s, starting {start_s:.0f} s and handing out all tasks
-{hand_s:.1f} s: about {share:.0%} of the time is work. This is a calculation; nobody has run it.
-"""
 
 
 def add_arguments(parser):
@@ -91,18 +75,18 @@ def _nothing():
 
 
 def make_page(rows):
-    """Return the page, as Markdown."""
-    table = '\n'.join(
-        f'| {row["engine"]} | {row["workers"]} | {row["task_ms"]:.2f} ms | {row["start_s"]:.1f} s '
-        f'| {row["sleeping"]:.2f} |' for row in rows)
-    files, workers = EPISODES // PER_FILE, MACHINES * CORES
+    """Return the page, as Markdown, from the rows of measure."""
+    rows = pd.DataFrame(rows)
+    table = pd.DataFrame({
+        'engine': rows['engine'], 'workers': rows['workers'],
+        'a task that does nothing': number(rows['task_ms'], 2) + ' ms',
+        'start to the first end': number(rows['start_s'], 1) + ' s',
+        'sleeping tasks': number(rows['sleeping'], 2)})
+    last, files, workers = rows.iloc[-1], EPISODES // PER_FILE, MACHINES * CORES
     rounds, task_s = math.ceil(files / workers), PER_FILE * EPISODE_S
-    hand_s = files * rows[-1]['task_ms'] / 1e3
-    work_s = rounds * task_s
-    return PAGE.format(
-        machine=f'{len(os.sched_getaffinity(0))} cores ({platform.machine()}), Python '
-        f'{platform.python_version()}', rows=table, sleep=SLEEP_S, episodes=EPISODES,
-        machines=MACHINES, cores=CORES, files=files, per_file=PER_FILE, task_s=task_s,
-        episode_s=EPISODE_S, workers=workers, rounds=rounds, work_s=work_s,
-        start_s=rows[-1]['start_s'], hand_s=hand_s,
-        share=work_s / (work_s + rows[-1]['start_s'] + hand_s))
+    return render(
+        'bench/templates/engine.md.j2', table=table, sleep=SLEEP_S, episodes=EPISODES,
+        cores_here=len(os.sched_getaffinity(0)), processor=platform.machine(),
+        python=platform.python_version(), machines=MACHINES, cores=CORES, files=files,
+        per_file=PER_FILE, task_s=task_s, episode_s=EPISODE_S, workers=workers, rounds=rounds,
+        work_s=rounds * task_s, start_s=last['start_s'], hand_s=files * last['task_ms'] / 1e3)

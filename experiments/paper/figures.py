@@ -4,19 +4,14 @@
 
 import io
 
+from experiments.paper.names import COPIES, method_order, variant_of
 from experiments.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
     GAINS,
     TITLES,
 )
-from experiments.paper.rows import (
-    COPIES,
-    find,
-    lower_hull,
-    method_order,
-    variant_of,
-)
+from experiments.paper.rows import find, lower_hull, select
 from matplotlib.figure import Figure
 import numpy as np
 from tap_ros.contract import EPISODE_FRAMES
@@ -94,21 +89,19 @@ def forward_scatter(rows, task='grasp'):
     """
     Draw error against match-step in forward prediction, ours beside the authors' (Fig. 4).
 
-    :param rows: of one scale.
+    :param rows: of rows.as_frame, of one scale.
     :param task: whose.
     :return: bytes of a PNG, or None without such rows.
     """
+    own = select(rows, task, 'forward')
+    own = own[~own['method'].isin(COPIES)]
+    errors, steps = (own[own['metric'] == metric].set_index('method')
+                     for metric in ('min_l1', 'match_step'))
     ours = {}  # a panel for each variant: errors are compared with fix of the same one
-    for row in rows:
-        if (row['metric'], row['task'], row['mode']) == ('min_l1', task, 'forward'):
-            if row['method'] in COPIES or not row['new_pixels']:
-                continue
-            step = find(rows, **{name: row[name] for name in (
-                'task', 'mode', 'method', 'new_pixels')}, metric='match_step')
-            if step:
-                variant = variant_of(row['method'])
-                ours.setdefault(variant, {})[row['method'].removesuffix(variant)] = (
-                    step['value'], row['value'], step, row)
+    for method in errors.index.intersection(steps.index):
+        error, step, variant = errors.loc[method], steps.loc[method], variant_of(method)
+        ours.setdefault(variant, {})[method.removesuffix(variant)] = (
+            step['value'], error['value'], step, error)
     if not ours:
         return None
     panels = [(f'ours {variant}'.strip(), ours[variant]) for variant in sorted(ours)]
@@ -160,14 +153,14 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
 
     On the left as in the paper, on the right without predictions that leave out an object.
 
-    :param rows: of one scale.
+    :param rows: of rows.as_frame, of one scale.
     :param task: whose.
     :param new_pixels: which variant; the paper's curve is of the one without.
     :return: bytes of a PNG, or None without such rows.
     """
-    methods = sorted({row['method'] for row in rows if row['mode'] == 'bidirectional' and (
-        row['metric'], row['task']) == ('bottleneck_frequency_0px', task)
-        and row.get('new_pixels', new_pixels) == new_pixels}, key=method_order)
+    own = select(rows, task, 'bidirectional', new_pixels)
+    methods = sorted(own['method'][own['metric'] == 'bottleneck_frequency_0px'],
+                     key=method_order)
     if not set(methods) - set(COPIES):
         return None
     figure, axes = _new_figure(4.2, 2, sharey=True)
@@ -176,12 +169,10 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
             ': bottleneck frequency', ', no object left out')):
         ends = {}
         for method in methods:
-            points = [find(rows, task=task, mode='bidirectional', method=method,
-                           new_pixels=new_pixels,
-                           metric=f'{prefix}bottleneck_frequency_{threshold}px')
-                      for threshold in THRESHOLDS]
-            value, low, high = (np.array([100 * p[name] for p in points])
-                                for name in ('value', 'ci_low', 'ci_high'))
+            points = 100 * own[own['method'] == method].set_index('metric').loc[
+                [f'{prefix}bottleneck_frequency_{threshold}px' for threshold in THRESHOLDS],
+                ['value', 'ci_low', 'ci_high']].to_numpy(float)
+            value, low, high = points.T
             colour = COLOURS[family(method)]
             axis.fill_between(THRESHOLDS, low, high, color=colour, alpha=0.10, linewidth=0)
             axis.plot(THRESHOLDS, value, linestyle=styles[method], color=colour, linewidth=1.8)
@@ -225,16 +216,16 @@ def gains(rows):
 
     Dots compare with fix, squares with fixed-time prediction at the same match-step.
 
-    :param rows: of one scale.
+    :param rows: of rows.as_frame, of one scale.
     :return: bytes of a PNG, or None without such rows.
     """
     markers = {'gain_over_fix': 'o', 'gain_over_fix_at_match_step': 's'}
-    chosen = [row for row in rows if row['metric'] in markers
-              and row['mode'] == 'bidirectional' and row.get('new_pixels', True)]
-    if not chosen:
+    chosen = rows[rows['metric'].isin(markers) & (rows['mode'] == 'bidirectional')
+                  & rows['new_pixels'].fillna(True)]
+    if chosen.empty:
         return None
-    tasks = [task for task in TITLES if any(row['task'] == task for row in chosen)]
-    methods = sorted({row['method'] for row in chosen}, key=method_order)
+    tasks = [task for task in TITLES if task in set(chosen['task'])]
+    methods = sorted(set(chosen['method']), key=method_order)
     figure, axes = _new_figure(1.3 + 0.27 * len(methods), len(tasks), sharey=True)
     for axis, task in zip(axes[0], tasks):
         axis.axvline(0, color='#a0a0a0', linewidth=1)

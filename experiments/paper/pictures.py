@@ -12,8 +12,8 @@ from pathlib import Path
 import re
 
 from experiments.paper.figures import COLOURS, family, file_name
+from experiments.paper.names import method_order
 from experiments.paper.published import TITLES
-from experiments.paper.rows import method_order
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np

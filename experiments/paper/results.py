@@ -9,7 +9,7 @@ from pathlib import Path
 from experiments.paper import figures
 from experiments.paper.page import make_page
 from experiments.paper.pictures import write_grids
-from experiments.paper.rows import group_runs, make_rows
+from experiments.paper.rows import as_frame, group_runs, make_rows
 from experiments.paper.runs import label
 from tap_ros.errors import ConfigError
 from tap_ros.files import write_atomically, write_rows
@@ -85,14 +85,15 @@ def write_results(folder='docs/results', runs='runs/paper', recordings='bags', p
     groups = group_runs(kept)
     rows = make_rows(groups)
     write_rows(folder / 'prediction.json', told_apart(rows))
+    frame = as_frame(rows)
     scales = [scale for scale in SCALES if any(run['scale'] == scale for run in kept)]
     for scale in scales:
-        _write_plots(folder, scale, rows, groups)
+        _write_plots(folder, scale, frame, groups)
         if pictures:
             write_grids(folder, [run for run in kept if run['scale'] == scale],
                         Path(runs) / scale, recordings)
     findings = folder / 'findings.md'
-    page = make_page(rows, kept, left_out, scales, sorted(p.name for p in folder.glob('*.png')),
+    page = make_page(frame, kept, left_out, scales, sorted(p.name for p in folder.glob('*.png')),
                      findings.read_text() if findings.exists() else '')
     write_atomically(folder / 'README.md', page)
     return rows
@@ -119,7 +120,7 @@ def told_apart(rows):
 
 def _write_plots(folder, scale, rows, groups):
     """Draw the plots of a scale; remove those that have nothing to show any more."""
-    rows = [row for row in rows if row['scale'] == scale]
+    rows = rows[rows['scale'] == scale]
     groups = [group for group in groups if group.key['scale'] == scale]
     plots = {
         'forward_scatter': figures.forward_scatter(rows),

@@ -10,19 +10,20 @@ are averaged, episode by episode; the interval does not tell how far another tra
 from dataclasses import dataclass
 import re
 
-from experiments.paper.runs import VARIANTS
+from experiments.paper.names import BEST, best_of_name, COPIES, variant_of
 import numpy as np
+import pandas as pd
 from tap_ros.evaluation.bottleneck import THRESHOLDS, VISIBLE
 from tap_ros.evaluation.intervals import bootstrap
-from tap_ros.prediction.methods import parse_method
 
-COPIES = ('copy-start', 'copy-goal')
-BEST = 'best-of-100'
 # Of the samples of a VAE.
 SPREADS = ('sample_spread', 'sample_spread_near', 'sample_spread_elsewhere', 'sample_spread_px')
 RESAMPLES = 1000
 BESIDE = 0.1  # a match within this share of the episode from an input lies beside it
 _DIGITS = 6
+_NONE = np.empty((1, 0))
+COLUMNS = ['task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n', 'seeds', 'scale',
+           'command', 'new_pixels', 'of', 'baseline']
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Group:
     Runs that differ by the seed only; all scored on the same N episodes.
 
     :param key: dict of task, mode, method, scale and, where something was trained, new_pixels.
-    :param scores: dict of float arrays (S, N), a row for each run; bottleneck only if defined.
+    :param scores: dict of float arrays (S, N), a row for each run; NaN where undefined.
     :param command: makes the runs.
     :param data_hash: of the recordings.
     :param of: for the best of 100, the method that was sampled from.
@@ -42,22 +43,6 @@ class Group:
     command: str
     data_hash: str
     of: str = ''
-
-
-def best_of_name(method):
-    """
-    Name the best of 100 samples of a method.
-
-    The paper's genmin + vae is its Eq. 10, with GAN: genmin-vae-gan here. So its samples are those
-    of genmin-vae-best-of-100; those of the CVAE without GAN (Eq. 9), genmin-vae here, are of
-    genmin-vae-wo-gan-best-of-100.
-
-    :param method: name of a method with a VAE.
-    :return: for example 'genmin-vae-best-of-100', with +relative or the like at its end.
-    """
-    stem, plus, suffix = method.partition('+')
-    stem = stem.removesuffix('-gan') if stem.endswith('-vae-gan') else f'{stem}-wo-gan'
-    return f'{stem}-{BEST}{plus}{suffix}'
 
 
 def group_runs(runs):
@@ -93,18 +78,11 @@ def _group(key, runs, part, of=''):
                               'bottleneck', 'object_mass')
              if all(name in part for part in parts)]
     scores = {name: np.array([part[name] for part in parts], float) for name in names}
-    if not np.isfinite(scores.get('bottleneck', np.nan)).any():
-        scores.pop('bottleneck', None)
     for name in (*SPREADS, 'target_bottleneck') if part == 'prediction' else ():
         if all(name in run['evaluation'] for run in runs):
             scores[name] = np.array([run['evaluation'][name] for run in runs], float)
     command = ' && '.join(run['command'] for run in runs)
     return Group(key, scores, command, runs[0]['data']['hash'], of)
-
-
-def _over_seeds(statistic):
-    """Make a statistic of (S, ..., N) from one along the last axis: its mean over the seeds."""
-    return lambda array: statistic(array).mean(0)
 
 
 def make_rows(groups):
@@ -121,56 +99,34 @@ def make_rows(groups):
         visible_bottleneck_frequency no object may be left out, see bottleneck.VISIBLE;
         target_bottleneck_frequency is that of the true frames at a fixed time.
     """
-    rows = []
-    for group in groups:
-        scores = group.scores
-        for metric in ('min_l1', 'match_step', 'match_fraction'):
-            if metric in scores:
-                rows.append(_row(group, metric, _over_seeds(_mean), scores[metric]))
-        if 'match_step' in scores:
-            rows.append(_row(group, 'match_step_std', _over_seeds(_std), scores['match_step']))
-            share = scores['match_fraction']
-            beside = share < BESIDE
-            if group.key['mode'] == 'bidirectional':
-                beside |= share > 1 - BESIDE
-            rows.append(_row(group, 'match_beside_input', _over_seeds(_mean), beside))
-        for metric in ('changed_l1', *SPREADS):  # not known of every episode
-            known = _known(scores, metric)
-            if known.size:
-                rows.append(_row(group, metric, _over_seeds(_mean), known))
-        if 'bottleneck' in scores and not group.key.get('new_pixels'):
-            defined = np.isfinite(scores['bottleneck']).all(0)
-            placed = scores['bottleneck'][:, defined]
-            visible = scores['object_mass'][:, defined] >= VISIBLE
-            for threshold in THRESHOLDS:
-                rows.append(_row(group, f'bottleneck_frequency_{threshold}px', _over_seeds(_mean),
-                                 placed <= threshold))
-                rows.append(_row(group, f'visible_bottleneck_frequency_{threshold}px',
-                                 _over_seeds(_mean), (placed <= threshold) & visible))
-            rows.append(_row(group, 'bottleneck_median_px', _over_seeds(_median), placed))
-        target = _known(scores, 'target_bottleneck')
-        if target.size and not group.key.get('new_pixels'):
-            rows.append(_row(group, 'target_bottleneck_frequency_2px', _over_seeds(_mean),
-                             target <= 2))
+    rows = [_row(group, metric, lambda array, statistic=statistic: statistic(array, -1).mean(0),
+                 values) for group in groups for metric, statistic, values in _measures(group)
+            if values.size]
     return rows + _gain_rows(groups) + _equal_gain_rows(groups)
 
 
-def _known(scores, name):
-    """Return the scores (S, N') of the episodes that have them; N' is 0 where there are none."""
-    values = scores.get(name, np.empty((1, 0)))
-    return values[:, np.isfinite(values).all(0)]
-
-
-def _mean(values):
-    return values.mean(-1)
-
-
-def _std(values):
-    return values.std(-1)
-
-
-def _median(values):
-    return np.median(values, -1)
+def _measures(group):
+    """Yield the name, the statistic over episodes and the values (S, N) of each metric."""
+    known = {name: values[:, np.isfinite(values).all(0)] for name, values in group.scores.items()}
+    for metric in ('min_l1', 'match_step', 'match_fraction'):
+        yield metric, np.mean, known.get(metric, _NONE)
+    yield 'match_step_std', np.std, known.get('match_step', _NONE)
+    share, has_goal = known.get('match_fraction', _NONE), group.key['mode'] == 'bidirectional'
+    yield 'match_beside_input', np.mean, (share < BESIDE) | (share > 1 - BESIDE) & has_goal
+    for metric in ('changed_l1', *SPREADS):
+        yield metric, np.mean, known.get(metric, _NONE)
+    if group.key.get('new_pixels'):
+        return
+    if 'bottleneck' in known:
+        placed = known['bottleneck']
+        visible = group.scores['object_mass'][
+            :, np.isfinite(group.scores['bottleneck']).all(0)] >= VISIBLE
+        for threshold in THRESHOLDS:
+            found = placed <= threshold
+            yield f'bottleneck_frequency_{threshold}px', np.mean, found
+            yield f'visible_bottleneck_frequency_{threshold}px', np.mean, found & visible
+        yield 'bottleneck_median_px', np.median, placed
+    yield 'target_bottleneck_frequency_2px', np.mean, known.get('target_bottleneck', _NONE) <= 2
 
 
 def _row(group, metric, statistic, *arrays, **more):
@@ -295,40 +251,37 @@ def lower_hull(at, points):
     return np.where(np.isfinite(lowest), lowest, np.nan)
 
 
+def as_frame(rows):
+    """
+    Make a table of rows, for the functions below and for all that shows them.
+
+    :param rows: of make_rows.
+    :return: DataFrame; new_pixels is NA for copying.
+    """
+    return pd.DataFrame(rows, columns=COLUMNS).astype({'new_pixels': 'boolean'})
+
+
+def select(rows, task, mode, new_pixels=True):
+    """Choose the rows (of as_frame) of one setting; those of copying belong to both variants."""
+    return rows[(rows['task'] == task) & (rows['mode'] == mode)
+                & (rows['new_pixels'] == new_pixels).fillna(True)]
+
+
+def of_metric(rows, metric, methods):
+    """Return a line of a metric for each method, indexed by it; lines of NaN where none is."""
+    return rows[rows['metric'] == metric].set_index('method').reindex(methods)
+
+
 def find(rows, **wanted):
     """
     Find a row.
 
-    :param rows: of make_rows.
+    :param rows: of as_frame.
     :param wanted: the values of its keys; a row without new_pixels fits any.
-    :return: the first row that fits, or None.
+    :return: dict, the first row that fits, or None.
     """
-    for row in rows:
-        if all(row.get(name, value if name == 'new_pixels' else None) == value
-               for name, value in wanted.items()):
-            return row
-    return None
+    for name, value in wanted.items():
+        rows = rows[(rows[name] == value).fillna(name == 'new_pixels')]
+    return None if rows.empty else rows.iloc[0].dropna().to_dict()
 
 
-def variant_of(method):
-    """Return which of runs.VARIANTS a method's name stands for; '' for the method as it is."""
-    name = re.sub(r'-r\d+$', '', method)
-    return max((variant for variant in VARIANTS if name.endswith(variant)), key=len)
-
-
-def method_order(method):
-    """
-    Give the place of a method in tables and pictures, as a sort key: copying, fix, min, genmin.
-
-    Forward genmin is ordered by beta from large to small, as its match-steps rise.
-    """
-    if method in COPIES:
-        return (0, 0, COPIES.index(method), False, method)
-    name = method.replace(f'-wo-gan-{BEST}', '').replace(f'-{BEST}', '')
-    name = re.sub(r'-r\d+$', '', name)
-    variant = variant_of(name)
-    parsed = parse_method(name.removesuffix(variant))
-    number = (parsed.fraction if parsed.loss == 'fix' else
-              -parsed.beta if parsed.beta is not None else 0)
-    kind = ('fix', 'min', 'genmin').index(parsed.loss) + 1 + 3 * parsed.vae + 3 * (BEST in method)
-    return (kind, parsed.selection != 'time_preference', number, bool(variant), method)

@@ -4,12 +4,13 @@
 
 from pathlib import Path
 
+from experiments.pages import interval, render
 from experiments.paper.places import read_json
 from experiments.paper.published import TITLES
 from experiments.paper.runs import label
 from experiments.paper.sweep import trained_on
-from experiments.paper.tables import markdown
 import numpy as np
+import pandas as pd
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.prediction import evaluate
@@ -81,65 +82,42 @@ def make_card(file, result, scores):
     :param scores: of score.
     :return: markdown.
     """
-    config, data, training = result['config'], result['data'], result['training']
-    name = label(result['method'], result.get('variant', ''), result.get('recursion', 1))
     kind = ('Predicts a later picture from a start picture alone' if result['mode'] == 'forward'
             else 'Predicts a subgoal picture between a start and a goal picture')
-    task = TITLES.get(result['task'], result['task'])
-    settings = ', '.join(f'{key} {config[key]}' for key in _SETTINGS
-                         if config.get(key) not in (None, ''))
-    lines = [
-        f'# {file.name}\n',
-        f'{kind}. Task: {task.lower()}; method: {name} (see docs/paper_map.md). Stored as '
-        'float16.\n',
-        markdown(['', ''], [
-            ['data', f'`{data["command"]}`: {data["episodes"]} episodes to train on, '
-                     f'{data["held_out"]} held out; hash `{trained_on(result)[:12]}`'],
-            ['training', f'`{result["command"]}`'],
-            ['settings', settings],
-            ['time', f'{training["seconds"] / 60:.0f} min on {training["machine"]}; '
-                     f'torch {training["torch"]}'],
-            ['use', '`ros2 run tap_ros predictor_node --ros-args -p weights:=<this file>`']],
-                 left=2),
-        '\nScores of this file on the held-out episodes, with 95% intervals over them; l1 is the '
-        'per-pixel mean on [0, 1]. Copying an input is scored too: a low l1 alone says nothing. '
-        'One training of one seed.\n',
-        markdown(['goal picture', 'method', 'min l1', 'of changed pixels',
-                  'match-step, share of the episode', f'bottlenecks at {THRESHOLD} px'],
-                 [row for goal, methods in scores.items() for row in _rows(goal, methods)],
-                 left=2),
-        *_samples(result['evaluation']),
-        '\nOf changed pixels: the error over those pixels alone in which the matched frame '
-        'differs from every input. What the picture shows and what it lacks: docs/results.\n',
-        '\nTrained on pictures of this simulated world alone; other cameras, arms and objects '
-        'need training of their own.']
-    return '\n'.join(lines) + '\n'
+    settings = [f'{key} {result["config"][key]}' for key in _SETTINGS
+                if result['config'].get(key) not in (None, '')]
+    return render(
+        'paper/templates/card.md.j2', file=file.name, kind=kind, result=result, settings=settings,
+        method=label(result['method'], result.get('variant', ''), result.get('recursion', 1)),
+        task=TITLES.get(result['task'], result['task']), hash=trained_on(result)[:12],
+        scores=_table(scores), **_samples(result['evaluation']))
 
 
 def _samples(evaluation):
-    """Say how good the best of 100 samples is and how much samples differ, if there are any."""
+    """Return how good the best of 100 samples is and how much samples differ, if there are any."""
     if 'best_of_100' not in evaluation:
-        return []
-    best = mean_interval(np.array(evaluation['best_of_100']['min_l1'], float))
+        return {'best': None}
     near, elsewhere = (np.nanmean(np.array(evaluation[f'sample_spread_{where}'], float))
                        for where in ('near', 'elsewhere'))
-    return [f'\nThe best of 100 samples, goal picture the last frame: min l1 {_text(best, 4)}. '
-            f'Samples differ by {near:.4f} on average around the objects and {elsewhere:.4f} '
-            'elsewhere (standard deviation on [0, 1]).']
+    best = np.array(evaluation['best_of_100']['min_l1'], float)
+    return {'best': _means([best], 4)[0], 'near': near, 'elsewhere': elsewhere}
 
 
-def _rows(goal, methods):
-    """Write a line for each method."""
-    for method, scores in methods.items():
-        placed = scores.bottleneck[np.isfinite(scores.bottleneck)]
-        changed = scores.changed_l1[np.isfinite(scores.changed_l1)]
-        yield [goal, method, _text(mean_interval(scores.min_l1), 4),
-               _text(mean_interval(changed), 3) if len(changed) else '-',
-               _text(mean_interval(scores.match_fraction), 2),
-               _text(mean_interval(placed <= THRESHOLD), 2) if len(placed) else '-']
+def _table(scores):
+    """Tabulate the means over the episodes, a line for each goal picture and method."""
+    keys = [(goal, method) for goal, methods in scores.items() for method in methods]
+    lines = [scores[goal][method] for goal, method in keys]
+    placed = [line.bottleneck[np.isfinite(line.bottleneck)] <= THRESHOLD for line in lines]
+    return pd.DataFrame(keys, columns=['goal picture', 'method']).assign(**{
+        'min l1': _means([line.min_l1 for line in lines], 4),
+        'of changed pixels': _means([line.changed_l1 for line in lines], 3),
+        'match-step, share of the episode': _means([line.match_fraction for line in lines], 2),
+        f'bottlenecks at {THRESHOLD} px': _means(placed, 2)})
 
 
-def _text(interval, digits):
-    """Write an Interval."""
-    value, low, high = (f'{x:.{digits}f}' for x in interval)
-    return f'{value} ({low} to {high})'
+def _means(values, digits):
+    """Write the mean of each array with its interval; NaN for arrays without a known value."""
+    known = [array[np.isfinite(array)] for array in values]
+    return interval(pd.DataFrame(
+        [mean_interval(array) if len(array) else [np.nan] * 3 for array in known],
+        columns=['value', 'ci_low', 'ci_high']), digits)

@@ -1,7 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of the results page, as Markdown."""
+"""
+The tables of the results page, as DataFrames of text.
 
+Their rows are those of rows.as_frame, of one scale.
+"""
+
+from experiments.pages import interval, number
+from experiments.paper.names import BEST, best_of_name, COPIES, method_order
 from experiments.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
@@ -9,8 +15,9 @@ from experiments.paper.published import (
     TABLE_1,
     TITLES,
 )
-from experiments.paper.rows import BEST, best_of_name, find, method_order
+from experiments.paper.rows import of_metric, select
 from experiments.paper.runs import paper_runs
+import pandas as pd
 from tap_ros.evaluation.bottleneck import THRESHOLDS
 
 NOT_RUN = '*not run*'
@@ -19,172 +26,125 @@ NOT_RUN = '*not run*'
 EQUAL = 0.10
 
 
-def markdown(header, lines, left=1):
-    """
-    Write a table.
-
-    :param header: list of str.
-    :param lines: list of lists of str.
-    :param left: so many columns are aligned to the left, the others to the right.
-    """
-    rule = ['---'] * left + ['---:'] * (len(header) - left)
-    return '\n'.join(f'| {" | ".join(line)} |' for line in [header, rule, *lines]) + '\n'
+def _methods_of(own, task, mode, new_pixels):
+    """List, in order, the methods of a setting and those that complete results have."""
+    names = {*own['method'], *(
+        run.label for scale in own['scale'].unique() for run in paper_runs(scale)
+        if (run.task, run.mode, run.new_pixels) == (task, mode, new_pixels))}
+    return sorted((name for name in names if BEST not in name), key=method_order)
 
 
-def with_interval(row, digits=4, unit=1, sign=''):
-    """Write a row's value with its interval: '0.0123 (0.0120 to 0.0126)'; '-' for None."""
-    if row is None:
-        return '-'
-    value, low, high = (f'{row[name] * unit:{sign}.{digits}f}'
-                        for name in ('value', 'ci_low', 'ci_high'))
-    return f'{value} ({low} to {high})'
-
-
-def plain(value, digits=4, unit=1, after=''):
-    """Write a number, or '-' for None."""
-    return '-' if value is None else f'{value * unit:.{digits}f}{after}'
-
-
-def methods_of(rows, task, mode, new_pixels=True, wanted=True):
-    """
-    List methods in the order of the tables.
-
-    :param rows: of one scale.
-    :param wanted: also those that a complete set of results has and these rows lack.
-    """
-    names = {row['method'] for row in rows if (row['task'], row['mode']) == (task, mode)
-             and row.get('new_pixels', new_pixels) == new_pixels}
-    if wanted and rows:
-        names |= {run.label for run in paper_runs(rows[0]['scale'])
-                  if (run.task, run.mode, run.new_pixels) == (task, mode, new_pixels)}
-    return sorted(names, key=method_order)
+def _match_steps(own, methods):
+    """Write the mean match-steps and their standard deviations."""
+    mean, spread = (number(of_metric(own, metric, methods)['value'], 1)
+                    for metric in ('match_step', 'match_step_std'))
+    return mean + ' ± ' + spread
 
 
 def scores_table(rows, task, mode, new_pixels=True):
-    """Write errors and match-steps of a task beside the paper's (Table 1)."""
-    published = TABLE_1.get(task, {}) if mode == 'bidirectional' and new_pixels else {}
-    lines = []
-    for method in methods_of(rows, task, mode, new_pixels):
-        if BEST in method:
-            continue
-        about = {'task': task, 'mode': mode, 'method': method, 'new_pixels': new_pixels}
-        error = find(rows, **about, metric='min_l1')
-        theirs = published.get(method, (None,) * 3)
-        line = [method, NOT_RUN, *['-'] * 4]
-        if error:
-            step, spread, beside, changed = (find(rows, **about, metric=metric) for metric in (
-                'match_step', 'match_step_std', 'match_beside_input', 'changed_l1'))
-            line = [method, with_interval(error), with_interval(changed, 3),
-                    f'{step["value"]:.1f} ± {spread["value"]:.1f}',
-                    plain(beside['value'], 0, 100, '%'), str(error['seeds'])]
-        if published:
-            line += [plain(theirs[0]),
-                     '-' if theirs[1] is None else f'{theirs[1]:.1f} ± {theirs[2]:.1f}']
-        lines.append(line)
-    header = ['method', 'min l1 (95% interval)', 'of changed pixels', 'match-step',
-              'beside an input', 'seeds']
-    return markdown(header + (['paper: min l1', 'match-step'] if published else []), lines)
+    """Show errors and match-steps of a task beside the paper's (Table 1)."""
+    own = select(rows, task, mode, new_pixels)
+    methods = _methods_of(own, task, mode, new_pixels)
+    error, changed, beside = (of_metric(own, metric, methods) for metric in (
+        'min_l1', 'changed_l1', 'match_beside_input'))
+    table = pd.DataFrame({
+        'min l1 (95% interval)': interval(error).fillna(NOT_RUN),
+        'of changed pixels': interval(changed, 3),
+        'match-step': _match_steps(own, methods),
+        'beside an input': number(beside['value'], 0, 100) + '%',
+        'seeds': number(error['seeds'], 0)})
+    if mode == 'bidirectional' and new_pixels and task in TABLE_1:
+        theirs = pd.DataFrame.from_dict(
+            TABLE_1[task], 'index', columns=['l1', 'step', 'std']).reindex(methods)
+        table['paper: min l1'] = number(theirs['l1'])
+        table['paper: match-step'] = number(theirs['step'], 1) + ' ± ' + number(theirs['std'], 1)
+    return table.rename_axis('method').reset_index()
 
 
 def gains_table(rows, new_pixels=True):
-    """Write how far errors are below fix's, and whether at the same match-step."""
-    lines = []
+    """Show how far errors are below fix's, and whether at the same match-step; may be empty."""
+    parts = []
     for task, title in TITLES.items():
-        for method in methods_of(rows, task, 'bidirectional', new_pixels, wanted=False):
-            about = {'task': task, 'mode': 'bidirectional', 'method': method,
-                     'new_pixels': new_pixels}
-            gain = find(rows, **about, metric='gain_over_fix')
-            if gain is None or gain.get('new_pixels', True) != new_pixels:
-                continue
-            steps, share = (find(rows, **about, metric=f'{name}_minus_fix')
-                            for name in ('match_step', 'match_fraction'))
-            equal = '-' if share is None else 'yes' if abs(share['value']) <= EQUAL else 'no'
-            theirs = GAINS.get(task) if method == 'genmin' and new_pixels else None
-            same = find(rows, **about, metric='gain_over_fix_at_match_step')
-            lines.append([title, method, gain['baseline'], with_interval(gain, 0, 100),
-                          plain(theirs, 1, 100), with_interval(steps, 1, sign='+'), equal,
-                          with_interval(same, 0, 100)])
-    return lines and markdown(
-        ['task', 'method', 'beside', 'error below fix, %', 'paper',
-         'match-step minus that of fix, frames', 'equal',
-         'error below fixed-time prediction at the same match-step, %'], lines, left=3)
+        own = select(rows, task, 'bidirectional', new_pixels)
+        own = own[own['new_pixels'].fillna(True) == new_pixels]  # copying: once
+        methods = sorted(own['method'][own['metric'] == 'gain_over_fix'], key=method_order)
+        gain, steps, share, same = (of_metric(own, metric, methods) for metric in (
+            'gain_over_fix', 'match_step_minus_fix', 'match_fraction_minus_fix',
+            'gain_over_fix_at_match_step'))
+        paper = pd.Series({'genmin': GAINS.get(task) if new_pixels else None}, methods, float)
+        near = share['value'].abs() <= EQUAL
+        parts.append(pd.DataFrame({
+            'task': title, 'method': gain.index, 'beside': gain['baseline'],
+            'error below fix, %': interval(gain, 0, 100), 'paper': number(paper, 1, 100),
+            'match-step minus that of fix, frames': interval(steps, 1, sign='+'),
+            'equal': near.map({True: 'yes', False: 'no'}).where(share['value'].notna()),
+            'error below fixed-time prediction at the same match-step, %':
+                interval(same, 0, 100)}))
+    return pd.concat(parts)
 
 
 def forward_table(rows, task='grasp'):
-    """Write the numbers of the forward scatter (Fig. 4), and gains at the same match-step."""
-    published = FORWARD_GRASP if task == 'grasp' else {}
-    lines = []
-    for method in methods_of(rows, task, 'forward'):
-        if BEST in method:
-            continue
-        about = {'task': task, 'mode': 'forward', 'method': method, 'new_pixels': True}
-        error, step, spread, gain = (find(rows, **about, metric=metric) for metric in (
-            'min_l1', 'match_step', 'match_step_std', 'gain_over_fix_at_match_step'))
-        line = [method, NOT_RUN, '-', '-']
-        if error:
-            line = [method, with_interval(error), f'{step["value"]:.1f} ± {spread["value"]:.1f}',
-                    with_interval(gain, 0, 100)]
-        theirs = published.get(method, (None, None))
-        lines.append([*line, plain(theirs[1]), plain(theirs[0], 1)])
-    return markdown(['method', 'min l1 (95% interval)', 'match-step',
-                     'error below fix at this match-step, %', "authors': min l1", 'match-step'],
-                    lines)
+    """Show the numbers of the forward scatter (Fig. 4), and gains at the same match-step."""
+    own = select(rows, task, 'forward')
+    methods = _methods_of(own, task, 'forward', True)
+    theirs = pd.DataFrame.from_dict(FORWARD_GRASP if task == 'grasp' else {}, 'index',
+                                    columns=['step', 'l1']).reindex(methods)
+    return pd.DataFrame({
+        'min l1 (95% interval)': interval(of_metric(own, 'min_l1', methods)).fillna(NOT_RUN),
+        'match-step': _match_steps(own, methods),
+        'error below fix at this match-step, %': interval(
+            of_metric(own, 'gain_over_fix_at_match_step', methods), 0, 100),
+        "authors': min l1": number(theirs['l1']),
+        "authors': match-step": number(theirs['step'], 1)}).rename_axis('method').reset_index()
 
 
 def bottleneck_table(rows, task):
-    """Write the bottleneck frequency at every threshold in percent, and the median score."""
-    lines = []
-    for method in methods_of(rows, task, 'bidirectional', new_pixels=False):
-        about = {'task': task, 'mode': 'bidirectional', 'method': method, 'new_pixels': False}
-        shares = [find(rows, **about, metric=f'bottleneck_frequency_{threshold}px')
-                  for threshold in THRESHOLDS]
-        if BEST in method:
-            continue
-        if shares[0] is None:
-            lines.append([method, NOT_RUN, *['-'] * (len(THRESHOLDS) + 2)])
-            continue
-        line = [method, *(plain(share['value'], 0, 100) for share in shares)]
-        line[1 + 2] = f'**{line[1 + 2]}**'
-        lines.append([
-            *line, with_interval(find(rows, **about, metric='bottleneck_median_px'), 1),
-            with_interval(find(rows, **about, metric='visible_bottleneck_frequency_2px'), 0, 100),
-            with_interval(find(rows, **about, metric='target_bottleneck_frequency_2px'), 0, 100)])
+    """Show the bottleneck frequency at every threshold in percent, and the median score."""
+    own = select(rows, task, 'bidirectional', new_pixels=False)
+    methods = _methods_of(own, task, 'bidirectional', False)
+    table = pd.DataFrame({f'{n} px': number(of_metric(
+        own, f'bottleneck_frequency_{n}px', methods)['value'], 0, 100) for n in THRESHOLDS})
+    table['2 px'] = '**' + table['2 px'] + '**'
+    table['0 px'] = table['0 px'].fillna(NOT_RUN)
+    table['median, px'] = interval(of_metric(own, 'bottleneck_median_px', methods), 1)
+    table['no object left out, 2 px'] = interval(
+        of_metric(own, 'visible_bottleneck_frequency_2px', methods), 0, 100)
+    table['the true frame at that time, 2 px'] = interval(
+        of_metric(own, 'target_bottleneck_frequency_2px', methods), 0, 100)
     if task == 'push2':
-        for method, share in BOTTLENECK_2PX.items():
-            lines.append([f'{method} in the paper', *('-' if n != 2 else plain(share, 0, 100)
-                                                            for n in THRESHOLDS), '-', '-', '-'])
-    return markdown(['method', *(f'{n} px' for n in THRESHOLDS), 'median, px',
-                     'no object left out, 2 px', 'the true frame at that time, 2 px'], lines)
+        theirs = number(pd.Series(BOTTLENECK_2PX), 0, 100)
+        table = pd.concat([table, theirs.add_suffix(' in the paper').to_frame('2 px')])
+    return table.rename_axis('method').reset_index()
 
 
 def best_table(rows):
-    """Write the best of 100 samples beside the lowest of the deterministic methods."""
-    lines = []
+    """Show the best of 100 samples beside the lowest of the other methods; may be empty."""
+    parts = []
     for task, title in TITLES.items():
         for new_pixels in (True, False):
-            for of in methods_of(rows, task, 'bidirectional', new_pixels):
-                if '-vae' not in of or BEST in of:
-                    continue
-                about = {'task': task, 'mode': 'bidirectional', 'new_pixels': new_pixels}
-                method = best_of_name(of)
-                best = find(rows, **about, method=method, metric='min_l1')
-                lowest = lowest_deterministic(rows, task, new_pixels)
-                spreads = [find(rows, **about, method=of, metric=f'sample_spread_{where}')
-                           for where in ('near', 'elsewhere')]
-                theirs = TABLE_1.get(task, {}).get(method, (None,))[0] if new_pixels else None
-                lines.append([title, method, of + ('' if new_pixels else ', no new pixels'),
-                              with_interval(best) if best else NOT_RUN,
-                              f'{lowest["method"]}: {lowest["value"]:.4f}' if lowest else '-',
-                              *(plain(spread and spread['value']) for spread in spreads),
-                              plain(theirs)])
-    return lines and markdown(
-        ['task', 'method', 'samples of', 'min l1 (95% interval)', 'lowest without VAE',
-         'spread of the samples near the objects', 'elsewhere', 'paper'], lines, left=3)
+            own = select(rows, task, 'bidirectional', new_pixels)
+            drawn = [method for method in _methods_of(own, task, 'bidirectional', new_pixels)
+                     if '-vae' in method]
+            best = [best_of_name(method) for method in drawn]
+            lowest = lowest_deterministic(rows, task, new_pixels)
+            paper = {name: scores[0] for name, scores in TABLE_1.get(task, {}).items()}
+            near, elsewhere = (number(of_metric(own, f'sample_spread_{where}', drawn)['value'])
+                               for where in ('near', 'elsewhere'))
+            parts.append(pd.DataFrame({
+                'task': title, 'method': best,
+                'samples of': [of + ('' if new_pixels else ', no new pixels') for of in drawn],
+                'min l1 (95% interval)': interval(
+                    of_metric(own, 'min_l1', best)).fillna(NOT_RUN).array,
+                'lowest without VAE': lowest and f'{lowest["method"]}: {lowest["value"]:.4f}',
+                'spread of the samples near the objects': near.array,
+                'elsewhere': elsewhere.array,
+                'paper': number(pd.Series(paper if new_pixels else {}, best, float)).array}))
+    return pd.concat(parts)
 
 
 def lowest_deterministic(rows, task, new_pixels=True):
-    """Find the row of the trained method without VAE with the lowest error, or None."""
-    candidates = [row for row in rows if row['metric'] == 'min_l1' and row['task'] == task
-                  and row['mode'] == 'bidirectional' and row.get('new_pixels') == new_pixels
-                  and '-vae' not in row['method']]
-    return min(candidates, key=lambda row: row['value'], default=None)
+    """Find the row (dict) of the trained method without VAE with the lowest error, or None."""
+    own = select(rows, task, 'bidirectional', new_pixels)
+    own = own[(own['metric'] == 'min_l1') & ~own['method'].str.contains('-vae')
+              & ~own['method'].isin(COPIES)]
+    return None if own.empty else own.loc[own['value'].idxmin()].to_dict()

@@ -109,7 +109,7 @@ def _write_results(out, films):
     write_rows(out / 'planning.json', rows)
     maps, findings = out / forward.FILE, out / 'planning_findings.md'
     write_atomically(out / 'planning.md', make_page(
-        rows, _all_films(out, rows, films),
+        rows, find_films(out, rows) | films,
         json.loads(maps.read_text()) if maps.exists() else (),
         findings.read_text() if findings.exists() else ''))
     return rows
@@ -163,13 +163,12 @@ def changed(planner, samples, iterations, replan_every):
                    replan_every=replan_every or planner.replan_every)
 
 
-def _all_films(out, rows, films):
-    """Return the strips made now and those made before."""
-    for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
-        name = f'planning/{task}-{parse_method(method).file_name}.png'
-        if (task, method) not in films and (out / name).exists():
-            films[task, method] = name, 'the best, the median and the worst scene'
-    return films
+def find_films(out, rows):
+    """Return the film strips that are there: {(task, method): (file name in out, caption)}."""
+    keys = dict.fromkeys((row['task'], row['method']) for row in rows)
+    names = {key: f'planning/{key[0]}-{parse_method(key[1]).file_name}.png' for key in keys}
+    return {key: (name, 'the best, the median and the worst scene')
+            for key, name in names.items() if (out / name).exists()}
 
 
 def _command(args, task, method):

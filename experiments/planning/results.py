@@ -7,7 +7,8 @@ from pathlib import Path
 
 from experiments.planning.methods import BASES, DEFAULTS, parse_method, SUBGOALS_ONLY
 from experiments.planning.runs import read_results
-import numpy as np
+import pandas as pd
+from scipy.stats import sem
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.evaluation.intervals import mean_interval
 
@@ -42,28 +43,25 @@ def make_rows(results):
     :return: list of dicts.
     """
     rows, names = [], {}
+    tables = {key: _table(scenes) for key, (_, scenes) in results.items()}
     for task, name in results:
         names.setdefault(task, set()).add(name)
     for (task, name), (settings, scenes) in results.items():
-        runs = [scenes[seed] for seed in sorted(scenes)]
-        finals = [run['final_cm'] for run in runs]
+        mine = tables[task, name]
         measured = [
-            ('final_distance_cm', finals, {'standard_error': _short(standard_error(finals))}),
-            ('success_5cm', [_success(run) for run in runs], {}),
-            ('steps', [run['steps'] for run in runs], {}),
-            ('plan_ms', [run['plan_ms'] for run in runs], {}),
-            ('tracking_error_px', [run.get('tracking_error_px') for run in runs], {})]
+            ('final_distance_cm', mine['final_cm'],
+             {'standard_error': _short(standard_error(mine['final_cm']))}),
+            ('success_5cm', mine['success'], {}), ('steps', mine['steps'], {}),
+            ('plan_ms', mine['plan_ms'], {}),
+            ('tracking_error_px', mine['tracking_error_px'], {})]
         for compares, partner in partners(parse_method(name), names[task]):
-            others, other = results[task, partner]
-            both = sorted(set(scenes) & set(other))
-            if both and comparable(compares, settings, others):
+            if comparable(compares, settings, results[task, partner][0]):
                 about = {'against': partner, 'compares': compares}
-                gaps = [scenes[seed]['final_cm'] - other[seed]['final_cm'] for seed in both]
-                measured.append(('final_distance_difference_cm', gaps, about))
-                gaps = [_success(scenes[seed]) - _success(other[seed]) for seed in both]
-                measured.append(('success_5cm_difference', gaps, about))
+                gaps = mine - tables[task, partner]  # NaN for scenes that only one has
+                measured += [('final_distance_difference_cm', gaps['final_cm'], about),
+                             ('success_5cm_difference', gaps['success'], about)]
         for metric, values, more in measured:
-            values = np.array([value for value in values if value is not None], float)
+            values = values.dropna()
             if len(values):
                 value, low, high = mean_interval(values)
                 rows.append({
@@ -72,6 +70,14 @@ def make_rows(results):
                     'seeds': 1, 'first_scene': min(scenes), **more, **_how(name, settings),
                     'command': settings.get('command', '')})
     return rows
+
+
+def _table(scenes):
+    """Return a line of numbers for each scene, by seed; success is 1 or 0."""
+    table = pd.DataFrame.from_dict(scenes, 'index').sort_index()
+    table['success'] = table['objects_cm'].map(max) < 100 * SUCCESS_DISTANCE
+    return table.reindex(columns=[
+        'final_cm', 'success', 'steps', 'plan_ms', 'tracking_error_px']).astype(float)
 
 
 def comparable(compares, settings, others):
@@ -128,15 +134,9 @@ def _how(name, settings):
         'device': settings['device'], 'precision': settings['precision']}
 
 
-def _success(scene):
-    """Say whether every object ended within SUCCESS_DISTANCE of its goal, as 0 or 1."""
-    return int(max(scene['objects_cm']) < 100 * SUCCESS_DISTANCE)
-
-
 def standard_error(values):
     """Return the standard error of a mean; 0 for a single value."""
-    values = np.asarray(values, float)
-    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
+    return float(sem(values)) if len(values) > 1 else 0.0
 
 
 def _short(value):

@@ -3,6 +3,7 @@
 """How far a mean over episodes can be trusted: percentile bootstrap intervals of 95%."""
 
 from typing import NamedTuple
+import warnings
 
 import numpy as np
 
@@ -34,21 +35,25 @@ def bootstrap(statistic, *arrays, resamples=RESAMPLES, seed=0):
     :param arrays: of the same N along the last axis, at least 1.
     :param resamples: how often to draw.
     :param seed: of the draws.
-    :return: Interval; both ends are NaN if the statistic is undefined in every draw.
+    :return: Interval over the draws in which the statistic is defined; NaN to NaN without any.
     """
+    from scipy import stats  # takes a second
+
     arrays = [np.asarray(array) for array in arrays]
     N = arrays[0].shape[-1]
     value = float(statistic(*arrays))
-    rng = np.random.default_rng(seed)
-    at_once = max(1, _DRAWN // max(array.size for array in arrays))
-    values = []
-    for first in range(0, resamples, at_once):
-        drawn = rng.integers(N, size=(min(at_once, resamples - first), N))
-        values.append(statistic(*(array[..., drawn] for array in arrays)))
-    values = np.concatenate(values)
-    if np.isnan(values).all():
+    if N == 1:
+        return Interval(value, value, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', stats.DegenerateDataWarning)  # of undefined draws
+        draws = stats.bootstrap(
+            (np.arange(N),), lambda drawn, axis: statistic(*(a[..., drawn] for a in arrays)),
+            n_resamples=resamples, batch=max(1, _DRAWN // max(a.size for a in arrays)),
+            vectorized=True, method='percentile', random_state=np.random.default_rng(seed),
+        ).bootstrap_distribution
+    if np.isnan(draws).all():
         return Interval(value, np.nan, np.nan)
-    low, high = np.nanpercentile(values, (2.5, 97.5))
+    low, high = np.nanpercentile(draws, (2.5, 97.5))
     return Interval(value, float(low), float(high))
 
 

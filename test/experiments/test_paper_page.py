@@ -61,7 +61,7 @@ def test_match_steps_are_called_equal_only_if_they_are(tmp_path):
 def test_sentences_follow_the_numbers(tmp_path):
     found = page_of(tmp_path / 'a', made_run('genmin+relative', scores(
         0.01, bottleneck=[1.0] * 30 + [9.0] * 10), new_pixels=False))
-    assert 'genmin+relative: 75%' in found and 'at least the 58%' in found
+    assert 'genmin+relative with 75%' in found and 'at least the 58%' in found
     found = page_of(tmp_path / 'b', made_run('genmin+relative', scores(
         0.01, bottleneck=[1.0] * 10 + [9.0] * 30), new_pixels=False))
     assert 'less than the 58%' in found

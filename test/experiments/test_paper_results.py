@@ -4,6 +4,7 @@
 
 import json
 
+from experiments.paper.names import best_of_name, method_order
 from experiments.paper.results import (
     load_runs,
     on_same_recordings,
@@ -11,12 +12,12 @@ from experiments.paper.results import (
     write_results,
 )
 from experiments.paper.rows import (
-    best_of_name,
+    as_frame,
+    COLUMNS,
     find,
     group_runs,
     lower_hull,
     make_rows,
-    method_order,
 )
 from made_runs import EPISODES, made_run, save_runs, scores
 import numpy as np
@@ -28,14 +29,15 @@ KEYS = {'task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n', '
 
 
 def rows_of(*runs):
-    return make_rows(group_runs(runs))
+    return as_frame(make_rows(group_runs(runs)))
 
 
 def test_every_row_has_all_keys_and_lies_in_its_interval():
-    rows = rows_of(made_run('fix', scores(0.02)), made_run('genmin', scores(0.01, seed=1)))
+    rows = make_rows(group_runs(
+        [made_run('fix', scores(0.02)), made_run('genmin', scores(0.01, seed=1))]))
     assert {row['method'] for row in rows} == {'fix', 'genmin', 'copy-start', 'copy-goal'}
     for row in rows:
-        assert KEYS <= set(row)
+        assert KEYS <= set(row) <= set(COLUMNS)
         assert row['ci_low'] <= row['value'] <= row['ci_high']
         assert row['n'] == EPISODES
 
@@ -95,16 +97,18 @@ def test_no_bottlenecks_are_counted_where_pixels_are_painted():
 
 
 def test_every_row_of_the_data_has_a_place_of_its_own():
-    rows = told_apart(rows_of(
-        *(made_run(method, scores(0.01, bottleneck=[1.0] * 40), new_pixels=new_pixels)
-          for method in ('fix', 'genmin') for new_pixels in (True, False))))
+    rows = told_apart(make_rows(group_runs(
+        made_run(method, scores(0.01, bottleneck=[1.0] * 40), new_pixels=new_pixels)
+        for method in ('fix', 'genmin') for new_pixels in (True, False))))
     places = [(row['task'], row['mode'], row['method'], row['metric']) for row in rows]
     assert len(set(places)) == len(places)
+    rows = as_frame(rows)
     painted = find(rows, method='genmin', metric='min_l1')
     assert painted['new_pixels'] and find(rows, method='genmin', metric='min_l1_warp_only')
     assert find(rows, method='genmin', metric='bottleneck_frequency_2px')
-    alone = told_apart(rows_of(made_run('fix', scores(0.01), new_pixels=False, task='push3')))
-    assert find(alone, method='fix', metric='min_l1')  # without the others it keeps its name
+    alone = told_apart(make_rows(group_runs(
+        [made_run('fix', scores(0.01), new_pixels=False, task='push3')])))
+    assert find(as_frame(alone), method='fix', metric='min_l1')  # it keeps its name
 
 
 def test_variants_of_a_method_have_names_of_their_own(tmp_path):

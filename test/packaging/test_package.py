@@ -21,6 +21,7 @@ ROSDEP_KEYS = {
     'cv2': 'python3-opencv',
     'matplotlib': 'python3-matplotlib',
     'numpy': 'python3-numpy',
+    'scipy': 'python3-scipy',
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
@@ -103,13 +104,17 @@ def test_manifests_are_valid_and_of_one_version():
     assert f"version='{manifests[0].version}'" in (ROOT / 'setup.py').read_text()
 
 
-def test_everything_imported_is_declared_with_ros_or_with_pip():
+def undeclared(folders, *files):
+    """Return what code imports that neither package.xml nor files of requirements name."""
     declared = {depend.name for depend in parse_package(str(ROOT)).exec_depends}
-    imported = imported_packages('tap_ros', 'sim_bridge', 'launch')
-    missing = [name for name in sorted(imported) if name not in declared
-               and ROSDEP_KEYS.get(name) not in declared
-               and not distributions_of(name) & set(requirements('requirements.txt'))]
-    assert not missing, f'neither in package.xml nor in requirements.txt: {missing}'
+    required = {distribution for file in files for distribution in requirements(file)}
+    return [name for name in sorted(imported_packages(*folders)) if name not in declared
+            and ROSDEP_KEYS.get(name) not in declared and not distributions_of(name) & required]
+
+
+def test_everything_imported_is_declared_with_ros_or_with_pip():
+    assert not undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt')
+    assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt')
 
 
 def test_what_rosdep_brings_from_apt_comes_from_wheels_without_it():
@@ -125,12 +130,13 @@ def test_nothing_is_required_that_nobody_imports():
     for name in imported_packages('tap_ros', 'sim_bridge', 'experiments', 'test'):
         used |= distributions_of(name)
     assert set(requirements('requirements.txt')) <= used
+    assert set(requirements('requirements-experiments.txt')) <= used
 
 
 def test_requirements_and_constraints_agree():
     pinned = requirements('constraints.txt')
-    for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-ray.txt',
-                 'requirements-ros.txt'):
+    for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-experiments.txt',
+                 'requirements-ray.txt', 'requirements-ros.txt'):
         for distribution, version in requirements(name).items():
             assert pinned[distribution] == version, f'{name}: {distribution}'
 

@@ -1,0 +1,51 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Names of methods in results: copying, the best of 100 samples, variants; and their order."""
+
+import re
+
+from experiments.paper.runs import VARIANTS
+from tap_ros.prediction.methods import parse_method
+
+COPIES = ('copy-start', 'copy-goal')
+BEST = 'best-of-100'
+
+
+def best_of_name(method):
+    """
+    Name the best of 100 samples of a method.
+
+    The paper's genmin + vae is its Eq. 10, with GAN: genmin-vae-gan here. So its samples are those
+    of genmin-vae-best-of-100; those of the CVAE without GAN (Eq. 9), genmin-vae here, are of
+    genmin-vae-wo-gan-best-of-100.
+
+    :param method: name of a method with a VAE.
+    :return: for example 'genmin-vae-best-of-100', with +relative or the like at its end.
+    """
+    stem, plus, suffix = method.partition('+')
+    stem = stem.removesuffix('-gan') if stem.endswith('-vae-gan') else f'{stem}-wo-gan'
+    return f'{stem}-{BEST}{plus}{suffix}'
+
+
+def variant_of(method):
+    """Return which of runs.VARIANTS a method's name stands for; '' for the method as it is."""
+    name = re.sub(r'-r\d+$', '', method)
+    return max((variant for variant in VARIANTS if name.endswith(variant)), key=len)
+
+
+def method_order(method):
+    """
+    Give the place of a method in tables and pictures, as a sort key: copying, fix, min, genmin.
+
+    Forward genmin is ordered by beta from large to small, as its match-steps rise.
+    """
+    if method in COPIES:
+        return (0, 0, COPIES.index(method), False, method)
+    name = method.replace(f'-wo-gan-{BEST}', '').replace(f'-{BEST}', '')
+    name = re.sub(r'-r\d+$', '', name)
+    variant = variant_of(name)
+    parsed = parse_method(name.removesuffix(variant))
+    number = (parsed.fraction if parsed.loss == 'fix' else
+              -parsed.beta if parsed.beta is not None else 0)
+    kind = ('fix', 'min', 'genmin').index(parsed.loss) + 1 + 3 * parsed.vae + 3 * (BEST in method)
+    return (kind, parsed.selection != 'time_preference', number, bool(variant), method)
