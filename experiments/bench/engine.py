@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmark of the engines: what a task costs beside its own work, and how long starting takes."""
 
+from dataclasses import dataclass
 import math
 import os
 from pathlib import Path
 import platform
 import time
 
-from tap_ros.engine import Engine, ENGINES, run_tasks, Task
+from tap_ros.engine import Engine, EngineName, ENGINES, run_tasks, Task
 from tap_ros.files import write_atomically, write_rows
+from tap_ros.options import Flag
 
 FEW, MANY = 50, 1050  # tasks that do nothing
 SLEEP_S = 0.1
@@ -35,14 +37,19 @@ row the work takes {work_s:.0f} s, starting {start_s:.0f} s and handing out all 
 """
 
 
-def add_arguments(parser):
-    """Add the options of this benchmark."""
-    parser.add_argument('--engines', nargs='+', choices=ENGINES, default=list(ENGINES),
-                        metavar='NAME', help='local, ray (default: both)')
-    parser.add_argument('--workers', nargs='+', type=int, default=[1, 2, 4, 8, 16], metavar='N',
-                        help='(default: %(default)s)')
-    parser.add_argument('--write', action='store_true',
-                        help='also write docs/results/engine.json and engine.md')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of this benchmark.
+
+    :param engines: which are measured.
+    :param workers: with how many each.
+    :param write: also write docs/results/engine.json and engine.md.
+    """
+
+    engines: tuple[EngineName, ...] = ENGINES
+    workers: tuple[int, ...] = (1, 2, 4, 8, 16)
+    write: Flag = False
 
 
 def run(args):
