@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every option of every command is spelled as it always was, and does what it always did."""
+"""Every option of every command: spelling and effect stay, and --help explains it."""
 
 import csv
 from dataclasses import fields, is_dataclass
@@ -8,6 +8,8 @@ import json
 from pathlib import Path
 import re
 import shlex
+import subprocess
+import sys
 
 import pytest
 from tap_ros.cli import main, read
@@ -28,7 +30,7 @@ PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.m
 SHOWN = {  # one of those with the same options
     tuple(re.findall(r'--\S+', command)) or command: command.strip() for page in PAGES
     for command in re.findall(r'-m tap_ros ([^`\n;|]+?)(?: #.*)?(?=[`\n;])', page.read_text())
-    if '...' not in command}.values()
+    if '...' not in command and '--tyro' not in command}.values()
 IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --scale full --list', 'bench',
                    'evaluate faults --only camera-silent', 'bench planning']
 
@@ -97,3 +99,66 @@ def test_commands_that_are_shown_are_valid(command):
         assert read(shlex.split(command))
     else:  # a command is mentioned, what it needs is left out
         assert any(known.startswith(command.split(' bags')[0].strip()) for known in NEEDED)
+
+
+@pytest.mark.parametrize('command', [*NEEDED, 'bench', 'evaluate', ''])
+def test_help_says_of_every_option_what_it_is(command, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '80')
+    with pytest.raises(SystemExit) as end:
+        main([*command.split(), '--help'])
+    assert end.value.code == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith('usage: python -m tap_ros') and lines[2]
+    assert max(map(len, lines[1:])) <= 80
+    text = ' '.join(re.sub(r'[^\x20-\x7e]', ' ', ' '.join(lines[3:])).split())
+    for row in TABLE:
+        option = row['words'].split()[0]
+        if row['command'] == command and option.startswith('--'):
+            shown = re.findall(rf'{option}\b[ ,](.*?)\((?:default|required)', text)
+            assert any(re.search('[a-z]{2,} .*[a-z]{2,}', re.sub(
+                r'--[\w-]+,?|\{.*?\}|\[.*\]|[A-Z:=]+', ' ', each)) for each in shown), option
+
+
+@pytest.mark.parametrize('line, named', [
+    ('', 'expected one of collect, import-bair'), ('colect', 'colect'),
+    ('evaluate', 'planning'), ('evaluate nothing', 'nothing'), ('bench nothing', 'nothing'),
+    ('train --model other', '--model'), ('collect', '--out'), ('collect --out', '--out'),
+    ('collect --out a --episodes many', '--episodes: expected INT'),
+    ('collect --out a --nothing 3', '--nothing'), ('collect --out a b', 'b'),
+    ('import-bair --out a', 'PATH'), ('paper --only', '--only'), ('paper --seeds 1 x', '--seeds'),
+    ('train --recordings --out a', '--recordings'), ('paper --ship run', '--ship'),
+    ('collect --out a --seed "\x1b[31m\n"', r'\x1b'), ('collect --out a --task "\x1b\n"', r'\x1b'),
+    ('collect --out a "\x1b\n"', r'\x1b')])
+def test_words_that_are_wrong_are_named_in_one_line(line, named, capsys):
+    assert main(shlex.split(line)) == 2
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1 and error.startswith('error: ') and named in error
+    assert '\x1b' not in error
+
+
+@pytest.mark.parametrize('command', ['', 'evaluate', 'bench', 'train', 'train --model forward'])
+def test_help_comes_without_what_takes_long_to_import(command):
+    slow = "{'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard'}"
+    run = subprocess.run([sys.executable, '-c', (
+        'import atexit, sys; from tap_ros.cli import main; '
+        f'atexit.register(lambda: print("slow:", {slow} & set(sys.modules))); '
+        'main(sys.argv[1:] + ["--help"])'), *command.split()], capture_output=True, text=True)
+    assert run.returncode == 0 and run.stdout.splitlines()[-1] == 'slow: set()'
+
+
+def test_a_shell_completes_commands_options_and_choices(tmp_path):
+    with pytest.raises(SystemExit):
+        main(['--tyro-write-completion', 'bash', str(tmp_path / 'tap_ros')])
+    complete = (
+        'source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); '
+        'COMP_LINE="$*"; COMP_POINT=${#COMP_LINE}; '
+        '$(complete -p tap_ros | sed "s/.*-F //; s/ .*//"); echo "${COMPREPLY[@]}"')
+
+    def completed(*words):
+        return subprocess.run(['bash', '-c', complete, 'bash', tmp_path / 'tap_ros', 'tap_ros',
+                               *words], capture_output=True, text=True).stdout.split()
+
+    assert completed('ev') == ['evaluate']
+    assert {'prediction', 'faults'} <= set(completed('evaluate', ''))
+    assert completed('train', '--learning') == ['--learning-rate']
+    assert completed('collect', '--engine', '') == ['local', 'ray']

@@ -31,7 +31,7 @@ class ForwardTrainingConfig:
     :param augment: mirror and recolour.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, windows and augmentation.
-    :param device: 'auto', 'cpu', 'cuda'.
+    :param device: where the model is: 'auto', 'cpu' or 'cuda'.
     :param threads: of the CPU; 0: as many as there are.
     :param log_every: steps between curve points.
     :param save_every: steps between checkpoints, scores and sample pictures.

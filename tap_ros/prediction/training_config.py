@@ -29,7 +29,7 @@ class RunSettings:
     :param out: the run's folder; if it holds a checkpoint, training goes on from there.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, batches and augmentation.
-    :param device: 'auto', 'cpu', 'cuda'.
+    :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
     :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 where it is fast.
     :param threads: of the CPU; 0: as many as there are.
     :param compile: use torch.compile; slow to start, results differ in the last digits.
