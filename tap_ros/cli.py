@@ -49,6 +49,7 @@ COMMANDS = {  # command: (one line of help, module or {word: the same})
 TRAIN_FORWARD = 'tap_ros.planning.train_command'  # what trains with --model forward
 PROG = 'python -m tap_ros'
 _COMPLETION = ('--tyro-print-completion', '--tyro-write-completion')
+_SHELLS = (['bash'], ['zsh'], ['fish'])
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,9 @@ def read(arguments):
     :raises UsageError: for words that are no command or option.
     """
     words = list(arguments)
-    completion = words[:1] and words[0] in _COMPLETION
+    completion = bool(words) and words[0] in _COMPLETION
+    if completion and words[1:2] not in _SHELLS:
+        raise UsageError(f'{words[0]}: expected bash, zsh or fish after it')
     runs = {All: _run_all}
     kinds = [_command(name, *about, None if completion else words, runs)
              for name, about in COMMANDS.items()]
@@ -116,7 +119,7 @@ def _command(name, summary, module, words, runs):
     :param words: from the name on, if it is this command that is asked for; None: all are.
     :param runs: gets the function for the options.
     """
-    asked = words is None or words[:1] == [name]
+    asked = words is None or bool(words) and words[0].replace('_', '-') == name
     if isinstance(module, dict):
         rest = words and words[1:] if asked else []
         kinds = [_command(word, *about, rest, runs) for word, about in module.items()]
