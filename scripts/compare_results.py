@@ -11,7 +11,6 @@ run by both engines. Times, machines and versions are left out of the comparison
 two cores. The exit code is 1 when anything differs.
 """
 
-import argparse
 import hashlib
 import json
 import os
@@ -26,6 +25,7 @@ import numpy as np
 from rclpy.serialization import deserialize_message
 from safetensors.numpy import load_file
 from tqdm import tqdm
+import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = 'bags/sample_push2'
@@ -103,17 +103,18 @@ def kept(value):
     return value
 
 
-def main():
-    """Compare, print a table, and exit with 1 when anything differs."""
-    parser = argparse.ArgumentParser(description=__doc__.strip().split('\n')[0])
-    parser.add_argument('commit', help='what to compare with, as git names it')
-    parser.add_argument('--only', help='only commands whose names hold this word', default='')
-    args = parser.parse_args()
-    chosen = {name: command for name, command in COMMANDS.items() if args.only in name}
+def main(commit: tyro.conf.Positional[str], only: str = ''):
+    """
+    Compare results with those of another commit; exit with 1 when anything differs.
+
+    :param commit: what to compare with, as git names it.
+    :param only: only commands whose names hold this word.
+    """
+    chosen = {name: command for name, command in COMMANDS.items() if only in name}
     rows, differ = [], False
     with tempfile.TemporaryDirectory(prefix='compare-') as folder:
         before = Path(folder) / 'before'
-        subprocess.run(['git', 'worktree', 'add', '--quiet', '--detach', str(before), args.commit],
+        subprocess.run(['git', 'worktree', 'add', '--quiet', '--detach', str(before), commit],
                        cwd=ROOT, check=True)
         try:
             for at, (name, command) in enumerate(tqdm(chosen.items(), unit='')):
@@ -126,10 +127,10 @@ def main():
                 rows.append(f'{"same" if same else "DIFFERENT":<10} {name:<40} {" ".join(found)}')
         finally:
             subprocess.run(['git', 'worktree', 'remove', '--force', str(before)], cwd=ROOT)
-    print(f'Compared with {args.commit}; hashes: there, here, here with --engine ray', *rows,
+    print(f'Compared with {commit}; hashes: there, here, here with --engine ray', *rows,
           sep='\n')
     raise SystemExit(1 if differ else 0)
 
 
 if __name__ == '__main__':
-    main()
+    tyro.cli(main)

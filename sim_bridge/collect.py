@@ -17,8 +17,8 @@ import numpy as np
 from sim_bridge.expert import ExpertConfig, run_episode
 from sim_bridge.grasp_expert import GraspConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks import get_task, TASKS
-from tap_ros.engine import add_engine_arguments, engine_of, LOCAL, run_tasks, Task
+from sim_bridge.tasks import get_task
+from tap_ros.engine import LOCAL, run_tasks, Task
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.episode import Episode
@@ -31,15 +31,33 @@ SETTINGS_FILE = 'collection.json'
 
 
 @dataclass(frozen=True)
-class CollectConfig:
-    """What to collect; two collections with equal settings are equal to the byte."""
+class CollectSettings:
+    """
+    What to collect.
+
+    :param task: name of a task, see tasks.TASKS.
+    :param episodes: how many in all; a larger number later adds to the same folder.
+    :param seed: of the first episode; the others count on from it.
+    :param image_size: width and height in pixels.
+    :param episodes_per_file: the bag is split into files of so many.
+    """
 
     task: str = 'push2'
     episodes: int = 1000
     seed: int = 0
     image_size: int = 64
     episodes_per_file: int = 25
-    expert: ExpertConfig | GraspConfig | None = None  # None: the default one of the task
+
+
+@dataclass(frozen=True)
+class CollectConfig(CollectSettings):
+    """
+    All that a recording follows from; two collections of equal ones are equal to the byte.
+
+    :param expert: what it is collected with; None: as is usual for the task.
+    """
+
+    expert: ExpertConfig | GraspConfig | None = None
 
 
 def collect(folder, config, engine=LOCAL, progress=True, stop=lambda: False):
@@ -207,40 +225,3 @@ def make_episode(simulator, observations, actions, outcome, start_ns=0):
         object_poses=np.stack([o.object_poses for o in observations]),
         goal_frame=goal.image, goal_pixels=goal.object_pixels, goal_poses=goal.object_poses,
         task=simulator.task.name, seed=simulator.scene.seed, outcome=outcome)
-
-
-def add_arguments(parser):
-    """Add the options of the command."""
-    default = CollectConfig()
-    parser.add_argument('--out', required=True, help='folder of the recording, say bags/push2')
-    parser.add_argument(
-        '--task', default=default.task, choices=list(TASKS), help='(default: %(default)s)')
-    parser.add_argument(
-        '--episodes', type=int, default=default.episodes,
-        help='how many in all; a larger number later adds to the same folder '
-        '(default: %(default)s)')
-    parser.add_argument(
-        '--seed', type=int, default=default.seed,
-        help='of the first episode; the others count on from it (default: %(default)s)')
-    parser.add_argument(
-        '--image-size', type=int, default=default.image_size,
-        help='width and height in pixels (default: %(default)s)')
-    parser.add_argument(
-        '--episodes-per-file', type=int, default=default.episodes_per_file,
-        help='the bag is split into files of so many (default: %(default)s)')
-    add_engine_arguments(parser)
-
-
-def run(args):
-    """Collect and say what was collected."""
-    config = CollectConfig(
-        task=args.task, episodes=args.episodes, seed=args.seed, image_size=args.image_size,
-        episodes_per_file=args.episodes_per_file)
-    result = collect(args.out, config, engine_of(args))
-    if not result['episodes']:
-        print(f'{args.out}: all {args.episodes} episodes were there already')
-        return
-    print(f"{args.out}: {result['episodes']} episodes, {result['frames']} frames in "
-          f"{result['seconds']['wall']:.0f} s; objects end "
-          f"{100 * result['mean_final_distance']:.1f} cm from their goals on average, "
-          f"{result['success_rate']:.0%} of the episodes succeed")

@@ -3,45 +3,64 @@
 """
 The command line: collect recordings, train, evaluate, show, measure.
 
-The options and the work of each command live beside what it is about, as add_arguments(parser) and
-run(args); a module is imported only when asked for, so that one command needs no ROS and another
-no simulator.
+A command is a module with Options, a dataclass, and run(options), beside what it is about; it is
+imported only when asked for, so that one command needs no ROS and another no simulator.
 """
 
-import argparse
+from dataclasses import dataclass
+from functools import reduce
 import importlib
+from operator import or_
 import os
 from pathlib import Path
 import sys
+from typing import Annotated
 
-from tap_ros.errors import ConfigError, TapError
+from tap_ros.errors import ConfigError, TapError, UsageError
+from tap_ros.learning.model_option import ModelOption
+from tap_ros.options import parse, parse_known
 from tap_ros.text import escaped
+from tyro import conf
 
-COMMANDS = {  # command: (one line of help, module or {what: module})
-    'collect': ('simulate the expert and record it', 'sim_bridge.collect'),
+COMMANDS = {  # command: (one line of help, module or {word: the same})
+    'collect': ('simulate the expert and record it', 'sim_bridge.collect_command'),
     'import-bair': ('import the BAIR robot pushing data set', 'tap_ros.recording.bair'),
-    'train': ('train on recordings', {
-        'predictor': 'tap_ros.prediction.train_command',
-        'forward': 'tap_ros.planning.train_command'}),
+    'train': ('train on recordings', 'tap_ros.prediction.train_command'),
     'evaluate': ('score trained weights', {
-        'prediction': 'tap_ros.evaluation.prediction',
-        'forward': 'tap_ros.evaluation.forward',
-        'planning': 'experiments.planning.command',
-        'faults': 'experiments.faults.nodes.command'}),
+        'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.prediction'),
+        'forward': ('score a forward model on recordings', 'tap_ros.evaluation.forward'),
+        'planning': ('plan scenes and score where the objects end (Table 2)',
+                     'experiments.planning.command'),
+        'faults': ('inject faults into real nodes and files', 'experiments.faults.nodes.command'),
+    }),
     'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo'),
     'bench': ('measure speed; without a name, all of it', {
-        'collect': 'experiments.bench.collect',
-        'engine': 'experiments.bench.engine',
-        'recording': 'experiments.bench.recording',
-        'training': 'experiments.bench.training',
-        'planning': 'experiments.bench.planning',
-        'service': 'experiments.bench.nodes.service'}),
+        'collect': ('speed of collecting', 'experiments.bench.collect'),
+        'engine': ('what a task costs beside its own work', 'experiments.bench.engine'),
+        'recording': ('speed of reading recordings', 'experiments.bench.recording'),
+        'training': ('speed of training the predictor', 'experiments.bench.training'),
+        'planning': ('time of a plan', 'experiments.bench.planning'),
+        'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
+    }),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }
-TRAIN_DEFAULT = 'predictor'
 EXTRAS = ('jinja2', 'pandas')  # what only experiments/ needs
+TRAIN_FORWARD = 'tap_ros.planning.train_command'  # what trains with --model forward
+PROG = 'python -m tap_ros'
+_COMPLETION = ('--tyro-print-completion', '--tyro-write-completion')
+_SHELLS = (['bash'], ['zsh'], ['fish'])
+
+
+@dataclass(frozen=True)
+class Unread:
+    """Options of a command that was not asked for."""
+
+
+@dataclass(frozen=True)
+class All:
+    """Options of all benchmarks, one after the other: none."""
 
 
 def main(arguments=None):
@@ -49,15 +68,16 @@ def main(arguments=None):
     Run one command.
 
     :param arguments: list of strings; by default those of the process.
-    :return: exit code: 0, 1 after an error that was named, 130 when interrupted.
+    :return: exit code: 0, 1 after an error that was named, 2 for words that are no command or
+        option, 130 when interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        args = build_parser(arguments).parse_args(arguments)
-        return args.run(args) or 0
+        run, options = read(arguments)
+        return run(options) or 0
     except TapError as error:
         print(f'error: {escaped(error, 2000)}', file=sys.stderr)
-        return 1
+        return 2 if isinstance(error, UsageError) else 1
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
@@ -78,37 +98,69 @@ def main(arguments=None):
         return 130
 
 
-def build_parser(arguments):
-    """Build the parser, with the options of just the command that is asked for."""
-    parser = argparse.ArgumentParser(prog='python -m tap_ros', description=__doc__.split('\n')[1])
-    commands = parser.add_subparsers(dest='command', required=True, metavar='command')
-    for name, (summary, modules) in COMMANDS.items():
-        command = commands.add_parser(name, help=summary, description=summary)
-        if arguments[:1] != [name]:
-            continue
-        if isinstance(modules, str):
-            _use(command, modules)
-        elif name == 'train':
-            # An option rather than a word, as the predictor is what most want to train.
-            command.add_argument(
-                '--model', choices=list(modules), default=TRAIN_DEFAULT,
-                help='what to train: the predictor, or the forward model of the planner (default: '
-                     '%(default)s); --help shows its options. To predict from the start alone is '
-                     '--mode forward of the predictor')
-            known, _ = _quiet(modules).parse_known_args(arguments[1:])
-            _use(command, modules[known.model])
-        else:
-            _add_words(command, name, modules, arguments)
-    return parser
+def read(arguments):
+    """
+    Find out which command is asked for.
+
+    :param arguments: list of strings.
+    :return: its function, and the options to call it with.
+    :raises UsageError: for words that are no command or option.
+    """
+    words = list(arguments)
+    completion = bool(words) and words[0] in _COMPLETION
+    if completion and words[1:2] not in _SHELLS:
+        raise UsageError(f'{words[0]}: expected bash, zsh or fish after it')
+    runs = {All: _run_all}
+    kinds = [_command(name, *about, None if completion else words, runs)
+             for name, about in COMMANDS.items()]
+    # What is completed is a name that a shell can look up, not three words.
+    options = parse(reduce(or_, kinds), words, 'tap_ros' if completion else PROG,
+                    __doc__.split('\n')[1])
+    return runs[type(options)], options
 
 
-def _use(parser, module):
-    """Give a parser the options and the work of a module."""
-    if module.startswith('experiments.'):
-        _find_experiments()
-    module = importlib.import_module(module)
-    module.add_arguments(parser)
-    parser.set_defaults(run=module.run)
+def _command(name, summary, module, words, runs):
+    """
+    Return the type of a command's options, a union where it has a second word.
+
+    :param module: of COMMANDS.
+    :param words: from the name on, if it is this command that is asked for; None: all are.
+    :param runs: gets the function for the options.
+    """
+    asked = words is None or bool(words) and words[0].replace('_', '-') == name
+    if isinstance(module, dict):
+        rest = words and words[1:] if asked else []
+        kinds = [_command(word, *about, rest, runs) for word, about in module.items()]
+        if name == 'bench':
+            kinds.append(Annotated[All, conf.subcommand(
+                'all', description='one after the other', is_default=True)])
+        kind = reduce(or_, kinds)
+    elif not asked:
+        kind = Unread
+    else:
+        if name == 'train' and words and _which_model(words[1:]) == 'forward':
+            module = TRAIN_FORWARD
+        kind = _load(module, runs, needed=words is not None)
+    return Annotated[kind, conf.subcommand(name, description=summary)]
+
+
+def _which_model(words):
+    """Return what --model says, which decides about the other options of train."""
+    return parse_known(ModelOption, words, f'{PROG} train').model
+
+
+def _load(name, runs, needed=True):
+    """Import a module of COMMANDS; return the type of its options."""
+    try:
+        if name.startswith('experiments.'):
+            _find_experiments()
+        module = importlib.import_module(name)
+    except (ConfigError, ImportError):
+        if needed:
+            raise
+        return Unread  # without ROS or a checkout it completes what there is
+    runs[module.Options] = module.run
+    return module.Options
 
 
 def _find_experiments():
@@ -121,29 +173,9 @@ def _find_experiments():
         sys.path.append(str(checkout))
 
 
-def _quiet(modules):
-    """Return a parser that only finds out what --model is."""
-    # Without abbreviations, else --mode would be one of --model.
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument('--model', choices=list(modules), default=TRAIN_DEFAULT)
-    return parser
-
-
-def _add_words(command, name, modules, arguments):
-    """Add a second word, for example of 'evaluate planning'."""
-    words = command.add_subparsers(dest='what', required=name != 'bench', metavar='what')
-    for word, module in modules.items():
-        chosen = words.add_parser(word, help=f'{name} {word}')
-        if arguments[1:2] == [word]:
-            _use(chosen, module)
-    command.set_defaults(run=lambda args: _run_all(name, modules))
-
-
-def _run_all(name, modules):
-    """Run every variant of a command with its default options."""
-    for word, module in modules.items():
-        print(f'== {name} {word}', flush=True)
-        parser = argparse.ArgumentParser()
-        _use(parser, module)
-        args = parser.parse_args([])
-        args.run(args)
+def _run_all(_):
+    """Run every benchmark with its default options."""
+    for word in COMMANDS['bench'][1]:
+        print(f'== bench {word}', flush=True)
+        run, options = read(['bench', word])
+        run(options)

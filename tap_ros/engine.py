@@ -21,11 +21,13 @@ import signal
 import socket
 import sys
 import threading
+from typing import get_args, Literal
 
 from tap_ros.errors import ConfigError, EngineError
 from tap_ros.text import escaped
 
-ENGINES = ('local', 'ray')
+EngineName = Literal['local', 'ray']
+ENGINES = get_args(EngineName)
 TRIES = 3  # of a task whose worker is killed
 _POLL_S = 0.5
 _PRESENT = 2  # tasks that a Ray cluster has for each of its cores
@@ -36,14 +38,14 @@ class Engine:
     """
     Where tasks run.
 
-    :param name: 'local', processes of this machine, or 'ray'.
-    :param workers: tasks at a time; 0: one a core, of the cluster with an address.
+    :param name: local: processes of this machine; ray: Ray, which needs `pip install ray`.
+    :param workers: tasks at a time, a process each; 0: one a core, of the cluster with an address.
     :param address: of a Ray cluster to join, such as 'auto' or '10.0.0.1:6379'; empty: Ray is
         started on this machine. Its machines need this package in the same place, and the folders
         that tasks write to.
     """
 
-    name: str = 'local'
+    name: EngineName = 'local'
     workers: int = 0
     address: str = ''
 
@@ -206,28 +208,6 @@ class _RayWorkers:
 
 
 _WORKERS = {'local': _LocalWorkers, 'ray': _RayWorkers}
-
-
-def add_engine_arguments(parser, workers='--workers'):
-    """
-    Add the options of an Engine to a parser.
-
-    :param parser: argparse parser.
-    :param workers: name of the option for the number of workers.
-    """
-    parser.add_argument(workers, type=int, default=0, dest='workers', metavar='N',
-                        help='tasks at a time, a process each (default: one a core)')
-    parser.add_argument('--engine', choices=ENGINES, default='local',
-                        help='local: processes of this machine; ray: Ray, which needs `pip '
-                        'install ray` (default: %(default)s)')
-    parser.add_argument('--address', default='', metavar='HOST:PORT',
-                        help='of a Ray cluster to join; its machines need this package and the '
-                        'same folders (default: Ray on this machine)')
-
-
-def engine_of(args):
-    """Return the Engine that parsed options ask for."""
-    return Engine(args.engine, args.workers, args.address)
 
 
 def _call(function, args):

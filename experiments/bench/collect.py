@@ -2,21 +2,40 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmark of collecting: seconds per recorded episode, split into its parts."""
 
+from dataclasses import dataclass
 import os
 from pathlib import Path
 import tempfile
 import time
+from typing import Annotated
 
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
+from sim_bridge.tasks import TASKS
 from tap_ros.engine import Engine
+from tap_ros.options import one_of
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of this benchmark.
+
+    :param task: what is recorded.
+    :param episodes: how many to collect.
+    :param workers: processes; 0: one a core.
+    """
+
+    task: Annotated[str, one_of(TASKS)] = 'push2'
+    episodes: int = 60
+    workers: int = 0
 
 
 def run(args):
     """Collect into a temporary folder and print where the time went."""
     with tempfile.TemporaryDirectory() as folder:
         config = CollectConfig(task=args.task, episodes=args.episodes, episodes_per_file=5)
-        result = collect(Path(folder) / 'bench', config, Engine(workers=args.workers or 0))
+        result = collect(Path(folder) / 'bench', config, Engine(workers=args.workers))
         size = sum(path.stat().st_size for path in Path(folder).rglob('*.mcap'))
     simulator = Simulator(args.task)
     simulator.reset(0)
@@ -40,10 +59,3 @@ mean final distance                               {100 * result['mean_final_dist
 success rate (all objects within 5 cm)            {result['success_rate']:.0%}
 size of the recording per frame                   {size / result['frames'] / 1024:.1f} KiB""")
 
-
-def add_arguments(parser):
-    """Add the options of this benchmark."""
-    parser.add_argument('--task', default='push2', help='task (default: %(default)s)')
-    parser.add_argument(
-        '--episodes', type=int, default=60, help='how many to collect (default: %(default)s)')
-    parser.add_argument('--workers', type=int, help='processes (default: one a core)')

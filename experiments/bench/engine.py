@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmark of the engines: what a task costs beside its own work, and how long starting takes."""
 
+from dataclasses import dataclass
 import math
 import os
 from pathlib import Path
@@ -10,8 +11,9 @@ import time
 
 from experiments.pages import number, render
 import pandas as pd
-from tap_ros.engine import Engine, ENGINES, run_tasks, Task
+from tap_ros.engine import Engine, EngineName, ENGINES, run_tasks, Task
 from tap_ros.files import write_atomically, write_rows
+from tap_ros.options import Flag
 
 FEW, MANY = 50, 1050  # tasks that do nothing
 SLEEP_S = 0.1
@@ -19,14 +21,19 @@ SLEEPS = 20  # tasks that sleep, for each worker
 MACHINES, CORES, EPISODES, PER_FILE, EPISODE_S = 100, 2, 10_000, 25, 0.23
 
 
-def add_arguments(parser):
-    """Add the options of this benchmark."""
-    parser.add_argument('--engines', nargs='+', choices=ENGINES, default=list(ENGINES),
-                        metavar='NAME', help='local, ray (default: both)')
-    parser.add_argument('--workers', nargs='+', type=int, default=[1, 2, 4, 8, 16], metavar='N',
-                        help='(default: %(default)s)')
-    parser.add_argument('--write', action='store_true',
-                        help='also write docs/results/engine.json and engine.md')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of this benchmark.
+
+    :param engines: which are measured.
+    :param workers: with how many each.
+    :param write: also write docs/results/engine.json and engine.md.
+    """
+
+    engines: tuple[EngineName, ...] = ENGINES
+    workers: tuple[int, ...] = (1, 2, 4, 8, 16)
+    write: Flag = False
 
 
 def run(args):

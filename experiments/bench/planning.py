@@ -9,6 +9,7 @@ the rate of a large matrix product, measured in the same run; it is compared wit
 pushing, since at the start many sequences stay above the objects, where nothing is predicted.
 """
 
+from dataclasses import dataclass
 import os
 import time
 
@@ -18,6 +19,7 @@ from sim_bridge.simulator import Simulator
 from tap_ros.contract import CLEAR, LOW
 from tap_ros.errors import PlanningError
 from tap_ros.images import to_float
+from tap_ros.options import ShippedFile
 from tap_ros.planning.action_sequences import FIRST_STD, HORIZON
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.mpc_inputs import Scene
@@ -30,17 +32,21 @@ from torch.utils.flop_counter import FlopCounterMode
 BILINEAR = 8  # operations to read one number between four
 
 
-def add_arguments(parser):
-    """Add the options of this benchmark."""
-    parser.add_argument(
-        '--plans', type=int, default=15, help='how many to time (default: %(default)s)')
-    parser.add_argument(
-        '--naive-samples', type=int, default=20,
-        help='how many of a plan to time one at a time; scaled up to a whole plan '
-        '(default: %(default)s)')
-    parser.add_argument('--weights', default=str(FORWARD_MODEL), metavar='FILE',
-                        help='of the forward model (default: the shipped ones)')
-    parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of this benchmark.
+
+    :param plans: how many to time.
+    :param naive_samples: how many of a plan to time one at a time; scaled up to a whole plan.
+    :param weights: of the forward model.
+    :param device: cpu or cuda.
+    """
+
+    plans: int = 15
+    naive_samples: int = 20
+    weights: ShippedFile = str(FORWARD_MODEL)
+    device: str = 'cpu'
 
 
 def run(args):

@@ -11,6 +11,7 @@ machine that is busy otherwise, the frames per second of processor time say more
 clock; ours uses all cores, so that the two differ.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 import resource
 import tempfile
@@ -18,6 +19,7 @@ import time
 
 from mcap.reader import make_reader
 import numpy as np
+from tap_ros.options import Folder
 from tap_ros.recording import topics
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
@@ -28,11 +30,11 @@ from tap_ros.recording.writer import EpisodeWriter
 DECODED = frozenset(topics.TYPES) - {topics.CAMERA_INFO, topics.CLOCK}
 
 
-def measure(recording=None, episodes=400, files=4, repeats=3, image_size=64):
+def measure(recording='', episodes=400, files=4, repeats=3, image_size=64):
     """
     Measure frames per second of all contenders on a raw and on a compressed copy of a recording.
 
-    :param recording: path whose first episodes are used; None: made up ones of 41 frames.
+    :param recording: path whose first episodes are used; empty: made up ones of 41 frames.
     :param episodes: how many.
     :param files: number of files that they are spread over.
     :param repeats: the best time of so many counts; contenders take turns.
@@ -76,7 +78,7 @@ def _contenders():
 
 def _write(folder, compression, recording, count, files, image_size):
     """Write the files to be read; return their paths and the number of frames."""
-    if recording is None:
+    if not recording:
         source = (_make_episode(seed, image_size) for seed in range(count))
     else:
         source = (episode for episode, _ in zip(iter_episodes(recording), range(count)))
@@ -137,17 +139,21 @@ def _build_cache(paths, scratch):
     return open_recordings(paths, scratch, progress=False).num_frames
 
 
-def add_arguments(parser):
-    """Add the options of this benchmark."""
-    parser.add_argument('--recording', help='use these episodes instead of made up ones')
-    parser.add_argument(
-        '--episodes', type=int, default=400, help='how many (default: %(default)s)')
-    parser.add_argument(
-        '--files', type=int, default=4,
-        help='files that they are spread over (default: %(default)s)')
-    parser.add_argument(
-        '--repeats', type=int, default=3,
-        help='the best of so many counts (default: %(default)s)')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of this benchmark.
+
+    :param recording: use these episodes instead of made up ones.
+    :param episodes: how many.
+    :param files: that they are spread over.
+    :param repeats: the best of so many counts.
+    """
+
+    recording: Folder = ''
+    episodes: int = 400
+    files: int = 4
+    repeats: int = 3
 
 
 def run(args):

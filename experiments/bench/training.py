@@ -7,35 +7,47 @@ The peak is the rate of a large matrix product in the precision of the training,
 same run.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import os
 import tempfile
+from typing import Annotated
 
 from experiments.bench.speed import matrix_rate, matrix_side
 from tap_ros.learning.devices import make_autocast, pick_device
+from tap_ros.options import Bags, Flag
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 from torch.utils.flop_counter import FlopCounterMode
+from tyro import conf
 
 METHODS = ('genmin-wo-gan', 'genmin', 'genmin-vae', 'genmin-vae-gan')
 
 
-def add_arguments(parser):
-    """Add the options of this benchmark."""
-    default = TrainingConfig(recordings=('',), out='')
-    parser.add_argument('--recordings', nargs='+', default=['bags/sample_push2'], metavar='BAG',
-                        help='to train on (default: %(default)s)')
-    parser.add_argument('--methods', nargs='+', default=list(METHODS), metavar='METHOD',
-                        help='as for train (default: %(default)s)')
-    parser.add_argument('--steps', type=int, default=30,
-                        help='how many to time (default: %(default)s)')
-    for name in ('base_width', 'batch_size', 'threads'):
-        parser.add_argument('--' + name.replace('_', '-'), type=int, help='as for train '
-                            '(default: %(default)s)', default=getattr(default, name))
-    parser.add_argument('--device', default='auto', help='as for train (default: %(default)s)')
-    parser.add_argument('--compile', action='store_true', help='as for train')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of this benchmark.
+
+    :param recordings: to train on.
+    :param methods: each as --method of train.
+    :param steps: how many to time.
+    :param base_width: as for train.
+    :param batch_size: as for train.
+    :param threads: as for train.
+    :param device: as for train.
+    :param compile: as for train.
+    """
+
+    recordings: Bags = ('bags/sample_push2',)
+    methods: Annotated[tuple[str, ...], conf.arg(metavar='METHOD [METHOD ...]')] = METHODS
+    steps: int = 30
+    base_width: int = TrainingConfig.base_width
+    batch_size: int = TrainingConfig.batch_size
+    threads: int = TrainingConfig.threads
+    device: str = TrainingConfig.device
+    compile: Flag = False
 
 
 def run(args):

@@ -2,62 +2,78 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros paper`: make the paper's prediction results again."""
 
+from dataclasses import dataclass
 from fnmatch import fnmatch
+from itertools import chain
+from typing import Annotated
 
 from experiments.paper.places import Places
 from experiments.paper.runs import paper_runs, SCALES
 from experiments.paper.sweep import data_hashes, find_state, sweep
 import numpy as np
-from tap_ros.engine import add_engine_arguments, engine_of
+from tap_ros.engine_options import EngineOptions
 from tap_ros.errors import ConfigError
+from tap_ros.options import default_text, Flag, Folder, one_of
+from tyro import conf
 
 
-def add_arguments(parser):
-    """Add the options of the command to a parser."""
-    places = Places()
-    parser.add_argument('--scale', choices=list(SCALES), default='small',
-                        help='small: for two CPU cores; full: as in the paper, for a large GPU '
-                        '(default: %(default)s)')
-    parser.add_argument('--only', nargs='+', action='extend', metavar='PATTERN',
-                        help='only runs whose names fit, such as "grasp-forward-*"')
-    parser.add_argument('--list', action='store_true',
-                        help='show the runs, how far they are and their scores; do nothing')
-    parser.add_argument('--collect', action='store_true', help='make the recordings only')
-    parser.add_argument('--results-only', action='store_true',
-                        help='only write the page and its data from the runs that are done')
-    parser.add_argument('--ship', nargs=2, metavar=('RUN', 'FILE'),
-                        help='write the weights of a run that is done at half their size, with a '
-                        'model card beside them')
-    add_engine_arguments(parser, '--jobs')
-    parser.add_argument('--limit', '--slice-minutes', type=float, metavar='MINUTES',
-                        help='stop after so many; the next call goes on')
-    parser.add_argument('--seeds', type=int, nargs='+', default=[0], metavar='SEED',
-                        help='of the trainings (default: 0)')
-    parser.add_argument('--episodes', type=int, default=0, metavar='N',
-                        help="collect so many of each task instead of the scale's")
-    parser.add_argument('--steps', type=int, default=0, metavar='N',
-                        help="train for so many steps instead of the scale's")
-    parser.add_argument('--fresh', action='store_true',
-                        help='begin runs anew that were begun with other settings or recordings')
-    parser.add_argument('--recordings', default=places.recordings, metavar='FOLDER',
-                        help='holds a recording for each task (default: %(default)s)')
-    parser.add_argument('--runs', default=places.runs, metavar='FOLDER',
-                        help='for trainings and weights (default: %(default)s)')
-    parser.add_argument('--results', default=places.results, metavar='FOLDER',
-                        help='for the page and its data (default: %(default)s)')
+@dataclass(frozen=True)
+class PlaceOptions(Places):
+    """Where things are."""
+
+    recordings: Folder = Places.recordings
+    runs: Folder = Places.runs
+    results: Folder = Places.results
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param scale: small: for two CPU cores; full: as in the paper, for a large GPU.
+    :param only: only runs whose names fit, such as "grasp-forward-*".
+    :param list: show the runs, how far they are and their scores; do nothing.
+    :param collect: make the recordings only.
+    :param results_only: only write the page and its data from the runs that are done.
+    :param ship: write the weights of a run that is done at half their size, with a model card
+        beside them.
+    :param limit: stop after so many; the next call goes on.
+    :param seeds: of the trainings.
+    :param episodes: collect so many of each task; 0: as the scale says.
+    :param steps: train for so many steps; 0: as the scale says.
+    :param fresh: begin runs anew that were begun with other settings or recordings.
+    """
+
+    scale: Annotated[str, one_of(SCALES)] = 'small'
+    only: Annotated[conf.UseAppendAction[tuple[tuple[str, ...], ...]], conf.arg(
+        metavar='PATTERN [PATTERN ...]', help_behavior_hint='(default: all)')] = ()
+    list: Flag = False
+    collect: Flag = False
+    results_only: Flag = False
+    ship: Annotated[tuple[str, str] | None, conf.arg(
+        metavar='RUN FILE', help_behavior_hint=default_text)] = None
+    limit: Annotated[float | None, conf.arg(
+        aliases=('--slice-minutes',), metavar='MINUTES', help_behavior_hint=default_text)] = None
+    seeds: tuple[int, ...] = (0,)
+    episodes: int = 0
+    steps: int = 0
+    fresh: Flag = False
+    engine: EngineOptions = EngineOptions()
+    places: PlaceOptions = PlaceOptions()
 
 
 def run(args):
     """
     Do what the command line says.
 
-    :param args: parsed arguments, of a parser that add_arguments was called with.
+    :param args: Options.
     :return: exit status: 0, or 1 if a run failed.
     :raises ConfigError: if no run fits, or a number makes no sense.
     """
     if min(args.episodes, args.steps) < 0 or (args.limit or 1) <= 0:
         raise ConfigError('limit, episodes, steps: expected numbers above 0')
-    places = Places(args.recordings, args.runs, args.results)
+    places = args.places
     if args.results_only:
         _write_results(places, pictures=True)
         return 0
@@ -67,7 +83,7 @@ def run(args):
     if args.list:
         show(runs, places)
         return 0
-    ends = sweep(runs, places, engine_of(args), args.limit, args.fresh, args.collect,
+    ends = sweep(runs, places, args.engine, args.limit, args.fresh, args.collect,
                  on_done=lambda: _try_results(places, pictures=False))
     failed = [end for end in ends if end.kind == 'failed']
     if not args.collect:
@@ -108,12 +124,13 @@ def choose_runs(args):
     :raises ConfigError: if a pattern fits none; the message names it.
     """
     runs = paper_runs(args.scale, args.seeds, args.episodes, args.steps)
-    if not args.only:
+    patterns = list(chain(*args.only))
+    if not patterns:
         return runs
-    for pattern in args.only:
+    for pattern in patterns:
         if not any(fnmatch(run.name, pattern) for run in runs):
             raise ConfigError(f'--only {pattern}: no run has such a name; --list shows all')
-    return [run for run in runs if any(fnmatch(run.name, pattern) for pattern in args.only)]
+    return [run for run in runs if any(fnmatch(run.name, pattern) for pattern in patterns)]
 
 
 def show(runs, places):

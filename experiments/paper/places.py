@@ -22,7 +22,7 @@ class Places:
 
     :param recordings: holds a recording for each task, under the task's name.
     :param runs: <scale>/<run>/ holds what a training leaves.
-    :param results: runs/<scale>/<run>.json is the result of a run; beside it stand the pages.
+    :param results: for the pages and their data; runs/<scale>/<run>.json is that of a run.
     """
 
     recordings: str = 'bags'

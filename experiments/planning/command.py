@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line of Table 2: python -m tap_ros evaluate planning."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import json
 from pathlib import Path
 import shlex
+from typing import Annotated, Literal
 
 from experiments.planning.films import write_films
 from experiments.planning.methods import parse_method
@@ -13,68 +14,78 @@ from experiments.planning.page import make_page
 from experiments.planning.results import load_results, make_rows
 from experiments.planning.runs import Job, run_jobs
 from tap_ros.contract import step_budget
-from tap_ros.engine import add_engine_arguments, engine_of
+from tap_ros.engine_options import EngineOptions
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import forward
 from tap_ros.files import write_atomically, write_rows
+from tap_ros.options import Flag, Folder, one_of, ShippedFile
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.scenes import FIRST_SCENE, PLANNING_TASKS
 from tap_ros.weights import find_predictor, FORWARD_MODEL
+from tyro import conf
 
-DEFAULT_METHODS = ['nothing', 'direct', 'fix', 'genmin', 'one_object', 'oracle_order',
-                   'true_subgoal', 'true_model']
+BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
+DEFAULT_METHODS = ('nothing', 'direct', 'fix', 'genmin', 'one_object', 'oracle_order',
+                   'true_subgoal', 'true_model')
 TRAINED = 'runs/paper/small/{task}-bidirectional-{name}-warp-s0/predictor.safetensors'
 
 
-def add_arguments(parser):
-    """Add the options of `evaluate planning` to a parser."""
-    add = parser.add_argument
-    add('--tasks', nargs='+', choices=PLANNING_TASKS, default=list(PLANNING_TASKS),
-        metavar='TASK', help='push2, push3 (default: both)')
-    add('--methods', nargs='+', default=DEFAULT_METHODS, metavar='METHOD',
-        help='nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped (the '
-        'shipped predictor) or the name of another one; with options behind colons: half, '
-        'recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper (its search '
-        'whatever --preset says), plain_cost, every<n>, for example genmin:half:carried (default: '
-        + ' '.join(DEFAULT_METHODS) + ')')
-    add('--predictor', nargs='+', default=[], metavar='NAME=FILE',
-        help='weights of predictors; {task} in FILE stands for the task (default: what '
-        f'the command paper trained: {TRAINED})')
-    add('--scenes', type=int, default=100, help='how many (default: %(default)s)')
-    add('--seed', type=int, default=FIRST_SCENE,
-        help='of the first scene (default: %(default)s)')
-    add_engine_arguments(parser, '--jobs')
-    add('--switch', choices=SWITCHES, default='reached',
-        help='go on from a subgoal when it is reached, or at its share of the budget as in the '
-        'paper (default: %(default)s); for all methods, as the next three')
-    add('--recursion', type=int, default=1, help='subgoals in a row (default: %(default)s)')
-    add('--samples', type=int, default=1,
-        help='subgoals to choose from, for predictors that draw (default: %(default)s)')
-    add('--tracking', choices=('ground_truth', 'carried'), default='ground_truth',
-        help='where object pixels come from (default: %(default)s)')
-    add('--preset', choices=list(PRESETS), default='default',
-        help='settings of the planner (default: %(default)s)')
-    add('--plan-samples', type=int, default=0, metavar='N',
-        help="samples of an iteration of the search; 0: the preset's (default: %(default)s)")
-    add('--plan-iterations', type=int, default=0, metavar='N',
-        help="iterations of the search; 0: the preset's (default: %(default)s)")
-    add('--replan-every', type=int, default=0, metavar='N',
-        help="plan anew at every so many actions; 0: the preset's (default: %(default)s)")
-    add('--step-budget', type=int, default=0,
-        help=f"control periods; 0: the paper's, {step_budget(2)} and {step_budget(3)} "
-        '(default: %(default)s)')
-    add('--forward-weights', metavar='FILE', default=str(FORWARD_MODEL),
-        help='of the forward model (default: the shipped ones)')
-    add('--device', default='cpu', help='of the networks: cpu or cuda (default: %(default)s)')
-    add('--out', default='docs/results', metavar='FOLDER',
-        help='for planning.json, planning.md and the scenes in planning/; an interrupted '
-        'evaluation goes on there (default: %(default)s)')
-    add('--recordings', default='runs/planning', metavar='FOLDER',
-        help='for MCAP files of the best, median and worst scene (default: %(default)s)')
-    add('--no-films', action='store_true', help='leave out film strips and recordings')
-    add('--results-only', action='store_true',
-        help='run nothing, make planning.json and planning.md again from the scenes')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param tasks: what is planned.
+    :param methods: nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped
+        for the shipped predictor, or the name of another one; with options behind colons: half,
+        recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper (its search
+        whatever --preset says), plain_cost, every<n>, for example genmin:half:carried.
+    :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
+        the command paper trained.
+    :param scenes: how many.
+    :param seed: of the first scene.
+    :param switch: go on from a subgoal when it is reached, or at its share of the budget as in
+        the paper; for all methods, as the next three.
+    :param recursion: subgoals in a row.
+    :param samples: subgoals to choose from, for predictors that draw.
+    :param tracking: where object pixels come from.
+    :param preset: settings of the planner.
+    :param plan_samples: samples of an iteration of the search; 0: the preset's.
+    :param plan_iterations: iterations of the search; 0: the preset's.
+    :param replan_every: plan anew at every so many actions; 0: the preset's.
+    :param forward_weights: of the forward model.
+    :param device: of the networks: cpu or cuda.
+    :param out: for planning.json, planning.md and the scenes in planning/; an interrupted
+        evaluation goes on there.
+    :param recordings: for MCAP files of the best, median and worst scene.
+    :param no_films: leave out film strips and recordings.
+    :param results_only: run nothing, make planning.json and planning.md again from the scenes.
+    """
+
+    tasks: tuple[Annotated[str, one_of(PLANNING_TASKS)], ...] = PLANNING_TASKS
+    methods: Annotated[tuple[str, ...], conf.arg(metavar='METHOD [METHOD ...]')] = DEFAULT_METHODS
+    predictor: Annotated[tuple[str, ...], conf.arg(
+        metavar='NAME=FILE [NAME=FILE ...]', help_behavior_hint=f'(default: {TRAINED})')] = ()
+    scenes: int = 100
+    seed: int = FIRST_SCENE
+    engine: EngineOptions = EngineOptions()
+    switch: Annotated[str, one_of(SWITCHES)] = 'reached'
+    recursion: int = 1
+    samples: int = 1
+    tracking: Literal['ground_truth', 'carried'] = 'ground_truth'
+    preset: Annotated[str, one_of(PRESETS)] = 'default'
+    plan_samples: int = 0
+    plan_iterations: int = 0
+    replan_every: int = 0
+    step_budget: Annotated[int, conf.arg(
+        help=f"control periods; 0: the paper's, {BUDGETS}.")] = 0
+    forward_weights: ShippedFile = str(FORWARD_MODEL)
+    device: str = 'cpu'
+    out: Folder = 'docs/results'
+    recordings: Folder = 'runs/planning'
+    no_films: Flag = False
+    results_only: Flag = False
 
 
 def run(args):
@@ -85,7 +96,7 @@ def run(args):
     if not args.results_only:
         jobs = make_jobs(args)
         seeds = range(args.seed, args.seed + args.scenes)
-        files = run_jobs(jobs, seeds, out / 'planning', engine_of(args))
+        files = run_jobs(jobs, seeds, out / 'planning', args.engine)
         _write_results(out, films)  # first: whatever happens to the films, these stay
         for job, file in zip(jobs, files):
             name = f'{job.task}-{job.method.file_name}'

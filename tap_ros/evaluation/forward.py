@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros evaluate forward`: how well object maps are carried."""
 
+from dataclasses import dataclass
 from pathlib import Path
 import shlex
 
@@ -9,6 +10,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.files import write_rows
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
+from tap_ros.options import Bags, Folder, ShippedFile
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
 from tap_ros.recording.cache import open_recordings
@@ -19,17 +21,23 @@ METHODS = {'map_error': 'forward_model', 'nothing_moves': 'nothing',
 FILE = 'forward_model.json'
 
 
-def add_arguments(parser):
-    """Add the options of the command to a parser."""
-    parser.add_argument('--recordings', nargs='+', required=True, metavar='BAG',
-                        help='bag folders with object pixels; each is scored on its own')
-    parser.add_argument('--weights', default=str(FORWARD_MODEL), metavar='FILE',
-                        help='of a forward model (default: the shipped ones)')
-    parser.add_argument('--test-fraction', type=float, default=TEST_FRACTION,
-                        help='share of the episodes that training held out, by seed; 1: all '
-                        '(default: %(default)s)')
-    parser.add_argument('--device', default='cpu', help='cpu or cuda (default: %(default)s)')
-    parser.add_argument('--out', metavar='FOLDER', help=f'write {FILE} there')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param recordings: bag folders with object pixels; each is scored on its own.
+    :param weights: of a forward model.
+    :param test_fraction: share of the episodes that training held out, by seed; 1: all.
+    :param device: cpu or cuda.
+    :param out: write forward_model.json there.
+    """
+
+    recordings: Bags
+    weights: ShippedFile = str(FORWARD_MODEL)
+    test_fraction: float = TEST_FRACTION
+    device: str = 'cpu'
+    out: Folder = ''
 
 
 def run(args):

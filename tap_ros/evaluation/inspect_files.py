@@ -3,23 +3,34 @@
 """Show what a recording or a weights file holds."""
 
 from collections import Counter
+from dataclasses import dataclass
 import json
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from tap_ros.files import write_atomically
 from tap_ros.learning.weights import load_tensors
+from tap_ros.options import File
 from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.recording.cache import open_recordings
 from tap_ros.text import escaped, listing
+from tyro import conf
 
 
-def add_arguments(parser):
-    """Add the options of the command."""
-    parser.add_argument('path', help='an .mcap file, a bag folder, or a .safetensors file')
-    parser.add_argument('--picture', help='write film strips of the first episodes to this PNG')
-    parser.add_argument(
-        '--episodes', type=int, default=8, help='episodes in the picture (default: %(default)s)')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param path: an .mcap file, a bag folder, or a .safetensors file.
+    :param picture: write film strips of the first episodes to this PNG.
+    :param episodes: episodes in the picture.
+    """
+
+    path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
+    picture: File = ''
+    episodes: int = 8
 
 
 def run(args):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 import json
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from tap_ros.errors import ConfigError
@@ -27,6 +28,7 @@ from tap_ros.evaluation.samples import draw_latents, SAMPLES, score_samples
 from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
+from tap_ros.options import Bags, Flag, Folder
 from tap_ros.pictures import grid, overlay
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
@@ -34,6 +36,7 @@ from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights import PREDICTORS
 import torch
+from tyro import conf
 
 METHODS = ('prediction', 'copy-start', 'copy-goal')
 _BATCH = 64
@@ -189,22 +192,29 @@ def write_pictures(path, network, store, episodes, goal_picture='last', scale=2)
     imsave(path, grid(rows, scale))
 
 
-def add_arguments(parser):
-    """Add the options of `python -m tap_ros evaluate prediction` to a parser."""
-    parser.add_argument('--weights', required=True, metavar='FILE',
-                        help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}')
-    parser.add_argument('--recordings', nargs='+', required=True, metavar='BAG',
-                        help='bag folders, folders of bag folders, or .mcap files')
-    parser.add_argument('--all', action='store_true',
-                        help='take every episode, not only those that training held out')
-    parser.add_argument('--goal-picture', choices=('last', 'recorded'), default='recorded',
-                        help="the episode's last frame, or the goal's own picture where reached, "
-                        'with the arm elsewhere (default: %(default)s)')
-    parser.add_argument('--margin', type=int, default=0,
-                        help='frames beside the context that do not count as matches')
-    parser.add_argument('--samples', type=int, default=SAMPLES,
-                        help='how many to draw of weights with z (default: %(default)s)')
-    parser.add_argument('--out', metavar='FOLDER', help='write scores.json and pictures.png there')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of `python -m tap_ros evaluate prediction`.
+
+    :param recordings: bag folders, folders of bag folders, or .mcap files.
+    :param all: take every episode, not only those that training held out.
+    :param goal_picture: the episode's last frame, or the goal's own picture where reached, with
+        the arm elsewhere.
+    :param margin: frames beside the context that do not count as matches.
+    :param samples: how many to draw of weights with z.
+    :param out: write scores.json and pictures.png there.
+    """
+
+    weights: Annotated[str, conf.arg(
+        metavar='FILE',
+        help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}.')]
+    recordings: Bags
+    all: Flag = False
+    goal_picture: Literal['last', 'recorded'] = 'recorded'
+    margin: int = 0
+    samples: int = SAMPLES
+    out: Folder = ''
 
 
 def run(args):

@@ -7,8 +7,10 @@ Each scene is pushed twice: directly, and via the subgoal that predict_subgoal a
 goes through the topics, services and actions that any client would use.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
 import time
+from typing import Annotated
 
 from action_msgs.msg import GoalStatus
 import numpy as np
@@ -36,9 +38,12 @@ from tap_ros.nodes.image_messages import decode_image, decode_map
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds
+from tap_ros.options import Flag, Folder, one_of
 from tap_ros.planning.scenes import FIRST_SCENE, PLANNING_TASKS
 from tqdm import tqdm
+from tyro import conf
 
+BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 MODES = ('direct', 'subgoal')
 START_TIMEOUT_S = 90.0
 CALL_TIMEOUT_S = 20.0
@@ -227,11 +232,32 @@ def start_nodes(processes, folder, task):
     processes.start('visual_mpc_node')
 
 
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the demo.
+
+    :param scenes: how many.
+    :param seed: of the first scene.
+    :param task: what is to be done in them.
+    :param out: folder for the page, the recording and the logs; a number is added when it exists.
+    :param attach: use nodes that run already, for example those of demo.launch.py.
+    """
+
+    scenes: int = 3
+    seed: int = FIRST_SCENE
+    task: Annotated[str, one_of(PLANNING_TASKS)] = PLANNING_TASKS[0]
+    step_budget: Annotated[int, conf.arg(
+        help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0
+    out: Folder = 'runs/demo'
+    attach: Flag = False
+
+
 def run(args):
     """
     Run the demo and leave a recording, logs and a page.
 
-    :param args: parsed arguments of add_arguments.
+    :param args: Options.
     :return: exit code.
     """
     if args.scenes < 1 or args.step_budget < 0:
@@ -287,23 +313,3 @@ def new_folder(wanted):
             continue
     raise TapError(f'{wanted}: thousands of folders of that name; remove some')
 
-
-def add_arguments(parser):
-    """Add the options of the demo."""
-    parser.add_argument(
-        '--scenes', type=int, default=3, help='how many scenes (default: %(default)s)')
-    parser.add_argument(
-        '--seed', type=int, default=FIRST_SCENE,
-        help='seed of the first scene (default: %(default)s)')
-    parser.add_argument(
-        '--task', default='push2', choices=PLANNING_TASKS, help='task (default: %(default)s)')
-    parser.add_argument(
-        '--step-budget', type=int, default=0,
-        help=f"most steps of one run; 0: the task's, {step_budget(2)} and "
-        f'{step_budget(3)} (default: %(default)s)')
-    parser.add_argument(
-        '--out', default='runs/demo', help='folder for the page, the recording and the logs '
-        '(default: %(default)s; a number is added when it exists)')
-    parser.add_argument(
-        '--attach', action='store_true',
-        help='use nodes that run already, for example those of demo.launch.py')

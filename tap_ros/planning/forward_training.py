@@ -7,7 +7,7 @@ Everything random is drawn from (seed, step), so that a run that was interrupted
 same result.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 import os
 from pathlib import Path
 import time
@@ -20,7 +20,7 @@ from tap_ros.learning.devices import pick_device
 from tap_ros.learning.panels import grey_panels
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
 from tap_ros.learning.schedule import learning_rate
-from tap_ros.learning.split import split_episodes, TEST_FRACTION
+from tap_ros.learning.split import split_episodes
 from tap_ros.learning.weights import save_weights
 from tap_ros.pictures import grid
 from tap_ros.planning.forward_data import draw_windows
@@ -34,60 +34,6 @@ from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
-
-
-@dataclass(frozen=True)
-class ForwardTrainingConfig:
-    """
-    Settings of a training run.
-
-    :param recordings: bag folders or .mcap files.
-    :param out: folder of the run.
-    :param steps: optimiser steps in all.
-    :param batch_size: windows per step.
-    :param horizon: control periods of the longest windows.
-    :param grow: share of the steps over which windows grow from 2 periods to the horizon.
-    :param pictures: pictures compared per window.
-    :param motion_factor: extra weight of pixels that changed since the window's first picture.
-    :param still_weight: weight of the mean share of the crop that is said to move.
-    :param width: channels of the recurrence; features: channels it reads.
-    :param augment: mirror and recolour.
-    :param test_fraction: share of episodes held out, by seed.
-    :param device: 'auto', 'cpu', 'cuda'; threads: of the CPU, 0: as many as there are.
-    """
-
-    recordings: tuple
-    out: str
-    steps: int = 6000
-    batch_size: int = 16
-    horizon: int = 8
-    grow: float = 0.4
-    pictures: int = 4
-    learning_rate: float = 2e-3
-    warmup: int = 100
-    gradient_clip: float = 1.0
-    average_decay: float = 0.995
-    motion_factor: float = 8.0
-    still_weight: float = 2e-4
-    width: int = 32
-    features: int = 8
-    augment: bool = True
-    test_fraction: float = TEST_FRACTION
-    seed: int = 0
-    device: str = 'auto'
-    threads: int = 0
-    log_every: int = 20
-    save_every: int = 500
-
-    def __post_init__(self):
-        for name in ('steps', 'batch_size', 'horizon', 'pictures', 'width', 'features',
-                     'log_every', 'save_every'):
-            if getattr(self, name) < 1:
-                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
-        for name, low, high in (('grow', 0, 1), ('test_fraction', 0, 0.9),
-                                ('average_decay', 0, 0.99999), ('learning_rate', 0, 1)):
-            if not low <= getattr(self, name) <= high:
-                raise ConfigError(f'{name}: expected {low}..{high}, got {getattr(self, name)}')
 
 
 def train(config, stop_at=None, progress=True):

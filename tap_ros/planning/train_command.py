@@ -1,40 +1,43 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line of the forward model's training: python -m tap_ros train --model forward."""
+"""The command `python -m tap_ros train --model forward`."""
 
-from dataclasses import fields
+from dataclasses import dataclass
 import json
 from pathlib import Path
+from typing import Annotated
 
-from tap_ros.planning.forward_training import ForwardTrainingConfig, train
-
-_HELP = {
-    'steps': 'optimiser steps in all', 'batch_size': 'windows per step',
-    'horizon': 'control periods of the longest windows', 'learning_rate': 'peak of Adam',
-    'width': 'channels of the recurrence', 'seed': 'of weights, windows and augmentation',
-    'device': "'auto', 'cpu' or 'cuda'", 'threads': 'of the CPU; 0: as many as there are',
-    'test_fraction': 'share of the episodes held out', 'save_every': 'steps between checkpoints',
-    'motion_factor': 'extra weight of pixels that changed'}
+from tap_ros.learning.model_option import ModelOption
+from tap_ros.options import Bags, default_text, Folder
+from tap_ros.planning.forward_training_config import ForwardTrainingConfig
+from tyro import conf
 
 
-def add_arguments(parser):
-    """Add the options of the forward model's training to a parser."""
-    parser.add_argument('--recordings', nargs='+', required=True, metavar='BAG',
-                        help='bag folders, folders of bag folders, or .mcap files')
-    parser.add_argument('--out', default='runs/forward_model',
-                        help='folder; an interrupted run goes on there (default: %(default)s)')
-    parser.add_argument('--stop-at', type=int, metavar='STEP', help='stop and save at this step')
-    for field in fields(ForwardTrainingConfig):
-        if field.name in _HELP:
-            parser.add_argument(
-                '--' + field.name.replace('_', '-'), type=type(field.default),
-                default=field.default, help=_HELP[field.name] + ' (default: %(default)s)')
+@dataclass(frozen=True)
+class Training(ForwardTrainingConfig):
+    """How the forward model is trained."""
+
+    recordings: Bags
+    out: Folder = 'runs/forward_model'
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(ModelOption):
+    """
+    Options of the command.
+
+    :param stop_at: stop and save at this step; the next call goes on.
+    """
+
+    stop_at: Annotated[int | None, conf.arg(
+        metavar='STEP', help_behavior_hint=default_text)] = None
+    training: Training
 
 
 def run(args):
     """Train, and print where the weights are and how good."""
-    values = {name: getattr(args, name) for name in _HELP}
-    config = ForwardTrainingConfig(recordings=tuple(args.recordings), out=args.out, **values)
-    path = train(config, stop_at=args.stop_at)
-    print(json.dumps(json.loads((Path(config.out) / 'scores.json').read_text()), indent=2))
+    from tap_ros.planning.forward_training import train  # torch takes seconds, --help does without
+    path = train(args.training, stop_at=args.stop_at)
+    scores = json.loads((Path(args.training.out) / 'scores.json').read_text())
+    print(json.dumps(scores, indent=2))
     print(f'weights: {path}')

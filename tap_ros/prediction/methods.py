@@ -4,10 +4,12 @@
 
 from dataclasses import dataclass
 import re
+from typing import get_args, Literal
 
 from tap_ros.errors import ConfigError
 
-MODES = ('bidirectional', 'forward')
+Mode = Literal['bidirectional', 'forward']
+MODES = get_args(Mode)
 SELECTIONS = ('time_preference', 'relative_to_copying', 'cost_of_reaching')
 DEFAULT_BETA = 4.0  # of plain genmin in forward prediction; in the paper 2, 4 and 7 did best
 NAMES = ('fix, fix0.25 ... fix1.00 (a share of the episode), min, genmin, genmin<beta> (forward), '

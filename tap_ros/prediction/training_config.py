@@ -9,14 +9,15 @@ one flat list.
 
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import get_args, Literal
 
 from tap_ros.errors import ConfigError
 from tap_ros.learning.split import TEST_FRACTION
-from tap_ros.prediction.methods import MODES, parse_method
+from tap_ros.prediction.methods import Mode, parse_method
 
-POSTERIORS = ('video', 'frame')
-GOAL_PICTURES = ('last', 'recorded', 'mixed')
-PRECISIONS = ('auto', 'float32', 'bfloat16')
+GoalPicture = Literal['last', 'recorded', 'mixed']
+Posterior = Literal['video', 'frame']
+Precision = Literal['auto', 'float32', 'bfloat16']
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class RunSettings:
     :param out: the run's folder; if it holds a checkpoint, training goes on from there.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, batches and augmentation.
-    :param device: 'auto', 'cpu', 'cuda'.
+    :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
     :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 where it is fast.
     :param threads: of the CPU; 0: as many as there are.
     :param compile: use torch.compile; slow to start, results differ in the last digits.
@@ -41,7 +42,7 @@ class RunSettings:
     test_fraction: float = TEST_FRACTION
     seed: int = 0
     device: str = 'auto'
-    precision: str = 'auto'
+    precision: Precision = 'auto'
     threads: int = 0
     compile: bool = False
     log_every: int = 20
@@ -51,7 +52,7 @@ class RunSettings:
         """Refuse settings that cannot be run with."""
         if not self.recordings:
             raise ConfigError('recordings: expected at least one .mcap file or bag folder')
-        _check_choice(self, precision=PRECISIONS)
+        _check_choice(self, precision=Precision)
         _check_least(self, 1, 'log_every', 'save_every')
         _check_least(self, 0, 'threads')
         _check_range(self, test_fraction=(0, 0.9))
@@ -64,9 +65,10 @@ class ObjectiveSettings:
 
     :param mode: 'bidirectional', from start and goal, or 'forward', from the start alone.
     :param method: 'fix' (Eq. 1), 'min' (Eq. 2) or 'genmin' (Eq. 5), as the paper names them: with
-        l1 and GAN; fix0.25 with its target at a quarter of the episode, genmin2 with beta = 2
-        (forward); -wo-gan is l1 alone, -vae adds z (Eq. 9), -vae-gan both (Eq. 10). +relative
-        selects by the error relative to copying, +reach by the cost of reaching (losses.py).
+        l1 and GAN; fix0.25 with its target at a quarter of the episode; genmin2 with beta = 2, in
+        forward prediction; -wo-gan is l1 alone, -vae adds z (Eq. 9), -vae-gan both (Eq. 10);
+        with +relative the error relative to copying selects, with +reach the cost of reaching
+        does (losses.py).
     :param bell_edge: w at both ends of the targets; 2/3 in the paper.
     :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
     :param changed_weight: how much more pixels of the target weigh in the outer error that differ
@@ -78,7 +80,7 @@ class ObjectiveSettings:
         B, slow: choose a small num_targets).
     """
 
-    mode: str = 'bidirectional'
+    mode: Mode = 'bidirectional'
     method: str = 'genmin-wo-gan+relative'
     bell_edge: float = 2 / 3
     outer_power: float = 0.5
@@ -86,11 +88,11 @@ class ObjectiveSettings:
     recursion: int = 1
     gan_weight: float = 5e-5
     kl_weight: float = 1e-4
-    posterior: str = 'video'
+    posterior: Posterior = 'video'
 
     def __post_init__(self):
         """Refuse a loss that there is not."""
-        _check_choice(self, mode=MODES, posterior=POSTERIORS)
+        _check_choice(self, mode=Mode, posterior=Posterior)
         _check_least(self, 1, 'recursion')
         _check_least(self, 0, 'changed_weight', 'gan_weight', 'kl_weight')
         _check_range(self, bell_edge=(1e-6, 1), outer_power=(0.1, 1))
@@ -137,14 +139,14 @@ class DataSettings:
     num_targets: int = 0
     max_frames: int = 0
     min_crop: float = 1.0
-    goal_picture: str = 'mixed'
+    goal_picture: GoalPicture = 'mixed'
     flip: bool = True
     colour: bool = True
     brightness: float = 0.2
 
     def __post_init__(self):
         """Refuse what cannot be taken from episodes."""
-        _check_choice(self, goal_picture=GOAL_PICTURES)
+        _check_choice(self, goal_picture=GoalPicture)
         _check_least(self, 0, 'margin', 'num_targets', 'max_frames')
         if 0 < self.max_frames < 3:
             raise ConfigError(f'max_frames: expected 0 or at least 3, got {self.max_frames}')
@@ -158,13 +160,13 @@ class NetworkSettings:
 
     :param new_pixels: whether the network may paint; object maps are best without.
     :param base_width: the network's width; 32 in the paper.
-    :param flow_scale: see PredictorConfig.
+    :param flow_scale: pixels of flow for an output of 1 of the flow decoder.
     :param latent_size: length of z, for the methods that have it.
     :param video_frames: the recognition network sees the video at so many moments; the paper: all.
     :param initial_weights: begin with these instead of fresh ones: a file, or the name of shipped
         weights; to learn another task from few episodes. The network must have the same shape.
-    :param pretrain_steps: steps of training the decoders as a frame generator first, at a rate of
-        1e-4 (appendix C).
+    :param pretrain_steps: steps of training the decoders as a frame generator first (appendix C),
+        at a rate of 1e-4.
     """
 
     new_pixels: bool = False
@@ -231,10 +233,10 @@ DEFAULTS = {field.name: field.default for field in fields(TrainingConfig)}
 
 
 def _check_choice(config, **choices):
-    """Refuse a field that is none of its choices."""
+    """Refuse a field that is none of its choices, a Literal."""
     for name, valid in choices.items():
-        if getattr(config, name) not in valid:
-            raise ConfigError(f'{name}: expected one of {", ".join(valid)}, '
+        if getattr(config, name) not in get_args(valid):
+            raise ConfigError(f'{name}: expected one of {", ".join(get_args(valid))}, '
                               f'got {getattr(config, name)!r}')
 
 

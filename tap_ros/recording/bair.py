@@ -22,15 +22,18 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 import re
+from typing import Annotated
 
 import cv2
 import numpy as np
 from tap_ros.errors import RecordingError, TapError
 from tap_ros.files import only_writer, storage_errors
+from tap_ros.options import Folder
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.tfrecord import parse_example, read_records
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 from tqdm import tqdm
+from tyro import conf
 
 FRAMES = 30
 SIZE = (64, 64, 3)
@@ -149,13 +152,18 @@ def read_episode(data, seed):
         task='bair', seed=seed)
 
 
-def add_arguments(parser):
-    """Add the options of the command."""
-    parser.add_argument(
-        'paths', nargs='+', metavar='PATH',
-        help='the folder softmotion30_44k, or .tfrecords files of it')
-    parser.add_argument(
-        '--out', required=True, help='folder for the bags train and test, say bags/bair')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of `python -m tap_ros import-bair`.
+
+    :param paths: the folder softmotion30_44k, or .tfrecords files of it.
+    :param out: folder for the bags train and test, say bags/bair.
+    """
+
+    paths: Annotated[conf.Positional[tuple[str, ...]], conf.arg(
+        metavar='PATH [PATH ...]', help_behavior_hint='(required)')]
+    out: Folder
 
 
 def run(args):

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the prediction metrics."""
 
-import argparse
 from dataclasses import replace
 from itertools import product
 import json
@@ -16,10 +15,11 @@ from tap_ros.evaluation.bottleneck import (
     MIN_MOTION,
     target_bottlenecks,
 )
-from tap_ros.evaluation.prediction import add_arguments, evaluate, run, write_pictures
+from tap_ros.evaluation.prediction import evaluate, Options, run, write_pictures
 from tap_ros.evaluation.samples import draw_latents, score_samples
 from tap_ros.images import to_float
 from tap_ros.learning.weights import save_weights
+from tap_ros.options import parse
 from tap_ros.prediction.batches import fixed_time, make_batch, Sampling
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
@@ -283,12 +283,10 @@ def test_the_command_scores_what_training_held_out(tmp_path, monkeypatch, capsys
     made = network(**options)
     weights = tmp_path / 'weights.safetensors'
     save_weights(weights, made, 'predictor', made.config, {'settings': {'test_fraction': 0.0}})
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
     common = ['--weights', str(weights), '--recordings', str(tmp_path / 'bag_0.mcap')]
     with pytest.raises(ConfigError, match='--all'):
-        run(parser.parse_args(common))
-    run(parser.parse_args([*common, '--all', '--samples', '3', '--out', str(tmp_path / 'out')]))
+        run(parse(Options, common))
+    run(parse(Options, [*common, '--all', '--samples', '3', '--out', str(tmp_path / 'out')]))
     shown = capsys.readouterr().out
     assert ('best of 3' in shown) == ('latent_size' in options)
     scores = json.loads((tmp_path / 'out' / 'scores.json').read_text())['scores']

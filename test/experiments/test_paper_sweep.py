@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the sweep, with tiny recordings and a few steps of training."""
 
-import argparse
 from dataclasses import replace
 import json
 import os
@@ -29,6 +28,7 @@ from tap_ros.engine import Engine
 from tap_ros.errors import ConfigError
 from tap_ros.files import locked
 from tap_ros.learning.split import split_episodes
+from tap_ros.options import parse
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
@@ -276,9 +276,7 @@ def test_an_interrupted_sweep_leaves_no_process_and_goes_on(places, number):
 
 
 def arguments(places, *options):
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    return parser.parse_args([
+    return parse(command.Options, [
         '--recordings', places.recordings, '--runs', places.runs, '--results', places.results,
         '--episodes', str(EPISODES), '--steps', '2', *options])
 

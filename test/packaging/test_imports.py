@@ -17,9 +17,9 @@ OWN = ('tap_ros', 'sim_bridge', 'experiments')
 # What takes seconds to import: what each node does without, so that it is back soon after a crash.
 DONE_WITHOUT = {
     ('sim_bridge.sim_node', 'tap_ros.nodes.recorder_node'):
-        ('torch', 'cv2', 'scipy', 'matplotlib', 'pandas', 'tensorboard'),
+        ('torch', 'cv2', 'scipy', 'matplotlib', 'pandas', 'tensorboard', 'tyro'),
     ('tap_ros.nodes.predictor_node', 'tap_ros.nodes.visual_mpc_node'):
-        ('scipy', 'matplotlib', 'pandas', 'tensorboard', 'mujoco'),
+        ('scipy', 'matplotlib', 'pandas', 'tensorboard', 'mujoco', 'tyro'),
 }
 PRINT_LOADED = """
 import importlib, sys

@@ -13,7 +13,8 @@ from tap_ros.errors import ConfigError
 from tap_ros.planning.forward_data import augment_windows, COLOUR_ORDERS, read_windows
 from tap_ros.planning.forward_loss import draw_arm_like, forward_loss, motion_weight
 from tap_ros.planning.forward_scores import map_errors
-from tap_ros.planning.forward_training import ForwardTrainingConfig, train
+from tap_ros.planning.forward_training import train
+from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.planning.table import project
 from tap_ros.recording.cache import open_recordings
 import torch

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records of the BAIR data set, written here byte by byte, arrive as recordings."""
 
-from argparse import ArgumentParser
 from functools import cache
 import struct
 
@@ -12,9 +11,10 @@ import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.learning.split import split_episodes
+from tap_ros.options import parse
 from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.networks import Predictor, PredictorConfig
-from tap_ros.recording.bair import add_arguments, find_shards, import_bair
+from tap_ros.recording.bair import find_shards, import_bair, Options
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.tfrecord import parse_example, read_records
 
@@ -313,7 +313,4 @@ def test_prediction_is_evaluated_without_objects(tmp_path, data_set):
 
 
 def test_the_command_takes_files_and_a_folder():
-    parser = ArgumentParser()
-    add_arguments(parser)
-    args = parser.parse_args(['a', 'b', '--out', 'c'])
-    assert (args.paths, args.out) == (['a', 'b'], 'c')
+    assert parse(Options, ['a', 'b', '--out', 'c']) == Options(('a', 'b'), 'c')

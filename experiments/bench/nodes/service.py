@@ -10,7 +10,7 @@ are answered, each with a queue of its own, spread over a few processes.
 """
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import multiprocessing
 import os
 import signal
@@ -61,18 +61,23 @@ class Load:
     lost: int
 
 
-def add_arguments(parser):
-    """Add the options of this benchmark."""
-    parser.add_argument('--rounds', type=int, default=6,
-                        help='turns of the service and of the model alone (default: %(default)s)')
-    parser.add_argument('--calls', type=int, default=100,
-                        help='calls in each turn (default: %(default)s)')
-    parser.add_argument('--clients', type=int, nargs='*', default=[1, 4, 16, 64], metavar='N',
-                        help='how many clients ask at once (default: 1 4 16 64)')
-    parser.add_argument('--seconds', type=float, default=5,
-                        help='how long they ask (default: %(default)s)')
-    parser.add_argument('--rate', type=float, default=30,
-                        help='pictures that stream in, per second (default: %(default)s)')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of this benchmark.
+
+    :param rounds: turns of the service and of the model alone.
+    :param calls: in each turn.
+    :param clients: how many clients ask at once; without a number, none do.
+    :param seconds: how long they ask.
+    :param rate: pictures that stream in, per second.
+    """
+
+    rounds: int = 6
+    calls: int = 100
+    clients: list[int] = field(default_factory=lambda: [1, 4, 16, 64])
+    seconds: float = 5
+    rate: float = 30
 
 
 def run(args):

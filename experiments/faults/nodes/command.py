@@ -2,26 +2,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command that injects faults: `python -m tap_ros evaluate faults`."""
 
+from dataclasses import dataclass
 import os
 import signal
+from typing import Annotated
 
 from experiments.faults.nodes.groups import GROUPS
 from experiments.faults.nodes.rig import Rig
 from experiments.faults.runner import choose, run_faults
+from tap_ros.options import Flag, Folder
+from tyro import conf
 
 
-def add_arguments(parser):
-    """Add the options of the command."""
-    parser.add_argument('--only', nargs='+', default=[], metavar='NAME',
-                        help='only these faults (default: all; --list names them)')
-    parser.add_argument('--share', type=float, default=1.0,
-                        help='share of the trials of each fault (default: %(default)s)')
-    parser.add_argument('--out', default='docs/results',
-                        help='folder of faults.json and faults.md (default: %(default)s)')
-    parser.add_argument('--again', action='store_true',
-                        help='try also what faults.json says already')
-    parser.add_argument('--list', action='store_true',
-                        help='list the faults and about how long each takes, and try none')
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param only: only these faults; --list names them.
+    :param share: share of the trials of each fault.
+    :param out: folder of faults.json and faults.md.
+    :param again: try also what faults.json says already.
+    :param list: list the faults and about how long each takes, and try none.
+    """
+
+    only: Annotated[tuple[str, ...], conf.arg(
+        metavar='NAME [NAME ...]', help_behavior_hint='(default: all)')] = ()
+    share: float = 1.0
+    out: Folder = 'docs/results'
+    again: Flag = False
+    list: Flag = False
 
 
 def run(args):

@@ -1,0 +1,130 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Options of a command from a dataclass: a field is an option, its `:param` line is its help.
+
+tyro reads them. Settings that the package uses without a command line stay free of it: a command
+takes them as a field, or adds to a subclass what only the command line knows, as EngineOptions
+does. Options of a field that is a dataclass itself stand in a box of their own in --help.
+"""
+
+from dataclasses import replace
+from typing import Annotated, get_args
+
+from tap_ros.errors import UsageError
+from tap_ros.text import escaped, listing
+import tyro
+from tyro import _errors as failures
+from tyro import conf
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+
+def default_text(default):
+    """Return what --help says of a default; of an empty one that there is none."""
+    return '(default: none)' if default in ('', "''", 'None') else f'(default: {default})'
+
+
+Bags = Annotated[tuple[str, ...], conf.arg(metavar='BAG [BAG ...]')]
+File = Annotated[str, conf.arg(metavar='FILE', help_behavior_hint=default_text)]
+Flag = Annotated[bool, conf.FlagCreatePairsOff]  # without --no-...
+Folder = Annotated[str, conf.arg(metavar='FOLDER', help_behavior_hint=default_text)]
+ShippedFile = Annotated[str, conf.arg(  # its own place is long, and other on each machine
+    metavar='FILE', help_behavior_hint='(default: the shipped ones)')]
+
+_STYLE = (conf.OmitArgPrefixes, conf.OmitSubcommandPrefixes, conf.HelptextFromCommentsOff)
+_RULES = ConstructorRegistry()
+
+
+def parse(kind, words, prog='python -m tap_ros', description=None):
+    """
+    Make options from words.
+
+    :param kind: dataclass, or a union of them with tyro.conf.subcommand.
+    :param words: list of strings.
+    :param prog: what the command is called in --help.
+    :param description: what it does, in --help; by default the summary of the dataclass.
+    :return: an object of that kind.
+    :raises UsageError: for words that it cannot be made from.
+    :raises SystemExit: after --help, and after what prints shell completion.
+    """
+    with failures.on_parse_error(_refuse):
+        return tyro.cli(
+            kind, args=words, prog=prog, description=description, config=_STYLE, registry=_RULES)
+
+
+def parse_known(kind, words, prog):
+    """Make options from those of the words that are some, and leave out the others; see parse."""
+    with failures.on_parse_error(_refuse):
+        return tyro.cli(
+            kind, args=words, prog=prog, config=_STYLE, registry=_RULES, add_help=False,
+            return_unknown_args=True)[0]
+
+
+def one_of(choices):
+    """
+    Return what makes a str in Annotated an option with choices.
+
+    :param choices: names, such as the keys of a dict. Where they are written down but here, a
+        Literal is simpler.
+    """
+    names = tuple(choices)
+    return PrimitiveConstructorSpec(
+        nargs=1, metavar='{' + ','.join(names) + '}', instance_from_str=lambda words: words[0],
+        is_instance=lambda value: value in names, str_from_instance=lambda value: [value],
+        choices=names)
+
+
+@_RULES.primitive_rule
+def _at_least_one(info):
+    """Let an option that is a tuple of any length need a value; one that is a list does not."""
+    kinds = get_args(info.type) if info.type_origin is tuple else ()
+    if kinds[1:] != (...,) or conf.UseAppendAction in info.markers:
+        return None
+    spec = ConstructorRegistry.get_primitive_spec(
+        PrimitiveTypeInfo.make(list[kinds[0]], info.markers))
+    if not isinstance(spec, PrimitiveConstructorSpec):
+        return spec
+
+    def convert(words):
+        if not words:
+            raise ValueError('expected at least one value')
+        return tuple(spec.instance_from_str(words))
+
+    one = spec.metavar[1:-1].split(' [')[0]
+    return replace(spec, metavar=f'{one} [{one} ...]', instance_from_str=convert,
+                   is_instance=lambda values: isinstance(values, tuple))
+
+
+def _refuse(event):
+    """Raise what is wrong with the words as one line; tyro says it in a box of ten."""
+    raise UsageError(f'{_reason(event)}; --help says what is valid')
+
+
+def _reason(event):
+    """Say what is wrong."""
+    match event:
+        case failures.MissingArgs():
+            missing = [each.arg for each in event.missing_arguments]
+            unknown = event.unrecognized_tokens
+            return (f'missing: {listing(map(_name, missing))}'
+                    + (f'; unknown: {listing(unknown)}' if unknown else ''))
+        case failures.UnrecognizedArgs():
+            return f'unknown: {listing(event.tokens)}'
+        case failures.InvalidChoice():
+            return (f'{_name(event.argument)}: expected one of {", ".join(event.choices)}, '
+                    f'got {event.value!r}')
+        case failures.BadValue():
+            return f'{_name(event.argument)}: expected {event.argument.lowered.metavar} after it'
+        case failures.MissingSubcommand():
+            return f'expected one of {", ".join(event.subcommand_spec.parser_from_name)}'
+        case failures.InstantiationFailure():
+            argument, message = event.argument, escaped(event.message)
+            return f'{_name(argument)}: expected {argument.lowered.metavar} ({message})' if (
+                argument) else message
+    return escaped(event)
+
+
+def _name(argument):
+    """Return how an option is spelled, or what stands for a word without one."""
+    return argument.lowered.metavar if argument.is_positional() else (
+        argument.lowered.name_or_flags[-1])
