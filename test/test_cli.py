@@ -74,9 +74,9 @@ def test_names_of_files_do_not_reach_the_terminal_raw(tmp_path, capsys):
 def test_a_missing_package_of_the_experiments_is_named_and_others_are_not_hidden(
         capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'pandas', None)
-    for name in ('pandas', 'no_such_module'):
+    for name in ('pandas', 'nosuch'):
         monkeypatch.setitem(COMMANDS, name, ('', name))
     assert main(['pandas']) == 1
     assert 'requirements-experiments.txt' in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
-        main(['no_such_module'])
+        main(['nosuch'])
