@@ -18,10 +18,12 @@ and no goal pictures. What the records do not say, and how the recordings fill i
 - The gripper's opening. It is NaN in /joint_states.
 """
 
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 import re
+from typing import Any
 
 import cv2
 import numpy as np
@@ -49,12 +51,12 @@ class Shard:
     split: str  # 'train' or 'test'
     numbers: range  # of its trajectories
 
-    def target(self, folder):
+    def target(self, folder: str | Path) -> Path:
         """Return the path of the recording that it becomes."""
         return Path(folder, self.split, f'{self.split}_{self.numbers.start}.mcap')
 
 
-def find_shards(paths):
+def find_shards(paths: Iterable[str | Path]) -> list[Shard]:
     """
     Find the files of the data set, in the order of division and number.
 
@@ -78,7 +80,7 @@ def find_shards(paths):
     return shards
 
 
-def import_bair(paths, folder, progress=True):
+def import_bair(paths: Iterable[str | Path], folder: str | Path, progress: bool = True) -> int:
     """
     Import files of the data set, or go on with an import that was interrupted.
 
@@ -113,14 +115,14 @@ def import_bair(paths, folder, progress=True):
     return done
 
 
-def _describe(bags):
+def _describe(bags: Iterable[Path]) -> None:
     """Write metadata.yaml of the bags that have files."""
     for bag in bags:
         if any(bag.glob('*.mcap')):
             write_metadata(bag)
 
 
-def read_episode(data, seed):
+def read_episode(data: bytes, seed: int) -> Episode:
     """
     Decode one record.
 
@@ -167,7 +169,7 @@ def run(args):
         print(f'{args.out}: all episodes were there already')
 
 
-def _shard(path):
+def _shard(path: Path) -> Shard:
     """Say what a file of the data set holds, by its name."""
     match = _NAME.fullmatch(path.name)
     numbers = range(int(match[1]), int(match[2]) + 1) if match else ()
@@ -179,7 +181,7 @@ def _shard(path):
     return Shard(path, split, numbers)
 
 
-def _import_shard(shard, target, bar):
+def _import_shard(shard: Shard, target: Path, bar: tqdm) -> None:
     """Import one file, wholly or not at all."""
     target.parent.mkdir(parents=True, exist_ok=True)
     count = 0
@@ -198,7 +200,7 @@ def _import_shard(shard, target, bar):
                 f'{"more" if count > len(shard.numbers) else count}; fetch the file again')
 
 
-def _picture(features, name):
+def _picture(features: Mapping[str, Any], name: str) -> np.ndarray:
     """Return a frame, (64, 64, 3) uint8 rgb."""
     value = features.get(name)
     if not isinstance(value, list) or len(value) != 1:
@@ -219,7 +221,7 @@ def _picture(features, name):
     return frame
 
 
-def _floats(features, name, count):
+def _floats(features: Mapping[str, Any], name: str, count: int) -> np.ndarray:
     """Return a vector, (count,) float32."""
     value = features.get(name)
     if not isinstance(value, np.ndarray) or value.shape != (count,):
