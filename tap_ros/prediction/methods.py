@@ -40,7 +40,7 @@ class Method:
     selection: str
 
 
-def parse_method(name):
+def parse_method(name: str) -> Method:
     """
     Find out what a method's name stands for.
 
