@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros evaluate forward`: how well object maps are carried."""
 
+from collections.abc import Mapping
 from pathlib import Path
 import shlex
+from typing import Any
 
+import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.files import write_rows
@@ -66,7 +69,8 @@ def run(args):
         write_rows(Path(args.out, FILE), rows)
 
 
-def make_rows(task, measured, data_hash, command):
+def make_rows(task: str, measured: Mapping[int, Mapping[str, np.ndarray]], data_hash: str,
+              command: str) -> list[dict[str, Any]]:
     """
     Turn measurements into rows.
 
