@@ -30,7 +30,7 @@ help:
 	@echo 'make test    all tests; ARGS="-k warp" chooses'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
-	@echo 'make faults  inject every fault into real nodes and files, in docs/results: three hours;'
+	@echo 'make faults  inject every fault into real nodes and files, in docs/results: five hours;'
 	@echo '             goes on where it was interrupted; ARGS=--list, ARGS="--only NAME"'
 	@echo 'make bench   measure the speed of each part; ARGS=...'
 	@echo 'make lint    check the style of the code and its types'

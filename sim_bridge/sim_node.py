@@ -25,6 +25,7 @@ from tap_ros.errors import TapError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
+from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
@@ -70,7 +71,9 @@ class SimNode(Node):
         self._create_publishers()
         # Subscribed before the twist, so that of two commands sent together it is taken first.
         self.create_subscription(Float64, 'gripper/command', self._on_gripper, STREAM)
-        self.create_subscription(TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM)
+        self.create_subscription(
+            TwistStamped, 'arm/delta_twist_cmds',
+            self._on_twist, STREAM)  # type: ignore[arg-type]  # with the info
         self.create_subscription(Float64, 'arm/command_timeout', self._on_timeout, LATCHED)
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
@@ -115,7 +118,7 @@ class SimNode(Node):
             return
         self._opening = min(max(message.data, 0.0), 1.0)
 
-    def _on_twist(self, message: TwistStamped) -> None:
+    def _on_twist(self, message: TwistStamped, info: dict[str, Any]) -> None:
         self._diagnostics.received('arm/delta_twist_cmds')
         stamp_ns = to_nanoseconds(message.header.stamp)
         move = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
@@ -137,7 +140,8 @@ class SimNode(Node):
             self._step(move)
         else:
             self._twist = move
-            self._valid_until = time.monotonic() + self._timeout / self.params['real_time_factor']
+            self._valid_until = (reception_time(info)
+                                 + self._timeout / self.params['real_time_factor'])
 
     def _on_timeout(self, message: Float64) -> None:
         if not 0 < message.data <= MAX_TIMEOUT:

@@ -146,8 +146,9 @@ def decode_gripper(message: JointState, name: str = 'joint_states') -> np.ndarra
         raise PlanningError(
             f'{name}: lacks {", ".join(missing)}; it has {listing(positions) or "no joints"}')
     gripper = np.array([positions[joint] for joint in GRIPPER_JOINTS], np.float32)
-    if not np.isfinite(gripper).all():
-        raise PlanningError(f'{name}: the gripper is at {gripper}; expected finite numbers')
+    for joint, position in zip(GRIPPER_JOINTS, gripper):
+        if not np.isfinite(position):
+            raise PlanningError(f'{name}: {joint} is at {position}; expected finite numbers')
     return gripper
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 MODES = ('subgoal', 'direct')
 TRACKING = ('ground_truth', 'carried')
 MAX_BUDGET = 1000
+MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
 
 
 def declare_parameters(node: 'Node') -> Parameters:
@@ -108,7 +109,8 @@ def check_request(request: 'ReachGoal.Goal') -> str:
     """
     Check what can be checked of a goal alone, and return its mode, the default filled in.
 
-    :raises ConfigError: for an unknown mode, or a budget or seed out of range.
+    :raises ConfigError: for an unknown mode, a budget or seed out of range, or more samples than
+        can be weighed.
     """
     if request.seed < 0:
         raise ConfigError(f'seed is {request.seed}; expected 0 or more')
@@ -118,4 +120,9 @@ def check_request(request: 'ReachGoal.Goal') -> str:
     if request.step_budget > MAX_BUDGET:
         raise ConfigError(f'step_budget is {request.step_budget}; expected 1 to {MAX_BUDGET}, or '
                           f'0 for {step_budget(2)}, with three objects {step_budget(3)}')
+    samples, depth = request.num_samples or 1, request.recursion_depth or 1
+    if mode == 'subgoal' and samples > 1 and samples * (depth + 1) > MAX_CHOICE:
+        raise ConfigError(
+            f'num_samples x (recursion_depth + 1) is {samples} x {depth + 1} = '
+            f'{samples * (depth + 1)}; at most {MAX_CHOICE} plans are made to choose a sample')
     return mode

@@ -23,6 +23,7 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
+from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
@@ -41,6 +42,7 @@ class Loop:
         self.pause_client = node.create_client(SetBool, 'sim/pause')
         self.predict_client = node.create_client(PredictSubgoal, 'predict_subgoal')
         self.reach_client = ActionClient(node, ReachGoal, 'reach_goal')
+        self.predictor_alive = Liveness(node, 'predictor_node')
         self.image = Newest(node, Image, 'camera/image_raw', STREAM)
         self.objects = Newest(node, ObjectStates, 'objects', STREAM)
         self.joints = Newest(node, JointState, 'joint_states', STREAM)
@@ -101,7 +103,8 @@ class Loop:
         raise AssertionError(response.message)
 
     def predict(self, timeout_s=60.0, **fields):
-        return call(self.predict_client, PredictSubgoal.Request(**fields), timeout_s)
+        return call(self.predict_client, PredictSubgoal.Request(**fields), timeout_s,
+                    server=self.predictor_alive)
 
     def reach(self, on_feedback=None, **fields):
         """Send a goal and wait for its end."""

@@ -16,12 +16,13 @@ from experiments.faults.nodes.world import (
 )
 import numpy as np
 from sensor_msgs.msg import Image
-from tap_msgs.msg import ObjectStates
+from tap_msgs.msg import Episode, ObjectStates
 from tap_ros.nodes.clients import in_executor
 from tap_ros.nodes.topics import STREAM, to_stamp
 
 STOP_S = 0.5
 END_S = 8.0
+DISCOVERED_S = 0.5  # that a new publisher takes to be heard
 FORGED = 'FORGED LINE'
 NAMES = (f'red\n{FORGED}', f'\x1b[31m{FORGED}\x1b[0m', f'a\r{FORGED}', f'a\x85{FORGED}',
          f'a\u2028{FORGED}', '\x1b]0;title\x07', f'a\x00\n{FORGED}')
@@ -70,7 +71,7 @@ def other_simulator(job):
         rig.commands.wait_for_moves(begin, 1, 20.0)
         try:
             other.start().wait_until_ready()
-            _judge(job, handle, time.monotonic() + 0.5)  # it has to be discovered first
+            _judge(job, handle, time.monotonic() + DISCOVERED_S)
         finally:
             other.end()
 
@@ -137,8 +138,10 @@ def future_stamps(job):
 def forged_names(job):
     """Send names with newlines and control characters to every node, and look into its log."""
     rig = job.rig
-    rig.need('visual_mpc_node', 'predictor_node', sim='real')
+    nodes = ('visual_mpc_node', 'predictor_node', 'recorder_node')
+    rig.need(*nodes, sim='real')
     rogue = rig.node.create_publisher(ObjectStates, 'objects', STREAM)
+    episodes = rig.node.create_publisher(Episode, 'episode', STREAM)
     seen = first_pictures()[0]
     try:
         for trial in job.trials():
@@ -149,6 +152,7 @@ def forged_names(job):
                 {'mode': name}, {'start_objects': objects},
                 {'start': Image(width=64, height=64, encoding=name, step=192)})]
             rogue.publish(objects)
+            episodes.publish(Episode(event=Episode.START, task=name, outcome=name))
             for fields in ({'mode': name}, {'goal_objects': objects}):
                 handle, _ = outcome(rig.begin, **goal_fields(**fields))
                 if handle is not None:
@@ -164,9 +168,10 @@ def forged_names(job):
             if wrong:  # what is in a log stays there
                 for node in list(rig.processes):
                     rig.remove(node)
-                rig.need('visual_mpc_node', 'predictor_node', sim='real')
+                rig.need(*nodes, sim='real')
     finally:
         rig.node.destroy_publisher(rogue)
+        rig.node.destroy_publisher(episodes)
 
 
 def _is_forged(text):
@@ -182,8 +187,11 @@ FAULTS = [
           'the arm pushes towards the goal of the old one.', ABORTED, 20, 4.0, reset,
           'until the goal ended', 's'),
     Fault('scene-other-simulator', 'a second simulator is started during a goal', 'Two cameras '
-          'publish on the same topic: pictures of two scenes take turns.', ABORTED, 10, 9.0,
-          other_simulator, 'until the goal ended', 's'),
+          'publish on the same topic: pictures of two scenes take turns.', 'The goal is aborted '
+          f'with the reason, and no move is sent later than {STOP_S + DISCOVERED_S:g} s after the '
+          f'second simulator says that it is ready, which includes {DISCOVERED_S:g} s until it is '
+          'discovered.', 10, 9.0, other_simulator,
+          f'until the goal ended, from {DISCOVERED_S:g} s after it was ready', 's'),
     Fault('scene-clock', 'the clock jumps during a goal', 'A computer sets its clock, or a '
           'recording is played in a loop.', ABORTED, 20, 3.0,
           lambda job: in_world(job, clock_jump), 'until the goal ended', 's'),

@@ -4,6 +4,7 @@
 
 from functools import partial
 import json
+import select
 import subprocess
 import sys
 import time
@@ -25,6 +26,7 @@ import torch
 PER_PROCESS = 8
 DEFAULT_DEPTH = 10  # of the queue of a client in ROS 2
 SOON_S = 10.0
+START_S = 60.0  # that a process of clients takes to find the service, or to end
 
 
 def call_at_once(clients, seconds, calls=0, depth=SERVICE_QOS.depth):
@@ -45,12 +47,14 @@ def call_at_once(clients, seconds, calls=0, depth=SERVICE_QOS.depth):
         start_new_session=True) for count in counts]
     try:
         for process in processes:
-            if process.stdout.readline() != 'ready\n':
+            if read_line(process, START_S) != 'ready\n':
                 raise TapError('a process of clients did not start')
         for process in processes:
             process.stdin.write('\n')
             process.stdin.flush()
-        found = [json.loads(process.stdout.readline()) for process in processes]
+        until = time.monotonic() + (seconds if not calls else calls * PATIENCE_S) + START_S
+        found = [json.loads(read_line(process, until - time.monotonic()))
+                 for process in processes]
     finally:
         for process in processes:
             try:
@@ -62,6 +66,16 @@ def call_at_once(clients, seconds, calls=0, depth=SERVICE_QOS.depth):
     total = {key: sum(part.get(key, 0) for part in found)
              for key in ('good', 'busy', 'refused', 'lost')}
     return {**total, 'seconds': max(part['seconds'] for part in found)}
+
+
+def read_line(process, timeout_s):
+    """Return the next line that a process prints; raise TapError when none comes in time."""
+    ready, _, _ = select.select([process.stdout], [], [], max(timeout_s, 0.0))
+    line = process.stdout.readline() if ready else ''
+    if not line:
+        raise TapError('a process of clients ' + (
+            'ended without a word' if ready else f'said nothing for {timeout_s:.0f} s'))
+    return line
 
 
 def many(job, clients, depth=SERVICE_QOS.depth):

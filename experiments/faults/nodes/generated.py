@@ -13,6 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import SetBool
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
+from tap_ros.nodes import heartbeat
 from tap_ros.nodes.clients import call, cancel_goal, in_executor, wait_for_future
 from tap_ros.nodes.topics import LATCHED
 
@@ -21,11 +22,28 @@ ROUND = 200  # batches between two good calls to everything
 MOST_FAILURES = 5  # of which each is shrunk, with nodes that start anew each time
 SHRINK_S = 240.0
 ANSWER_S = 10.0
-LATCHED_TOPICS = ('goal/image', 'goal/objects')
 TEST = """\
-@pytest.mark.parametrize('where, fields', {cases!r})
-def test_a_message_ends_no_node(where, fields): ...
+To see it again, and for the tests:
+
+from experiments.faults.nodes.generated import Target
+from experiments.faults.nodes.rig import Rig
+from numpy import inf, nan
+
+CASES = {cases!r}
+
+
+def test_these_messages_end_no_node():
+    with Rig() as rig:
+        Target(rig).send(CASES)
 """
+
+
+def _qos(name):
+    if name in strategies.LATCHED_TOPICS:
+        return LATCHED
+    if name.endswith('/heartbeat'):
+        return heartbeat.QOS
+    return QoSProfile(depth=200, durability=DurabilityPolicy.VOLATILE)
 
 
 class Failed(AssertionError):
@@ -44,10 +62,8 @@ class Target:
         self.sent = 0
         rig.need()
         node = rig.node
-        stream = QoSProfile(depth=200, durability=DurabilityPolicy.VOLATILE)
         self._publishers = {
-            name: node.create_publisher(strategies.message_type(kind), name,
-                                        LATCHED if name in LATCHED_TOPICS else stream)
+            name: node.create_publisher(strategies.message_type(kind), name, _qos(name))
             for name, kind in strategies.TOPICS.items()}
         self._clients = {name: node.create_client(strategies.message_type(kind), name)
                          for name, kind in strategies.SERVICES.items()}

@@ -65,8 +65,14 @@ def predictor(job):
                 unanswered = f'the first call was refused: {response.message}'
             if unanswered:
                 unanswered = f'first call after {time.monotonic() - begin:.1f} s: {unanswered}'
-            why = joined(noticed, lost, told, stopped, unanswered)
-            if unanswered:
+            begin = time.monotonic()
+            handle, again = outcome(rig.begin, **goal_fields('subgoal'))
+            if handle is not None:
+                again = '' if rig.commands.wait_for_moves(begin, 1, 20.0) else 'nothing moved'
+                ended, _ = outcome(rig.finish, handle)
+                again = again and f'first goal via a subgoal: {again}; it {ended}'
+            why = joined(noticed, lost, told, stopped, unanswered, again)
+            if unanswered or again:
                 rig.need('visual_mpc_node', 'predictor_node')
             job.record(not why, why, None if noticed and seconds == float('inf') else seconds)
 
@@ -163,16 +169,17 @@ FAULTS = [
     Fault('predictor-killed', 'the predictor is killed during a call', 'It ran out of memory, or '
           'its machine went down, while the planner waits for a subgoal.', 'Its death is noticed '
           'within 1 s, nothing moves, the goal is aborted naming the '
-          'predictor, and the first call after the restart is answered.', 100, 7.0, predictor,
-          'until its death was noticed', 's'),
+          'predictor; after the restart the first call is answered, and the first goal via '
+          'a subgoal moves the arm.', 100, 7.0, predictor,
+          'until its death was noticed, where it was', 's'),
     Fault('planner-killed', 'the planner is killed during a goal', 'Nobody is left who could send '
           'a command to stop.', 'Its death is noticed and its client told within 1 s, the arm of '
           'the simulator stands still, and the first goal after the restart succeeds.', 50, 12.0,
-          planner, 'until its death was noticed', 's'),
+          planner, 'until its death was noticed, where it was', 's'),
     Fault('simulator-killed', 'the simulator is killed during a goal', 'Camera and arm are gone '
           'at once.', 'Its death is noticed within 1 s, a zero command is sent within 0.5 s, the '
           'goal is aborted, and the first reset and goal after the restart succeed.', 50, 15.0,
-          simulator, 'until its death was noticed', 's'),
+          simulator, 'until its death was noticed, where it was', 's'),
     Fault('planner-paused', f'the planner stands still for {PAUSED_S:g} s during a goal', 'Its '
           'machine sleeps or swaps. What waited for it meanwhile looks new and is old.', 'The '
           'goal is aborted with that reason, and nothing moves before the next one.', 20, 9.0,

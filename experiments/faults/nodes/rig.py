@@ -164,7 +164,7 @@ class Rig:
                     server=self.alive['sim_node'])
 
     def begin(self, timeout_s=CALL_S, on_feedback=None, **fields):
-        """Send a goal, straight to the pixels of the goal by default; return its handle."""
+        """Send a goal; return its handle."""
         return send_goal(self.reach_client, ReachGoal.Goal(**fields), timeout_s, on_feedback,
                          self.alive['visual_mpc_node'])
 

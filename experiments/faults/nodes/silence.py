@@ -3,6 +3,7 @@
 """Inputs that fall silent or tell nonsense: nothing moves by them."""
 
 from functools import partial
+import re
 import time
 
 from experiments.faults.fault import Fault
@@ -21,6 +22,7 @@ STOP_S = 0.5
 AGES_S = (0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 60.0)
 ABSURD = (5.4e8, 5000.0, -7000.0, float('inf'), float('-inf'), float('nan'), 1e308, -1e30, 70.0,
           -10.0)
+BOUNDS = re.compile(r'expected (finite numbers|(u from )?-?[\d.]+ to -?[\d.]+)')
 
 
 def judge_stop(job, moment):
@@ -117,7 +119,7 @@ def absurd_to_planner(job, spoil):
                 handle = rig.begin(**goal_fields())
             end, error = outcome(rig.result, handle, 12.0)
             moves = rig.commands.moves(moment + (STOP_S * job.patience if during else 0.0))
-            why = error or judge_refusal(end.removeprefix('aborted: '), name, value)
+            why = error or judge_refusal(end.removeprefix('aborted: '), name)
             if end and not end.startswith('aborted'):
                 why = f'{name} {value:g}: the goal {end}'
             if moves:
@@ -141,18 +143,18 @@ def absurd_to_predictor(job):
         response, why = outcome(rig.predict, 10.0, **predict_fields(**{field: objects}))
         if response is not None:
             why = (f'pixel {value:g} was accepted' if response.success
-                   else judge_refusal(response.message, view.object_names[1], value))
+                   else judge_refusal(response.message, view.object_names[1]))
         if not rig.processes['predictor_node'].alive:
             why = f'pixel {value:g} ended the node: {rig.processes["predictor_node"].last_line()}'
             rig.need('predictor_node')
         job.record(not why, why)
 
 
-def judge_refusal(message, name, value):
-    """Say what a refusal of a pixel lacks; an empty string if nothing."""
-    if name not in message and abs(value) < 1e30:
+def judge_refusal(message, name):
+    """Say what a refusal of a number lacks; an empty string if nothing."""
+    if not re.search(rf'(?<![^\W_]){re.escape(name)}\b', message):
         return f'the refusal does not name {name}: {message}'
-    if np.isfinite(value) and not any(bound in message for bound in ('63', '64', 'expected')):
+    if not BOUNDS.search(message):
         return f'the refusal does not name the bounds: {message}'
     return ''
 
@@ -174,12 +176,13 @@ FAULTS = [
           'moves sent', 'moves'),
     Fault('pixels-planner', 'absurd object pixels, to the planner', 'The object tracker reports a '
           'place outside the picture, infinity or NaN.', 'The goal is aborted with the name of '
-          'the object and the bounds; nothing moves by such a pixel.', 40, 2.0,
+          'the object and what is expected; nothing moves by such a pixel.', 40, 2.0,
           partial(absurd_to_planner, spoil=absurd_pixels)),
     Fault('joints-planner', 'absurd joints, to the planner', 'The driver of the arm speaks of '
           'millimetres or of another frame, or says nonsense.', 'The goal is aborted with the '
-          'joint and the bounds; nothing moves by such a joint.', 40, 2.0,
+          'joint and what is expected; nothing moves by such a joint.', 40, 2.0,
           partial(absurd_to_planner, spoil=absurd_joints)),
     Fault('pixels-predictor', 'absurd object pixels, to the predictor', 'The same in a request '
-          'for a subgoal.', 'Refused with the name of the object and the bounds; the node lives.',
+          'for a subgoal.', 'Refused with the name of the object and what is expected; the node '
+          'lives.',
           40, 0.5, absurd_to_predictor)]

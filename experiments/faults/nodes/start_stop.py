@@ -14,7 +14,6 @@ from experiments.faults.nodes.attacked import Attacked
 import numpy as np
 
 END_S = 10.0
-USUAL_S = 4.0  # that a start takes
 SIDE_BY_SIDE = 2
 EARLY = 'ended by Python itself, while it imported'
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -28,7 +27,8 @@ def start_stop(job, name):
     is no fault of the node, and counts as held when it left no traceback.
     """
     random = np.random.default_rng(0)
-    trials = [(trial, random.uniform(0, USUAL_S), random.uniform(0, 0.5) * (trial % 3 > 0))
+    usual_s = _seconds_to_start(job.folder, name)
+    trials = [(trial, random.uniform(0, 1.2 * usual_s), random.uniform(0, 0.5) * (trial % 3 > 0))
               for trial in job.trials()]
     with ThreadPoolExecutor(SIDE_BY_SIDE) as pool:
         early = 0
@@ -38,10 +38,27 @@ def start_stop(job, name):
     job.note = f'{early} times {EARLY}'
 
 
+def _seconds_to_start(folder, name):
+    """Return how long a start takes, two at a time as in the trials."""
+    begin = time.monotonic()
+    nodes = [
+        Attacked(name, folder / f'usual{number}.log', _parameters(folder, name, number)).start()
+        for number in range(SIDE_BY_SIDE)]
+    for node in nodes:
+        node.wait_until_ready()
+    seconds = time.monotonic() - begin
+    for node in nodes:
+        node.kill()
+    return seconds
+
+
+def _parameters(folder, name, number):
+    return {'folder': folder / f'bag{number}'} if name == 'recorder_node' else {}
+
+
 def _one(folder, name, trial, early_s, late_s):
     """Start and end a node once; return what was wrong, and the seconds that it took to end."""
-    bag = folder / f'bag{trial}'
-    parameters = {'folder': bag} if name == 'recorder_node' else {}
+    parameters = _parameters(folder, name, trial)
     node = Attacked(name, folder / f'{trial}.log', parameters).start()
     if trial % 2:
         time.sleep(early_s)
@@ -53,7 +70,8 @@ def _one(folder, name, trial, early_s, late_s):
     asked = time.monotonic()
     code = node.end(number, END_S)
     seconds = time.monotonic() - asked
-    shutil.rmtree(bag, ignore_errors=True)
+    for bag in parameters.values():
+        shutil.rmtree(bag, ignore_errors=True)
     if code is None:
         return f'did not end within {END_S:g} s of {number.name}', seconds
     if not began and 'run_node' not in node.text and (

@@ -14,10 +14,15 @@ TOPICS = {
     'camera/image_raw': 'sensor_msgs/Image', 'objects': 'tap_msgs/ObjectStates',
     'joint_states': 'sensor_msgs/JointState', 'goal/image': 'sensor_msgs/Image',
     'goal/objects': 'tap_msgs/ObjectStates', 'arm/delta_twist_cmds': 'geometry_msgs/TwistStamped',
-    'gripper/command': 'std_msgs/Float64', 'episode': 'tap_msgs/Episode'}
+    'gripper/command': 'std_msgs/Float64', 'episode': 'tap_msgs/Episode',
+    'arm/command_timeout': 'std_msgs/Float64', 'arm/refused': 'tap_msgs/CommandRefused',
+    'predictor_node/heartbeat': 'std_msgs/Header', 'clock': 'rosgraph_msgs/Clock',
+    'camera/camera_info': 'sensor_msgs/CameraInfo'}
+LATCHED_TOPICS = ('goal/image', 'goal/objects', 'arm/command_timeout')
 SERVICES = {
     'predict_subgoal': 'tap_msgs/srv/PredictSubgoal', 'sim/reset': 'tap_msgs/srv/ResetScene',
-    'sim/step': 'tap_msgs/srv/StepScene', 'sim/pause': 'std_srvs/srv/SetBool'}
+    'sim/step': 'tap_msgs/srv/StepScene', 'sim/pause': 'std_srvs/srv/SetBool',
+    'recorder/record': 'std_srvs/srv/SetBool'}
 ACTION = 'reach_goal'
 
 UINT8, UINT32, UINT64 = 2**8 - 1, 2**32 - 1, 2**64 - 1
@@ -42,13 +47,16 @@ def counts(most):
     return st.sampled_from((0, 1, 2, 3, 48, 64, 192, most)) | st.integers(0, most)
 
 
+def stamps():
+    """Return stamps, extreme ones often."""
+    return st.fixed_dictionaries({
+        'sec': st.sampled_from((0, 1, -1, 2**31 - 1, -2**31)) | st.integers(0, 100),
+        'nanosec': st.sampled_from((0, 1, 10**9 - 1, UINT32))})
+
+
 def headers():
     """Return headers with any stamp."""
-    return st.fixed_dictionaries({
-        'stamp': st.fixed_dictionaries({
-            'sec': st.sampled_from((0, 1, -1, 2**31 - 1, -2**31)) | st.integers(0, 100),
-            'nanosec': st.sampled_from((0, 1, 10**9 - 1, UINT32))}),
-        'frame_id': texts()})
+    return st.fixed_dictionaries({'stamp': stamps(), 'frame_id': texts()})
 
 
 def images():
@@ -105,6 +113,14 @@ def fields(type_name):
             'header': headers(), 'twist': st.fixed_dictionaries(
                 {'linear': vector, 'angular': few(vector, {})})}),
         'std_msgs/Float64': st.fixed_dictionaries({'data': numbers()}),
+        'tap_msgs/CommandRefused': st.fixed_dictionaries({
+            'header': headers(), 'message': texts()}),
+        'std_msgs/Header': headers(),
+        'rosgraph_msgs/Clock': st.fixed_dictionaries({'clock': stamps()}),
+        'sensor_msgs/CameraInfo': st.fixed_dictionaries({
+            'header': headers(), 'height': counts(UINT32), 'width': counts(UINT32),
+            'distortion_model': texts(), 'd': st.lists(numbers(), max_size=8),
+            'k': st.lists(numbers(), min_size=9, max_size=9)}),
         'tap_msgs/Episode': st.fixed_dictionaries({
             'header': headers(), 'event': counts(UINT8), 'task': texts(),
             'seed': counts(UINT64), 'outcome': texts()}),

@@ -1,0 +1,62 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The file of parameters names what the nodes declare, with the values that they have anyway."""
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from rclpy.context import Context
+from rclpy.node import Node
+from tap_ros.contract import NODE_MODULES
+import yaml
+
+FILE = Path(__file__).parents[2] / 'config/tap_ros.yaml'
+NODES = {key.removeprefix('/**/'): values['ros__parameters']
+         for key, values in yaml.safe_load(FILE.read_text()).items()}
+DECLARED_IN = {'sim_node': 'sim_bridge.sim_node', 'recorder_node': 'tap_ros.nodes.recorder_node',
+               'predictor_node': 'tap_ros.nodes.predictor_setup',
+               'visual_mpc_node': 'tap_ros.nodes.planner_setup'}
+LEFT_OUT = {'sim_node': set(), 'predictor_node': set(), 'visual_mpc_node': {'weights'},
+            'recorder_node': {'topics'}}
+
+
+def declared(name, *arguments):
+    """Return the values of the parameters that a node declares, started with arguments."""
+    context = Context()
+    context.init(args=['--ros-args', *arguments])
+    node = Node(name, context=context)
+    try:
+        before = set(node._parameters)
+        import_module(DECLARED_IN[name]).declare_parameters(node)
+        return {key: node.get_parameter(key).value for key in set(node._parameters) - before}
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def test_every_node_has_its_part():
+    assert set(NODES) == set(NODE_MODULES)
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_the_file_has_every_parameter_with_its_default(name):
+    values = declared(name)
+    for key in LEFT_OUT[name]:
+        del values[key]
+    if name == 'predictor_node':  # there a file, here its name
+        values['weights'] = Path(values['weights']).stem
+    assert NODES[name] == values
+    assert {key: type(value) for key, value in NODES[name].items()} == {
+        key: type(value) for key, value in values.items()}
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_the_file_reaches_the_node(name, tmp_path):
+    given = NODES[name] | {
+        key: not value if isinstance(value, bool) else 0.9 * value
+        for key, value in NODES[name].items() if isinstance(value, (bool, float))}
+    file = tmp_path / 'changed.yaml'
+    file.write_text(yaml.dump({f'/**/{name}': {'ros__parameters': given}}))
+    values = declared(name, '--params-file', str(file))
+    assert {key: values[key] for key in given} == given

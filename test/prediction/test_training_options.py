@@ -1,0 +1,290 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Each option of a training does what it says."""
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+from tap_ros.images import to_float
+from tap_ros.learning.checkpoints import start
+from tap_ros.learning.frames import MappedFrames
+from tap_ros.learning.parallel import Processes
+from tap_ros.learning.schedule import learning_rate
+from tap_ros.learning.weights import load_tensors
+from tap_ros.prediction import training
+from tap_ros.prediction.predictor import load_network
+from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.recording.cache import open_recordings
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+import torch
+
+STILL = {'learning_rate': 1e-12, 'discriminator_rate': 1e-12}  # weights stay what they begin with
+HEAD = 'network.head.0.weight'
+
+
+@pytest.fixture
+def config(bag, tmp_path):
+    return TrainingConfig(
+        recordings=(str(bag),), out=str(tmp_path / 'run'), base_width=4, batch_size=4, steps=1,
+        warmup=0, margin=1, test_fraction=0.3, threads=1, precision='float32', log_every=1,
+        average_decay=0.0, new_pixels=True)
+
+
+@pytest.fixture
+def trained(config, tmp_path):
+    """Train with some options; return the checkpoint's tensors."""
+    def run(stop_at=None, **options):
+        run.count += 1
+        run.config = replace(config, **{'out': str(tmp_path / f'run{run.count}'), **options})
+        run.path = training.train(run.config, stop_at=stop_at, progress=False)
+        return load_tensors(f'{run.config.out}/checkpoint.safetensors')[0]
+    run.count = 0
+    return run
+
+
+def curve(folder, name):
+    return [(point.step, point.value) for point in
+            EventAccumulator(folder).Reload().Scalars(f'train/{name}')]
+
+
+def moments(tensors, optimizer):
+    """Return all first moments of an Adam in one vector."""
+    return torch.cat([value.flatten() for name, value in sorted(tensors.items())
+                      if name.startswith(f'optimizer.{optimizer}.') and 'exp_avg' in name
+                      and 'exp_avg_sq' not in name])
+
+
+@pytest.mark.parametrize('clip', [0.0, 0.01, 1e6])
+def test_the_gradient_is_clipped_to_the_norm_given(trained, clip):
+    tensors = trained(gradient_clip=clip)
+    (_, norm), = curve(trained.config.out, 'gradient_norm')
+    used = moments(tensors, 0).norm().item() / (1 - 0.9)  # Adam's first step
+    assert norm > 0.02
+    assert used == pytest.approx(min(norm, clip or norm), rel=1e-3)
+
+
+@pytest.mark.parametrize('warmup', [0, 4])
+def test_both_learning_rates_are_those_of_the_schedule(trained, warmup):
+    options = {'method': 'genmin', 'steps': 5, 'warmup': warmup, 'stop_at': 1}
+    before = trained(**options | STILL)
+    tensors = trained(**options, learning_rate=3e-3, discriminator_rate=5e-4)
+    for name, rate in (('network.head', 3e-3), ('helpers.discriminator', 5e-4)):
+        name = next(key for key in tensors if key.startswith(name) and key.endswith('weight'))
+        moved = (tensors[name] - before[name]).abs()
+        # Adam's first step has the length of the rate, whatever the gradient.
+        assert moved.max().item() == pytest.approx(
+            learning_rate(0, 5, warmup, rate), rel=0.02), name
+
+
+def test_adam_remembers_less_where_networks_are_trained_against_each_other():
+    def betas(**helpers):
+        state = start(torch.nn.Linear(1, 1), 1e-3, 'cpu', helpers)
+        return [optimizer.param_groups[0]['betas'] for optimizer in state.optimizers]
+    assert betas() == betas(recognition=torch.nn.Linear(1, 1)) == [(0.9, 0.999)]
+    assert betas(discriminator=torch.nn.Linear(1, 1)) == [(0.5, 0.999)] * 2
+
+
+@pytest.mark.parametrize('step, decay, stays', [
+    (0, 0.999, 0.1), (8, 0.999, 0.5), (10**6, 0.9, 0.9), (0, 0.0, 0.0)])
+def test_the_average_moves_fast_at_first(step, decay, stays):
+    state = start(torch.nn.Linear(3, 2), 1e-3, 'cpu')
+    before = state.average.weight.clone()
+    with torch.no_grad():
+        state.network.weight += 1.0
+    state.step = step
+    state.update_average(decay)
+    assert torch.allclose(state.average.weight, before + (1 - stays), atol=1e-6)
+
+
+def test_the_average_is_shipped_and_its_decay_is_the_one_given(trained):
+    tensors = trained(steps=3, average_decay=0.9)
+    assert not tensors[HEAD].equal(tensors[HEAD.replace('network', 'average')])
+    shipped = dict(load_network(trained.path)[0].named_parameters())
+    assert shipped['head.0.weight'].equal(tensors[HEAD.replace('network', 'average')])
+    tensors = trained(steps=3, average_decay=0.0)
+    assert tensors[HEAD].equal(tensors[HEAD.replace('network', 'average')])
+
+
+def test_the_decoders_alone_are_pretrained(trained):
+    plain, begun = trained(**STILL), trained(pretrain_steps=2, **STILL)
+    changed = {name.split('.')[1] for name in plain if name.startswith('network.')
+               and name.endswith('weight') and not torch.allclose(
+                   plain[name], begun[name], atol=1e-6)}
+    assert changed and all('decoder' in name for name in changed)
+
+
+@pytest.mark.parametrize('values', [
+    {'base_width': 8}, {'flow_scale': 4.0}, {'new_pixels': False},
+    {'method': 'genmin-vae', 'latent_size': 5}, {'mode': 'forward'}])
+def test_the_network_is_the_one_asked_for(trained, values):
+    trained(**values)
+    shape = load_network(trained.path)[0].config
+    assert (shape.base_width, shape.flow_scale, shape.new_pixels) == (
+        values.get('base_width', 4), values.get('flow_scale', 16.0),
+        values.get('new_pixels', True))
+    assert shape.latent_size == values.get('latent_size', 0)
+    assert shape.num_context == (1 if 'mode' in values else 2)
+
+
+@pytest.mark.parametrize('posterior, method, images', [
+    ('video', 'genmin-vae', 5), ('frame', 'genmin-vae', 3)])
+def test_z_is_inferred_from_as_many_pictures_as_asked_for(trained, posterior, method, images):
+    tensors = trained(method=method, posterior=posterior, video_frames=5, num_targets=2)
+    first = next(value for name, value in sorted(tensors.items())
+                 if name.startswith('helpers.recognition.encoder') and value.ndim == 4)
+    assert first.shape[1] == 3 * images
+
+
+@pytest.mark.parametrize('fraction', [0.0, 0.2, 0.5])
+def test_so_many_episodes_are_held_out(trained, fraction):
+    trained(test_fraction=fraction)
+    with open(f'{trained.config.out}/run.json') as file:
+        run = json.load(file)
+    assert run['episodes'] + run['held_out'] == 24
+    assert abs(run['held_out'] - 24 * fraction) <= 4  # by a hash of each seed
+    assert (run['held_out'] == 0) == (fraction == 0)
+
+
+def test_curves_have_a_point_every_so_many_steps(trained):
+    trained(steps=6, log_every=3)
+    assert [step for step, _ in curve(trained.config.out, 'loss')] == [3, 6]
+
+
+def test_a_checkpoint_is_written_every_so_many_steps(trained, monkeypatch):
+    steps, save = [], training.save_checkpoint
+
+    def note(path, state, *args):
+        steps.append(state.step)
+        save(path, state, *args)
+    monkeypatch.setattr(training, 'save_checkpoint', note)
+    trained(steps=5, save_every=2)
+    assert steps == [2, 4, 5]
+
+
+def test_the_precision_is_the_one_given(trained):
+    exact, again, half = (trained(precision=name)[HEAD]
+                          for name in ('float32', 'float32', 'bfloat16'))
+    assert exact.equal(again) and not exact.equal(half)
+
+
+def test_so_many_threads_are_used(trained):
+    before = torch.get_num_threads()
+    try:
+        for count in (1, 2):
+            trained(threads=count)
+            assert torch.get_num_threads() == count
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize('option, method, term, factor', [
+    ('gan_weight', 'genmin', 'gan', 10.0), ('kl_weight', 'genmin-vae', 'kl', 10.0)])
+def test_terms_of_the_loss_have_their_weights(trained, option, method, term, factor):
+    values = []
+    for weight in (1e-3, 1e-3 * factor):
+        trained(method=method, **{option: weight}, **STILL)
+        (_, value), = curve(trained.config.out, f'loss_{term}')
+        (_, error), = curve(trained.config.out, 'loss_error')
+        (_, loss), = curve(trained.config.out, 'loss')
+        assert loss == pytest.approx(error + value, rel=1e-5)
+        values.append(value)
+    assert values[1] == pytest.approx(factor * values[0], rel=1e-3)
+
+
+def losses(trained, **options):
+    trained(**options)
+    return dict(curve(trained.config.out, 'loss'))[1]
+
+
+def test_each_setting_of_the_objective_reaches_the_loss(trained):
+    plain = losses(trained, method='genmin-wo-gan')
+    assert losses(trained, method='genmin-wo-gan') == plain
+    for options in ({'bell_edge': 1.0}, {'outer_power': 1.0}, {'changed_weight': 5.0},
+                    {'recursion': 2}, {'method': 'min-wo-gan'}, {'method': 'fix-wo-gan'}):
+        changed = losses(trained, **{'method': 'genmin-wo-gan', **options})
+        assert changed != pytest.approx(plain, rel=1e-6), options
+
+
+# What is taken from the episodes
+
+
+@pytest.fixture(scope='module')
+def store(bag, tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('TAP_ROS_CACHE', str(tmp_path_factory.mktemp('cache')))
+        yield open_recordings([str(bag)], progress=False)
+
+
+@pytest.fixture
+def drawn(config, store):
+    """Return the (Batch, Augmentation) of some steps of a training with some options."""
+    def draw(steps=6, **options):
+        settings = replace(config, steps=steps, **{
+            'batch_size': 8, 'goal_picture': 'last', **options})
+        return [(batch, augmentation) for _, batch, augmentation in training._batches(
+            store, MappedFrames(store), np.arange(len(store.lengths)), settings,
+            Processes(0, 1), 0, steps)]
+    return draw
+
+
+def test_a_batch_has_so_many_episodes(drawn):
+    assert {len(batch.context) for batch, _ in drawn(batch_size=5)} == {5}
+
+
+def test_margins_are_kept(drawn):
+    for margin in (0, 2):
+        batches = [batch for batch, _ in drawn(margin=margin)]
+        assert {batch.first.min().item() for batch in batches} == {1 + margin}
+        assert all((batch.last == batch.end - 1 - margin).all() for batch in batches)
+
+
+def test_so_many_targets_are_drawn(drawn):
+    assert {batch.targets.shape[1] for batch, _ in drawn(num_targets=2)} == {2}
+    assert max(batch.valid.sum(1).max() for batch, _ in drawn(num_targets=0)) > 5
+
+
+def test_longer_episodes_are_cut(drawn):
+    assert {batch.end.max().item() for batch, _ in drawn(max_frames=5)} == {4}
+    assert max(batch.end.max().item() for batch, _ in drawn()) == 10
+
+
+def test_episodes_are_cut_to_pieces_of_at_least_the_share_given(drawn):
+    whole = {tuple(batch.end[:, 0].tolist()) for batch, _ in drawn()}
+    ends = torch.cat([batch.end for batch, _ in drawn(12, min_crop=0.6)])
+    assert min(min(end) for end in whole) == 6
+    assert 2 <= ends.min() < 6 and ends.float().mean() < 8
+
+
+def test_the_goal_picture_is_the_one_asked_for(drawn, store):
+    def recorded(**options):
+        """Tell for each episode drawn whether its goal is the inverted one of these recordings."""
+        return torch.cat([(to_float(batch.context[:, 1]).mean((1, 2, 3)) > 0)
+                          for batch, _ in drawn(**options)]).float().mean()
+    assert recorded(goal_picture='last') == 0
+    assert recorded(goal_picture='recorded') == 1
+    assert 0.2 < recorded(goal_picture='mixed') < 0.8
+
+
+def test_forward_prediction_sees_the_start_alone(drawn):
+    assert {batch.context.shape[1] for batch, _ in drawn(mode='forward')} == {1}
+
+
+def test_the_video_has_so_many_moments_and_is_made_where_it_is_needed(drawn):
+    assert all(batch.video is None for batch, _ in drawn(2))
+    videos = [batch.video for batch, _ in drawn(2, method='genmin-vae', video_frames=7)]
+    assert {video.shape[1] for video in videos} == {7}
+
+
+def test_pictures_change_as_asked_for_and_not_at_all_without(drawn):
+    def looks(**options):
+        augmentations = [augmentation for _, augmentation in drawn(20, **options)]
+        return (torch.cat([a.flip for a in augmentations]).float().mean().item(),
+                torch.cat([a.order for a in augmentations]).unique(dim=0).tolist(),
+                (torch.cat([a.gain for a in augmentations]) - 1).abs().max().item())
+    off = {'flip': False, 'colour': False, 'brightness': 0.0}
+    assert looks(**off) == (0.0, [[0, 1, 2]], 0.0)
+    assert 0.3 < looks(**off | {'flip': True})[0] < 0.7
+    assert len(looks(**off | {'colour': True})[1]) == 6
+    assert 0.25 < looks(**off | {'brightness': 0.3})[2] <= 0.3
