@@ -7,14 +7,19 @@ from pathlib import Path
 import shutil
 import subprocess
 import sys
+import tempfile
 
 from experiments.faults.children import Reader, run_limited
 from experiments.faults.fault import Fault
 from experiments.faults.made_files import write_recording
+from tap_ros.errors import TapError
+from tap_ros.learning.weights import load_tensors, save_weights
+from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.recording.writer import write_metadata
 
 TIMEOUT_S = 180.0
 EXPECTED_S = 20.0
+OLD = 'old.safetensors'  # weights that were there before
 
 
 @contextmanager
@@ -98,16 +103,35 @@ def train(job):
     source.mkdir()
     write_recording(source / 'source_0.mcap', episodes=8, length=8, size=64)
     write_metadata(source)
+    network = Predictor(PredictorConfig(base_width=1))
+    old = job.folder / OLD
+    save_weights(old, network, 'predictor', network.config, {})
     for trial in job.trials():
-        size = int(job.random.integers(20_000, 400_000))
+        size = old.stat().st_size + int(job.random.integers(20_000, 400_000))
         ended, left = run_on_full_disk(job.folder / f'train{trial}', size, [
             'train', '--recordings', str(source), '--out', '{}', '--steps', '20', '--batch-size',
-            '4', '--base-width', '4', '--save-every', '5'])
-        why = judge_ended(ended)
+            '4', '--base-width', '4', '--save-every', '5'], lambda place: shutil.copy(old, place))
+        why = judge_ended(ended) or _damaged_weights(left)
         litter = [name for name in left if name.endswith(('.part', '.tmp'))]
         if not why and litter:
             why = f'left behind: {", ".join(litter)}'
         job.record(not why, why, ended.seconds)
+
+
+def _damaged_weights(left):
+    """Say which weights of those left cannot be loaded; an empty string if all can."""
+    if OLD not in left:
+        return 'the weights that were there before are gone'
+    with tempfile.TemporaryDirectory() as folder:
+        for name, data in left.items():
+            if name.endswith('.safetensors'):
+                path = Path(folder) / Path(name).name
+                path.write_bytes(data)
+                try:
+                    load_tensors(path)
+                except TapError as error:
+                    return f'what is left cannot be loaded: {error}'
+    return ''
 
 
 def _unreadable(job, left):

@@ -14,6 +14,8 @@ from tap_ros.errors import TapError
 Request = TypeVar('Request')
 Answer = TypeVar('Answer')
 
+PREPARE_TIMEOUT = 8.0  # s that an interrupted start waits for what it was preparing
+
 
 class Busy(TapError):
     """A request cannot wait: too many do already, or nobody answers any more."""
@@ -46,8 +48,16 @@ class RequestQueue(Generic[Request, Answer]):
         prepared: Future[None] = Future()
         self._thread = threading.Thread(
             target=self._run, args=(prepare, prepared), name='request queue', daemon=True)
-        self._thread.start()
-        prepared.result()
+        try:
+            self._thread.start()
+            prepared.result()
+        except BaseException:
+            # Interrupted: Python would abort if it ended while this thread is in C++.
+            with self._changed:
+                self._ending = True
+            if self._thread.is_alive():
+                self._thread.join(PREPARE_TIMEOUT)
+            raise
 
     def __len__(self) -> int:
         """Return how many requests wait."""

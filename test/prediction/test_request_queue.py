@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the queue of requests: each is answered once, whatever happens to the others."""
 
+import _thread
 from collections import Counter
 import threading
+import time
 
 import pytest
 from tap_ros.prediction.request_queue import Busy, RequestQueue
@@ -179,3 +181,18 @@ def test_an_answer_that_cannot_be_given_leaves_the_others_theirs(capsys):
     assert done.wait(TIMEOUT) and answers == [2]
     queue.close(TIMEOUT)
     assert 'the client has gone' in capsys.readouterr().err
+
+
+def test_an_interrupted_start_leaves_no_thread_at_work():
+    prepared, threads = threading.Event(), []
+
+    def prepare():
+        threads.append(threading.current_thread())
+        _thread.interrupt_main()
+        time.sleep(0.3)
+        prepared.set()
+        return lambda batch: batch
+
+    with pytest.raises(KeyboardInterrupt):
+        RequestQueue(prepare, len, 1, 1, 1)
+    assert prepared.is_set() and not threads[0].is_alive()

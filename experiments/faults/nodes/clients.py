@@ -4,6 +4,7 @@
 
 from functools import partial
 import json
+import re
 import select
 import subprocess
 import sys
@@ -98,6 +99,9 @@ def for_long(job):
 def _take_down(job, found):
     per_s = found['good'] / max(found['seconds'], 1e-9)
     job.record(True, times=found['good'] + found['busy'], figure=per_s)
+    job.note = f'{found["good"]} with a subgoal, {found["busy"]} told to come later'
+    if found['good'] < found['busy']:
+        job.record(False, 'most requests were told to come later')
     if found['lost']:
         job.record(False, f'not answered within {PATIENCE_S:g} s', times=found['lost'])
     if found['refused']:
@@ -125,8 +129,9 @@ def large(job):
         begin = time.monotonic()
         response, why = outcome(rig.predict, 120.0, **fields)
         seconds = time.monotonic() - begin
-        if response is not None and not response.success and not response.message:
-            why = 'refused without a reason'
+        if response is not None and not response.success and not re.search(
+                'at most|expected', response.message):
+            why = f'refused without a bound: {response.message}'
         if not why and seconds > SOON_S:
             why = f'answered after {seconds:.0f} s'
         if not why:

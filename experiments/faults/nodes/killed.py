@@ -53,7 +53,14 @@ def predictor(job):
             noticed, seconds = judge_notice(job, watch, moment)
             end, lost = outcome(rig.result, handle, 30.0)
             took = time.monotonic() - moment
-            stopped = 'the arm was moved' if rig.commands.moves(moment) else ''
+            stopped, _ = judge_stop(job, moment)
+            if rig.commands.moves(moment):
+                stopped = 'the arm was moved'
+            begin = time.monotonic()
+            _, refused = outcome(rig.predict, 5.0, **predict_fields())
+            late = time.monotonic() - begin > NOTICED_S * job.patience
+            silent = (f'a call while it was dead: {refused or "was answered"}'
+                      if late or 'predictor_node, has ended' not in refused else '')
             told = '' if end is None or (
                 end.startswith('aborted') and 'predict' in end) else f'the goal {end}'
             if not lost and not told and took > max(NOTICED_S * job.patience, seconds):
@@ -71,7 +78,7 @@ def predictor(job):
                 again = '' if rig.commands.wait_for_moves(begin, 1, 20.0) else 'nothing moved'
                 ended, _ = outcome(rig.finish, handle)
                 again = again and f'first goal via a subgoal: {again}; it {ended}'
-            why = joined(noticed, lost, told, stopped, unanswered, again)
+            why = joined(noticed, lost, told, stopped, silent, unanswered, again)
             if unanswered or again:
                 rig.need('visual_mpc_node', 'predictor_node')
             job.record(not why, why, None if noticed and seconds == float('inf') else seconds)
@@ -168,9 +175,10 @@ def paused(job):
 FAULTS = [
     Fault('predictor-killed', 'the predictor is killed during a call', 'It ran out of memory, or '
           'its machine went down, while the planner waits for a subgoal.', 'Its death is noticed '
-          'within 1 s, nothing moves, the goal is aborted naming the '
-          'predictor; after the restart the first call is answered, and the first goal via '
-          'a subgoal moves the arm.', 100, 7.0, predictor,
+          'within 1 s, a zero command is sent, nothing moves, the goal is aborted naming the '
+          'predictor, and a call meanwhile fails within 1 s with its name; after the restart '
+          'the first call is answered, and the first goal via a subgoal moves the arm.', 100,
+          8.0, predictor,
           'until its death was noticed, where it was', 's'),
     Fault('planner-killed', 'the planner is killed during a goal', 'Nobody is left who could send '
           'a command to stop.', 'Its death is noticed and its client told within 1 s, the arm of '

@@ -74,7 +74,7 @@ def _one(folder, name, trial, early_s, late_s):
         shutil.rmtree(bag, ignore_errors=True)
     if code is None:
         return f'did not end within {END_S:g} s of {number.name}', seconds
-    if not began and 'run_node' not in node.text and (
+    if not began and ', in run_node' not in node.text and (
             code == -number or 'KeyboardInterrupt' in node.text):
         return EARLY, seconds
     if 'Traceback' in node.text:
