@@ -33,7 +33,7 @@ help:
 	@echo 'make faults  inject every fault into real nodes and files, in docs/results: five hours;'
 	@echo '             goes on where it was interrupted; ARGS=--list, ARGS="--only NAME"'
 	@echo 'make bench   measure the speed of each part; ARGS=...'
-	@echo 'make lint    check the style of the code'
+	@echo 'make lint    check the style of the code and its types'
 	@echo 'make build   only the set-up: .venv, install/; then, to work in it:'
 	@echo '             . scripts/environment.bash'
 	@echo 'make clean   remove what the set-up made'
@@ -56,7 +56,7 @@ bench: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros bench $(ARGS)
 
 lint: build
-	@$(ENTER); ruff check .
+	@$(ENTER); ruff check . && mypy
 
 build: .venv/build.done
 	@:

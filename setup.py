@@ -18,7 +18,9 @@ setup(
     license='Apache-2.0',
     python_requires='>=3.11',
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
-    package_data={NAME: ['nodes/*.xml', 'weights/*.safetensors', 'weights/*.md']},
+    package_data={
+        NAME: ['*.pyi', 'nodes/*.xml', 'py.typed', 'weights/*.safetensors', 'weights/*.md'],
+        'sim_bridge': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 from sim_bridge.scene import ARM_GEOM_GROUP, CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.errors import SceneError
 
@@ -23,20 +24,20 @@ class Camera:
     fovy: float = CAMERA_FOVY  # degrees
 
     @property
-    def K(self):
+    def K(self) -> np.ndarray:
         """Intrinsics, 3x3, in pixels."""
         focal = 0.5 * self.height / np.tan(np.radians(self.fovy) / 2)
         return np.array([
             [focal, 0, (self.width - 1) / 2], [0, focal, (self.height - 1) / 2], [0, 0, 1]])
 
     @property
-    def extrinsics(self):
+    def extrinsics(self) -> np.ndarray:
         """World to camera, 3x4, metres; the camera looks along +z, x right, y down."""
         c, s = np.cos(self.tilt), np.sin(self.tilt)
         rotation = np.array([[1, 0, 0], [0, -c, -s], [0, s, -c]])
         return np.column_stack([rotation, -rotation @ np.array(CAMERA_POSITION)])
 
-    def project(self, points):
+    def project(self, points: ArrayLike) -> np.ndarray:
         """
         Project points of the world into the picture.
 
@@ -56,7 +57,7 @@ class Renderer:
     the thread that built it.
     """
 
-    def __init__(self, model, image_size):
+    def __init__(self, model: mujoco.MjModel, image_size: int) -> None:
         self._size = image_size
         # Torch's CUDA build brings triton, whose LLVM has to be loaded before that of Mesa.
         with contextlib.suppress(ImportError):
@@ -75,7 +76,7 @@ class Renderer:
         self._hide.geomgroup[ARM_GEOM_GROUP] = 0
         self.use(model)
 
-    def use(self, model):
+    def use(self, model: mujoco.MjModel) -> None:
         """Render this model from now on."""
         self._model = model
         self._scene = mujoco.MjvScene(model, MAX_SCENE_GEOMS)
@@ -83,7 +84,7 @@ class Renderer:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = 0
 
-    def render(self, data, hide_arm=False):
+    def render(self, data: mujoco.MjData, hide_arm: bool = False) -> np.ndarray:
         """
         Render one picture.
 
@@ -100,7 +101,7 @@ class Renderer:
         mujoco.mjr_readPixels(picture, None, self._viewport, self._context)
         return np.ascontiguousarray(picture[::-1])
 
-    def close(self):
+    def close(self) -> None:
         """Free the context."""
         self._gl.make_current()  # else another renderer's objects would be freed
         self._context.free()

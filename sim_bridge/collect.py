@@ -8,17 +8,19 @@ files do not depend on the number of workers. A finished file has its final name
 collection goes on with the files that are not there yet.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 import json
 from pathlib import Path
 import time
+from typing import Any
 
 import numpy as np
 from sim_bridge.expert import ExpertConfig, run_episode
 from sim_bridge.grasp_expert import GraspConfig
-from sim_bridge.simulator import Simulator
+from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import get_task
-from tap_ros.engine import LOCAL, run_tasks, Task
+from tap_ros.engine import Engine, LOCAL, run_tasks, Task
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.episode import Episode
@@ -60,7 +62,8 @@ class CollectConfig(CollectSettings):
     expert: ExpertConfig | GraspConfig | None = None
 
 
-def collect(folder, config, engine=LOCAL, progress=True, stop=lambda: False):
+def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
+            progress: bool = True, stop: Callable[[], bool] = lambda: False) -> dict[str, Any]:
     """
     Collect a recording, or go on with one that was interrupted.
 
@@ -92,7 +95,8 @@ def collect(folder, config, engine=LOCAL, progress=True, stop=lambda: False):
     return result
 
 
-def _collect_missing(folder, config, engine, progress, stop):
+def _collect_missing(folder: Path, config: CollectConfig, engine: Engine, progress: bool,
+                     stop: Callable[[], bool]) -> dict[str, Any]:
     """Collect the files that are not there yet; see collect."""
     shards = -(-config.episodes // config.episodes_per_file)
     missing = [i for i in range(shards) if not _is_whole(folder, config, i)]
@@ -109,7 +113,7 @@ def _collect_missing(folder, config, engine, progress, stop):
     return _summary(stats, time.perf_counter() - start) | {'whole': len(stats) == len(missing)}
 
 
-def _summary(stats, wall):
+def _summary(stats: Sequence[dict[str, Any]], wall: float) -> dict[str, Any]:
     """Add up what the workers measured."""
     distances = np.concatenate([s['distances'] for s in stats]) if stats else np.zeros((0, 1))
     seconds = {
@@ -122,7 +126,7 @@ def _summary(stats, wall):
         'seconds': {'wall': wall, **seconds}}
 
 
-def _check_settings(folder, config):
+def _check_settings(folder: Path, config: CollectConfig) -> None:
     """Keep the settings beside the recording and refuse to mix it with other ones."""
     path = folder / SETTINGS_FILE
     settings = json.loads(json.dumps(asdict(config)))
@@ -140,7 +144,7 @@ def _check_settings(folder, config):
     write_atomically(path, json.dumps(settings, indent=2) + '\n')
 
 
-def _read_settings(path):
+def _read_settings(path: Path) -> dict[str, Any]:
     """Return the settings that a recording was made with."""
     try:
         before = json.loads(path.read_text())
@@ -152,7 +156,7 @@ def _read_settings(path):
     return before
 
 
-def _is_whole(folder, config, shard):
+def _is_whole(folder: Path, config: CollectConfig, shard: int) -> bool:
     """Say whether a file is there with all its episodes; the last may have been of fewer."""
     path = _shard_path(folder, shard)
     try:
@@ -161,21 +165,21 @@ def _is_whole(folder, config, shard):
         return False
 
 
-def _shard_path(folder, shard):
+def _shard_path(folder: str | Path, shard: int) -> Path:
     """Return the path of one file, named as rosbag2 names the files of a split bag."""
     return Path(folder) / f'{Path(folder).resolve().name}_{shard}.mcap'
 
 
-def _episodes(config, shard):
+def _episodes(config: CollectConfig, shard: int) -> range:
     """Return the numbers of the episodes in one file."""
     first = shard * config.episodes_per_file
     return range(first, min(first + config.episodes_per_file, config.episodes))
 
 
-def _collect_shard(folder, config, shard):
+def _collect_shard(folder: str | Path, config: CollectConfig, shard: int) -> dict[str, Any]:
     """Collect one file; runs in a worker process."""
     simulator = Simulator(config.task, config.image_size)
-    stats = {
+    stats: dict[str, Any] = {
         'shard': shard, 'frames': 0, 'outcomes': [], 'distances': [],
         'seconds': {'search': 0.0, 'step': 0.0, 'write': 0.0}}
     path = _shard_path(folder, shard)
@@ -196,7 +200,8 @@ def _collect_shard(folder, config, shard):
     return stats
 
 
-def make_episode(simulator, observations, actions, outcome, start_ns=0):
+def make_episode(simulator: Simulator, observations: Sequence[Observation], actions: np.ndarray,
+                 outcome: str, start_ns: int = 0) -> Episode:
     """
     Put what was observed and done into an Episode.
 

@@ -31,7 +31,7 @@ class Options:
     engine: EngineOptions = EngineOptions()
 
 
-def run(args):
+def run(args: Options) -> None:
     """Collect and say what was collected."""
     result = collect(args.out, CollectConfig(**vars(args.recording)), args.engine)
     if not result['episodes']:

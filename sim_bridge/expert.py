@@ -11,14 +11,15 @@ the paper's non-deterministic planner gives. Proposing whole pushes rather than 
 displacements is our deviation: a few dozen samples then suffice.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import time
 
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.grasp_expert import run_grasp_episode
-from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, SUBSTEPS
+from sim_bridge.grasp_expert import EpisodeRun, GraspConfig, run_grasp_episode
+from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, Simulator, SUBSTEPS
 from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
 
 MAX_PUSH_STEPS = 24  # longest macro action, in control periods
@@ -30,7 +31,7 @@ TILT_COST = 0.2  # m, added to a sample that topples an object
 class ExpertConfig:
     """How hard the expert searches, and how it varies."""
 
-    num_samples: tuple = (8, 24)  # fewest and most, drawn anew for each episode
+    num_samples: tuple[int, int] = (8, 24)  # fewest and most, drawn anew for each episode
     num_iterations: int = 2
     num_elites: int = 5
     explore: float = 0.1  # probability that a random sample is executed instead of the best
@@ -38,9 +39,9 @@ class ExpertConfig:
     nearest: float = 0.06  # m, worth of pushing the object nearest to the gripper first
     step_cost: float = 0.001  # m per control period
     done_distance: float = 0.02  # m, an object this near its goal is left alone
-    wander: tuple = (5, 10)  # control periods of a random walk before the first push
-    travel_speed: tuple = (0.06, 0.08)  # m per control period
-    push_speed: tuple = (0.03, 0.055)
+    wander: tuple[int, int] = (5, 10)  # control periods of a random walk before the first push
+    travel_speed: tuple[float, float] = (0.06, 0.08)  # m per control period
+    push_speed: tuple[float, float] = (0.03, 0.055)
 
 
 class Expert:
@@ -53,7 +54,8 @@ class Expert:
     :param rollout: mujoco.rollout.Rollout to share between episodes.
     """
 
-    def __init__(self, simulator, rng, config, rollout):
+    def __init__(self, simulator: Simulator, rng: np.random.Generator, config: ExpertConfig,
+                 rollout: mujoco.rollout.Rollout) -> None:
         self._simulator, self._rng, self._config = simulator, rng, config
         self._rollout = rollout
         self._scratch = mujoco.MjData(simulator.model)  # rollouts overwrite it
@@ -61,7 +63,7 @@ class Expert:
         self._num_samples = rng.integers(*config.num_samples, endpoint=True)
         self._preference = rng.uniform(0, config.preference, simulator.task.num_objects)
 
-    def wander(self):
+    def wander(self) -> np.ndarray:
         """
         Plan to rise and walk about at random before the first push.
 
@@ -81,7 +83,7 @@ class Expert:
         path = np.concatenate([here[None], np.column_stack([path, np.full(steps, LIFTED)])])
         return np.column_stack([np.diff(path, axis=0), np.zeros(steps)])
 
-    def plan(self, steps_left):
+    def plan(self, steps_left: int) -> np.ndarray | None:
         """
         Search for the next push.
 
@@ -113,13 +115,14 @@ class Expert:
             mean, spread = parameters.mean(0), parameters.std(0) + [0.08, 0.006, 0.01, 0.005]
         return best
 
-    def _sample(self, todo, poses, mean, spread):
+    def _sample(self, todo: Sequence[int] | np.ndarray, poses: np.ndarray, mean: np.ndarray | None,
+                spread: np.ndarray | None) -> list[tuple[int, np.ndarray, float]]:
         """Draw pushes: (object, (angle, offset, overshoot, push speed), travel speed)."""
         rng, config = self._rng, self._config
         pushes = []
         for _ in range(self._num_samples):
             k = int(rng.choice(todo))
-            if mean is None:
+            if mean is None or spread is None:
                 gap = self._goals[k, :2] - poses[k, :2]
                 parameters = np.array([
                     np.arctan2(gap[1], gap[0]) + rng.normal(0, 0.35), rng.normal(0, 0.025),
@@ -130,7 +133,8 @@ class Expert:
             pushes.append((k, parameters, rng.uniform(*config.travel_speed)))
         return pushes
 
-    def _actions(self, k, parameters, travel_speed, poses):
+    def _actions(self, k: int, parameters: np.ndarray, travel_speed: float,
+                 poses: np.ndarray) -> np.ndarray:
         """Turn a push into actions: lift, travel, come down, push."""
         angle, offset, overshoot, push_speed = parameters
         here = self._simulator.target
@@ -157,7 +161,7 @@ class Expert:
         positions = np.concatenate([here[None, :3], *waypoints])[:MAX_PUSH_STEPS + 1]
         return np.column_stack([np.diff(positions, axis=0), np.zeros(len(positions) - 1)])
 
-    def _costs(self, plans, distances, first):
+    def _costs(self, plans: Sequence[np.ndarray], distances: np.ndarray, first: int) -> np.ndarray:
         """Roll all plans out in the true simulator; return (N,) metres."""
         simulator = self._simulator
         lengths = np.array([len(plan) for plan in plans])
@@ -179,7 +183,9 @@ class Expert:
             :, first]
 
 
-def run_episode(simulator, seed, config=None, rollout=None):
+def run_episode(
+        simulator: Simulator, seed: int, config: ExpertConfig | GraspConfig | None = None,
+        rollout: mujoco.rollout.Rollout | None = None) -> EpisodeRun:
     """
     Run one episode of the expert, from the first motion of the arm to the last of an object.
 
@@ -193,12 +199,14 @@ def run_episode(simulator, seed, config=None, rollout=None):
         seconds spent in the search and in stepping and rendering.
     """
     if simulator.task.gripping:
+        assert config is None or isinstance(config, GraspConfig)
         return run_grasp_episode(simulator, seed, config, rollout)
+    assert config is None or isinstance(config, ExpertConfig)
     observations = [simulator.reset(seed)]
     rng = np.random.default_rng([seed, simulator.task.num_objects, 1])
     rollout = rollout or mujoco.rollout.Rollout(nthread=0)
     expert = Expert(simulator, rng, config or ExpertConfig(), rollout)
-    actions = []
+    actions: list[np.ndarray] = []
     seconds = {'search': 0.0, 'step': 0.0}
     while (steps_left := simulator.task.num_frames - len(observations)) > 0:
         begin = time.perf_counter()
@@ -212,11 +220,11 @@ def run_episode(simulator, seed, config=None, rollout=None):
             actions.append(action)
         seconds['step'] += time.perf_counter() - planned
     length = _last_motion(np.array([o.object_poses[:, :3] for o in observations])) + 1
-    actions = np.array(actions[:length - 1] + [np.zeros(4)], np.float32)
-    return observations[:length], actions, simulator.outcome(), seconds
+    done = np.array(actions[:length - 1] + [np.zeros(4)], np.float32)
+    return observations[:length], done, simulator.outcome(), seconds
 
 
-def _last_motion(positions):
+def _last_motion(positions: np.ndarray) -> int:
     """Return the first frame from which on no object moves; positions (T, K, 3) metres."""
     away = np.linalg.norm(positions - positions[-1], axis=-1).max(1) > STILL
     moving = np.flatnonzero(away)

@@ -9,14 +9,17 @@ them may be chosen. Now and then a random place is taken, which may miss: such e
 How fast the arm goes, how low and how high, and where it waits varies from episode to episode.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import time
 
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls
+from sim_bridge.simulator import OBJECT_QPOS_START, Observation, ramp_controls, Simulator
 from tap_ros.contract import CLEAR, MOVE_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW
+
+EpisodeRun = tuple[list[Observation], np.ndarray, str, dict[str, float]]  # see run_grasp_episode
 
 RANGE = 0.3  # m, |x| and |y| of the random walk, all in view
 FAR = 0.22  # m, a start so far from the grasp that the first step cannot hit the object
@@ -31,12 +34,12 @@ class GraspConfig:
     num_iterations: int = 2
     num_elites: int = 5
     explore: float = 0.1  # probability that a random place is taken instead of the best
-    spread: tuple = (0.03, 0.04)  # m along x and y around the object's origin, at first
-    hover: tuple = (0.1, 0.13)  # m, heights of the gripper before it drops,
-    low: tuple = (0.004, 0.018)  # when it grasps
-    lift: tuple = (0.12, 0.14)  # and how far it lifts
-    travel_speed: tuple = (0.035, 0.08)  # m per control period
-    walk: tuple = (1, 6)  # control periods of the random walk at the end, if there is time
+    spread: tuple[float, float] = (0.03, 0.04)  # m along x and y around the origin, at first
+    hover: tuple[float, float] = (0.1, 0.13)  # m, heights of the gripper before it drops,
+    low: tuple[float, float] = (0.004, 0.018)  # when it grasps
+    lift: tuple[float, float] = (0.12, 0.14)  # and how far it lifts
+    travel_speed: tuple[float, float] = (0.035, 0.08)  # m per control period
+    walk: tuple[int, int] = (1, 6)  # control periods of the random walk at the end
     wiggle: float = 0.035  # m per control period, of the random walk
 
 
@@ -50,19 +53,20 @@ class GraspExpert:
     :param rollout: mujoco.rollout.Rollout to share between episodes.
     """
 
-    def __init__(self, simulator, rng, config, rollout):
+    def __init__(self, simulator: Simulator, rng: np.random.Generator, config: GraspConfig,
+                 rollout: mujoco.rollout.Rollout) -> None:
         self._simulator, self._rng, self._config = simulator, rng, config
         self._rollout = rollout
         self._scratch = mujoco.MjData(simulator.model)  # rollouts overwrite it
         self._hover = rng.uniform(*config.hover)
         self._low = rng.uniform(*config.low)
         self._top = self._low + rng.uniform(*config.lift)
-        self._drop_steps = rng.integers(1, 3)
-        self._walk_steps = rng.integers(*config.walk, endpoint=True)
+        self._drop_steps = int(rng.integers(1, 3))
+        self._walk_steps = int(rng.integers(*config.walk, endpoint=True))
         # A grasp ends with the lift: it may be slow.
-        self._lift_steps = rng.integers(*((2, 5) if simulator.task.lift else (1, 3)))
+        self._lift_steps = int(rng.integers(*((2, 5) if simulator.task.lift else (1, 3))))
 
-    def pick(self, steps_left):
+    def pick(self, steps_left: int) -> np.ndarray:
         """
         Plan to go to the object, grasp and lift it.
 
@@ -74,11 +78,11 @@ class GraspExpert:
         place = self._search()
         # From afar the arm rises on the way.
         far = np.linalg.norm(place - here[:2]) > FAR
-        rise = here[2] < CLEAR - 0.02 and not far
+        rise = bool(here[2] < CLEAR - 0.02 and not far)
         travel, fastest = self._travel_steps(place - here[:2])
         fixed = rise + self._drop_steps + 1 + self._lift_steps
         travel = min(travel, max(steps_left - fixed, fastest))
-        idle = self._rng.integers(0, 1 + max(min(steps_left - fixed - travel, 4), 0))
+        idle = int(self._rng.integers(0, 1 + max(min(steps_left - fixed - travel, 4), 0)))
         lift_steps = self._lift_steps
         if self._simulator.task.lift:
             # Up to the last frame: idle frames beside the goal picture would make copying perfect.
@@ -98,7 +102,7 @@ class GraspExpert:
         opening[:opened] = 1
         return np.column_stack([np.diff(path, axis=0), opening])
 
-    def _reserve(self, steps_left):
+    def _reserve(self, steps_left: int) -> int:
         """Hurry if there is little time; return the control periods that placing will take."""
         simulator = self._simulator
         if simulator.task.kind != 'pick_place':
@@ -114,7 +118,7 @@ class GraspExpert:
                 setattr(self, name, getattr(self, name) - 1)
         return carry + self._drop_steps + 2 + self._walk_steps
 
-    def place(self, steps_left):
+    def place(self, steps_left: int) -> np.ndarray:
         """
         Plan to carry the object to its goal, let go, leave and walk about.
 
@@ -140,19 +144,19 @@ class GraspExpert:
         opening[:closed] = 0
         return np.column_stack([np.diff(path, axis=0), opening])[:steps_left]
 
-    def _travel_steps(self, way):
+    def _travel_steps(self, way: np.ndarray) -> tuple[int, int]:
         """Draw how many control periods a way (2,) takes, and say how few would do."""
         fastest = max(int(np.ceil(np.abs(way).max() / MOVE_LIMIT)), 1)
         speed = self._rng.uniform(*self._config.travel_speed)
         return max(int(np.ceil(np.linalg.norm(way) / speed)), fastest), fastest
 
-    def _search(self):
+    def _search(self) -> np.ndarray:
         """Return the gripper's x and y, (2,) metres, for a grasp."""
         config, rng = self._config, self._rng
         origin = self._simulator.object_poses()[0, :2]
         mean, spread = origin, np.array(config.spread)
         explore = rng.random() < config.explore
-        best_cost, best = np.inf, None
+        best_cost, best = np.inf, origin
         for _ in range(config.num_iterations):
             places = rng.normal(mean, spread, (config.num_samples, 2))
             places = np.clip(places, WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])
@@ -165,7 +169,7 @@ class GraspExpert:
             mean, spread = places[order].mean(0), places[order].std(0) + 0.004
         return best
 
-    def _costs(self, places):
+    def _costs(self, places: np.ndarray) -> np.ndarray:
         """Grasp at all places (N, 2) in the true simulator; return (N,) metres not lifted."""
         simulator = self._simulator
         lift = self._top - self._low
@@ -190,12 +194,14 @@ class GraspExpert:
             (upright < 0.95) | lost)
 
 
-def _line(start, end, steps):
+def _line(start: np.ndarray, end: np.ndarray, steps: int) -> list[np.ndarray]:
     """Return the points after start on a straight way of so many steps."""
     return [start + share * (end - start) for share in np.linspace(0, 1, steps + 1)[1:]]
 
 
-def run_grasp_episode(simulator, seed, config=None, rollout=None):
+def run_grasp_episode(
+        simulator: Simulator, seed: int, config: GraspConfig | None = None,
+        rollout: mujoco.rollout.Rollout | None = None) -> EpisodeRun:
     """
     Run one episode of exactly as many frames as the task has.
 
@@ -210,9 +216,9 @@ def run_grasp_episode(simulator, seed, config=None, rollout=None):
     rng = np.random.default_rng([seed, simulator.task.stream, 1])
     expert = GraspExpert(
         simulator, rng, config or GraspConfig(), rollout or mujoco.rollout.Rollout(nthread=0))
-    actions = []
+    actions: list[np.ndarray] = []
     seconds = {'search': 0.0, 'step': 0.0}
-    plans = [expert.pick]
+    plans: list[Callable[[int], np.ndarray]] = [expert.pick]
     if simulator.task.kind == 'pick_place':
         plans.append(expert.place)
     plans.append(lambda left: np.tile([0, 0, 0, actions[-1][3]], (left, 1)))  # hold still
@@ -226,5 +232,5 @@ def run_grasp_episode(simulator, seed, config=None, rollout=None):
             observations.append(simulator.step(action))
             actions.append(action)
         seconds['step'] += time.perf_counter() - begin
-    actions = np.array(actions + [np.zeros(4)], np.float32)
-    return observations, actions, simulator.outcome(), seconds
+    done = np.array(actions + [np.zeros(4)], np.float32)
+    return observations, done, simulator.outcome(), seconds

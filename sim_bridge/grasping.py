@@ -15,7 +15,7 @@ FINGER_DEPTH = 0.022  # m, thickness of a finger and a little room
 FINGER_HALF_WIDTH = 0.02  # m, along y
 
 
-def graspable_shape(rng):
+def graspable_shape(rng: np.random.Generator) -> ObjectShape:
     """
     Draw a thin shape and its colours.
 
@@ -31,7 +31,7 @@ def graspable_shape(rng):
     return box_shape(kind, thickness, length, rng.uniform(0.03, 0.05), colours)
 
 
-def graspable_yaw(shape, rng):
+def graspable_yaw(shape: ObjectShape, rng: np.random.Generator) -> float:
     """Draw a yaw with which some part of the shape lies nearly along y; radians."""
     if shape.kind == 'disc':
         return rng.uniform(0, 2 * np.pi)
@@ -40,7 +40,7 @@ def graspable_yaw(shape, rng):
     return (quarters * np.pi / 2 + rng.uniform(-GRASP_YAW, GRASP_YAW)) % (2 * np.pi)
 
 
-def grasp_place(shape, yaw):
+def grasp_place(shape: ObjectShape, yaw: float) -> tuple[np.ndarray, float, float]:
     """
     Find a place where the fingers can hold an object that stands with this yaw.
 

@@ -9,7 +9,9 @@ origin of an object is its centre of area, and the camera's field of view is 34 
 32 and tilted a little lower, so that the whole workspace is in a square picture.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -36,12 +38,13 @@ class ObjectShape:
     """The boxes or disc that make one object: sizes and places in metres, colours in [0, 1]."""
 
     kind: str
-    half_sizes: tuple  # per part: (x, y, z) of a box, or (radius, half height) of a disc
-    centres: tuple  # per part: (x, y)
-    colours: tuple  # per part: (r, g, b)
+    # per part: (x, y, z) of a box, or (radius, half height) of a disc
+    half_sizes: tuple[tuple[float, ...], ...]
+    centres: tuple[tuple[float, float], ...]  # per part: (x, y)
+    colours: tuple[tuple[float, ...], ...]  # per part: (r, g, b)
 
 
-def random_shape(rng):
+def random_shape(rng: np.random.Generator) -> ObjectShape:
     """
     Draw a shape and its colours.
 
@@ -56,7 +59,8 @@ def random_shape(rng):
         kind, HALF_THICKNESS, rng.uniform(0.05, 0.09), rng.uniform(0.02, 0.05), colours)
 
 
-def box_shape(kind, thickness, length, arm_length, colours):
+def box_shape(kind: str, thickness: float, length: float, arm_length: float,
+              colours: tuple[tuple[float, ...], ...]) -> ObjectShape:
     """
     Make a bar along y, and its arm for an L or a T; all lengths are halves, in metres.
 
@@ -73,12 +77,13 @@ def box_shape(kind, thickness, length, arm_length, colours):
     return ObjectShape(kind, (bar, arm), (tuple(-centroid), tuple(arm_centre - centroid)), colours)
 
 
-def object_names(count):
+def object_names(count: int) -> tuple[str, ...]:
     """Return the names of the objects, in order: object_0, object_1, ..."""
     return tuple(f'object_{i}' for i in range(count))
 
 
-def build_scene(shapes, image_size=64, gripping=False):
+def build_scene(shapes: Sequence[ObjectShape], image_size: int = 64,
+                gripping: bool = False) -> mujoco.MjModel:
     """
     Compile the MuJoCo model of a table with a gripper and the given objects.
 
@@ -120,7 +125,7 @@ def build_scene(shapes, image_size=64, gripping=False):
     return spec.compile()
 
 
-def _add_camera(world, tilt, fovy):
+def _add_camera(world: mujoco.MjsBody, tilt: float, fovy: float) -> None:
     """Add the one camera, looking from the front down onto the table."""
     half = tilt / 2
     world.add_camera(
@@ -128,7 +133,7 @@ def _add_camera(world, tilt, fovy):
         fovy=fovy)
 
 
-def _add_gripper(spec, world, surface):
+def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, surface: dict[str, Any]) -> None:
     """Add the gripper on three slide joints, and two fingers that open along x."""
     gripper = world.add_body(name='gripper', pos=[0, 0, FINGER_CLEARANCE], gravcomp=1)
     arm = {'group': ARM_GEOM_GROUP, 'density': 0, **surface}
@@ -153,7 +158,7 @@ def _add_gripper(spec, world, surface):
         _add_servo(spec, f'{side}_finger', kp=400, kv=10, limit=20)
 
 
-def _add_servo(spec, joint, kp, kv, limit):
+def _add_servo(spec: mujoco.MjSpec, joint: str, kp: float, kv: float, limit: float) -> None:
     """Add a position servo on a joint: force = kp (target - position) - kv velocity."""
     actuator = spec.add_actuator(
         name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
@@ -165,7 +170,7 @@ def _add_servo(spec, joint, kp, kv, limit):
     actuator.forcerange = [-limit, limit]
 
 
-def _add_object(world, name, shape):
+def _add_object(world: mujoco.MjsBody, name: str, shape: ObjectShape) -> None:
     """Add one free object; its parts share a body."""
     body = world.add_body(name=name, pos=[0, 0, HALF_HEIGHT])
     body.add_freejoint(name=name)

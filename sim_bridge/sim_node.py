@@ -5,14 +5,16 @@
 import math
 import sys
 import time
+from typing import Any
 
-from geometry_msgs.msg import TwistStamped
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Twist, TwistStamped
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from sim_bridge.simulator import Simulator
+from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import TASKS
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
@@ -48,14 +50,14 @@ class SimNode(Node):
     command that is not carried out learns it from arm/refused.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('sim_node')
         self.params = declare_parameters(self)
         task = self.params['task']
         self._sim = Simulator(task, self.params['image_size'])
         self._hide_arm = False
         self._opening = 0.0  # the newest gripper command
-        self._twist = None  # real time: the command for the next period
+        self._twist: np.ndarray | None = None  # real time: the command for the next period
         self._valid_until = 0.0  # monotonic time at which it runs out
         self._timeout = self.params['command_timeout']  # s that a command is valid
         self._stamp_ns = FIRST_STAMP  # of the newest image; never goes back, unlike the physics
@@ -69,7 +71,9 @@ class SimNode(Node):
         self._create_publishers()
         # Subscribed before the twist, so that of two commands sent together it is taken first.
         self.create_subscription(Float64, 'gripper/command', self._on_gripper, STREAM)
-        self.create_subscription(TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM)
+        self.create_subscription(
+            TwistStamped, 'arm/delta_twist_cmds',
+            self._on_twist, STREAM)  # type: ignore[arg-type]  # with the info
         self.create_subscription(Float64, 'arm/command_timeout', self._on_timeout, LATCHED)
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
@@ -87,13 +91,13 @@ class SimNode(Node):
         self.get_logger().info(
             f'ready: task {task}, seed {self.params["seed"]}, {mode}')
 
-    def close(self):
+    def close(self) -> None:
         """End the episode."""
         self._end_episode()
         self._sim.close()
 
-    def _create_publishers(self):
-        self._newest = {}  # topic -> the message sent last
+    def _create_publishers(self) -> None:
+        self._newest: dict[str, Any] = {}  # topic -> the message sent last
         self._streams = {
             topic: self.create_publisher(kind, topic, STREAM) for topic, kind in {
                 'clock': ClockMessage, 'joint_states': JointState, 'objects': ObjectStates,
@@ -105,7 +109,7 @@ class SimNode(Node):
 
     # Commands
 
-    def _on_gripper(self, message):
+    def _on_gripper(self, message: Float64) -> None:
         self._diagnostics.received('gripper/command')
         if not math.isfinite(message.data):
             self.get_logger().warning(
@@ -114,7 +118,7 @@ class SimNode(Node):
             return
         self._opening = min(max(message.data, 0.0), 1.0)
 
-    def _on_twist(self, message, info):
+    def _on_twist(self, message: TwistStamped, info: dict[str, Any]) -> None:
         self._diagnostics.received('arm/delta_twist_cmds')
         stamp_ns = to_nanoseconds(message.header.stamp)
         move = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
@@ -139,7 +143,7 @@ class SimNode(Node):
             self._valid_until = (reception_time(info)
                                  + self._timeout / self.params['real_time_factor'])
 
-    def _on_timeout(self, message):
+    def _on_timeout(self, message: Float64) -> None:
         if not 0 < message.data <= MAX_TIMEOUT:
             self.get_logger().warning(
                 f'arm/command_timeout ignored: data is {message.data}; expected seconds, more '
@@ -147,7 +151,7 @@ class SimNode(Node):
             return
         self._timeout = message.data
 
-    def _refuse_twist(self, twist, move, stamp_ns):
+    def _refuse_twist(self, twist: Twist, move: np.ndarray, stamp_ns: int) -> str:
         """Say why a command cannot be used; an empty string if it can."""
         for axis, value in zip('xyz', move):
             if not math.isfinite(value):
@@ -168,7 +172,7 @@ class SimNode(Node):
                     f'the newest is stamped {self._stamp_ns} ns')
         return ''
 
-    def _on_timer(self):
+    def _on_timer(self) -> None:
         if not self._paused:
             move, self._twist = self._twist, None
             if move is None or time.monotonic() > self._valid_until:
@@ -177,7 +181,8 @@ class SimNode(Node):
 
     # Services
 
-    def _on_reset(self, request, response):
+    def _on_reset(self, request: ResetScene.Request,
+                  response: ResetScene.Response) -> ResetScene.Response:
         try:
             self._reset(request.task or 'push2', request.seed, request.hide_arm)
         except TapError as error:
@@ -187,7 +192,8 @@ class SimNode(Node):
         response.message = f'{self._sim.task.name}, seed {request.seed}'
         return response
 
-    def _on_step(self, request, response):
+    def _on_step(self, request: StepScene.Request,
+                 response: StepScene.Response) -> StepScene.Response:
         periods = request.num_periods or 1
         if periods > MAX_PERIODS:
             response.message = (
@@ -203,7 +209,7 @@ class SimNode(Node):
         response.stamp = to_stamp(self._stamp_ns)
         return response
 
-    def _on_pause(self, request, response):
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._paused = request.data
         self._twist = None
         response.success = True
@@ -212,7 +218,7 @@ class SimNode(Node):
 
     # Simulation
 
-    def _reset(self, task, seed, hide_arm):
+    def _reset(self, task: str, seed: int, hide_arm: bool) -> None:
         """Start a scene; if it cannot be, the present one stays as it is."""
         if task == self._sim.task.name:
             sim = self._sim
@@ -232,7 +238,7 @@ class SimNode(Node):
         self._publish_goal(sim.goal(hide_arm or self.params['hide_arm_in_goal']))
         self._publish(observation)
 
-    def _step(self, move):
+    def _step(self, move: np.ndarray) -> None:
         """Let one control period pass and publish what the camera then sees."""
         begin = time.perf_counter()
         observation = self._sim.step(np.append(move, self._opening))
@@ -241,7 +247,7 @@ class SimNode(Node):
         self._num_steps += 1
         self._publish(observation)
 
-    def _end_episode(self):
+    def _end_episode(self) -> None:
         if self._in_episode:
             self._in_episode = False
             outcome = self._sim.outcome() if self._num_steps else 'interrupted'
@@ -249,7 +255,7 @@ class SimNode(Node):
 
     # Messages
 
-    def _publish(self, observation):
+    def _publish(self, observation: Observation) -> None:
         if self._hide_arm:
             observation = self._sim.observe(hide_arm=True)
         stamp = to_stamp(self._stamp_ns)
@@ -263,17 +269,17 @@ class SimNode(Node):
             'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME)}
         self._send_newest()
 
-    def _send_newest(self):
+    def _send_newest(self) -> None:
         """Send what the camera sees now, again if need be."""
         for topic, message in self._newest.items():
             self._streams[topic].publish(message)
 
-    def _publish_goal(self, goal):
+    def _publish_goal(self, goal: Observation) -> None:
         stamp = to_stamp(self._stamp_ns)
         self._goal_objects.publish(encode_observed(goal, stamp))
         self._goal_image.publish(encode_image(goal.image, stamp, CAMERA_FRAME))
 
-    def _publish_episode(self, event, outcome):
+    def _publish_episode(self, event: int, outcome: str) -> None:
         scene = self._sim.scene
         message = Episode(event=event, task=scene.task.name, seed=scene.seed, outcome=outcome)
         message.header.stamp = to_stamp(self._stamp_ns)
@@ -281,7 +287,7 @@ class SimNode(Node):
         self._episode.publish(message)
 
 
-def declare_parameters(node):
+def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare('task', 'push2', 'Task of the first scene.', choices=list(TASKS))
@@ -304,14 +310,14 @@ def declare_parameters(node):
     return parameters
 
 
-def encode_observed(observation, stamp):
+def encode_observed(observation: Observation, stamp: Time) -> ObjectStates:
     """Encode the objects of an Observation, which come from the simulator itself."""
     return encode_objects(
         observation.object_names, observation.object_pixels, observation.object_poses, stamp,
         WORLD_FRAME, ObjectStates.SOURCE_GROUND_TRUTH)
 
 
-def main(args=None):
+def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
     return run_node(SimNode, 'sim_node', args)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 from sim_bridge.camera import Camera, Renderer
 from sim_bridge.grasping import grasp_place
 from sim_bridge.scene import (
@@ -44,12 +45,12 @@ class Observation:
     image: np.ndarray  # (H, W, 3) uint8 rgb
     stamp_ns: int  # simulated time
     gripper: np.ndarray  # (4,) float32: x, y, z of the fingertips in m, opening in [0, 1]
-    object_names: tuple
+    object_names: tuple[str, ...]
     object_pixels: np.ndarray  # (K, 2) float32 (u, v) of the object origins
     object_poses: np.ndarray  # (K, 7) float64: x, y, z in m, quaternion x, y, z, w
 
 
-def clip_action(action):
+def clip_action(action: ArrayLike) -> np.ndarray:
     """
     Limit an action to what the arm does in one control period.
 
@@ -63,12 +64,12 @@ def clip_action(action):
     return np.append(clip_moves(action[:3]), np.clip(action[3], 0, 1))
 
 
-def clip_moves(moves):
+def clip_moves(moves: np.ndarray) -> np.ndarray:
     """Limit displacements (..., 3), in m, to what the arm does in one control period."""
     return np.clip(moves, np.negative(ACTION_LIMIT), ACTION_LIMIT)
 
 
-def ramp_controls(target, actions):
+def ramp_controls(target: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     Turn actions into servo targets for every physics step.
 
@@ -100,16 +101,16 @@ class Simulator:
     :raises SceneError: for an unknown task, a bad size, or when nothing can be rendered.
     """
 
-    def __init__(self, task='push2', image_size=64):
+    def __init__(self, task: str = 'push2', image_size: int = 64) -> None:
         self.task = get_task(task)
         if not 16 <= image_size <= 1024:
             raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')
         self.camera = Camera(image_size, image_size)
         if self.task.gripping:
             self.camera = Camera(image_size, image_size, GRIP_TILT, GRIP_FOVY)
-        self._renderer = None
+        self._renderer: Renderer | None = None
 
-    def reset(self, seed):
+    def reset(self, seed: int) -> Observation:
         """
         Draw the scene of this seed and put everything at its start.
 
@@ -134,7 +135,8 @@ class Simulator:
         self._goal = [self.photograph(poses, gripper, hide_arm) for hide_arm in (False, True)]
         return self.observe()
 
-    def photograph(self, object_poses, gripper=None, hide_arm=False):
+    def photograph(self, object_poses: np.ndarray, gripper: np.ndarray | None = None,
+                   hide_arm: bool = False) -> Observation:
         """
         Observe the objects at other places; nothing moves.
 
@@ -157,7 +159,7 @@ class Simulator:
         mujoco.mj_forward(self.model, self.data)
         return observation
 
-    def goal(self, hide_arm=False):
+    def goal(self, hide_arm: bool = False) -> Observation:
         """
         Return the Observation of the goal.
 
@@ -168,7 +170,7 @@ class Simulator:
         """
         return self._goal[1 if hide_arm else 0]
 
-    def step(self, action):
+    def step(self, action: ArrayLike) -> Observation:
         """
         Act for one control period.
 
@@ -184,8 +186,9 @@ class Simulator:
             mujoco.mj_step(self.model, self.data)
         return self.observe()
 
-    def observe(self, hide_arm=False):
+    def observe(self, hide_arm: bool = False) -> Observation:
         """Return the Observation of this moment."""
+        assert self._renderer is not None, 'reset comes first'
         mujoco.mj_forward(self.model, self.data)
         poses = self.object_poses()
         opening = self.data.qpos[3:5].mean() / FINGER_TRAVEL
@@ -197,17 +200,17 @@ class Simulator:
             object_pixels=self.camera.project(poses[:, :3]).astype(np.float32),
             object_poses=poses)
 
-    def object_poses(self):
+    def object_poses(self) -> np.ndarray:
         """Return (K, 7): x, y, z in m, quaternion x, y, z, w."""
         poses = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
         return poses[:, [0, 1, 2, 4, 5, 6, 3]].copy()
 
-    def distances(self):
+    def distances(self) -> np.ndarray:
         """Return (K,) metres from each object's origin to its goal, in three dimensions."""
         return np.linalg.norm(
             self.object_poses()[:, :3] - self.goal().object_poses[:, :3], axis=1)
 
-    def outcome(self):
+    def outcome(self) -> str:
         """
         Return 'success' or 'failure'.
 
@@ -221,24 +224,24 @@ class Simulator:
             good = (self.distances() < SUCCESS_DISTANCE).all()
         return 'success' if good else 'failure'
 
-    def state(self):
+    def state(self) -> np.ndarray:
         """Return the full physics state, as mujoco.rollout takes it."""
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
         state = np.empty(mujoco.mj_stateSize(self.model, kind))
         mujoco.mj_getState(self.model, self.data, state, kind)
         return state
 
-    def close(self):
+    def close(self) -> None:
         """Free the OpenGL context."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
-    def _fingers(self):
+    def _fingers(self) -> list[int]:
         """Return the numbers of the fingers' geoms."""
         return [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
 
-    def _after_last_push(self):
+    def _after_last_push(self) -> np.ndarray:
         """Return where the gripper touches one object that it has just pushed to its goal."""
         starts, goals = self.scene.start_poses[:, :2], self.scene.goal_poses[:, :2]
         k = nearest_first(self.scene.gripper_start[:2], starts, goals)[-1]
@@ -252,19 +255,19 @@ class Simulator:
         mujoco.mj_setState(self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         return gripper
 
-    def _holding(self):
+    def _holding(self) -> np.ndarray:
         """Return where the gripper holds the lifted object, and its opening."""
         place, _, half_gap = grasp_place(self.scene.shapes[0], self.scene.start_poses[0, 2])
         return np.array([
             *self.scene.goal_poses[0, :2] + place, self.task.lift + GRASP_HEIGHT,
             (half_gap - FINGER_GAP) / FINGER_TRAVEL])
 
-    def _leaving(self):
+    def _leaving(self) -> np.ndarray:
         """Return where the open gripper is above the object that it has just put down."""
         place, _, _ = grasp_place(self.scene.shapes[0], self.scene.start_poses[0, 2])
         return np.array([*self.scene.goal_poses[0, :2] + place, LEAVE_HEIGHT, 1])
 
-    def _place(self, object_poses, gripper):
+    def _place(self, object_poses: np.ndarray, gripper: np.ndarray) -> None:
         """Put objects at poses (K, 7) and the gripper at (3,), closed, or (4,), all at rest."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:3] = gripper[:3]
@@ -276,7 +279,7 @@ class Simulator:
         mujoco.mj_forward(self.model, self.data)
 
 
-def _lift(planar_poses, height=0.0):
+def _lift(planar_poses: np.ndarray, height: float = 0.0) -> np.ndarray:
     """Turn (K, 3) x, y, yaw into (K, 7) poses at a height above the table in metres."""
     poses = np.zeros((len(planar_poses), 7))
     poses[:, :2] = planar_poses[:, :2]

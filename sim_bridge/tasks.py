@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from sim_bridge.grasping import grasp_place, graspable_shape, graspable_yaw
-from sim_bridge.scene import random_shape
+from sim_bridge.scene import ObjectShape, random_shape
 from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.errors import SceneError
 
@@ -43,17 +43,17 @@ class Task:
     num_objects: int
     start_separation: float  # m between object origins at the start
     kind: str = 'push'  # or 'grasp', 'pick_place'
-    reach: tuple = ()  # m, nearest and farthest start of the gripper, for grasps
+    reach: tuple[float, float] = (0.0, 0.0)  # m, nearest and farthest start, for grasps
     lift: float = 0.0  # m, height of the goal above the table
     stream: int = 0  # of random numbers, besides the seed; no two tasks have the same
 
     @property
-    def num_frames(self):
+    def num_frames(self) -> int:
         """Number of frames of the longest episode."""
         return EPISODE_FRAMES[self.name]
 
     @property
-    def gripping(self):
+    def gripping(self) -> bool:
         """Whether the gripper has to hold the object."""
         return self.kind != 'push'
 
@@ -76,13 +76,13 @@ class Scene:
 
     task: Task
     seed: int
-    shapes: tuple
+    shapes: tuple[ObjectShape, ...]
     start_poses: np.ndarray  # (K, 3)
     goal_poses: np.ndarray  # (K, 3)
     gripper_start: np.ndarray  # (3,) m
 
 
-def get_task(name):
+def get_task(name: str) -> Task:
     """
     Look up a task.
 
@@ -93,7 +93,7 @@ def get_task(name):
     return TASKS[name]
 
 
-def sample_scene(task, seed):
+def sample_scene(task: Task, seed: int) -> Scene:
     """
     Draw shapes, starts, goals and the gripper's start.
 
@@ -122,7 +122,7 @@ def sample_scene(task, seed):
         gripper_start=gripper_away_from(rng, starts))
 
 
-def _sample_grasp(task, seed, rng):
+def _sample_grasp(task: Task, seed: int, rng: np.random.Generator) -> Scene:
     """Draw a scene with one object that can be held; its goal is lifted, or elsewhere."""
     shape = graspable_shape(rng)
     yaw = graspable_yaw(shape, rng)
@@ -141,7 +141,7 @@ def _sample_grasp(task, seed, rng):
         gripper_start=np.append(gripper, rng.uniform(0, GRIPPER_HEIGHT)))
 
 
-def gripper_away_from(rng, positions):
+def gripper_away_from(rng: np.random.Generator, positions: np.ndarray) -> np.ndarray:
     """
     Draw a place of the gripper that touches no object.
 
@@ -155,7 +155,7 @@ def gripper_away_from(rng, positions):
             return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
 
 
-def nearest_first(hand, starts, goals):
+def nearest_first(hand: np.ndarray, starts: np.ndarray, goals: np.ndarray) -> list[int]:
     """
     Order objects as the expert mostly takes them: always the one nearest to the gripper.
 
@@ -171,7 +171,7 @@ def nearest_first(hand, starts, goals):
     return order
 
 
-def _draw_starts(rng, task):
+def _draw_starts(rng: np.random.Generator, task: Task) -> np.ndarray:
     """Draw object origins (K, 2) that are far enough apart."""
     while True:
         starts = rng.uniform(-OBJECT_RANGE, OBJECT_RANGE, (task.num_objects, 2))
@@ -179,7 +179,8 @@ def _draw_starts(rng, task):
             return starts
 
 
-def _draw_goals(rng, starts, attempts=1000):
+def _draw_goals(rng: np.random.Generator, starts: np.ndarray,
+                attempts: int = 1000) -> np.ndarray | None:
     """Draw a goal at the fixed distance from each start; None when there seems to be no room."""
     for _ in range(attempts):
         angles = rng.uniform(0, 2 * np.pi, len(starts))
@@ -189,7 +190,7 @@ def _draw_goals(rng, starts, attempts=1000):
     return None
 
 
-def _apart(positions, separation):
+def _apart(positions: np.ndarray, separation: float) -> bool:
     """Tell whether all pairs of positions (K, 2) are at least so far apart."""
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     return (gaps[np.triu_indices(len(positions), 1)] >= separation).all()

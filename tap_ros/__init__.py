@@ -27,11 +27,11 @@ _EXPORTS = {
 __all__ = list(_EXPORTS)
 
 
-def __getattr__(name):
+def __getattr__(name: str) -> object:
     if name not in _EXPORTS:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     return getattr(import_module(_EXPORTS[name]), name)
 
 
-def __dir__():
+def __dir__() -> list[str]:
     return [*globals(), *_EXPORTS]

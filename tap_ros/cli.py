@@ -7,6 +7,7 @@ A command is a module with Options, a dataclass, and run(options), beside what i
 imported only when asked for, so that one command needs no ROS and another no simulator.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 import importlib
@@ -14,7 +15,7 @@ from operator import or_
 import os
 from pathlib import Path
 import sys
-from typing import Annotated
+from typing import Annotated, Any, cast, TypeAlias
 
 from tap_ros.errors import ConfigError, TapError, UsageError
 from tap_ros.learning.model_option import ModelOption
@@ -22,7 +23,11 @@ from tap_ros.options import parse, parse_known
 from tap_ros.text import escaped
 from tyro import conf
 
-COMMANDS = {  # command: (one line of help, module or {word: the same})
+# Of a command: the name of its module, or {word: (one line of help, the same)}.
+Module: TypeAlias = 'str | dict[str, tuple[str, Module]]'
+Run: TypeAlias = Callable[[Any], int | None]
+
+COMMANDS: dict[str, tuple[str, Module]] = {
     'collect': ('simulate the expert and record it', 'sim_bridge.collect_command'),
     'import-bair': ('import the BAIR robot pushing data set', 'tap_ros.recording.bair'),
     'train': ('train on recordings', 'tap_ros.prediction.train_command'),
@@ -63,7 +68,7 @@ class All:
     """Options of all benchmarks, one after the other: none."""
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run one command.
 
@@ -98,7 +103,7 @@ def main(arguments=None):
         return 130
 
 
-def read(arguments):
+def read(arguments: Sequence[str]) -> tuple[Run, Any]:
     """
     Find out which command is asked for.
 
@@ -110,16 +115,17 @@ def read(arguments):
     completion = bool(words) and words[0] in _COMPLETION
     if completion and words[1:2] not in _SHELLS:
         raise UsageError(f'{words[0]}: expected bash, zsh or fish after it')
-    runs = {All: _run_all}
+    runs: dict[Any, Run] = {All: _run_all}
     kinds = [_command(name, *about, None if completion else words, runs)
              for name, about in COMMANDS.items()]
     # What is completed is a name that a shell can look up, not three words.
     options = parse(reduce(or_, kinds), words, 'tap_ros' if completion else PROG,
-                    __doc__.split('\n')[1])
+                    (__doc__ or '').split('\n')[1])
     return runs[type(options)], options
 
 
-def _command(name, summary, module, words, runs):
+def _command(name: str, summary: str, module: Module, words: list[str] | None,
+             runs: dict[Any, Run]) -> Any:
     """
     Return the type of a command's options, a union where it has a second word.
 
@@ -144,12 +150,12 @@ def _command(name, summary, module, words, runs):
     return Annotated[kind, conf.subcommand(name, description=summary)]
 
 
-def _which_model(words):
+def _which_model(words: list[str]) -> str:
     """Return what --model says, which decides about the other options of train."""
-    return parse_known(ModelOption, words, f'{PROG} train').model
+    return str(parse_known(ModelOption, words, f'{PROG} train').model)
 
 
-def _load(name, runs, needed=True):
+def _load(name: str, runs: dict[Any, Run], needed: bool = True) -> Any:
     """Import a module of COMMANDS; return the type of its options."""
     try:
         if name.startswith('experiments.'):
@@ -163,7 +169,7 @@ def _load(name, runs, needed=True):
     return module.Options
 
 
-def _find_experiments():
+def _find_experiments() -> None:
     """Let experiments/ be imported, which is beside this package and not installed with it."""
     checkout = Path(__file__).resolve().parents[1]
     if not (checkout / 'experiments').is_dir():
@@ -173,9 +179,9 @@ def _find_experiments():
         sys.path.append(str(checkout))
 
 
-def _run_all(_):
+def _run_all(_: All) -> None:
     """Run every benchmark with its default options."""
-    for word in COMMANDS['bench'][1]:
+    for word in cast(dict[str, Any], COMMANDS['bench'][1]):
         print(f'== bench {word}', flush=True)
         run, options = read(['bench', word])
         run(options)

@@ -6,6 +6,8 @@ The contract between simulator, recordings, planner and nodes: what they share s
 Constants and a function of them. Nothing is imported, so that setup.py can read this file, too.
 """
 
+
+
 # Motion: an action is (dx, dy, dz, opening).
 CONTROL_PERIOD = 0.25  # s that one action takes
 MOVE_LIMIT = 0.08  # m per control period, |dx| and |dy|
@@ -49,6 +51,6 @@ NODE_MODULES = {
 }
 
 
-def step_budget(num_objects):
+def step_budget(num_objects: int) -> int:
     """Return B of App. F, how many commands a goal may take: as many as an episode has frames."""
     return EPISODE_FRAMES['push2' if num_objects <= 2 else 'push3']

@@ -9,8 +9,8 @@ killed runs again. Which tasks are done already, and so are left out, their call
 """
 
 from collections import deque
-from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 import multiprocessing
@@ -21,7 +21,7 @@ import signal
 import socket
 import sys
 import threading
-from typing import get_args, Literal
+from typing import Any, get_args, Literal, NoReturn, Self
 
 from tap_ros.errors import ConfigError, EngineError
 from tap_ros.text import escaped
@@ -49,7 +49,7 @@ class Engine:
     workers: int = 0
     address: str = ''
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse an engine that there is not."""
         if self.name not in ENGINES:
             raise ConfigError(f'engine: expected one of {", ".join(ENGINES)}, got {self.name!r}')
@@ -73,11 +73,16 @@ class Task:
     """
 
     name: str
-    function: Callable
-    args: tuple = ()
+    function: Callable[..., Any]
+    args: tuple[Any, ...] = ()
 
 
-def run_tasks(tasks, engine=LOCAL, stop=lambda: False, tick=lambda: None):
+Ended = Iterator[tuple[Task, Callable[[], Any]]]  # see run_tasks
+
+
+def run_tasks(
+        tasks: Iterable[Task], engine: Engine = LOCAL, stop: Callable[[], bool] = lambda: False,
+        tick: Callable[[], object] = lambda: None) -> Ended:
     """
     Run tasks, in their order as far as there are workers.
 
@@ -107,24 +112,23 @@ def run_tasks(tasks, engine=LOCAL, stop=lambda: False, tick=lambda: None):
 class _LocalWorkers:
     """A pool of processes; a new one where a worker was killed."""
 
-    def __init__(self, engine, count):
+    def __init__(self, engine: Engine, count: int) -> None:
         self.room = min(engine.workers or len(os.sched_getaffinity(0)), count)
-        self.running = {}  # future to Task
-        self._lost = {}  # id of a Task to how often it was in a pool that broke
-        self._pool = None
+        self.running: dict[Future[Any], Task] = {}
+        self._lost: dict[int, int] = {}  # id of a Task to how often it was in a pool that broke
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         self._pool = ProcessPoolExecutor(
             self.room, multiprocessing.get_context('spawn'), _start_worker)
         return self
 
-    def __exit__(self, kind, *_):
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         processes = list((self._pool._processes or {}).values()) if self.running or kind else []
         for process in processes:  # tasks are idempotent: what is in progress may be lost
             process.terminate()
         self._pool.shutdown(cancel_futures=True)
 
-    def begin(self, task):
+    def begin(self, task: Task) -> None:
         try:
             future = self._pool.submit(_call, task.function, task.args)
         except BrokenProcessPool:
@@ -132,7 +136,7 @@ class _LocalWorkers:
             future = self._pool.submit(_call, task.function, task.args)
         self.running[future] = task
 
-    def ended(self):
+    def ended(self) -> Ended:
         done, _ = wait(self.running, timeout=_POLL_S, return_when=FIRST_COMPLETED)
         again = []
         for future in done:
@@ -148,7 +152,7 @@ class _LocalWorkers:
         for task in again:
             self.begin(task)
 
-    def _renew(self):
+    def _renew(self) -> None:
         self._pool.shutdown(cancel_futures=True)
         self.__enter__()
 
@@ -156,16 +160,16 @@ class _LocalWorkers:
 class _RayWorkers:
     """Ray Core, which runs the task of a worker or machine that died on another one."""
 
-    def __init__(self, engine, count):
+    def __init__(self, engine: Engine, count: int) -> None:
         try:
             import ray
         except ImportError as error:
             raise ConfigError('engine: Ray is not installed; type `pip install ray`, or choose '
                               '--engine local') from error
         self._ray, self._engine, self._count = ray, engine, count
-        self.running = {}  # reference to Task
+        self.running: dict[Any, Task] = {}  # by reference
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         ray, engine = self._ray, self._engine
         _check_answers(engine.address)
         options = {'address': engine.address} if engine.address else {
@@ -181,21 +185,21 @@ class _RayWorkers:
         self._call = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_call)
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         for reference in self.running:
             self._ray.cancel(reference, force=True)
         self._ray.shutdown()
 
-    def begin(self, task):
+    def begin(self, task: Task) -> None:
         self.running[self._call.remote(task.function, task.args)] = task
 
-    def ended(self):
+    def ended(self) -> Ended:
         done, _ = self._ray.wait(list(self.running), timeout=_POLL_S)
         for reference in done:
             task = self.running.pop(reference)
             yield task, self._get(reference, task)
 
-    def _get(self, reference, task):
+    def _get(self, reference: Any, task: Task) -> Callable[[], Any]:
         """Fetch a result now, as there is none once Ray is shut down."""
         errors = self._ray.exceptions
         try:
@@ -207,26 +211,27 @@ class _RayWorkers:
             return _raising(_lost(task))
 
 
-_WORKERS = {'local': _LocalWorkers, 'ray': _RayWorkers}
+_WORKERS: dict[str, type[_LocalWorkers] | type[_RayWorkers]] = {
+    'local': _LocalWorkers, 'ray': _RayWorkers}
 
 
-def _call(function, args):
+def _call(function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
     return function(*args)
 
 
-def _raising(error):
+def _raising(error: BaseException) -> Callable[[], NoReturn]:
     """Return a function that raises an error."""
-    def get():
+    def get() -> NoReturn:
         raise error
     return get
 
 
-def _lost(task):
+def _lost(task: Task) -> EngineError:
     return EngineError(f'{task.name}: its worker process was killed {TRIES} times, perhaps for '
                        'want of memory; start again with fewer workers: what is done is kept')
 
 
-def _check_answers(address):
+def _check_answers(address: str) -> None:
     """Refuse a cluster that is not there at once; Ray itself tries for minutes."""
     host, _, port = address.rpartition(':')
     if host and port.isdigit():
@@ -236,26 +241,28 @@ def _check_answers(address):
             raise _no_answer(address, error) from error
 
 
-def _no_answer(address, error):
+def _no_answer(address: str, error: Exception) -> ConfigError:
     return ConfigError(f'engine: Ray does not answer at {address or "this machine"} '
                        f'({escaped(error)}); start it with `ray start`, or correct --address')
 
 
-def _start_worker():
+def _start_worker() -> None:
     """
     Let a worker end with its parent alone.
 
     Who holds the lock of a folder is the only one to write there, so it must not outlive it; what
     a terminal sends to both is the parent's to handle.
     """
-    def end():
-        connection.wait([multiprocessing.parent_process().sentinel])
+    def end() -> None:
+        parent = multiprocessing.parent_process()
+        assert parent is not None, 'a worker has one'
+        connection.wait([parent.sentinel])
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end, daemon=True).start()
 
 
-def _environment():
+def _environment() -> dict[str, str]:
     """Return what workers need of this process's environment: where modules are."""
     checkout = str(Path(__file__).resolve().parents[1])
     places = [checkout, *(place for place in sys.path if place)]

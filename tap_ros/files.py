@@ -6,12 +6,15 @@ Files that appear complete or not at all, folders that one process writes to at 
 A kill or a full disk leaves what was there before: the old file stays until the new one is whole.
 """
 
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 import errno
 import fcntl
+from io import FileIO
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from tap_ros.errors import StorageError
 from tap_ros.text import escaped
@@ -19,7 +22,7 @@ from tap_ros.text import escaped
 _NOT_OF_STORAGE = (errno.ENOENT, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ECONNRESET)
 
 
-def write_atomically(path, data):
+def write_atomically(path: str | Path, data: bytes | bytearray | memoryview | str) -> None:
     """
     Write a file in one step; an existing one is replaced.
 
@@ -44,7 +47,7 @@ def write_atomically(path, data):
         _sync_folder(path.parent)
 
 
-def write_rows(path, rows):
+def write_rows(path: str | Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """
     Write a table as JSON in one step, a row a line, so that changes can be read.
 
@@ -56,7 +59,7 @@ def write_rows(path, rows):
 
 
 @contextmanager
-def storage_errors(path):
+def storage_errors(path: str | Path) -> Iterator[None]:
     """
     Turn what the system says about storage into one line.
 
@@ -78,7 +81,7 @@ def storage_errors(path):
 
 
 @contextmanager
-def only_writer(folder):
+def only_writer(folder: str | Path) -> Iterator[None]:
     """
     Be the only process that writes to a folder, as long as the context lasts.
 
@@ -99,7 +102,7 @@ def only_writer(folder):
 
 
 @contextmanager
-def locked(path, wait=False):
+def locked(path: str | Path, wait: bool = False) -> Iterator[bool]:
     """
     Hold a lock as long as the context lasts; it ends with the process, however that ends.
 
@@ -112,7 +115,7 @@ def locked(path, wait=False):
         yield _lock(file.fileno(), wait)
 
 
-def _lock(handle, wait):
+def _lock(handle: int, wait: bool) -> bool:
     """Lock an open file or folder; say whether it could be."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
@@ -123,7 +126,7 @@ def _lock(handle, wait):
     return True
 
 
-def _open_alone(part):
+def _open_alone(part: Path) -> FileIO:
     """Open a file, empty, that no other process writes at once; one left by a kill serves."""
     while True:
         stream = open(part, 'ab', buffering=0)
@@ -140,7 +143,7 @@ def _open_alone(part):
         stream.close()
 
 
-def _sync_folder(folder):
+def _sync_folder(folder: Path) -> None:
     """Bring the name of a new file to the disk, where the file system can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

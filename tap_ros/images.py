@@ -7,11 +7,18 @@ Inside the networks: NCHW float32 in [-1, 1]. Outside: HWC uint8, rgb8.
 A pixel position is (u, v) = (column, row) with (0, 0) at the centre of the top-left pixel.
 """
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.errors import ImageError
 
+if TYPE_CHECKING:
+    import torch
 
-def to_float(images):
+
+def to_float(images: 'np.ndarray | torch.Tensor') -> 'torch.Tensor':
     """
     Turn pictures into network inputs.
 
@@ -25,7 +32,7 @@ def to_float(images):
     return images.movedim(-1, -3).float().div_(127.5).sub_(1.0)
 
 
-def to_uint8(images):
+def to_uint8(images: 'torch.Tensor') -> np.ndarray:
     """
     Turn network outputs into pictures, rounding to the nearest value.
 
@@ -36,7 +43,7 @@ def to_uint8(images):
     return pixels.byte().movedim(-3, -1).contiguous().cpu().numpy()
 
 
-def check_image(image, name, size=None):
+def check_image(image: object, name: str, size: Sequence[int] | None = None) -> np.ndarray:
     """
     Accept a picture or say what is wrong with it.
 
@@ -58,7 +65,7 @@ def check_image(image, name, size=None):
     return image
 
 
-def check_pixels(pixels, name):
+def check_pixels(pixels: ArrayLike | None, name: str) -> np.ndarray:
     """
     Accept object positions or say what is wrong with them.
 
@@ -79,7 +86,7 @@ def check_pixels(pixels, name):
     return pixels
 
 
-def in_picture(pixels, size):
+def in_picture(pixels: np.ndarray, size: Sequence[int]) -> np.ndarray | np.bool_:
     """
     Tell which positions are in a picture; it reaches half a pixel beyond the outermost centres.
 

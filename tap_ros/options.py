@@ -8,8 +8,10 @@ takes them as a field, or adds to a subclass what only the command line knows, a
 does. Options of a field that is a dataclass itself stand in a box of their own in --help.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Annotated, get_args
+from types import GenericAlias
+from typing import Annotated, Any, cast, get_args, NoReturn
 
 from tap_ros.errors import UsageError
 from tap_ros.text import escaped, listing
@@ -19,7 +21,7 @@ from tyro import conf
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 
-def default_text(default):
+def default_text(default: str) -> str:
     """Return what --help says of a default; of an empty one that there is none."""
     return '(default: none)' if default in ('', "''", 'None') else f'(default: {default})'
 
@@ -35,7 +37,8 @@ _STYLE = (conf.OmitArgPrefixes, conf.OmitSubcommandPrefixes, conf.HelptextFromCo
 _RULES = ConstructorRegistry()
 
 
-def parse(kind, words, prog='python -m tap_ros', description=None):
+def parse(kind: Any, words: Sequence[str], prog: str = 'python -m tap_ros',
+          description: str | None = None) -> Any:
     """
     Make options from words.
 
@@ -52,7 +55,7 @@ def parse(kind, words, prog='python -m tap_ros', description=None):
             kind, args=words, prog=prog, description=description, config=_STYLE, registry=_RULES)
 
 
-def parse_known(kind, words, prog):
+def parse_known(kind: Any, words: Sequence[str], prog: str) -> Any:
     """Make options from those of the words that are some, and leave out the others; see parse."""
     with failures.on_parse_error(_refuse):
         return tyro.cli(
@@ -60,7 +63,7 @@ def parse_known(kind, words, prog):
             return_unknown_args=True)[0]
 
 
-def one_of(choices):
+def one_of(choices: Iterable[str]) -> PrimitiveConstructorSpec[str]:
     """
     Return what makes a str in Annotated an option with choices.
 
@@ -75,17 +78,17 @@ def one_of(choices):
 
 
 @_RULES.primitive_rule
-def _at_least_one(info):
+def _at_least_one(info: PrimitiveTypeInfo) -> Any:
     """Let an option that is a tuple of any length need a value; one that is a list does not."""
-    kinds = get_args(info.type) if info.type_origin is tuple else ()
+    kinds: tuple[Any, ...] = get_args(info.type) if info.type_origin is tuple else ()
     if kinds[1:] != (...,) or conf.UseAppendAction in info.markers:
         return None
     spec = ConstructorRegistry.get_primitive_spec(
-        PrimitiveTypeInfo.make(list[kinds[0]], info.markers))
+        PrimitiveTypeInfo.make(cast(Any, GenericAlias(list, kinds[0])), info.markers))
     if not isinstance(spec, PrimitiveConstructorSpec):
         return spec
 
-    def convert(words):
+    def convert(words: list[str]) -> tuple[Any, ...]:
         if not words:
             raise ValueError('expected at least one value')
         return tuple(spec.instance_from_str(words))
@@ -95,12 +98,12 @@ def _at_least_one(info):
                    is_instance=lambda values: isinstance(values, tuple))
 
 
-def _refuse(event):
+def _refuse(event: Any) -> NoReturn:
     """Raise what is wrong with the words as one line; tyro says it in a box of ten."""
     raise UsageError(f'{_reason(event)}; --help says what is valid')
 
 
-def _reason(event):
+def _reason(event: Any) -> str:
     """Say what is wrong."""
     match event:
         case failures.MissingArgs():
@@ -124,7 +127,7 @@ def _reason(event):
     return escaped(event)
 
 
-def _name(argument):
+def _name(argument: Any) -> str:
     """Return how an option is spelled, or what stands for a word without one."""
     return argument.lowered.metavar if argument.is_positional() else (
         argument.lowered.name_or_flags[-1])

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures for people: object maps over a frame, panels side by side, film strips."""
 
+from collections.abc import Iterable, Sequence
+
 import cv2
 import numpy as np
 
@@ -11,7 +13,7 @@ GAP = 2  # white pixels between panels
 MARGIN = 8  # pixels outside a picture from where no mark reaches into it
 
 
-def enlarge(image, scale):
+def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
     """
     Make a picture larger without blurring it.
 
@@ -22,7 +24,9 @@ def enlarge(image, scale):
     return image.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def overlay(image, object_maps, scale=1, start_pixels=None, goal_pixels=None):
+def overlay(image: np.ndarray, object_maps: Iterable[np.ndarray], scale: int = 1,
+            start_pixels: np.ndarray | None = None,
+            goal_pixels: np.ndarray | None = None) -> np.ndarray:
     """
     Tint a picture where objects are expected.
 
@@ -37,7 +41,8 @@ def overlay(image, object_maps, scale=1, start_pixels=None, goal_pixels=None):
     for k, probability in enumerate(object_maps):
         # The square root makes spread-out maps visible beside sharp ones.
         strength = np.sqrt(probability / max(probability.max(), 1e-12))[..., None] * 0.85
-        tinted += strength * (np.float32(OBJECT_COLOURS[k % len(OBJECT_COLOURS)]) - tinted)
+        colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)], np.float32)
+        tinted += strength * (colour - tinted)
     canvas = enlarge(np.rint(tinted).astype(np.uint8), scale)
     for pixels, draw in ((start_pixels, _circle), (goal_pixels, _cross)):
         for k, pixel in enumerate(() if pixels is None else pixels):
@@ -45,22 +50,24 @@ def overlay(image, object_maps, scale=1, start_pixels=None, goal_pixels=None):
                 # Far outside, where no mark is seen, numbers may be too large to draw.
                 near = (min(max(x, -MARGIN), limit + MARGIN)
                         for x, limit in zip(pixel, image.shape[1::-1]))
-                centre = tuple(int((x + 0.5) * scale) for x in near)
-                draw(canvas, centre, scale, OBJECT_COLOURS[k % len(OBJECT_COLOURS)])
+                u, v = (int((x + 0.5) * scale) for x in near)
+                draw(canvas, (u, v), scale, OBJECT_COLOURS[k % len(OBJECT_COLOURS)])
     return canvas
 
 
-def _circle(canvas, centre, scale, colour):
+def _circle(canvas: np.ndarray, centre: tuple[int, int], scale: int,
+            colour: tuple[int, int, int]) -> None:
     cv2.circle(canvas, centre, 3 * scale, colour, max(scale // 3, 1), cv2.LINE_AA)
 
 
-def _cross(canvas, centre, scale, colour):
+def _cross(canvas: np.ndarray, centre: tuple[int, int], scale: int,
+           colour: tuple[int, int, int]) -> None:
     cv2.drawMarker(
         canvas, centre, colour, cv2.MARKER_TILTED_CROSS, 4 * scale, max(scale // 3, 1),
         cv2.LINE_AA)
 
 
-def grid(rows, scale=1):
+def grid(rows: Sequence[Sequence[np.ndarray]], scale: int = 1) -> np.ndarray:
     """
     Put panels of one size side by side, and rows below each other.
 
@@ -78,7 +85,7 @@ def grid(rows, scale=1):
     return sheet
 
 
-def film_strip(frames, count=10):
+def film_strip(frames: Sequence[np.ndarray] | np.ndarray, count: int = 10) -> list[np.ndarray]:
     """
     Choose evenly spaced frames, the first and the last among them.
 
@@ -90,7 +97,7 @@ def film_strip(frames, count=10):
     return [frames[i] for i in chosen]
 
 
-def png_bytes(image):
+def png_bytes(image: np.ndarray) -> bytes:
     """
     Encode a picture.
 

@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Text that comes from outside (messages, files), made fit for a log line or a terminal."""
 
+from collections.abc import Iterable
+
 LIMIT = 200  # characters that are shown of one text
 
 
-def escaped(text, limit=LIMIT):
+def escaped(text: object, limit: int = LIMIT) -> str:
     """
     Return text in one line: newlines, ESC and all else that does not print as escapes.
 
@@ -19,7 +21,7 @@ def escaped(text, limit=LIMIT):
     return shown if len(text) <= limit else f'{shown}... ({len(text) - limit} more)'
 
 
-def listing(names, limit=8):
+def listing(names: Iterable[object], limit: int = 8) -> str:
     """
     Return names in one line, escaped, with commas between.
 

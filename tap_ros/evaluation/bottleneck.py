@@ -6,12 +6,16 @@ Whether a prediction is a bottleneck: some objects at their goals, others in pla
 Object positions are the recordings', that is, the simulator's ground truth; they score only.
 """
 
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.planning.expected_distance import distances_to_pixels
 from tap_ros.prediction.batches import fixed_time, uses_recorded_goal
+from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps, WarpedMaps
+from tap_ros.recording.episode import Episode
 import torch
 
 THRESHOLDS = tuple(range(11))  # px
@@ -21,7 +25,8 @@ MIN_MOTION = 4.0  # px
 VISIBLE = 0.5  # least mass, of 1, that the maps of all objects keep if these are to be seen
 
 
-def bottleneck_scores(maps, start_pixels, goal_pixels):
+def bottleneck_scores(maps: torch.Tensor, start_pixels: torch.Tensor,
+                      goal_pixels: torch.Tensor) -> torch.Tensor:
     """
     Score how near a prediction is to some objects at their goals and the others at their starts.
 
@@ -38,7 +43,7 @@ def bottleneck_scores(maps, start_pixels, goal_pixels):
         start_pixels, goal_pixels)))
 
 
-def _least_sum(to_start, to_goal):
+def _least_sum(to_start: torch.Tensor, to_goal: torch.Tensor) -> torch.Tensor:
     """Return (B,), the least sum of distances (B, K) with some objects moved, but not all."""
     halfway = list(product((False, True), repeat=to_start.shape[1]))[1:-1]
     scores = [torch.where(torch.tensor(moved, device=to_start.device), to_goal, to_start).sum(1)
@@ -46,7 +51,7 @@ def _least_sum(to_start, to_goal):
     return torch.stack(scores).amin(0)
 
 
-def bottleneck_frequency(scores, threshold):
+def bottleneck_frequency(scores: ArrayLike, threshold: float) -> np.ndarray:
     """
     Compute which share of predictions is a bottleneck.
 
@@ -57,7 +62,7 @@ def bottleneck_frequency(scores, threshold):
     return (np.asarray(scores) <= threshold).mean(-1)
 
 
-def context_pixels(episode, goal_picture):
+def context_pixels(episode: Episode, goal_picture: str) -> np.ndarray:
     """
     Find the objects of an episode at its start and its goal.
 
@@ -71,7 +76,7 @@ def context_pixels(episode, goal_picture):
     return np.stack([episode.object_pixels[0], goal]).astype(np.float32)
 
 
-def predicted_maps(pixels, prediction, b):
+def predicted_maps(pixels: np.ndarray, prediction: Prediction, b: int) -> WarpedMaps:
     """
     Warp one-hot maps of the objects as a prediction warps its context pictures.
 
@@ -86,7 +91,8 @@ def predicted_maps(pixels, prediction, b):
     return WarpedMaps(warped.maps[0], warped.mass[0])
 
 
-def target_bottlenecks(episodes, fraction, goal_picture):
+def target_bottlenecks(episodes: Sequence[Episode], fraction: float,
+                       goal_picture: str) -> np.ndarray:
     """
     Score the true frames at a fixed time: whether that time is a bottleneck by itself.
 
@@ -106,13 +112,14 @@ def target_bottlenecks(episodes, fraction, goal_picture):
     return result
 
 
-def can_be_bottleneck(pixels):
+def can_be_bottleneck(pixels: np.ndarray) -> bool:
     """Say whether there are two objects or more, known and moved; pixels (2, K, 2)."""
     return bool(pixels.shape[1] >= 2 and np.isfinite(pixels).all() and (
         np.linalg.norm(pixels[1] - pixels[0], axis=-1).min() >= MIN_MOTION))
 
 
-def score_bottlenecks(episodes, prediction, goal_picture):
+def score_bottlenecks(episodes: Sequence[Episode], prediction: Prediction,
+                      goal_picture: str) -> tuple[np.ndarray, np.ndarray]:
     """
     Score the predictions of a batch, and copying the start or the goal instead.
 

@@ -2,12 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scenes of the demo as one animated GIF: direct beside via the subgoal."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from matplotlib.animation import PillowWriter
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from tap_ros.evaluation.demo_report import MODE_NAMES
+from matplotlib.image import AxesImage
+import numpy as np
+from tap_ros.evaluation.demo_report import MODE_NAMES, SceneRuns
 from tap_ros.files import write_atomically
 from tap_ros.pictures import enlarge, overlay
 
@@ -18,7 +22,7 @@ FRAMES_PER_S = 10
 HOLD = 15  # frames for which the end of a scene stands still
 
 
-def write_film(path, scenes):
+def write_film(path: str | Path, scenes: Sequence[SceneRuns]) -> None:
     """
     Write a film of scenes, one after the other; crosses mark where the objects should end.
 
@@ -45,7 +49,7 @@ def write_film(path, scenes):
         write_atomically(path, part.read_bytes())
 
 
-def _panels(count, picture):
+def _panels(count: int, picture: np.ndarray) -> tuple[Figure, list[tuple[Axes, AxesImage]]]:
     """Return a figure and its panels, each the axes and what is drawn on them."""
     H, W = (SCALE * side for side in picture.shape[:2])
     width, height = count * (W + GAP) + GAP, HEAD + H + GAP
@@ -59,7 +63,8 @@ def _panels(count, picture):
     return figure, panels
 
 
-def _show(panel, name, picture, goal_pixels=None):
+def _show(panel: tuple[Axes, AxesImage], name: str, picture: np.ndarray,
+          goal_pixels: np.ndarray | None = None) -> None:
     """Put a picture and its name on a panel."""
     axes, drawn = panel
     axes.set_title(name, fontsize=10, pad=5)

@@ -3,9 +3,11 @@
 """One self-contained HTML page about a few scenes, each pushed directly and via a subgoal."""
 
 import base64
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import html
 import io
+from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
@@ -21,7 +23,7 @@ MODE_COLOURS = {'direct': '#648fff', 'subgoal': '#dc267f'}
 class Run:
     """One attempt at a scene."""
 
-    frames: list  # T + 1 pictures (H, W, 3) uint8
+    frames: list[np.ndarray]  # T + 1 pictures (H, W, 3) uint8
     distances: np.ndarray  # (T + 1, K) metres from each object to its goal
     message: str  # how the planner said that it ended
     planning_ms: float  # median time of one plan
@@ -38,10 +40,10 @@ class SceneRuns:
     goal_pixels: np.ndarray
     subgoal: np.ndarray  # (H, W, 3) uint8
     object_maps: np.ndarray  # (K, H, W)
-    runs: dict  # mode -> Run
+    runs: dict[str, Run]  # by mode
 
 
-def results_table(scenes):
+def results_table(scenes: Sequence[SceneRuns]) -> str:
     """
     Say in plain text how far from their goals the objects ended.
 
@@ -61,11 +63,11 @@ def results_table(scenes):
     return '\n'.join([head, rule, *rows, rule, _row(f'mean of {len(scenes)}', means)])
 
 
-def _row(label, distances):
+def _row(label: str, distances: Iterable[float]) -> str:
     return f'{label:<26}' + ''.join(f'{100 * d:>12.1f}' for d in distances)
 
 
-def write_report(path, scenes, note=''):
+def write_report(path: str | Path, scenes: Sequence[SceneRuns], note: str = '') -> None:
     """
     Write the page; everything is inside the one file.
 
@@ -98,7 +100,7 @@ be. Doing nothing ends 20 cm from the goals.</p>
     write_atomically(path, page)
 
 
-def write_overview(path, scenes):
+def write_overview(path: str | Path, scenes: Sequence[SceneRuns]) -> None:
     """
     Write one picture: a row for each scene with start, goal, subgoal and its object maps.
 
@@ -109,7 +111,7 @@ def write_overview(path, scenes):
     write_atomically(path, png_bytes(grid(rows)))
 
 
-def _prediction(scene):
+def _prediction(scene: SceneRuns) -> list[tuple[str, np.ndarray]]:
     """Return (caption, picture) of start, goal, subgoal and object maps."""
     k = len(scene.object_maps)
     maps = overlay(
@@ -120,7 +122,7 @@ def _prediction(scene):
         (f'its object maps: {k} colours; circles mark the starts, crosses the goals', maps)]
 
 
-def _scene_section(scene):
+def _scene_section(scene: SceneRuns) -> str:
     """Return the HTML of one scene."""
     pictures = _prediction(scene)
     for mode, run in scene.runs.items():
@@ -137,14 +139,14 @@ def _scene_section(scene):
             f'{_figure("error over time", _error_plot(scene), "smooth")}{strips}')
 
 
-def _figure(caption, png, kind=''):
+def _figure(caption: str, png: bytes, kind: str = '') -> str:
     data = base64.b64encode(png).decode()
     return (f'<figure><img class="{kind}" alt="{html.escape(caption)}" '
             f'src="data:image/png;base64,{data}"><figcaption>{html.escape(caption)}'
             '</figcaption></figure>')
 
 
-def _error_plot(scene):
+def _error_plot(scene: SceneRuns) -> bytes:
     """Plot the mean distance of the objects to their goals over time; return PNG bytes."""
     figure = Figure(figsize=(5.2, 2.6), dpi=100, layout='constrained')
     axes = figure.subplots()

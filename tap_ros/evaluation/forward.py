@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `python -m tap_ros evaluate forward`: how well object maps are carried."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 import shlex
+from typing import Any
 
+import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.files import write_rows
@@ -40,7 +43,7 @@ class Options:
     out: Folder = ''
 
 
-def run(args):
+def run(args: Options) -> None:
     """
     Print a table, and write what --out asks for.
 
@@ -74,7 +77,8 @@ def run(args):
         write_rows(Path(args.out, FILE), rows)
 
 
-def make_rows(task, measured, data_hash, command):
+def make_rows(task: str, measured: Mapping[int, Mapping[str, np.ndarray]], data_hash: str,
+              command: str) -> list[dict[str, Any]]:
     """
     Turn measurements into rows.
 

@@ -33,7 +33,7 @@ class Options:
     episodes: int = 8
 
 
-def run(args):
+def run(args: Options) -> None:
     """Print a summary; write a picture when asked to."""
     if Path(args.path).suffix == '.safetensors':
         _, about = load_tensors(args.path)

@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far a mean over episodes can be trusted: percentile bootstrap intervals of 95%."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 import warnings
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 RESAMPLES = 2000
 _DRAWN = 2 ** 22  # numbers drawn at once, to bound memory
@@ -25,7 +27,8 @@ class Interval(NamedTuple):
     high: float
 
 
-def bootstrap(statistic, *arrays, resamples=RESAMPLES, seed=0):
+def bootstrap(statistic: Callable[..., Any], *arrays: ArrayLike, resamples: int = RESAMPLES,
+              seed: int = 0) -> Interval:
     """
     Estimate a statistic of episodes: N of the N episodes are drawn again and again.
 
@@ -57,7 +60,7 @@ def bootstrap(statistic, *arrays, resamples=RESAMPLES, seed=0):
     return Interval(value, float(low), float(high))
 
 
-def mean_interval(values, **options):
+def mean_interval(values: ArrayLike, **options: int) -> Interval:
     """
     Estimate the mean over episodes.
 
@@ -68,7 +71,7 @@ def mean_interval(values, **options):
     return bootstrap(lambda values: values.mean(-1), np.asarray(values, float), **options)
 
 
-def gain_interval(errors, baseline, **options):
+def gain_interval(errors: ArrayLike, baseline: ArrayLike, **options: int) -> Interval:
     """
     Estimate by which share a method's mean error is below a baseline's on the same episodes.
 

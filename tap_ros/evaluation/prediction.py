@@ -7,11 +7,12 @@ All errors are per-pixel means of the absolute difference on [0, 1]. Copying the
 picture goes through the same measurement: a low error alone proves nothing.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from tap_ros.errors import ConfigError
@@ -23,17 +24,18 @@ from tap_ros.evaluation.bottleneck import (
     THRESHOLDS,
     VISIBLE,
 )
-from tap_ros.evaluation.intervals import bootstrap, gain_interval, mean_interval
-from tap_ros.evaluation.samples import draw_latents, SAMPLES, score_samples
+from tap_ros.evaluation.intervals import bootstrap, gain_interval, Interval, mean_interval
+from tap_ros.evaluation.samples import draw_latents, SAMPLES, SampleScores, score_samples
 from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
 from tap_ros.options import Bags, Flag, Folder
 from tap_ros.pictures import grid, overlay
-from tap_ros.prediction.batches import make_batch, Sampling
+from tap_ros.prediction.batches import Batch, make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
+from tap_ros.prediction.networks import Predictor
 from tap_ros.prediction.predictor import load_network
-from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.weights import PREDICTORS
 import torch
 from tyro import conf
@@ -67,7 +69,7 @@ class EpisodeScores:
     bottleneck: np.ndarray
     object_mass: np.ndarray
 
-    def intervals(self):
+    def intervals(self) -> dict[str, Interval]:
         """
         Average over the episodes.
 
@@ -96,7 +98,7 @@ class EpisodeScores:
                     partial(bottleneck_frequency, threshold=threshold), visible)
         return result
 
-    def summary(self):
+    def summary(self) -> dict[str, float]:
         """
         Average over the episodes, without intervals.
 
@@ -107,7 +109,9 @@ class EpisodeScores:
                 **{name: interval.value for name, interval in self.intervals().items()}}
 
 
-def evaluate(network, store, episodes, margin=0, goal_picture='last', seed=0):
+def evaluate(network: Predictor, store: EpisodeStore, episodes: Sequence[int] | np.ndarray,
+             margin: int = 0, goal_picture: str = 'last',
+             seed: int = 0) -> dict[str, EpisodeScores]:
     """
     Measure a predictor, and copying, on episodes it was not trained on.
 
@@ -125,7 +129,7 @@ def evaluate(network, store, episodes, margin=0, goal_picture='last', seed=0):
     device = next(network.parameters()).device
     forward, latent_size = network.config.num_context == 1, network.config.latent_size
     methods = METHODS[:2] if forward else METHODS
-    parts = {method: [] for method in methods}
+    parts: dict[str, list[list[np.ndarray]]] = {method: [] for method in methods}
     for at in range(0, len(episodes), _BATCH):
         chosen = episodes[at:at + _BATCH]
         batch = make_batch(store, chosen, Sampling(
@@ -150,7 +154,8 @@ def evaluate(network, store, episodes, margin=0, goal_picture='last', seed=0):
             for method, rows in parts.items()}
 
 
-def _changed_l1(images, batch, match, context):
+def _changed_l1(images: torch.Tensor, batch: Batch, match: torch.Tensor,
+                context: torch.Tensor) -> torch.Tensor:
     """Measure EpisodeScores.changed_l1 of pictures (B, 3, H, W); return (B,)."""
     targets = to_float(batch.targets[torch.arange(len(match)), match])
     changed = changed_pixels(targets, context)  # B, 1, H, W
@@ -158,7 +163,9 @@ def _changed_l1(images, batch, match, context):
     return error / changed.sum((1, 2, 3))  # 0 / 0 is NaN
 
 
-def write_pictures(path, network, store, episodes, goal_picture='last', scale=2):
+def write_pictures(path: str | Path, network: Predictor, store: EpisodeStore,
+                   episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
+                   scale: int = 2) -> None:
     """
     Write a sheet of predictions, a row for each episode.
 
@@ -217,7 +224,7 @@ class Options:
     out: Folder = ''
 
 
-def run(args):
+def run(args: Options) -> None:
     """
     Score weights, print a table with copying beside them, and write what --out asks for.
 
@@ -238,7 +245,7 @@ def run(args):
     print(f'{len(episodes)} episodes, goal picture: {args.goal_picture}; l1 on [0, 1]; object '
           'positions: ground truth; in brackets 95% intervals over the episodes')
     _print_table(scores)
-    about = {method: value.summary() | {'intervals': {
+    about: dict[str, Any] = {method: value.summary() | {'intervals': {
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
     if network.config.latent_size:
@@ -252,15 +259,15 @@ def run(args):
         write_pictures(folder / 'pictures.png', network, store, episodes[:12], args.goal_picture)
 
 
-def _std(values):
+def _std(values: np.ndarray) -> np.ndarray:
     return values.std(-1)
 
 
-def _median(values):
+def _median(values: np.ndarray) -> np.ndarray:
     return np.median(values, -1)
 
 
-def _print_table(scores):
+def _print_table(scores: Mapping[str, EpisodeScores]) -> None:
     """Print a line for each metric, a column for each method."""
     columns = {method: value.intervals() for method, value in scores.items()}
     print(f'{"":20s}' + ''.join(f'{method:>28s}' for method in columns))
@@ -274,9 +281,9 @@ def _print_table(scores):
             print(f'min_l1 below {method} by {_text(gain)}')
 
 
-def _report_samples(samples, count):
+def _report_samples(samples: SampleScores, count: int) -> dict[str, float]:
     """Print what the samples score; return it as a dict."""
-    result = {'count': count}
+    result: dict[str, float] = {'count': count}
     for name, title in (('min_l1', f'min_l1, best of {count}'), ('spread', 'sample spread'),
                         ('spread_px', 'sample spread, px')):
         values = getattr(samples, name)
@@ -287,6 +294,6 @@ def _report_samples(samples, count):
     return result
 
 
-def _text(interval):
+def _text(interval: Interval) -> str:
     """Write an Interval."""
     return '{:.4f} ({:.4f}, {:.4f})'.format(*interval)

@@ -2,15 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the samples of a predictor with z are worth: the best of many, and how they differ."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.evaluation.bottleneck import context_pixels
 from tap_ros.images import to_float
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
+from tap_ros.prediction.networks import Prediction, Predictor
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
 import torch
+
+if TYPE_CHECKING:
+    from tap_ros.recording.cache import EpisodeStore
 
 SAMPLES = 100  # of the paper's last row of Table 1
 NEAR = 6.0  # px
@@ -42,7 +48,7 @@ class SampleScores:
     spread_px: np.ndarray
 
 
-def draw_latents(episodes, count, size, seed=0):
+def draw_latents(episodes: Iterable[int], count: int, size: int, seed: int = 0) -> torch.Tensor:
     """
     Draw z from the prior, for each episode its own, whichever others are asked for.
 
@@ -57,7 +63,9 @@ def draw_latents(episodes, count, size, seed=0):
         for i in episodes]))
 
 
-def score_samples(network, store, episodes, margin=0, goal_picture='last', count=SAMPLES, seed=0):
+def score_samples(network: Predictor, store: 'EpisodeStore', episodes: Iterable[int],
+                  margin: int = 0, goal_picture: str = 'last', count: int = SAMPLES,
+                  seed: int = 0) -> SampleScores:
     """
     Measure many samples of each episode.
 
@@ -95,7 +103,7 @@ def score_samples(network, store, episodes, margin=0, goal_picture='last', count
     return SampleScores(*(np.array(column) for column in zip(*rows)))
 
 
-def _near(pixels, size):
+def _near(pixels: np.ndarray, size: Sequence[int]) -> torch.Tensor:
     """Mark the pixels near an object in a context picture; pixels (2, K, 2), bool (H, W)."""
     v, u = np.indices(size)
     at = pixels.reshape(-1, 2)
@@ -104,7 +112,7 @@ def _near(pixels, size):
                              <= NEAR).any(0))
 
 
-def _spread_px(prediction, pixels):
+def _spread_px(prediction: Prediction, pixels: np.ndarray) -> float:
     """Measure how differently the samples of one episode place its objects."""
     if prediction.new_pixels is not None or not pixels.size or not np.isfinite(pixels).all():
         return np.nan

@@ -6,15 +6,20 @@ The state of a training run, and its way to a file and back.
 Batches and augmentation are drawn from (seed, step), so that there are no random numbers in it.
 """
 
+from collections.abc import Mapping
 import copy
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, Generic, TypeVar
 
 from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.learning.devices import placed
 from tap_ros.learning.weights import load_tensors, save_tensors
 from tap_ros.text import escaped
 import torch
+
+Trained = TypeVar('Trained', bound=torch.nn.Module)
 
 # Settings that change where a run happens and what it shows, not what it learns.
 FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
@@ -22,7 +27,7 @@ _REMEDY = 'remove it to begin anew, or choose another --out folder'
 
 
 @dataclass
-class TrainingState:
+class TrainingState(Generic[Trained]):
     """
     What changes during training.
 
@@ -36,28 +41,30 @@ class TrainingState:
     :param seconds: time they took, over all sessions.
     """
 
-    network: torch.nn.Module
-    average: torch.nn.Module
+    network: Trained
+    average: Trained
     helpers: torch.nn.ModuleDict
-    optimizers: list
+    optimizers: list[torch.optim.Optimizer]
     step: int = 0
     seconds: float = 0.0
 
     @torch.no_grad()
-    def update_average(self, decay):
+    def update_average(self, decay: float) -> None:
         """
         Move the average towards the network; faster at the beginning.
 
         :param decay: share of the average that stays, 0..1.
         """
         decay = min(decay, (1 + self.step) / (10 + self.step))
-        averages, weights = list(self.average.parameters()), list(self.network.parameters())
+        averages: list[torch.Tensor] = list(self.average.parameters())
+        weights: list[torch.Tensor] = list(self.network.parameters())
         torch._foreach_lerp_(averages, weights, 1 - decay)
         for mine, other in zip(self.average.buffers(), self.network.buffers()):
             mine.copy_(other)  # batch norm's statistics are averages already
 
 
-def start(network, learning_rate, device, helpers=None):
+def start(network: Trained, learning_rate: float, device: torch.device,
+          helpers: Mapping[str, torch.nn.Module] | None = None) -> TrainingState[Trained]:
     """
     Begin a training run.
 
@@ -68,20 +75,21 @@ def start(network, learning_rate, device, helpers=None):
         'discriminator' are trained against the others.
     :return: TrainingState.
     """
-    helpers = torch.nn.ModuleDict(helpers or {}).to(device, memory_format=torch.channels_last)
-    network = network.to(device, memory_format=torch.channels_last)
+    helpers = placed(torch.nn.ModuleDict(helpers or {}), device)
+    network = placed(network, device)
     average = copy.deepcopy(network).eval().requires_grad_(False)
     groups = [list(network.parameters()), []]
     for name, helper in helpers.items():
         groups[name.endswith('discriminator')] += helper.parameters()
     # DCGAN's beta1 of 0.5 where networks are trained against each other.
     betas = (0.5 if groups[1] else 0.9, 0.999)
-    optimizers = [torch.optim.Adam(group, learning_rate, betas, fused=True)
-                  for group in groups if group]
+    optimizers: list[torch.optim.Optimizer] = [
+        torch.optim.Adam(group, learning_rate, betas, fused=True) for group in groups if group]
     return TrainingState(network, average, helpers, optimizers)
 
 
-def save_checkpoint(path, state, settings, data_hash):
+def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mapping[str, Any],
+                    data_hash: str) -> None:
     """
     Write the whole state of a run, in one step.
 
@@ -102,7 +110,8 @@ def save_checkpoint(path, state, settings, data_hash):
         'settings': settings, 'data_hash': data_hash})
 
 
-def load_checkpoint(path, state, settings, data_hash, defaults=MappingProxyType({})):
+def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mapping[str, Any],
+                    data_hash: str, defaults: Mapping[str, Any] = MappingProxyType({})) -> None:
     """
     Put the state of a run back.
 
@@ -138,7 +147,7 @@ def load_checkpoint(path, state, settings, data_hash, defaults=MappingProxyType(
     state.step, state.seconds = about['step'], about['seconds']
 
 
-def _put_back(state, tensors):
+def _put_back(state: TrainingState[Any], tensors: Mapping[str, torch.Tensor]) -> None:
     """Put tensors of a checkpoint back into networks and optimizers."""
     for prefix, module in (('network.', state.network), ('average.', state.average),
                            ('helpers.', state.helpers)):

@@ -2,9 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the pictures of a batch come from: files that are mapped, or the memory of a GPU."""
 
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 from tqdm import tqdm
+
+if TYPE_CHECKING:
+    from tap_ros.recording.cache import EpisodeStore
+
+# From (B,) indices of episodes and int (B, N) frame numbers to uint8 (B, N, H, W, 3).
+Frames = Callable[[Sequence[int] | np.ndarray, np.ndarray], torch.Tensor]
 
 GOAL = -1  # the "time" of the goal's own picture
 
@@ -16,10 +25,10 @@ class MappedFrames:
     :param store: the EpisodeStore.
     """
 
-    def __init__(self, store):
+    def __init__(self, store: 'EpisodeStore') -> None:
         self._store = store
 
-    def __call__(self, episodes, times):
+    def __call__(self, episodes: Sequence[int] | np.ndarray, times: np.ndarray) -> torch.Tensor:
         """
         Gather pictures.
 
@@ -45,7 +54,8 @@ class ResidentFrames:
     :param progress: whether to show a progress bar.
     """
 
-    def __init__(self, store, device, progress=False):
+    def __init__(self, store: 'EpisodeStore', device: torch.device | str,
+                 progress: bool = False) -> None:
         self._first = np.concatenate([[0], np.cumsum(store.lengths)])
         self._goal = np.full(len(store), -1)
         goals = [i for i in range(len(store)) if store[i].goal_frame is not None]
@@ -58,7 +68,7 @@ class ResidentFrames:
             if self._goal[i] >= 0:
                 self._frames[self._goal[i]] = torch.from_numpy(np.array(store[i].goal_frame))
 
-    def __call__(self, episodes, times):
+    def __call__(self, episodes: Sequence[int] | np.ndarray, times: np.ndarray) -> torch.Tensor:
         """Gather pictures as MappedFrames does, on the device."""
         episodes = np.asarray(episodes)[:, None]
         index = np.where(times == GOAL, self._goal[episodes], self._first[episodes] + times)

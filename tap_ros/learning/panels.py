@@ -2,10 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What networks say, as panels of a picture for people."""
 
+from typing import TYPE_CHECKING
+
+import numpy as np
 from tap_ros.images import to_uint8
 
+if TYPE_CHECKING:
+    import torch
 
-def grey_panels(maps):
+
+def grey_panels(maps: 'torch.Tensor') -> list[np.ndarray]:
     """
     Show numbers from 0 to 1 as grey.
 

@@ -9,9 +9,11 @@ DistributedDataParallel, which cannot be told that discriminators stand still wh
 learns from them.
 """
 
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 import os
+from typing import Any
 
 from tap_ros.errors import ConfigError
 import torch
@@ -31,11 +33,11 @@ class Processes:
     count: int = 1
 
     @property
-    def first(self):
+    def first(self) -> bool:
         """Whether this is the one that writes files and shows progress."""
         return self.rank == 0
 
-    def part(self, batch_size):
+    def part(self, batch_size: int) -> slice:
         """
         Return the slice of a batch that is this process's.
 
@@ -47,7 +49,7 @@ class Processes:
         size = batch_size // self.count
         return slice(self.rank * size, (self.rank + 1) * size)
 
-    def average_gradients(self, parameters):
+    def average_gradients(self, parameters: Iterable[torch.Tensor]) -> None:
         """Replace the gradients of parameters by their mean over the processes."""
         if self.count == 1:
             return
@@ -58,7 +60,7 @@ class Processes:
         for gradient, part in zip(gradients, parts):
             gradient.copy_(part.view_as(gradient))
 
-    def mean(self, value):
+    def mean(self, value: torch.Tensor) -> torch.Tensor:
         """Return the mean of a tensor over the processes."""
         if self.count == 1:
             return value
@@ -66,7 +68,7 @@ class Processes:
         distributed.all_reduce(value)
         return value / self.count
 
-    def agree(self, flag, device):
+    def agree(self, flag: bool, device: torch.device) -> bool:
         """Return what the first process says, so that all do the same."""
         if self.count == 1:
             return flag
@@ -74,7 +76,7 @@ class Processes:
         distributed.broadcast(said, 0)
         return bool(said)
 
-    def wait(self):
+    def wait(self) -> None:
         """Wait until all processes are here."""
         if self.count > 1:
             distributed.barrier()
@@ -84,7 +86,7 @@ ALONE = Processes()
 
 
 @contextmanager
-def joined(device):
+def joined(device: torch.device) -> Iterator[Processes]:
     """
     Join the processes that torchrun started with this one.
 
@@ -102,12 +104,12 @@ def joined(device):
         distributed.destroy_process_group()
 
 
-def local_rank():
+def local_rank() -> int:
     """Return the number of this process among those of its machine, which is that of its GPU."""
     return int(os.environ.get('LOCAL_RANK', 0))
 
 
-def share_batch_norm(module, processes):
+def share_batch_norm(module: nn.Module, processes: Processes) -> None:
     """
     Let batch normalisation use the statistics of the whole batch.
 
@@ -123,20 +125,20 @@ class _Sum(torch.autograd.Function):
     """Add up a tensor over the processes; what comes back is added up, too."""
 
     @staticmethod
-    def forward(_, value):
+    def forward(_: Any, value: torch.Tensor) -> torch.Tensor:
         value = value.clone()
         distributed.all_reduce(value)
         return value
 
     @staticmethod
-    def backward(_, gradient):
+    def backward(_: Any, gradient: torch.Tensor) -> torch.Tensor:
         return _Sum.forward(_, gradient.contiguous())
 
 
 class _SharedBatchNorm2d(nn.BatchNorm2d):
     """Batch normalisation over all processes; torch's own exists for GPUs only."""
 
-    def forward(self, x):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
         if not self.training:
             return super().forward(x)
         count = x.numel() / x.size(1) * distributed.get_world_size()
@@ -145,6 +147,8 @@ class _SharedBatchNorm2d(nn.BatchNorm2d):
         centred = values - mean[:, None, None]
         variance = _Sum.apply(centred.square().sum((0, 2, 3))) / count
         with torch.no_grad():
+            assert self.running_mean is not None and self.running_var is not None
+            assert self.num_batches_tracked is not None and self.momentum is not None
             self.num_batches_tracked += 1
             self.running_mean.lerp_(mean, self.momentum)
             self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)

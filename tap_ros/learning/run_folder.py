@@ -2,26 +2,32 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder of a training run: one process writes to it, and a full disk is told in one line."""
 
+from collections.abc import Iterator, Mapping, Sized
 from contextlib import contextmanager
 import json
 from pathlib import Path
 import platform
 import threading
+from typing import Any, TYPE_CHECKING
 
 from tap_ros.files import only_writer, storage_errors, write_atomically
+from tap_ros.learning.checkpoints import TrainingState
 from tap_ros.learning.devices import device_name
 import torch
 
+if TYPE_CHECKING:
+    from tap_ros.recording.cache import EpisodeStore
+
 
 @contextmanager
-def run_folder(folder):
+def run_folder(folder: str | Path) -> Iterator[None]:
     """
     Write to the folder of a training run, as the only process.
 
     :param folder: made if it is not there.
     :raises StorageError: when another process trains there, or it cannot be written.
     """
-    def tell(failed):
+    def tell(failed: threading.ExceptHookArgs) -> None:
         # The thread that writes the curves; its error is raised where the next point is added.
         if not isinstance(failed.exc_value, OSError):
             before(failed)
@@ -34,7 +40,8 @@ def run_folder(folder):
             threading.excepthook = before
 
 
-def run_facts(state, seed, store, training, held_out):
+def run_facts(state: TrainingState[Any], seed: int, store: 'EpisodeStore', training: Sized,
+              held_out: Sized) -> dict[str, Any]:
     """
     Return what is known of a run, for run.json and the weights file.
 
@@ -51,7 +58,7 @@ def run_facts(state, seed, store, training, held_out):
         'torch': torch.__version__, 'python': platform.python_version()}
 
 
-def describe_run(folder, **files):
+def describe_run(folder: str | Path, **files: Mapping[str, Any]) -> None:
     """
     Write what a run was.
 

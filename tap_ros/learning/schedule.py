@@ -5,7 +5,7 @@
 import math
 
 
-def learning_rate(step, steps, warmup, highest):
+def learning_rate(step: int, steps: int, warmup: int, highest: float) -> float:
     """
     Compute a step's learning rate: a linear rise, then half a cosine down to 2 %.
 

@@ -2,15 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which episodes a network is trained on, and which it is measured on."""
 
+from typing import TYPE_CHECKING
 import zlib
 
 import numpy as np
 from tap_ros.errors import RecordingError
 
+if TYPE_CHECKING:
+    from tap_ros.recording.cache import EpisodeStore
+
 TEST_FRACTION = 0.05  # held out unless a training says otherwise
 
 
-def split_episodes(store, test_fraction=TEST_FRACTION, min_frames=3):
+def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
+                   min_frames: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """
     Split episodes into training and held-out ones, by task and seed.
 

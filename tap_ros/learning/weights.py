@@ -7,12 +7,15 @@ No pickle is ever read or written. A file appears under its name only when it is
 is read from it is what was written: anything else is refused with a WeightsError of one line.
 """
 
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, fields
 import hashlib
 import json
 import math
 import os
+from pathlib import Path
 import stat
+from typing import Any, get_origin, TypeVar
 
 from safetensors import SafetensorError
 from safetensors.torch import load, save
@@ -21,12 +24,16 @@ from tap_ros.files import write_atomically
 from tap_ros.text import escaped, listing
 import torch
 
+Config = TypeVar('Config')  # a dataclass
+Network = TypeVar('Network', bound=torch.nn.Module)
+
 _FORMAT = 'tap_ros 2'  # 1 had no SHA-256
 _MAX_HEADER = 2 ** 22  # bytes; names, shapes and description of the largest networks need 1%
 _AGAIN = 'copy it again, or train again'
 
 
-def save_weights(path, module, kind, config, training):
+def save_weights(path: str | Path, module: torch.nn.Module | dict[str, torch.Tensor], kind: str,
+                 config: Any, training: Any) -> None:
     """
     Write a network's weights.
 
@@ -37,11 +44,12 @@ def save_weights(path, module, kind, config, training):
     :param training: what made it: data hash, seed, steps, scores. Anything JSON can hold.
     """
     state = module if isinstance(module, dict) else module.state_dict()
-    config = asdict(config) if is_dataclass(config) else dict(config)
-    save_tensors(path, state, {'kind': kind, 'config': config, 'training': training})
+    values = dict(config) if isinstance(config, Mapping) else asdict(config)
+    save_tensors(path, state, {'kind': kind, 'config': values, 'training': training})
 
 
-def load_weights(path, kind):
+def load_weights(path: str | Path,
+                 kind: str) -> tuple[dict[str, Any], dict[str, torch.Tensor], dict[str, Any]]:
     """
     Read what save_weights has written, onto the CPU.
 
@@ -67,7 +75,9 @@ def load_weights(path, kind):
     return about['config'], state, about['training']
 
 
-def make_network(network_class, config_class, values, state, path):
+def make_network(network_class: Callable[[Config], Network], config_class: type[Config],
+                 values: Mapping[str, Any], state: Mapping[str, torch.Tensor],
+                 path: str | Path) -> Network:
     """
     Make the network of a file, with its weights.
 
@@ -90,7 +100,7 @@ def make_network(network_class, config_class, values, state, path):
     return network
 
 
-def make_config(config_class, values, path):
+def make_config(config_class: type[Config], values: Mapping[str, Any], path: str | Path) -> Config:
     """
     Turn the configuration found in a file back into its dataclass.
 
@@ -101,7 +111,9 @@ def make_config(config_class, values, path):
     :raises WeightsError: for a key that this version does not know or that is missing, and for
         a value of another type, that is not finite, or that cannot be used.
     """
-    known = {field.name: field.type for field in fields(config_class)}
+    known: dict[str, Any] = {
+        field.name: get_origin(field.type) or field.type
+        for field in fields(config_class)}  # type: ignore[arg-type]
     unknown, missing = sorted(set(values) - set(known)), sorted(set(known) - set(values))
     if unknown or missing:
         what = f'unknown configuration {listing(unknown)}' if unknown else (
@@ -124,7 +136,7 @@ _EXPECTED = {bool: 'true or false', int: 'a whole number', float: 'a finite numb
              tuple: 'a list of finite numbers'}
 
 
-def _is_a(value, kind):
+def _is_a(value: object, kind: Any) -> bool:
     """Say whether a value from JSON is of a field's type."""
     if kind is tuple:
         return isinstance(value, list) and all(_is_a(each, float) for each in value)
@@ -135,7 +147,8 @@ def _is_a(value, kind):
     return kind is float and isinstance(value, float) and math.isfinite(value)
 
 
-def check_fit(wanted, state, path):
+def check_fit(wanted: Mapping[str, torch.Tensor], state: Mapping[str, torch.Tensor],
+              path: str | Path) -> None:
     """
     Compare weights with what a network has.
 
@@ -160,7 +173,8 @@ def check_fit(wanted, state, path):
                                f'wants {tensor.dtype}. Train again')
 
 
-def save_tensors(path, tensors, about):
+def save_tensors(path: str | Path, tensors: Mapping[str, torch.Tensor],
+                 about: Mapping[str, Any]) -> None:
     """
     Write tensors and a JSON description into one safetensors file, in one step.
 
@@ -175,7 +189,7 @@ def save_tensors(path, tensors, about):
         'format': _FORMAT, 'about': text, 'sha256': content_digest(tensors, text)}))
 
 
-def load_tensors(path):
+def load_tensors(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     """
     Read what save_tensors has written.
 
@@ -187,7 +201,7 @@ def load_tensors(path):
     return tensors, about
 
 
-def stored_digest(path):
+def stored_digest(path: str | Path) -> str:
     """
     Return the SHA-256 of what a file holds, once it is found to be right.
 
@@ -198,7 +212,7 @@ def stored_digest(path):
     return _load(path)[2]
 
 
-def _load(path):
+def _load(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, Any], str]:
     """Return tensors, description and SHA-256 of a file."""
     name = escaped(path)
     data = _read(path, name)
@@ -224,7 +238,7 @@ def _load(path):
     return tensors, about, digest
 
 
-def _read(path, name):
+def _read(path: str | Path, name: str) -> bytes:
     """Return the bytes of a file whose header is not longer than can be."""
     try:
         # without O_NONBLOCK a pipe would wait for somebody to write to it
@@ -246,12 +260,12 @@ def _read(path, name):
                            f'{escaped(getattr(error, "strerror", None) or error)}') from error
 
 
-def _header_length(data):
+def _header_length(data: bytes) -> int:
     """Return the length that a file's first bytes give its header."""
     return int.from_bytes(data[:8], 'little')
 
 
-def content_digest(tensors, about):
+def content_digest(tensors: Mapping[str, torch.Tensor], about: str) -> str:
     """Return the SHA-256 of tensors, in the order of their names, and of a description."""
     found = hashlib.sha256()
     for part in (_FORMAT, about):
@@ -259,5 +273,5 @@ def content_digest(tensors, about):
     for name in sorted(tensors):
         tensor = tensors[name]
         found.update(json.dumps([name, str(tensor.dtype), list(tensor.shape)]).encode())
-        found.update(tensor.reshape(-1).view(torch.uint8).numpy())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return found.hexdigest()

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What visual_mpc_node sends to the arm, and the watch that stops it."""
 
+from collections.abc import Collection
 import math
 import threading
 import time
+from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
@@ -13,6 +15,12 @@ from std_msgs.msg import Float64
 from tap_ros.errors import PlanningError
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.text import escaped
+
+if TYPE_CHECKING:
+    from builtin_interfaces.msg import Time
+    from rclpy.node import Node
+    from tap_ros.nodes.observations import Observations
+    from tap_ros.nodes.parameters import Parameters
 
 WATCH_S = 0.02  # how often it is checked whether the arm has to be stopped
 STOOD_S = 2.0  # a watch that was away for longer shows that the process, or all, stood still
@@ -32,10 +40,11 @@ class Arm:
     :param sensors: Observations of what is watched.
     """
 
-    def __init__(self, node, params, sensors):
+    def __init__(self, node: 'Node', params: 'Parameters', sensors: 'Observations') -> None:
         self._node, self._params, self._sensors = node, params, sensors
         self._lock = threading.Condition()  # no command may follow the end of a goal
-        self._goal, self._topics = None, ()
+        self._goal: object = None
+        self._topics: tuple[str, ...] = ()
         self._moved_at = self._stopped_at = -math.inf  # monotonic time
         self._ticked_at, self._stood_s = now_awake(), 0.0
         self._gripper = node.create_publisher(Float64, 'gripper/command', STREAM)
@@ -46,7 +55,7 @@ class Arm:
         self._thread = threading.Thread(target=self._watch, name='arm watch', daemon=True)
         self._thread.start()
 
-    def begin(self, goal):
+    def begin(self, goal: object) -> None:
         """Let a goal, any object, move the arm; nothing else may from now on."""
         with self._lock:
             self._goal, self._topics = goal, ()
@@ -55,7 +64,7 @@ class Arm:
             self._stop()
             self._lock.notify()
 
-    def end(self, goal=None):
+    def end(self, goal: object = None) -> None:
         """
         Stop the arm; the goal may not move it any more.
 
@@ -66,7 +75,8 @@ class Arm:
                 self._goal = None
             self._stop()
 
-    def send(self, goal, action, stamp, topics):
+    def send(self, goal: object, action: np.ndarray, stamp: 'Time',
+             topics: Collection[str]) -> bool:
         """
         Send one command within the limits.
 
@@ -103,7 +113,7 @@ class Arm:
             self._twist.publish(message)
         return True
 
-    def close(self, seconds):
+    def close(self, seconds: float) -> None:
         """Stop the arm for good; wait until that has left, at most so many seconds."""
         self.end()
         with self._lock:
@@ -112,7 +122,7 @@ class Arm:
         self._thread.join(seconds)
         self._twist.wait_for_all_acked(Duration(seconds=seconds))
 
-    def _watch(self):
+    def _watch(self) -> None:
         """Stop the arm whenever it is time to, until close."""
         while not self._closed:
             with self._lock:
@@ -128,31 +138,31 @@ class Arm:
                         throttle_duration_sec=1.0)
             time.sleep(WATCH_S)
 
-    def _tick(self):
+    def _tick(self) -> None:
         """Find out whether the process has stood still since the watch last came by."""
         now = now_awake()
         if now - self._ticked_at > STOOD_S:
             self._stood_s = now - self._ticked_at
         self._ticked_at = now
 
-    def _stop_if_due(self, now):
+    def _stop_if_due(self, now: float) -> None:
         """Stop the arm when a command or a sensor is too old, and again after REPEAT_S."""
         if now - self._stopped_at >= REPEAT_S and (
                 now - self._moved_at > self._params['max_silence']
                 or self._silent(self._topics, now, renewed=True)):
             self._stop()
 
-    def _silent(self, topics, now, renewed=False):
+    def _silent(self, topics: Collection[str], now: float, renewed: bool = False) -> bool:
         """Tell whether one of the topics is silent."""
         ages = self._sensors.ages(topics, now, renewed)
         return any(age > self._params['max_silence'] for age in ages.values())
 
-    def _stop(self):
+    def _stop(self) -> None:
         """Send a zero command; it has no stamp, since it answers no image."""
         self._stopped_at = time.monotonic()
         self._twist.publish(TwistStamped())
 
 
-def now_awake():
+def now_awake() -> float:
     """Return a time in s that goes on while the machine is suspended."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)

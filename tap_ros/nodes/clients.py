@@ -2,12 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """For programs that use the nodes: calls with a time-out, goals, and the newest messages."""
 
+from collections.abc import Callable
 import threading
 import time
+from typing import Any, Self, TYPE_CHECKING, TypeVar
 
 from action_msgs.msg import GoalStatus
 from rclpy.executors import SingleThreadedExecutor
 from tap_ros.errors import TapError
+
+if TYPE_CHECKING:
+    from rclpy.action import ActionClient
+    from rclpy.action.client import ClientGoalHandle
+    from rclpy.client import Client
+    from rclpy.node import Node
+    from rclpy.qos import QoSProfile
+    from rclpy.task import Future
+    from tap_ros.nodes.heartbeat import Liveness
+
+Found = TypeVar('Found')
 
 NEWBORN_S = 0.7  # until others have heard of a node that has just started
 
@@ -25,27 +38,28 @@ class Spinner:
     :param node: rclpy Node; destroying it stays with the caller.
     """
 
-    def __init__(self, node):
+    def __init__(self, node: 'Node') -> None:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._spin, name='spinner', daemon=True)
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         self._thread.start()
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join(timeout=5.0)
         self._executor.shutdown(timeout_sec=1.0)
 
-    def _spin(self):
+    def _spin(self) -> None:
         while not self._stop.is_set():
             self._executor.spin_once(timeout_sec=0.1)
 
 
-def call(client, request, timeout_s, give_up=lambda: False, server=None):
+def call(client: 'Client', request: Any, timeout_s: float,
+         give_up: Callable[[], bool] = lambda: False, server: 'Liveness | None' = None) -> Any:
     """
     Call a service from a thread that does not spin the node.
 
@@ -84,7 +98,7 @@ def call(client, request, timeout_s, give_up=lambda: False, server=None):
     return future.result()
 
 
-def in_executor(node, function, timeout_s):
+def in_executor(node: 'Node', function: Callable[[], Found], timeout_s: float) -> Found:
     """
     Call a function in the thread that spins a node, where no answer is handled meanwhile.
 
@@ -97,13 +111,15 @@ def in_executor(node, function, timeout_s):
     :return: what the function returns; what it raises is raised.
     :raises CallError: when the node is not spun, or its thread is busy for too long.
     """
-    done, found = threading.Event(), []
+    done = threading.Event()
+    found: list[Found] = []
+    failed: list[Exception] = []
 
-    def run():
+    def run() -> None:
         try:
-            found.append((function(), None))
+            found.append(function())
         except Exception as error:  # it would end the executor
-            found.append((None, error))
+            failed.append(error)
         done.set()
 
     if node.executor is None:
@@ -112,13 +128,12 @@ def in_executor(node, function, timeout_s):
     if not done.wait(timeout_s):
         raise CallError(f'node {node.get_name()}: its callbacks have kept it busy for '
                         f'{timeout_s:g} s')
-    value, error = found[0]
-    if error is not None:
-        raise error
-    return value
+    if failed:
+        raise failed[0]
+    return found[0]
 
 
-def cancel_goal(handle, timeout_s=1.0):
+def cancel_goal(handle: 'ClientGoalHandle', timeout_s: float = 1.0) -> 'Future':
     """
     Ask for the end of a goal.
 
@@ -130,14 +145,16 @@ def cancel_goal(handle, timeout_s=1.0):
     return in_executor(handle._action_client._node, handle.cancel_goal_async, timeout_s)
 
 
-def wait_for_future(future, timeout_s):
+def wait_for_future(future: 'Future', timeout_s: float) -> bool:
     """Wait until a future is done, without spinning; tell whether it is."""
     done = threading.Event()
     future.add_done_callback(lambda _: done.set())
     return done.wait(max(timeout_s, 0.0))
 
 
-def send_goal(action_client, goal, timeout_s, on_feedback=None, server=None):
+def send_goal(action_client: 'ActionClient', goal: Any, timeout_s: float,
+              on_feedback: Callable[[Any], object] | None = None,
+              server: 'Liveness | None' = None) -> 'ClientGoalHandle':
     """
     Send a goal and wait until it is accepted.
 
@@ -170,7 +187,8 @@ def send_goal(action_client, goal, timeout_s, on_feedback=None, server=None):
     return handle
 
 
-def wait_for_result(handle, timeout_s, server=None):
+def wait_for_result(handle: 'ClientGoalHandle', timeout_s: float,
+                    server: 'Liveness | None' = None) -> tuple[int, Any]:
     """
     Wait for the end of a goal; cancel it when it takes too long.
 
@@ -208,19 +226,19 @@ class Newest:
     :param qos: its QoSProfile.
     """
 
-    def __init__(self, node, message_type, topic, qos):
+    def __init__(self, node: 'Node', message_type: type, topic: str, qos: 'QoSProfile') -> None:
         self._topic = topic
         self._condition = threading.Condition()
         self._count = 0
-        self._message = None
+        self._message: Any = None
         node.create_subscription(message_type, topic, self._put, qos)
 
     @property
-    def count(self):
+    def count(self) -> int:
         """Number of messages received so far."""
         return self._count
 
-    def wait(self, timeout_s, accept=lambda message: True):
+    def wait(self, timeout_s: float, accept: Callable[[Any], bool] = lambda message: True) -> Any:
         """
         Return the newest message once it is acceptable.
 
@@ -236,7 +254,7 @@ class Newest:
         got = f'{self._count} messages, none of them as wanted' if self._count else 'no message'
         raise CallError(f'topic {self._topic}: {got} within {timeout_s:g} s')
 
-    def _put(self, message):
+    def _put(self, message: Any) -> None:
         with self._condition:
             self._message = message
             self._count += 1

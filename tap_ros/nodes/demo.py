@@ -8,19 +8,21 @@ goes through the topics, services and actions that any client would use.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 import time
-from typing import Annotated
+from typing import Annotated, Any
 
 from action_msgs.msg import GoalStatus
 import numpy as np
 import rclpy
 from rclpy.action import ActionClient
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 from sim_bridge.tasks import get_task
 from tap_msgs.action import ReachGoal
-from tap_msgs.msg import ObjectStates
+from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError, TapError
@@ -57,27 +59,25 @@ class Watch:
     :param node: rclpy Node that another thread spins.
     """
 
-    def __init__(self, node):
-        self._kept = {}
+    def __init__(self, node: Node) -> None:
+        self._kept: dict[str, dict[int, Any]] = {}
         self._topics = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')}
         for topic, (message_type, name) in self._topics.items():
-            node.create_subscription(
-                message_type, name, lambda message, topic=topic: self._keep(topic, message),
-                STREAM)
+            node.create_subscription(message_type, name, partial(self._keep, topic), STREAM)
         self.begin()
 
-    def begin(self):
+    def begin(self) -> None:
         """Forget what was seen."""
         self.first_ns = 0  # what is stamped before this is of another scene
         self._kept = {topic: {} for topic in self._topics}
 
-    def seen(self):
+    def seen(self) -> tuple[list[Image], list[ObjectStates]]:
         """Return the images and the objects that belong to them, in order of their stamps."""
         images, objects = (dict(found) for found in self._kept.values())
         stamps = sorted(stamp for stamp in set(images) & set(objects) if stamp >= self.first_ns)
         return [images[stamp] for stamp in stamps], [objects[stamp] for stamp in stamps]
 
-    def _keep(self, topic, message):
+    def _keep(self, topic: str, message: Any) -> None:
         self._kept[topic][to_nanoseconds(message.header.stamp)] = message
 
 
@@ -88,7 +88,7 @@ class DemoClient:
     :param processes: NodeProcesses to keep an eye on.
     """
 
-    def __init__(self, processes):
+    def __init__(self, processes: NodeProcesses) -> None:
         self.node = rclpy.create_node('demo')
         self._processes = processes
         self._reset = self.node.create_client(ResetScene, 'sim/reset')
@@ -102,7 +102,7 @@ class DemoClient:
         self._goal.subscribe(self.node, {
             'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}, LATCHED)
 
-    def wait_until_ready(self):
+    def wait_until_ready(self) -> None:
         """Wait until every node offers what it offers only when it is ready."""
         deadline = time.monotonic() + START_TIMEOUT_S
         waiting = {
@@ -121,7 +121,7 @@ class DemoClient:
         # That of the first scene, which is kept for late joiners: the next one is another.
         self._goal.wait(('image', 'objects'), CALL_TIMEOUT_S)
 
-    def reset(self, task, seed):
+    def reset(self, task: str, seed: int) -> dict[str, Any]:
         """Start a scene; return its goal as a dict of image and objects."""
         before = self._goal.newest('image', 'objects')
         after_ns = -1 if before is None else to_nanoseconds(before['image'].header.stamp)
@@ -140,12 +140,12 @@ class DemoClient:
             raise TapError(f'no camera or goal picture came within {CALL_TIMEOUT_S:g} s')
         return goal
 
-    def start(self):
+    def start(self) -> tuple[Image, ObjectStates]:
         """Return the first picture of the scene and the objects in it."""
         images, objects = self._camera.seen()
         return images[0], objects[0]
 
-    def predict(self):
+    def predict(self) -> Subgoal:
         """Ask for a subgoal as a person would by hand: with an empty request."""
         deadline = time.monotonic() + CALL_TIMEOUT_S
         while True:
@@ -158,7 +158,7 @@ class DemoClient:
                 raise TapError(f'predict_subgoal: {answer.message}')
             time.sleep(0.2)
 
-    def push(self, mode, seed, step_budget, goal):
+    def push(self, mode: str, seed: int, step_budget: int, goal: dict[str, Any]) -> Run:
         """
         Have the arm push until the goal is reached or the budget spent.
 
@@ -166,7 +166,7 @@ class DemoClient:
         """
         planning_ms = []
         with tqdm(total=step_budget, desc=f'    {mode:<8}', unit='step', leave=False) as bar:
-            def on_feedback(feedback):
+            def on_feedback(feedback: Any) -> None:
                 planning_ms.append(feedback.planning_ms)
                 bar.set_postfix_str(
                     f'to the {feedback.stage}, {feedback.expected_distance:.1f} px expected')
@@ -187,24 +187,24 @@ class DemoClient:
             message=result.message, planning_ms=float(np.median(planning_ms or [np.nan])))
 
 
-def positions(message):
+def positions(message: ObjectStates) -> np.ndarray:
     """Return (K, 3) metres of a tap_msgs/ObjectStates."""
     points = [state.pose.position for state in message.objects]
     return np.array([(p.x, p.y, p.z) for p in points])
 
 
-def pixels(message):
+def pixels(message: ObjectStates) -> np.ndarray:
     """Return (K, 2) (u, v) of a tap_msgs/ObjectStates."""
     return np.array([(state.u, state.v) for state in message.objects])
 
 
-def run_scene(client, task, seed, step_budget):
+def run_scene(client: DemoClient, task: str, seed: int, step_budget: int) -> SceneRuns:
     """
     Push one scene in every mode.
 
     :return: SceneRuns.
     """
-    runs = {}
+    runs: dict[str, Run] = {}
     for mode in MODES:
         goal = client.reset(task, seed)
         if not runs:
@@ -224,7 +224,7 @@ def run_scene(client, task, seed, step_budget):
         runs=runs)
 
 
-def start_nodes(processes, folder, task):
+def start_nodes(processes: NodeProcesses, folder: Path, task: str) -> None:
     """Start the three nodes and the recorder."""
     processes.start('recorder_node', folder=folder / 'recording')
     processes.start('sim_node', lock_step=True, task=task)
@@ -253,7 +253,7 @@ class Options:
     attach: Flag = False
 
 
-def run(args):
+def run(args: Options) -> int:
     """
     Run the demo and leave a recording, logs and a page.
 
@@ -302,7 +302,7 @@ def run(args):
     return 0
 
 
-def new_folder(wanted):
+def new_folder(wanted: str | Path) -> Path:
     """Make a folder of this name, or with the next free number behind it."""
     for number in range(1, 10000):
         folder = Path(wanted if number == 1 else f'{wanted}-{number}')

@@ -2,16 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a node is, once a second on /diagnostics, where rqt and Foxglove look for it."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 import math
 import threading
 import time
+from typing import Any, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from tap_ros.nodes.windows import percentiles, rate, Window
 from tap_ros.text import escaped
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 PERIOD = 1.0  # s
 RATE_SECONDS = 10.0  # over which rates are taken, of RATE_LIMIT messages at most
@@ -52,7 +57,8 @@ class Diagnostics:
     :param queue: called without arguments, returns how many requests wait; None for no queue.
     """
 
-    def __init__(self, node, inputs, queue=None):
+    def __init__(self, node: 'Node', inputs: Mapping[str, float],
+                 queue: Callable[[], int] | None = None) -> None:
         self._node = node
         self._queue = queue
         self._lock = threading.Lock()
@@ -60,14 +66,14 @@ class Diagnostics:
                         for topic, max_age_s in inputs.items()}
         self._by_name = self._inputs | {
             topic: self._inputs[node.resolve_topic_name(topic)] for topic in inputs}
-        self._work = {}  # what -> Work
+        self._work: dict[str, Work] = {}  # what -> Work
         self._errors, self._last_error, self._error_time = 0, '', -math.inf
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         # Its own group: it goes on while the node works, where there are threads enough.
         node.create_timer(PERIOD, self._publish, MutuallyExclusiveCallbackGroup(),
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def received(self, topic):
+    def received(self, topic: str) -> None:
         """
         Note a message.
 
@@ -80,7 +86,7 @@ class Diagnostics:
             source.newest = now
             source.arrivals.add(now)
 
-    def took(self, ms, what):
+    def took(self, ms: float, what: str) -> None:
         """
         Note how long a piece of work took.
 
@@ -93,7 +99,7 @@ class Diagnostics:
             work.count += 1
             work.durations.add(now, ms)
 
-    def error(self, text):
+    def error(self, text: object) -> None:
         """
         Note what went wrong.
 
@@ -103,7 +109,7 @@ class Diagnostics:
             self._errors += 1
             self._last_error, self._error_time = escaped(text), time.monotonic()
 
-    def _publish(self):
+    def _publish(self) -> None:
         queue = None if self._queue is None else self._queue()  # it may take locks of its own
         now = time.monotonic()
         message = DiagnosticArray()
@@ -114,8 +120,8 @@ class Diagnostics:
                 message.status.append(self._describe_input(topic, source, now))
         self._publisher.publish(message)
 
-    def _describe_work(self, queue, now):
-        values = {} if queue is None else {'queue': queue}
+    def _describe_work(self, queue: int | None, now: float) -> DiagnosticStatus:
+        values: dict[str, int | str] = {} if queue is None else {'queue': queue}
         for what, work in self._work.items():
             p50, p99 = percentiles(work.durations.newest(now)[1])
             values |= {f'{what} calls': work.count,
@@ -129,7 +135,7 @@ class Diagnostics:
                     'service', DiagnosticStatus.ERROR, self._last_error, values)
         return self._status('service', DiagnosticStatus.OK, 'OK', values)
 
-    def _describe_input(self, topic, source, now):
+    def _describe_input(self, topic: str, source: Input, now: float) -> DiagnosticStatus:
         age = now - source.newest
         if not source.count:
             level, status, age = DiagnosticStatus.WARN, 'NotReceived', math.nan
@@ -141,7 +147,8 @@ class Diagnostics:
             'status': status, 'age_s': f'{age:.3f}', 'max_age_s': f'{source.max_age_s:g}',
             'rate_hz': f'{rate(source.arrivals.newest(now)[0]):.2f}', 'count': source.count})
 
-    def _status(self, name, level, text, values):
+    def _status(self, name: str, level: bytes, text: str,
+                values: Mapping[str, Any]) -> DiagnosticStatus:
         return DiagnosticStatus(
             name=f'{self._node.get_name()}: {name}', level=level, message=text,
             hardware_id=self._node.get_fully_qualified_name(),

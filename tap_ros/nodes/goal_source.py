@@ -2,12 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The goal of a reach_goal request: what it sends along, else what came by topic."""
 
+from collections.abc import Callable, Iterable
+from typing import Any, TYPE_CHECKING
+
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.errors import PlanningError
 from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, to_nanoseconds
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from tap_msgs.action import ReachGoal
 
 TOPICS = {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}
 
@@ -20,17 +27,19 @@ class GoalSource:
     :param on_message: called with the topic name after each message.
     """
 
-    def __init__(self, node, on_message):
+    def __init__(self, node: 'Node', on_message: Callable[[str], object]) -> None:
         self._node = node
         self._newest = Observations(*TOPICS, latched=True)
         self._newest.subscribe(node, TOPICS, LATCHED, on_message=on_message)
         self.begin(())
 
-    def begin(self, needed):
+    def begin(self, needed: Iterable[str]) -> None:
         """Begin a request that takes these of TOPICS from their topics."""
-        self._needed, self._stamp = tuple(needed), None
+        self._needed = tuple(needed)
+        self._stamp: int | None = None
 
-    def take(self, request, timeout_s, give_up):
+    def take(self, request: 'ReachGoal.Goal', timeout_s: float,
+             give_up: Callable[[], bool]) -> dict[str, Any]:
         """
         Return the goal as {'image': message, 'objects': message}.
 
@@ -50,7 +59,7 @@ class GoalSource:
         self._stamp = to_nanoseconds(found[self._needed[0]].header.stamp)
         return goal | {topic: found[topic] for topic in self._needed}
 
-    def changed(self, since):
+    def changed(self, since: float) -> bool:
         """
         Tell whether take would return another goal now, which had come before.
 
@@ -65,11 +74,11 @@ class GoalSource:
                                 f'{self._names(self._needed)}')
         return True
 
-    def _names(self, topics):
+    def _names(self, topics: Iterable[str]) -> str:
         return ', '.join(self._node.resolve_topic_name(TOPICS[topic][1]) for topic in topics)
 
 
-def needed_topics(request, mode):
+def needed_topics(request: 'ReachGoal.Goal', mode: str) -> list[str]:
     """Return those of TOPICS that a request leaves to them."""
     return [topic for topic, empty in (
         ('image', mode == 'subgoal' and is_empty(request.goal_image)),

@@ -4,12 +4,17 @@
 
 import threading
 import time
+from typing import Any, TYPE_CHECKING
 
 from rclpy.duration import Duration
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 from tap_ros.nodes.observations import reception_time
 from tap_ros.text import escaped
+
+if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+    from rclpy.node import Node
 
 BEAT_S = 0.1
 LEASE_S = 0.4  # of the topic's liveliness, for other programs that watch it
@@ -29,19 +34,19 @@ class Heartbeat:
     :param node: rclpy Node.
     """
 
-    def __init__(self, node):
+    def __init__(self, node: 'Node') -> None:
         self._node = node
         self._publisher = node.create_publisher(Header, '~/heartbeat', QOS)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name='heartbeat', daemon=True)
         self._thread.start()
 
-    def end(self):
+    def end(self) -> None:
         """Beat no more; to be called before the node is destroyed."""
         self._ended.set()
         self._thread.join(1.0)
 
-    def _run(self):
+    def _run(self) -> None:
         while not self._ended.wait(BEAT_S):
             try:
                 self._publisher.publish(Header(stamp=self._node.get_clock().now().to_msg()))
@@ -62,16 +67,18 @@ class Liveness:
     :param callback_group: callback group, None for the node's own.
     """
 
-    def __init__(self, node, name, callback_group=None):
+    def __init__(self, node: 'Node', name: str,
+                 callback_group: 'CallbackGroup | None' = None) -> None:
         self.name = name
-        self._beat_at = None  # monotonic time of the newest beat
-        self._doubted_at = None  # when its silence was seen first
+        self._beat_at: float | None = None  # monotonic time of the newest beat
+        self._doubted_at: float | None = None  # when its silence was seen first
         self._changed = threading.Condition()
         node.create_subscription(
-            Header, f'{name}/heartbeat', self._on_beat, QOS, callback_group=callback_group)
+            Header, f'{name}/heartbeat', self._on_beat,  # type: ignore[arg-type]  # with the info
+            QOS, callback_group=callback_group)
 
     @property
-    def dead(self):
+    def dead(self) -> bool:
         """Tell whether a node that was heard is heard no more; to be asked again and again."""
         now = time.monotonic()
         if not self._silent(now):
@@ -81,16 +88,16 @@ class Liveness:
         doubted_at = self._doubted_at
         return doubted_at is not None and now - doubted_at > DOUBT_S
 
-    def wait_until_alive(self, seconds):
+    def wait_until_alive(self, seconds: float) -> bool:
         """Wait until one that has died lives again; tell so, and True if none was heard yet."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._silent(time.monotonic()), seconds)
 
-    def _silent(self, now):
+    def _silent(self, now: float) -> bool:
         beat_at = self._beat_at
         return beat_at is not None and now - beat_at > SILENT_S
 
-    def _on_beat(self, _, info):
+    def _on_beat(self, _: Header, info: dict[str, Any]) -> None:
         with self._changed:
             self._beat_at = reception_time(info)
             self._changed.notify_all()

@@ -3,7 +3,9 @@
 """sensor_msgs/Image to arrays and back; what cannot be used is refused with the reason."""
 
 import array
+from collections.abc import Collection, Sequence
 import sys
+from typing import TYPE_CHECKING
 
 import numpy as np
 from sensor_msgs.msg import Image
@@ -12,16 +14,19 @@ from tap_ros.errors import ImageError
 from tap_ros.images import check_image
 from tap_ros.text import escaped
 
+if TYPE_CHECKING:
+    from builtin_interfaces.msg import Time
+
 MAX_BYTES = 32 * 2**20  # of one picture: rgb8 of 3840x2160 pixels has 24 MiB
 MAX_FRAME_ID = 100  # characters; it comes back with every picture and map of an answer
 
 
-def is_empty(message):
+def is_empty(message: Image) -> bool:
     """Tell whether an image field was left as it is by default."""
     return message.width == 0 and message.height == 0 and len(message.data) == 0
 
 
-def encode_image(image, stamp, frame_id):
+def encode_image(image: np.ndarray, stamp: 'Time', frame_id: str) -> Image:
     """
     Turn a picture into a message.
 
@@ -34,7 +39,7 @@ def encode_image(image, stamp, frame_id):
     return _pack(check_image(image, 'image'), PICTURE_ENCODING, stamp, frame_id)
 
 
-def encode_map(values, stamp, frame_id):
+def encode_map(values: np.ndarray, stamp: 'Time', frame_id: str) -> Image:
     """
     Turn one object map into a message.
 
@@ -46,7 +51,8 @@ def encode_map(values, stamp, frame_id):
     return _pack(np.asarray(values, np.float32), MAP_ENCODING, stamp, frame_id)
 
 
-def decode_image(message, name, size=None, resize=False):
+def decode_image(message: Image, name: str, size: Sequence[int] | None = None,
+                 resize: bool = False) -> np.ndarray:
     """
     Turn a message into a picture.
 
@@ -68,7 +74,7 @@ def decode_image(message, name, size=None, resize=False):
     return check_image(np.ascontiguousarray(image), name, size)
 
 
-def decode_map(message, name, size=None):
+def decode_map(message: Image, name: str, size: Sequence[int] | None = None) -> np.ndarray:
     """
     Turn a message into an object map.
 
@@ -89,7 +95,7 @@ def decode_map(message, name, size=None):
     return values
 
 
-def resize_image(image, size):
+def resize_image(image: np.ndarray, size: Sequence[int]) -> np.ndarray:
     """
     Resize a picture with antialiasing.
 
@@ -104,7 +110,8 @@ def resize_image(image, size):
     return planes[0].round().clamp(0, 255).byte().movedim(0, -1).contiguous().numpy()
 
 
-def resize_pixels(pixels, old_size, new_size):
+def resize_pixels(pixels: np.ndarray, old_size: Sequence[int],
+                  new_size: Sequence[int]) -> np.ndarray:
     """
     Move pixel positions along with a resized picture.
 
@@ -118,14 +125,14 @@ def resize_pixels(pixels, old_size, new_size):
     return ((np.asarray(pixels, np.float64) + 0.5) * scale - 0.5).astype(np.float32)
 
 
-def _check_encoding(message, name, valid):
+def _check_encoding(message: Image, name: str, valid: Collection[str]) -> None:
     """Refuse another encoding than the valid ones."""
     if message.encoding not in valid:
         raise ImageError(f"{name}: encoding '{escaped(message.encoding, 40)}' cannot be used; "
                          f'valid encodings: {", ".join(valid)}')
 
 
-def _rows(message, name, bytes_per_pixel):
+def _rows(message: Image, name: str, bytes_per_pixel: int) -> np.ndarray:
     """Check the layout and return uint8 (height, width * bytes_per_pixel) without padding."""
     height, width, step = message.height, message.width, message.step
     if len(message.data) > MAX_BYTES:
@@ -149,7 +156,7 @@ def _rows(message, name, bytes_per_pixel):
     return data[:, :row_bytes]
 
 
-def _pack(values, encoding, stamp, frame_id):
+def _pack(values: np.ndarray, encoding: str, stamp: 'Time', frame_id: str) -> Image:
     """Fill a message with rows that are not padded."""
     values = np.ascontiguousarray(values)
     message = Image()

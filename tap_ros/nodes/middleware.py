@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fast DDS for the nodes: it forgets a dead process soon, and a restarted one is heard."""
 
+from collections.abc import MutableMapping
 import os
 from pathlib import Path
 
@@ -14,7 +15,7 @@ RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
 LOCALHOST_ONLY = 'ROS_LOCALHOST_ONLY'  # older than RANGE, and still stronger
 
 
-def configure_fast_dds(environ=os.environ):
+def configure_fast_dds(environ: MutableMapping[str, str] = os.environ) -> None:
     """
     Let Fast DDS give up this process 3 s after its death, and use UDP alone.
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+from typing import Any, Self
 
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
@@ -22,12 +23,12 @@ class NodeProcesses:
     :param log_folder: folder of the logs, made if it is not there.
     """
 
-    def __init__(self, log_folder):
+    def __init__(self, log_folder: str | Path) -> None:
         self._folder = Path(log_folder)
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._processes = {}
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self, name, **parameters):
+    def start(self, name: str, **parameters: Any) -> None:
         """
         Start a node.
 
@@ -44,7 +45,7 @@ class NodeProcesses:
                 command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
                 start_new_session=True)
 
-    def check(self):
+    def check(self) -> None:
         """
         Make sure that all still run.
 
@@ -57,7 +58,7 @@ class NodeProcesses:
                     f'{name} ended with exit code {process.returncode}; the end of '
                     f'{self._log(name)}:\n' + '\n'.join(lines[-5:]))
 
-    def stop(self, timeout_s=15):
+    def stop(self, timeout_s: float = 15) -> dict[str, int]:
         """End all nodes, politely first; return the exit code of each."""
         running = [p for p in self._processes.values() if p.poll() is None]
         for process in running:
@@ -70,11 +71,11 @@ class NodeProcesses:
                 process.wait()
         return {name: process.returncode for name, process in self._processes.items()}
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def _log(self, name):
+    def _log(self, name: str) -> Path:
         return self._folder / f'{name}.log'

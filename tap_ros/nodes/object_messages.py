@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Objects, gripper and camera geometry: messages to arrays and back."""
 
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
 from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
 from sensor_msgs.msg import CameraInfo, JointState
@@ -11,11 +14,15 @@ from tap_ros.errors import PlanningError
 from tap_ros.images import in_picture
 from tap_ros.text import escaped, listing
 
+if TYPE_CHECKING:
+    from builtin_interfaces.msg import Time
+
 MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is predicted
 MAX_NAME = 100  # characters
 
 
-def encode_objects(names, pixels, poses, stamp, frame_id, source):
+def encode_objects(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray, stamp: 'Time',
+                   frame_id: str, source: str) -> ObjectStates:
     """
     Turn objects into a message.
 
@@ -39,7 +46,8 @@ def encode_objects(names, pixels, poses, stamp, frame_id, source):
     return message
 
 
-def decode_objects(message, name, size=None):
+def decode_objects(message: ObjectStates, name: str,
+                   size: Sequence[int] | None = None) -> tuple[tuple[str, ...], np.ndarray]:
     """
     Turn a message into names and pixels.
 
@@ -68,7 +76,7 @@ def decode_objects(message, name, size=None):
     return names, pixels.astype(np.float32)
 
 
-def _check_pixel(name, pixel, size):
+def _check_pixel(name: str, pixel: np.ndarray, size: Sequence[int] | None) -> None:
     """Refuse a pixel (u, v) that is unknown, or not in a picture of this (height, width)."""
     if size is None:
         with np.errstate(over='ignore'):  # what float32 cannot hold becomes infinite
@@ -87,7 +95,8 @@ def _check_pixel(name, pixel, size):
             'seen')
 
 
-def match_objects(names, other_names, other_pixels, name, other_name):
+def match_objects(names: Sequence[str], other_names: Sequence[str], other_pixels: np.ndarray,
+                  name: str, other_name: str) -> np.ndarray:
     """
     Put pixels of the same objects into the same order.
 
@@ -107,7 +116,7 @@ def match_objects(names, other_names, other_pixels, name, other_name):
     return other_pixels[[other_names.index(object_name) for object_name in names]]
 
 
-def encode_gripper(gripper, stamp, frame_id):
+def encode_gripper(gripper: np.ndarray, stamp: 'Time', frame_id: str) -> JointState:
     """
     Turn the gripper's state into a message.
 
@@ -122,7 +131,7 @@ def encode_gripper(gripper, stamp, frame_id):
     return message
 
 
-def decode_gripper(message, name='joint_states'):
+def decode_gripper(message: JointState, name: str = 'joint_states') -> np.ndarray:
     """
     Find the gripper among joints.
 
@@ -143,7 +152,8 @@ def decode_gripper(message, name='joint_states'):
     return gripper
 
 
-def encode_camera_info(K, size, stamp, frame_id):
+def encode_camera_info(K: np.ndarray, size: Sequence[int], stamp: 'Time',
+                       frame_id: str) -> CameraInfo:
     """
     Describe a pinhole camera without distortion.
 

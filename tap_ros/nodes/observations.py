@@ -3,12 +3,19 @@
 """Messages of several topics put together by their stamp, with the time of their reception."""
 
 from collections import OrderedDict
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 import math
 import threading
 import time
+from typing import Any, TYPE_CHECKING
 
 from tap_ros.nodes.topics import to_nanoseconds
+
+if TYPE_CHECKING:
+    from rclpy.callback_groups import CallbackGroup
+    from rclpy.node import Node
+    from rclpy.qos import QoSProfile
 
 DEPTH = 10  # stamps remembered
 JUMP_NS = 10 * 10**9  # a stamp so far ahead of all others is not believed at once
@@ -20,7 +27,7 @@ class Moment:
     """Messages of one stamp."""
 
     stamp_ns: int
-    messages: dict  # topic -> message
+    messages: dict[str, Any]  # topic -> message
     received: float  # s, monotonic: when the one that was received first came, or came again
 
 
@@ -40,19 +47,23 @@ class Observations:
     :ivar jumps: how often the clock has jumped.
     """
 
-    def __init__(self, *topics, latched=False):
+    def __init__(self, *topics: str, latched: bool = False) -> None:
         self._topics = topics
         self._latched = latched
         self._changed = threading.Condition()
-        self._by_stamp = OrderedDict()  # stamp in ns -> {topic: (message, received)}
-        self._newest = {}  # topic -> stamp in ns
-        self._previous = {}  # topic -> the stamp before that
-        self._received = {}  # topic -> monotonic time of its last message
-        self._renewed = {}  # topic -> monotonic time of its last message with a new stamp
-        self._suspects = {topic: [] for topic in topics}  # stamps in a row that are not believed
+        # stamp in ns -> {topic: (message, received)}
+        self._by_stamp: OrderedDict[int, dict[str, tuple[Any, float]]] = OrderedDict()
+        self._newest: dict[str, int] = {}  # topic -> stamp in ns
+        self._previous: dict[str, int] = {}  # topic -> the stamp before that
+        self._received: dict[str, float] = {}  # topic -> monotonic time of its last message
+        self._renewed: dict[str, float] = {}  # likewise, with a new stamp
+        # topic -> stamps in a row that are not believed
+        self._suspects: dict[str, list[int]] = {topic: [] for topic in topics}
         self.count, self.jumps = 0, 0
 
-    def subscribe(self, node, types, qos, callback_group=None, on_message=None):
+    def subscribe(self, node: 'Node', types: Mapping[str, tuple[type, str]], qos: 'QoSProfile',
+                  callback_group: 'CallbackGroup | None' = None,
+                  on_message: Callable[[str], object] | None = None) -> None:
         """
         Subscribe to the topics.
 
@@ -63,15 +74,17 @@ class Observations:
         :param on_message: called with the topic name after each message, or None.
         """
         for topic, (message_type, name) in types.items():
-            def receive(message, info, topic=topic, name=name):
+            def receive(message: Any, info: dict[str, Any], topic: str = topic,
+                        name: str = name) -> None:
                 self.put(topic, message, reception_time(info))
                 if on_message is not None:
                     on_message(name)
 
             node.create_subscription(
-                message_type, name, receive, qos, callback_group=callback_group)
+                message_type, name, receive,  # type: ignore[arg-type]  # may take the info, too
+                qos, callback_group=callback_group)
 
-    def put(self, topic, message, received=None):
+    def put(self, topic: str, message: Any, received: float | None = None) -> None:
         """
         Add a message with a header.
 
@@ -94,7 +107,7 @@ class Observations:
             self.count += 1
             self._changed.notify_all()
 
-    def _believe(self, topic, stamp):
+    def _believe(self, topic: str, stamp: int) -> bool:
         """Tell whether a stamp is used; forget all others when the clock has jumped to it."""
         self._drop_stray(topic, stamp)
         clock = max(self._newest.values(), default=stamp)
@@ -115,14 +128,15 @@ class Observations:
             others.clear()
         return True
 
-    def _drop_stray(self, topic, stamp):
+    def _drop_stray(self, topic: str, stamp: int) -> None:
         """Forget the newest message of a topic when this stamp goes on from the one before it."""
         newest, previous = self._newest.get(topic), self._previous.get(topic)
-        if newest is not None and previous <= stamp < newest:
+        if newest is not None and previous is not None and previous <= stamp < newest:
             self._newest[topic] = previous
             self._by_stamp.get(newest, {}).pop(topic, None)
 
-    def newest(self, *topics, after_ns=-1, since=-math.inf):
+    def newest(self, *topics: str, after_ns: int = -1,
+               since: float = -math.inf) -> dict[str, Any] | None:
         """
         Return the newest {topic: message} that has all of `topics`; None if there is none.
 
@@ -132,7 +146,8 @@ class Observations:
         moment = self.moment(topics, after_ns, since)
         return None if moment is None else moment.messages
 
-    def moment(self, topics, after_ns=-1, since=-math.inf):
+    def moment(self, topics: Collection[str], after_ns: int = -1,
+               since: float = -math.inf) -> Moment | None:
         """Return the same with its stamp and time of reception, as a Moment."""
         with self._changed:
             found = [stamp for stamp, parts in self._by_stamp.items() if stamp > after_ns and all(
@@ -144,7 +159,8 @@ class Observations:
             return Moment(stamp, {topic: message for topic, (message, _) in parts.items()},
                           min(parts[topic][1] for topic in topics))
 
-    def wait(self, topics, timeout_s, after_ns=-1, give_up=lambda: False):
+    def wait(self, topics: Collection[str], timeout_s: float, after_ns: int = -1,
+             give_up: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
         """
         Wait for an observation.
 
@@ -164,23 +180,23 @@ class Observations:
                 self._changed.wait(min(left, 0.1))
         return None
 
-    def wait_for_change(self, timeout_s, count):
+    def wait_for_change(self, timeout_s: float, count: int) -> None:
         """Wait until something has come or wake was called since `count`, or the time is over."""
         with self._changed:
             self._changed.wait_for(lambda: self.count != count, timeout_s)
 
-    def wake(self):
+    def wake(self) -> None:
         """Make all that wait look again."""
         with self._changed:
             self.count += 1
             self._changed.notify_all()
 
-    def missing(self, topics):
+    def missing(self, topics: Collection[str]) -> list[str]:
         """Return those of `topics` of which nothing has come since the start."""
         with self._changed:
             return [topic for topic in topics if topic not in self._received]
 
-    def ages(self, topics, now, renewed=False):
+    def ages(self, topics: Collection[str], now: float, renewed: bool = False) -> dict[str, float]:
         """
         Return how long ago each topic was heard, {topic: seconds}, infinity for never.
 
@@ -192,7 +208,7 @@ class Observations:
             return {topic: now - times.get(topic, -math.inf) for topic in topics}
 
 
-def reception_time(info):
+def reception_time(info: Mapping[str, Any]) -> float:
     """
     Return the monotonic time at which the middleware received a message.
 

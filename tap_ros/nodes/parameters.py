@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node parameters with a description and a range, refused with a reason when wrong."""
 
+from collections.abc import Iterable, Sequence
+from typing import Any, TYPE_CHECKING
+
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -11,6 +14,10 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from tap_ros.errors import ConfigError
 
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from rclpy.parameter import Parameter
+
 
 class Parameters:
     """
@@ -19,17 +26,18 @@ class Parameters:
     :param node: rclpy Node.
     """
 
-    def __init__(self, node):
+    def __init__(self, node: 'Node') -> None:
         self._node = node
-        self._choices = {}
+        self._choices: dict[str, tuple[str, ...]] = {}
         node.add_on_set_parameters_callback(self._check_choices)
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> Any:
         """Return the present value."""
         return self._node.get_parameter(name).value
 
-    def declare(self, name, default, description, low=None, high=None, choices=None,
-                read_only=True):
+    def declare(self, name: str, default: Any, description: str, low: float | None = None,
+                high: float | None = None, choices: Sequence[str] | None = None,
+                read_only: bool = True) -> Any:
         """
         Declare one parameter and return its value.
 
@@ -44,7 +52,7 @@ class Parameters:
         :raises ConfigError: when the value given at the start is of another type or out of range.
         """
         descriptor = ParameterDescriptor(description=description, read_only=read_only)
-        if low is not None and isinstance(default, float):
+        if low is not None and high is not None and isinstance(default, float):
             descriptor.floating_point_range = [
                 FloatingPointRange(from_value=float(low), to_value=float(high))]
         elif low is not None:
@@ -59,7 +67,7 @@ class Parameters:
             raise ConfigError(
                 f'parameter {name}: {reason}. {description} Default: {default!r}') from error
 
-    def _check_choices(self, parameters):
+    def _check_choices(self, parameters: Iterable['Parameter']) -> SetParametersResult:
         """Refuse strings that are none of the choices."""
         for parameter in parameters:
             choices = self._choices.get(parameter.name)
@@ -71,7 +79,7 @@ class Parameters:
         return SetParametersResult(successful=True)
 
 
-def check_device(device):
+def check_device(device: str) -> None:
     """
     Accept a device or say that it is not there.
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from tap_ros.contract import (
     CLIMB_LIMIT,
@@ -20,13 +22,17 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.text import escaped
 from tap_ros.weights import FORWARD_MODEL
 
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from tap_msgs.action import ReachGoal
+
 MODES = ('subgoal', 'direct')
 TRACKING = ('ground_truth', 'carried')
 MAX_BUDGET = 1000
 MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
 
 
-def declare_parameters(node):
+def declare_parameters(node: 'Node') -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare('weights', str(FORWARD_MODEL),
@@ -82,7 +88,7 @@ def declare_parameters(node):
     return parameters
 
 
-def load_planner(parameters):
+def load_planner(parameters: Parameters) -> VisualMPC:
     """
     Load weights, and plan once, so that the first command comes as fast as the others.
 
@@ -99,7 +105,7 @@ def load_planner(parameters):
     return mpc
 
 
-def check_request(request):
+def check_request(request: 'ReachGoal.Goal') -> str:
     """
     Check what can be checked of a goal alone, and return its mode, the default filled in.
 

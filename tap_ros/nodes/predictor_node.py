@@ -3,12 +3,14 @@
 """Serves predict_subgoal: decode, predict what waits together, encode."""
 
 from collections import deque
+from collections.abc import Callable
 import math
 import os
 import sys
 import threading
 import time
 import traceback
+from typing import Any, TYPE_CHECKING
 
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -19,7 +21,7 @@ from tap_ros.errors import TapError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.late_answers import create_late_service, take_waiting
-from tap_ros.nodes.predictor_requests import encode_answer, RequestReader, TOPICS
+from tap_ros.nodes.predictor_requests import encode_answer, RequestReader, Task, TOPICS
 from tap_ros.nodes.predictor_setup import (
     declare_parameters,
     load_predictors,
@@ -32,6 +34,11 @@ from tap_ros.nodes.topics import LATCHED
 from tap_ros.pictures import overlay
 from tap_ros.prediction.request_queue import Busy, RequestQueue, THREAD_NAME
 from tap_ros.text import escaped
+
+if TYPE_CHECKING:
+    from tap_ros.prediction.predictor import Subgoal as PredictedSubgoal
+
+Found = tuple[list['PredictedSubgoal'], float]  # of one request, and ms that the network took
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 SHOW_PERIOD = 0.1  # s between two looks for a subgoal to publish
@@ -47,7 +54,7 @@ class PredictorNode(Node):
     the answers.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('predictor_node')
         self.params = declare_parameters(self)
         self._queue = RequestQueue(
@@ -61,7 +68,8 @@ class PredictorNode(Node):
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
-        self._unshown = deque(maxlen=1)  # (Task, prediction, message) until it is published
+        # Until it is published.
+        self._unshown: deque[tuple[Task, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
         # Apart from the answers, which need not wait for it.
         self.create_timer(SHOW_PERIOD, self._look_around,
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -73,7 +81,7 @@ class PredictorNode(Node):
         self.get_logger().info(
             f'ready: {", ".join(sizes)}, {self.params["device"]}, {", ".join(files)}')
 
-    def close(self):
+    def close(self) -> None:
         """Answer all that wait, and let the batch in progress end."""
         self._queue.close(CLOSE_TIMEOUT)
         take_waiting(self._service)  # they are told that the node is ending
@@ -81,7 +89,7 @@ class PredictorNode(Node):
 
     # In the executor: what comes, and what people see
 
-    def _on_request(self, request, send):
+    def _on_request(self, request: PredictSubgoal.Request, send: Callable[[Any], object]) -> None:
         """Check a request, and let it wait or refuse it."""
         begin = time.perf_counter()
         try:
@@ -90,12 +98,12 @@ class PredictorNode(Node):
         except Exception as error:
             self._send(send, self._refusal(error))
 
-    def _look_around(self):
+    def _look_around(self) -> None:
         """Show what is new, and take what has come, whose age and rate diagnostics tell."""
         self._show()
         self._reader.pull()
 
-    def _show(self):
+    def _show(self) -> None:
         """Publish the newest subgoal for planners and people, if there is one that is not yet."""
         if not self._unshown:
             return
@@ -112,16 +120,16 @@ class PredictorNode(Node):
 
     # In the thread of the queue
 
-    def _load(self):
+    def _load(self) -> Callable[[list[Task]], list[Found]]:
         """Load the weights; return what predicts."""
         # Here, since OpenMP is slow where two threads have begun parallel work on few cores.
         self._predictors = load_predictors(
             self.params['weights'], self.params['forward_weights'], self.params['device'])
         return self._predict
 
-    def _predict(self, tasks):
+    def _predict(self, tasks: list[Task]) -> list[Found]:
         """Predict Tasks together; return (subgoals, ms that the network took) for each."""
-        answers = [None] * len(tasks)
+        answers: list[Found] = [([], 0.0)] * len(tasks)
         for mode, predictor in self._predictors.items():
             chosen = [index for index, task in enumerate(tasks) if task.mode == mode]
             if not chosen:
@@ -133,7 +141,8 @@ class PredictorNode(Node):
                 answers[index] = subgoals, elapsed_ms
         return answers
 
-    def _answer(self, task, found, send, begin):
+    def _answer(self, task: Task, found: Found | Exception, send: Callable[[Any], object],
+                begin: float) -> None:
         """Send the answer to a task that came at `begin`: found by _predict, or an exception."""
         try:
             if isinstance(found, Exception):
@@ -150,7 +159,7 @@ class PredictorNode(Node):
 
     # In either
 
-    def _refusal(self, error):
+    def _refusal(self, error: Exception) -> PredictSubgoal.Response:
         """Return the response that says what was wrong, and log it."""
         if isinstance(error, Busy):
             self.get_logger().warning(f'predict_subgoal: {error}', throttle_duration_sec=1.0)
@@ -161,13 +170,13 @@ class PredictorNode(Node):
             error = f'internal error: {type(error).__name__}: {escaped(error)}'
         return PredictSubgoal.Response(success=False, message=str(error))
 
-    def _log_unexpected(self, error, what):
+    def _log_unexpected(self, error: Exception, what: str) -> None:
         """Log an error that is none of ours, with where it came from."""
         self._diagnostics.error(error)
         for line in ''.join(traceback.format_exception(error)).splitlines():
             self.get_logger().error(f'{what}: {escaped(line)}')
 
-    def _send(self, send, response):
+    def _send(self, send: Callable[[Any], object], response: PredictSubgoal.Response) -> None:
         """Send a response; its client may have gone."""
         try:
             send(response)
@@ -176,7 +185,7 @@ class PredictorNode(Node):
                 f'predict_subgoal: an answer cannot be sent: {escaped(error)}')
 
 
-def main(args=None):
+def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
     code = run_node(PredictorNode, 'predictor_node', args)
     if any(thread.name == THREAD_NAME for thread in threading.enumerate()):

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Requests of predict_subgoal and what stands in for their empty fields; their answers."""
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 import numpy as np
@@ -13,6 +15,7 @@ from tap_ros.contract import CAMERA_FRAME
 from tap_ros.errors import ImageError
 from tap_ros.nodes.image_messages import decode_image, is_empty, resize_pixels
 from tap_ros.nodes.object_messages import decode_objects, match_objects
+from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.predictor_setup import (
     check_count,
     check_work,
@@ -23,8 +26,11 @@ from tap_ros.nodes.predictor_setup import (
 from tap_ros.nodes.pulled import PulledObservations
 from tap_ros.nodes.subgoal_messages import encode_subgoal
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
-from tap_ros.prediction.predictor import Question
+from tap_ros.prediction.predictor import Question, Subgoal, SubgoalPredictor
 from tap_ros.text import listing
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 TOPICS = {  # what stands in for the fields that a request leaves empty
     'start': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
@@ -37,7 +43,7 @@ class View:
     """A picture that came with a request or from a topic, ready for the predictor."""
 
     image: np.ndarray  # (H, W, 3) uint8
-    names: tuple  # K object names
+    names: tuple[str, ...]  # K object names
     pixels: np.ndarray  # (K, 2) float32 (u, v)
     lacking: str  # why there are no objects; empty if there are
     stamp: Time
@@ -50,13 +56,13 @@ class Task:
 
     mode: str
     question: Question
-    names: tuple  # K object names; none where a picture lacks objects
+    names: tuple[str, ...]  # K object names; none where a picture lacks objects
     lacking: str  # why there are none; empty if there are
     stamp: Time  # of the start picture
     frame_id: str
 
     @property
-    def rows(self):
+    def rows(self) -> int:
         """Return how much of a batch it takes: about one for each map that is carried."""
         return self.question.num_samples * max(len(self.names), 1)
 
@@ -71,18 +77,20 @@ class RequestReader:
     :param on_message: called with the topic name for each message that has come.
     """
 
-    def __init__(self, node, params, predictors, on_message):
+    def __init__(self, node: 'Node', params: Parameters,
+                 predictors: Mapping[str, SubgoalPredictor],
+                 on_message: Callable[[str], object]) -> None:
         self._node, self._params, self._predictors = node, params, predictors
         self._newest = {
             'start': PulledObservations(node, TOPICS['start'], STREAM, on_message=on_message),
             'goal': PulledObservations(node, TOPICS['goal'], LATCHED, True, on_message)}
 
-    def pull(self):
+    def pull(self) -> None:
         """Take what has come on the topics."""
         for observations in self._newest.values():
             observations.pull()
 
-    def read(self, request):
+    def read(self, request: PredictSubgoal.Request) -> Task:
         """
         Check and decode a request.
 
@@ -107,11 +115,11 @@ class RequestReader:
         goal_pixels = match_objects(
             names, goal.names, goal.pixels, 'start_objects', 'goal_objects'
         ) if names and goal else None
-        question = Question(start.image, goal and goal.image, start_pixels, goal_pixels,
+        question = Question(start.image, goal.image if goal else None, start_pixels, goal_pixels,
                             num_samples, depth, request.seed)
         return Task(mode, question, names, lacking, start.stamp, start.frame_id)
 
-    def _view(self, name, image, objects, size):
+    def _view(self, name: str, image: Image, objects: ObjectStates, size: Sequence[int]) -> View:
         """Decode a picture and its objects; take the newest ones if it was left empty."""
         lacking = '' if objects.objects else f'{name}_objects are empty'
         if is_empty(image):
@@ -127,7 +135,7 @@ class RequestReader:
         return View(picture, names, pixels, lacking, image.header.stamp,
                     image.header.frame_id or CAMERA_FRAME)
 
-    def _find(self, name):
+    def _find(self, name: str) -> dict[str, Any]:
         """Return the newest picture, and its objects if there are any with its stamp."""
         newest = self._newest[name]
         found = newest.newest('image')
@@ -145,7 +153,7 @@ class RequestReader:
                 ('image', 'objects'), OBJECTS_TIMEOUT, after_ns=stamp - 1) or found
         return found
 
-    def _explain(self, name, found):
+    def _explain(self, name: str, found: Mapping[str, Any]) -> str:
         """Say why what was found has no objects."""
         topic, newest = self._topic(name, 'objects'), self._newest[name].newest('objects')
         if 'objects' in found:
@@ -157,12 +165,13 @@ class RequestReader:
         return (f'the newest on {topic} has the stamp {stamps[0]}, the picture on '
                 f'{self._topic(name, "image")} {stamps[1]}; publish both with the same')
 
-    def _topic(self, name, what):
+    def _topic(self, name: str, what: str) -> str:
         """Return the full name of a topic, for messages."""
         return self._node.resolve_topic_name(TOPICS[name][what][1])
 
 
-def encode_answer(task, subgoals, elapsed_ms):
+def encode_answer(task: Task, subgoals: Sequence[Subgoal],
+                  elapsed_ms: float) -> PredictSubgoal.Response:
     """Turn what was predicted for a Task into a response."""
     wanted = task.question.num_samples
     message = (f'{task.mode}, {len(subgoals)} subgoal{"s" * (len(subgoals) > 1)}, '

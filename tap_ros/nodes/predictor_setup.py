@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, weights and requests of predictor_node: what is checked before it predicts."""
 
+from collections.abc import Collection
+from typing import TYPE_CHECKING
+
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.parameters import check_device, Parameters
@@ -9,6 +12,10 @@ from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.text import escaped
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from tap_msgs.srv import PredictSubgoal
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
@@ -23,7 +30,7 @@ HOW_TO_GET = {  # weights for each mode
     'forward': 'start it with -p forward_weights:=FILE, trained for the start alone'}
 
 
-def declare_parameters(node):
+def declare_parameters(node: 'Node') -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     shipped = ', '.join(PREDICTORS)
@@ -42,7 +49,8 @@ def declare_parameters(node):
     return parameters
 
 
-def load_predictors(weights, forward_weights, device):
+def load_predictors(weights: str, forward_weights: str,
+                    device: str) -> dict[str, SubgoalPredictor]:
     """
     Load what the node serves.
 
@@ -69,7 +77,7 @@ def load_predictors(weights, forward_weights, device):
     return predictors
 
 
-def choose_mode(request, modes):
+def choose_mode(request: 'PredictSubgoal.Request', modes: Collection[str]) -> str:
     """
     Choose how to predict.
 
@@ -97,14 +105,14 @@ def choose_mode(request, modes):
     return 'forward'
 
 
-def check_count(value, name, highest):
+def check_count(value: int, name: str, highest: int) -> int:
     """Return a count of a request, 1 for 0; raise ConfigError above the highest."""
     if value > highest:
         raise ConfigError(f'{name} is {value}; expected 1 to {highest}, or 0 for 1')
     return value or 1
 
 
-def check_work(num_samples, depth, num_objects):
+def check_work(num_samples: int, depth: int, num_objects: int) -> None:
     """Raise ConfigError when one answer would take too long or be too large."""
     if num_samples * depth > MAX_SUBGOALS:
         raise ConfigError(

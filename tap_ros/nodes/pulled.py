@@ -2,11 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observations that are taken only when somebody asks for them."""
 
+from collections.abc import Callable, Collection, Mapping
 import threading
 import time
+from typing import Any, TYPE_CHECKING
 
 from rclpy.callback_groups import CallbackGroup
 from tap_ros.nodes.observations import Observations, reception_time
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from rclpy.qos import QoSProfile
 
 MOST = 100  # messages of a topic that are taken at once; more come with the next question
 PAUSE = 0.005  # s between two looks while waiting
@@ -15,15 +21,15 @@ PAUSE = 0.005  # s between two looks while waiting
 class Unwatched(CallbackGroup):
     """Subscriptions of this group wake no executor; their messages wait to be taken."""
 
-    def can_execute(self, entity):
+    def can_execute(self, entity: Any) -> bool:
         """Tell that no callback is ever due."""
         return False
 
-    def beginning_execution(self, entity):
+    def beginning_execution(self, entity: Any) -> bool:
         """Refuse to begin a callback."""
         return False
 
-    def ending_execution(self, entity):
+    def ending_execution(self, entity: Any) -> None:
         """Do nothing: none has begun."""
 
 
@@ -40,7 +46,8 @@ class PulledObservations:
     :param on_message: called with the topic name for each message that is taken, or None.
     """
 
-    def __init__(self, node, types, qos, latched=False, on_message=None):
+    def __init__(self, node: 'Node', types: Mapping[str, tuple[type, str]], qos: 'QoSProfile',
+                 latched: bool = False, on_message: Callable[[str], object] | None = None) -> None:
         self._taking = threading.Lock()
         self._observations = Observations(*types, latched=latched)
         self._on_message = on_message
@@ -51,12 +58,13 @@ class PulledObservations:
                 message_type, name, lambda message: None, qos, callback_group=group)
             for topic, (message_type, name) in types.items()}
 
-    def newest(self, *topics):
+    def newest(self, *topics: str) -> dict[str, Any] | None:
         """Return the newest {topic: message} that has all of `topics`; None if there is none."""
         self.pull()
         return self._observations.newest(*topics)
 
-    def wait(self, topics, timeout_s, after_ns):
+    def wait(self, topics: Collection[str], timeout_s: float,
+             after_ns: int) -> dict[str, Any] | None:
         """
         Wait for an observation.
 
@@ -73,12 +81,12 @@ class PulledObservations:
                 return found
             time.sleep(PAUSE)
 
-    def missing(self, topics):
+    def missing(self, topics: Collection[str]) -> list[str]:
         """Return those of `topics` of which nothing has come since the start."""
         self.pull()
         return self._observations.missing(topics)
 
-    def pull(self):
+    def pull(self) -> None:
         """Take what has come, all topics together in the order in which it came."""
         with self._taking:
             come = []

@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 import sys
 import time
+from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -52,15 +53,18 @@ class RecorderNode(Node):
     When the disk is full or gone it says so, keeps what was written readable, and stays up.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('recorder_node')
         self.params = declare_parameters(self)
-        self._writer = None
-        self._failure = None  # why what was asked for last is not recorded, or not whole
+        self._writer: BagWriter | None = None
+        # Why what was asked for last is not recorded, or not whole.
+        self._failure: str | None = None
         self._count = self._unflushed = 0
-        self._sources = {}  # resolved topic -> Source
-        self._last = {}  # latched topic -> what write_raw takes, for bags that start later
-        self._mismatched = []  # (resolved topic, policy) to subscribe to anew
+        self._sources: dict[str, Source] = {}  # resolved topic -> Source
+        # Latched topic -> what write_raw takes, for bags that start later.
+        self._last: dict[str, tuple[str, bytes, topics.Qos]] = {}
+        # Resolved topic and policy to subscribe to anew.
+        self._mismatched: list[tuple[str, Any]] = []
         self._wanted = list(self.params['topics'])
         if not self._wanted:
             raise ConfigError('parameter topics: is empty; name at least one topic')
@@ -76,22 +80,23 @@ class RecorderNode(Node):
             f'ready: recording to {escaped(self._writer.folder)}' if self._writer
             else 'ready: call recorder/record with data true to start')
 
-    def close(self):
+    def close(self) -> int:
         """Finish the bag; return the exit code, 1 when the last one is not whole."""
         self._finish()
         return int(self._failure is not None)
 
     # Bags
 
-    def _start(self):
+    def _start(self) -> Path:
         """
         Begin a new bag.
 
+        :return: its folder.
         :raises TapError: when it cannot be made, or written to.
         """
         self._failure = None
-        self._writer = BagWriter(
-            free_folder(self.params['folder']), compression=self.params['compression'])
+        folder = free_folder(self.params['folder'])
+        self._writer = BagWriter(folder, compression=self.params['compression'])
         self._count = self._unflushed = 0
         now = time.time_ns()
         for topic, (type_name, data, qos) in self._last.items():
@@ -100,8 +105,9 @@ class RecorderNode(Node):
             self._flush()  # a full disk is to be known now, not at the first message
         if self._failure is not None:
             raise RecordingError(self._failure)
+        return folder
 
-    def _finish(self):
+    def _finish(self) -> str:
         """End the bag; return what became of it, for people."""
         if self._writer is None:
             return self._failure or 'nothing was being recorded'
@@ -119,7 +125,10 @@ class RecorderNode(Node):
         self.get_logger().info(f'recorded {text}')
         return text
 
-    def _write(self, topic, type_name, data, log_time_ns, publish_time_ns, qos):
+    def _write(self, topic: str, type_name: str, data: bytes, log_time_ns: int,
+               publish_time_ns: int, qos: topics.Qos) -> None:
+        if self._writer is None:
+            return
         try:
             self._writer.write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
         except RecordingError as error:  # of this topic alone
@@ -131,15 +140,17 @@ class RecorderNode(Node):
         self._count += 1
         self._unflushed += 1
 
-    def _flush(self):
+    def _flush(self) -> None:
         """Bring what was written so far to the disk."""
         self._unflushed = 0
+        if self._writer is None:
+            return
         try:
             self._writer.flush()
         except Exception as error:
             self._give_up(error)
 
-    def _give_up(self, error):
+    def _give_up(self, error: Exception) -> None:
         """Stop recording after a failed write."""
         if self._writer is None:
             return
@@ -152,14 +163,13 @@ class RecorderNode(Node):
         self.get_logger().error(self._failure)
         self._diagnostics.error(self._failure)
 
-    def _on_record(self, request, response):
+    def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         try:
             if not request.data:
                 response.message = self._finish()
             else:
-                if self._writer is None:
-                    self._start()
-                response.message = f'recording to {escaped(self._writer.folder)}'
+                folder = self._writer.folder if self._writer else self._start()
+                response.message = f'recording to {escaped(folder)}'
             response.success = self._failure is None
         except Exception as error:  # whatever it is, the caller gets an answer
             self._failure = response.message = escaped(error, LONG)
@@ -169,7 +179,7 @@ class RecorderNode(Node):
 
     # Topics
 
-    def _subscribe_known(self):
+    def _subscribe_known(self) -> None:
         """Subscribe to wanted topics whose type is known, here or to the running system."""
         found = dict(self.get_topic_names_and_types())
         for name in list(self._wanted):
@@ -186,23 +196,24 @@ class RecorderNode(Node):
             except ConfigError as error:
                 self.get_logger().error(f'{escaped(topic)} is not recorded: {escaped(error)}')
 
-    def _subscribe(self, topic, type_name, qos):
-        def on_message(data, info):
+    def _subscribe(self, topic: str, type_name: str, qos: QoSProfile) -> None:
+        def on_message(data: bytes, info: dict[str, Any]) -> None:
             try:
                 self._on_message(topic, data, info)
             except Exception as error:  # no message ends the node
                 self._tell(f'{escaped(topic)}: a message was not recorded', error)
 
-        def on_mismatch(info):
+        def on_mismatch(info: Any) -> None:
             self._mismatched.append((topic, info.last_policy_kind))
 
         subscription = self.create_subscription(
-            message_class(type_name), topic, on_message, qos, raw=True,
+            message_class(type_name), topic, on_message,  # type: ignore[arg-type]  # with the info
+            qos, raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=on_mismatch, use_default_callbacks=False))
         self._sources[topic] = Source(type_name, qos, subscription)
 
-    def _on_message(self, topic, data, info):
+    def _on_message(self, topic: str, data: bytes, info: dict[str, Any]) -> None:
         self._diagnostics.received(topic)
         source = self._sources[topic]
         latched = source.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
@@ -218,18 +229,18 @@ class RecorderNode(Node):
             self._write(topic, source.type_name, data, received,
                         info['source_timestamp'] or received, qos)
 
-    def _on_timer(self):
+    def _on_timer(self) -> None:
         try:
             self._look_after()
         except Exception as error:
             self._tell('the topics could not be looked after', error)
 
-    def _tell(self, what, error):
+    def _tell(self, what: str, error: Exception) -> None:
         """Log what a callback raised; not each time, for it may come with every message."""
         self.get_logger().error(
             f'{what}: {type(error).__name__}: {escaped(error)}', throttle_duration_sec=1.0)
 
-    def _look_after(self):
+    def _look_after(self) -> None:
         """Bring what was written to the disk, and look after topics."""
         if self._writer is not None and self._unflushed:
             self._flush()
@@ -252,7 +263,7 @@ class RecorderNode(Node):
             self._subscribe_known()
 
 
-def declare_parameters(node):
+def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare('folder', 'bags/recording',
@@ -265,7 +276,7 @@ def declare_parameters(node):
     return parameters
 
 
-def free_folder(wanted):
+def free_folder(wanted: str | Path) -> Path:
     """Return this folder, or the first one with a number added that does not exist."""
     folder, number = Path(wanted), 1
     while folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -274,7 +285,7 @@ def free_folder(wanted):
     return folder
 
 
-def message_class(type_name):
+def message_class(type_name: str) -> type:
     """
     Import the class of a message type.
 
@@ -290,7 +301,7 @@ def message_class(type_name):
         ) from error
 
 
-def main(args=None):
+def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
     return run_node(RecorderNode, 'recorder_node', args)
 

@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Starting and ending a node process."""
 
+from collections.abc import Callable
 import signal
 import sys
 import threading
 import traceback
+from typing import Any, TYPE_CHECKING
 
 import rclpy
 from rclpy.executors import (
@@ -19,12 +21,16 @@ from tap_ros.nodes.heartbeat import Heartbeat
 from tap_ros.nodes.middleware import configure_fast_dds
 from tap_ros.text import escaped
 
+if TYPE_CHECKING:
+    from rclpy.executors import Executor
+    from rclpy.node import Node
 
 class _Ended(BaseException):
     """A signal came while the node started."""
 
 
-def run_node(make_node, name, args=None, num_threads=1):
+def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = None,
+             num_threads: int = 1) -> int:
     """
     Run one node until SIGINT, SIGTERM, or its terminal is closed.
 
@@ -78,7 +84,7 @@ def run_node(make_node, name, args=None, num_threads=1):
     return code
 
 
-def answering(node, callback):
+def answering(node: 'Node', callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """
     Let a service answer whatever its callback raises.
 
@@ -86,7 +92,7 @@ def answering(node, callback):
     :param callback: of a service whose response has the fields success and message.
     :return: a callback that raises nothing.
     """
-    def answer(request, response):
+    def answer(request: Any, response: Any) -> Any:
         try:
             return callback(request, response)
         except Exception as error:
@@ -98,13 +104,13 @@ def answering(node, callback):
     return answer
 
 
-def _end(*_):
+def _end(*_: Any) -> None:
     # Not KeyboardInterrupt: after one that leaves an exec(), as in making a dataclass, Python ends
     # by SIGINT even where it was caught.
     raise _Ended
 
 
-def _handle_signals(handler):
+def _handle_signals(handler: Callable[[int, Any], Any]) -> None:
     """Handle what ends a node. A shell ignores SIGINT for jobs in the background; nodes do not."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGQUIT):
         signal.signal(number, handler)
@@ -112,7 +118,7 @@ def _handle_signals(handler):
         signal.signal(signal.SIGHUP, handler)
 
 
-def _spin_once(executor, node):
+def _spin_once(executor: 'Executor', node: 'Node') -> None:
     """Run what is ready; a signal is noticed after 0.1 s at most."""
     try:
         executor.spin_once(timeout_sec=0.1)
@@ -124,7 +130,7 @@ def _spin_once(executor, node):
             + traceback.format_exc())
 
 
-def _close(node):
+def _close(node: Any) -> int:
     """Let the node end what it does; return its exit code."""
     try:
         return node.close() or 0

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predicted subgoals to messages and back."""
 
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
 from geometry_msgs.msg import Point
 import numpy as np
 from tap_msgs.msg import Subgoal as SubgoalMessage
@@ -11,8 +14,13 @@ from tap_ros.nodes.object_messages import match_objects
 from tap_ros.prediction.predictor import Subgoal
 from tap_ros.text import escaped
 
+if TYPE_CHECKING:
+    from builtin_interfaces.msg import Time
+    from tap_msgs.srv import PredictSubgoal
 
-def encode_subgoal(subgoal, names, stamp, frame_id):
+
+def encode_subgoal(subgoal: Subgoal, names: Iterable[str], stamp: 'Time',
+                   frame_id: str) -> SubgoalMessage:
     """
     Turn a Subgoal of the predictor into a message.
 
@@ -31,7 +39,8 @@ def encode_subgoal(subgoal, names, stamp, frame_id):
     return message
 
 
-def decode_subgoals(response, names, size):
+def decode_subgoals(response: 'PredictSubgoal.Response', names: Sequence[str],
+                    size: Sequence[int]) -> list[Subgoal]:
     """
     Turn an answer of predict_subgoal into Subgoals.
 
@@ -52,7 +61,8 @@ def decode_subgoals(response, names, size):
         response.subgoals, response.sample, response.level)]
 
 
-def _decode(message, names, size, sample, level):
+def _decode(message: SubgoalMessage, names: Sequence[str], size: Sequence[int], sample: int,
+            level: int) -> Subgoal:
     """Turn one tap_msgs/Subgoal into a Subgoal."""
     found = tuple(message.object_names)
     if not len(found) == len(message.object_maps) == len(message.expected_pixels):

@@ -17,12 +17,12 @@ STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE,
 SERVICE_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
-def to_stamp(nanoseconds):
+def to_stamp(nanoseconds: int) -> Time:
     """Return builtin_interfaces/Time."""
     seconds, rest = divmod(int(nanoseconds), 10**9)
     return Time(sec=seconds, nanosec=rest)
 
 
-def to_nanoseconds(stamp):
+def to_nanoseconds(stamp: Time) -> int:
     """Return the nanoseconds of a builtin_interfaces/Time."""
     return stamp.sec * 10**9 + stamp.nanosec

@@ -3,11 +3,13 @@
 """Serves reach_goal: drives planning.reach by what is seen, and sends its commands."""
 
 from collections import deque
+from collections.abc import Collection, Sequence
 import math
 import sys
 import threading
 import time
 import traceback
+from typing import Any, cast, TYPE_CHECKING
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -34,10 +36,17 @@ from tap_ros.nodes.sight import TOPICS as SENSORS
 from tap_ros.nodes.subgoal_messages import decode_subgoals
 from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.action_sequences import Limits
+from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.hierarchy import choose_sample, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig
 from tap_ros.text import escaped
+
+if TYPE_CHECKING:
+    from rclpy.action.server import ServerGoalHandle
+    from tap_ros.planning.hierarchy import Target
+    from tap_ros.planning.reach import Seen
+    from tap_ros.prediction.predictor import Subgoal
 
 STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
 
@@ -53,14 +62,14 @@ class VisualMpcNode(Node):
     A second goal is rejected meanwhile. Whatever the way a goal ends, the last command is zero.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('visual_mpc_node')
         self.params = declare_parameters(self)
         self._mpc = load_planner(self.params)
         self._ending = False
-        self._cancelled = None  # the goal that was cancelled last
+        self._cancelled: ServerGoalHandle | None = None  # the goal that was cancelled last
         self._busy = threading.Lock()  # held while a goal is executed
-        self._refusals = deque(maxlen=10)
+        self._refusals: deque[tuple[int, str]] = deque(maxlen=10)
         self._diagnostics = Diagnostics(self, {
             **dict.fromkeys((name for _, name in SENSORS.values()), STALE_S),
             **dict.fromkeys((name for _, name in GOAL.values()), math.inf)})
@@ -79,7 +88,7 @@ class VisualMpcNode(Node):
             goal_callback=self._on_goal, cancel_callback=self._on_cancel)
         self.get_logger().info(f'ready: {self.params["device"]}, {self.params["weights"]}')
 
-    def close(self):
+    def close(self) -> None:
         """End the goal in progress, and see that the command to stop has left."""
         self._ending = True
         self._arm.end()
@@ -89,24 +98,24 @@ class VisualMpcNode(Node):
 
     # Callbacks
 
-    def _on_goal(self, _):
+    def _on_goal(self, _: ReachGoal.Goal) -> GoalResponse:
         if self._ending or self._busy.locked():
             self.get_logger().warning(
                 'reach_goal rejected: another goal is in progress; cancel it or wait for its end')
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
-    def _on_cancel(self, handle):
+    def _on_cancel(self, handle: 'ServerGoalHandle') -> CancelResponse:
         self._cancelled = handle  # who asks its state still finds it executing
         self._arm.end(handle)  # at once: a plan may be in progress
         self._sensors.wake()
         return CancelResponse.ACCEPT
 
-    def _on_refused(self, message):
+    def _on_refused(self, message: CommandRefused) -> None:
         self._refusals.append((to_nanoseconds(message.header.stamp), escaped(message.message)))
         self._sensors.wake()
 
-    def _execute(self, handle):
+    def _execute(self, handle: 'ServerGoalHandle') -> ReachGoal.Result:
         """Run a goal to its end; runs in a thread of the executor."""
         result = ReachGoal.Result()
         if not self._busy.acquire(blocking=False):  # two were accepted at the same time
@@ -143,7 +152,8 @@ class VisualMpcNode(Node):
 
     # One goal
 
-    def _reach(self, handle, accepted, result):
+    def _reach(self, handle: 'ServerGoalHandle', accepted: float,
+               result: ReachGoal.Result) -> None:
         """Show the loop what is seen since `accepted`, do what it answers, fill the result."""
         request = handle.request
         mode = check_request(request)
@@ -171,7 +181,7 @@ class VisualMpcNode(Node):
                 result.success, result.message = answer.outcome == 'reached', answer.message
                 return
             if isinstance(answer, Aim):
-                targets = self._aim(handle, mode, seen, config.limits)
+                targets = self._aim(handle, mode, answer.seen, config.limits)
                 num_subgoals = len(targets) - 1
                 reach.head_for(targets, time.monotonic())
                 continue
@@ -189,29 +199,31 @@ class VisualMpcNode(Node):
             else:
                 self._sensors.wait_for_change(0.1, count)
 
-    def _config(self, request):
+    def _config(self, request: ReachGoal.Goal) -> ReachConfig:
         """Return the settings of a goal."""
         params = self.params
-        follower = self._mpc.model if params['tracking'] == 'carried' else None
+        learned = cast(ForwardModel, self._mpc.model)  # as load_planner has loaded it
+        follower = learned if params['tracking'] == 'carried' else None
         limits = Limits(params['max_step_xy'], params['max_step_z'])
         return ReachConfig(request.step_budget, params['switch'], params['goal_tolerance'],
                            follower, limits, params['max_age'], params['image_timeout'])
 
-    def _is_cancelled(self, handle):
+    def _is_cancelled(self, handle: 'ServerGoalHandle') -> bool:
         return self._cancelled is handle or handle.is_cancel_requested
 
-    def _cancelled_or_ending(self, handle):
+    def _cancelled_or_ending(self, handle: 'ServerGoalHandle') -> bool:
         return self._is_cancelled(handle) or self._ending
 
-    def _go_on(self, handle):
+    def _go_on(self, handle: 'ServerGoalHandle') -> None:
         if self._cancelled_or_ending(handle):
             raise Cancelled('cancelled' if self._is_cancelled(handle) else 'the node is ending')
 
     # Where to go
 
-    def _aim(self, handle, mode, seen, limits):
+    def _aim(self, handle: 'ServerGoalHandle', mode: str, seen: 'Seen',
+             limits: Limits) -> list['Target']:
         """Return the Targets of a goal, asking for subgoals if it is to go by any."""
-        if not seen.names:
+        if not seen.names or seen.pixels is None:
             raise PlanningError('objects: none are seen, so there is nothing to push; publish '
                                 'their pixels')
         request = handle.request
@@ -228,7 +240,8 @@ class VisualMpcNode(Node):
                 request.seed, limits, lambda: self._go_on(handle))
         return targets_by(subgoals, goal_pixels)
 
-    def _ask_for_subgoals(self, handle, goal, names):
+    def _ask_for_subgoals(self, handle: 'ServerGoalHandle', goal: dict[str, Any],
+                          names: Sequence[str]) -> list['Subgoal']:
         """Return the Subgoals of all samples, their objects in the order of `names`."""
         wanted, seen = handle.request, self._sight.messages
         request = PredictSubgoal.Request(
@@ -250,7 +263,8 @@ class VisualMpcNode(Node):
                                 f'{escaped(response.message, 1000)}')
         return decode_subgoals(response, names, self._mpc.image_size)
 
-    def _send(self, handle, accepted, reach, command, topics):
+    def _send(self, handle: 'ServerGoalHandle', accepted: float, reach: Reach, command: Command,
+              topics: Collection[str]) -> bool:
         """
         Send a command; tell whether it was: not when a sensor is silent or it comes too late.
 
@@ -271,7 +285,7 @@ class VisualMpcNode(Node):
             handle, command.plan.action, to_stamp(command.seen.stamp_ns), topics)
 
 
-def cancel_is_known(handle, seconds=1.0):
+def cancel_is_known(handle: 'ServerGoalHandle', seconds: float = 1.0) -> bool:
     """Wait until rclpy knows that a goal is cancelled, which is after _on_cancel has returned."""
     deadline = time.monotonic() + seconds
     while not handle.is_cancel_requested and time.monotonic() < deadline:
@@ -279,14 +293,14 @@ def cancel_is_known(handle, seconds=1.0):
     return handle.is_cancel_requested
 
 
-def stage_name(index, num_subgoals):
+def stage_name(index: int, num_subgoals: int) -> str:
     """Return what feedback calls the target of this index; after the subgoals comes the goal."""
     if index == num_subgoals:
         return 'goal'
     return 'subgoal' if num_subgoals == 1 else f'subgoal {index + 1} of {num_subgoals}'
 
 
-def main(args=None):
+def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
     return run_node(VisualMpcNode, 'visual_mpc_node', args, num_threads=4)
 

@@ -13,18 +13,18 @@ class Window:
     :param limit: most numbers kept, the newest ones; bounds the memory whatever their rate.
     """
 
-    def __init__(self, seconds, limit):
+    def __init__(self, seconds: float, limit: int) -> None:
         self._seconds = seconds
         self._times, self._values = np.empty(limit), np.empty(limit)  # rings: fast to summarise
         self._count = 0
 
-    def add(self, now, value=0.0):
+    def add(self, now: float, value: float = 0.0) -> None:
         """Add a number that came at `now`, in seconds of a clock that never goes back."""
         place = self._count % len(self._times)
         self._times[place], self._values[place] = now, value
         self._count += 1
 
-    def newest(self, now):
+    def newest(self, now: float) -> tuple[np.ndarray, np.ndarray]:
         """Return times and values, each float64 (N,), oldest first."""
         limit = len(self._times)
         places = np.arange(max(self._count - limit, 0), self._count) % limit
@@ -32,7 +32,7 @@ class Window:
         return self._times[places], self._values[places]
 
 
-def rate(times):
+def rate(times: np.ndarray) -> float:
     """
     Return how many came per second; 0 for fewer than two.
 
@@ -42,6 +42,6 @@ def rate(times):
     return (len(times) - 1) / span if span > 0 else 0.0
 
 
-def percentiles(values):
+def percentiles(values: np.ndarray) -> np.ndarray:
     """Return the 50th and the 99th percentile; NaN without values."""
     return np.percentile(values, (50, 99)) if len(values) else np.full(2, np.nan)

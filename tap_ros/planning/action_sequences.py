@@ -15,6 +15,7 @@ past; the horizon then reaches into one segment more.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.contract import CLIMB_LIMIT, LIFTED, LOW, MOVE_LIMIT
 
 SEGMENTS = 5  # displacements within the horizon
@@ -56,23 +57,23 @@ class SequenceShape:
     climb_limit: float = CLIMB_LIMIT
 
     @property
-    def num_moves(self):
+    def num_moves(self) -> int:
         """Number of displacements that the horizon touches."""
         return SEGMENTS + (self.phase != 0)
 
     @property
-    def size(self):
+    def size(self) -> int:
         """Number of parameters."""
         return 2 * self.num_moves + 1 + (self.phase is None)
 
-    def split(self, parameters):
+    def split(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return displacements (N, M, 2), the lifted segments and the phases, ints (N,)."""
         moves = parameters[:, :2 * self.num_moves].reshape(len(parameters), self.num_moves, 2)
         counts = np.rint(parameters[:, 2 * self.num_moves:]).astype(int)
         fixed = self.phase is not None
         return moves, counts[:, 0], np.full(len(counts), self.phase) if fixed else counts[:, 1]
 
-    def join(self, moves, lifted, phase):
+    def join(self, moves: np.ndarray, lifted: int, phase: int) -> np.ndarray:
         """Return the parameters (D,) of displacements (M, 2) or fewer, the others standing."""
         parameters = np.zeros(self.size)
         kept = moves[:self.num_moves].ravel()
@@ -80,13 +81,13 @@ class SequenceShape:
         parameters[2 * self.num_moves:] = [lifted, phase][:1 + (self.phase is None)]
         return parameters
 
-    def first_gaussian(self):
+    def first_gaussian(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and deviation (D,) to begin a search with."""
         counts = np.array([MAX_LIFT, REPEAT - 1][:1 + (self.phase is None)]) / 2
         still = np.zeros(2 * self.num_moves)
         return np.append(still, counts), np.append(still + FIRST_STD, counts)
 
-    def clip(self, parameters, least_lift=0):
+    def clip(self, parameters: np.ndarray, least_lift: int = 0) -> np.ndarray:
         """
         Limit parameters (N, D) to what the arm may do; lift and phase become whole numbers.
 
@@ -97,7 +98,7 @@ class SequenceShape:
         counts = np.clip(np.rint(counts), lowest[:counts.shape[1]], highest[:counts.shape[1]])
         return np.hstack([np.clip(moves, -self.move_limit, self.move_limit), counts])
 
-    def least_lift(self, height):
+    def least_lift(self, height: float) -> int:
         """
         Return how many segments the gripper has to be lifted at least.
 
@@ -107,17 +108,18 @@ class SequenceShape:
         return int(self.upright and self.climb_limit >= LIFTED - LOW
                    and LOW + 0.02 < height < LIFTED - 0.03)
 
-    def lifts(self):
+    def lifts(self) -> list[tuple[int, int]]:
         """Return the ways to be lifted, as (segments, phase), the shortest first."""
         phases = range(REPEAT) if self.phase is None else [self.phase]
         ways = [(n, phase) for n in range(1, MAX_LIFT + 1) for phase in phases]
         return sorted(ways, key=lambda way: REPEAT * way[0] - way[1])
 
-    def segment(self, phase):
+    def segment(self, phase: ArrayLike) -> np.ndarray:
         """Return the segment (N, HORIZON) of each control period, for phases (N,)."""
         return (np.arange(HORIZON) + np.asarray(phase)[:, None]) // REPEAT
 
-    def climbs(self, lifted, phase, height):
+    def climbs(self, lifted: np.ndarray, phase: np.ndarray,
+               height: float) -> tuple[np.ndarray, np.ndarray]:
         """
         Plan the heights.
 
@@ -134,7 +136,7 @@ class SequenceShape:
         near = min(VERTICAL, max(self.climb_limit, 0.02))  # slow ones wait until it is done
         return climb, (np.abs(missing) < near) | (not self.upright)
 
-    def actions(self, parameters, height):
+    def actions(self, parameters: np.ndarray, height: float) -> np.ndarray:
         """
         Expand parameters.
 
@@ -153,7 +155,7 @@ class SequenceShape:
         actions[..., :2] *= np.where(low, slow, 1)[..., None]
         return actions
 
-    def landings(self, actions, gripper):
+    def landings(self, actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
         """
         Find where the gripper comes down: passes LOW + VERTICAL.
 
@@ -167,13 +169,13 @@ class SequenceShape:
         return np.where(
             down.any(1)[:, None], path[np.arange(len(path)), first, :2], np.nan)
 
-    def following(self):
+    def following(self) -> 'SequenceShape':
         """Return the shape one control period later."""
         if self.phase is None:
             return self
         return replace(self, phase=(self.phase + 1) % REPEAT)
 
-    def shift(self, parameters):
+    def shift(self, parameters: np.ndarray) -> np.ndarray:
         """
         Carry parameters (D,) over to the next control period.
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cross-entropy method, for any cost."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ class CEMConfig:
     num_iterations: int = 3
     num_elites: int = 10
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if not 1 <= self.num_elites <= self.num_samples:
             raise ConfigError(f'num_elites: expected 1..{self.num_samples} (num_samples), '
                               f'got {self.num_elites}')
@@ -28,7 +29,11 @@ class CEMConfig:
             raise ConfigError(f'num_iterations: expected at least 1, got {self.num_iterations}')
 
 
-def cem(cost, mean, std, config, rng, repair=None, proposals=None, recheck=None):
+def cem(cost: Callable[[np.ndarray], np.ndarray], mean: np.ndarray, std: np.ndarray,
+        config: CEMConfig, rng: np.random.Generator,
+        repair: Callable[[np.ndarray], np.ndarray] | None = None,
+        proposals: np.ndarray | None = None,
+        recheck: Callable[[np.ndarray], np.ndarray] | None = None) -> tuple[np.ndarray, float]:
     """
     Search the minimum of a cost (cross-entropy method, App. F of the paper).
 
@@ -67,6 +72,6 @@ def cem(cost, mean, std, config, rng, repair=None, proposals=None, recheck=None)
     return best[winner], float(best_costs[winner])
 
 
-def _finite(costs):
+def _finite(costs: np.ndarray) -> np.ndarray:
     """Return costs as float64, the worst where they are not numbers."""
     return np.nan_to_num(np.asarray(costs, np.float64), nan=np.inf, posinf=np.inf)

@@ -13,7 +13,7 @@ from tap_ros.planning.table import pixel_points
 import torch
 
 
-def distances_to_pixels(maps, pixels):
+def distances_to_pixels(maps: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     """
     Compute the expected distance of each map to a place of its own.
 
@@ -27,7 +27,7 @@ def distances_to_pixels(maps, pixels):
     return (maps * torch.sqrt(u ** 2 + v ** 2)).sum((-2, -1))
 
 
-def distances_to_places(maps, places):
+def distances_to_places(maps: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     """
     Compute the expected distance of each map to many places.
 
@@ -41,7 +41,7 @@ def distances_to_places(maps, places):
     return weights @ torch.cdist(grid, places)
 
 
-def distances_to_all_pixels(maps):
+def distances_to_all_pixels(maps: np.ndarray) -> np.ndarray:
     """
     Compute the expected distance of each map to every pixel of the picture.
 

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Windows of recordings for the forward model, and their augmentation."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
@@ -10,6 +12,9 @@ from tap_ros.errors import RecordingError
 from tap_ros.images import to_float
 from tap_ros.planning.table import mirror_table
 import torch
+
+if TYPE_CHECKING:
+    from tap_ros.recording.cache import EpisodeStore
 
 COLOUR_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 
@@ -25,12 +30,14 @@ class Windows:
     mirrored: torch.Tensor  # (B,) bool
     colours: torch.Tensor  # (B, 3) int64: channel i shows what was channel colours[i]
 
-    def to(self, device):
+    def to(self, device: torch.device | str) -> 'Windows':
         """Copy everything to a device."""
         return Windows(**{name: tensor.to(device) for name, tensor in vars(self).items()})
 
 
-def read_windows(store, episodes, starts, steps):
+def read_windows(store: 'EpisodeStore', episodes: np.ndarray | Sequence[int],
+                 starts: np.ndarray | Sequence[int],
+                 steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Read windows from a store.
 
@@ -53,7 +60,9 @@ def read_windows(store, episodes, starts, steps):
     return np.stack(images), grippers, np.stack(actions).astype(np.float32)
 
 
-def draw_windows(store, episodes, batch_size, steps, homography, rng, augment=True):
+def draw_windows(store: 'EpisodeStore', episodes: np.ndarray | Sequence[int], batch_size: int,
+                 steps: int, homography: torch.Tensor, rng: np.random.Generator,
+                 augment: bool = True) -> Windows:
     """
     Draw a batch of windows at random and augment it.
 
@@ -71,7 +80,8 @@ def draw_windows(store, episodes, batch_size, steps, homography, rng, augment=Tr
     return augment_windows(images, grippers, actions, homography, mirrored, orders)
 
 
-def augment_windows(images, grippers, actions, homography, mirrored, orders):
+def augment_windows(images: np.ndarray, grippers: np.ndarray, actions: np.ndarray,
+                    homography: torch.Tensor, mirrored: np.ndarray, orders: np.ndarray) -> Windows:
     """
     Mirror pictures left to right and swap their colour channels, everything else to match.
 
@@ -91,13 +101,13 @@ def augment_windows(images, grippers, actions, homography, mirrored, orders):
     return batch
 
 
-def recolour(images, colours):
+def recolour(images: torch.Tensor, colours: torch.Tensor) -> torch.Tensor:
     """Reorder the first three channels of images (B, ..., C, H, W) by colours (B, ..., 3)."""
     index = colours[..., None, None].expand(*images.shape[:-3], 3, *images.shape[-2:])
     return torch.cat([images[..., :3, :, :].gather(-3, index), images[..., 3:, :, :]], -3)
 
 
-def mirror(images, mirrored):
+def mirror(images: torch.Tensor, mirrored: torch.Tensor) -> torch.Tensor:
     """Flip those images (B, ..., H, W) left to right that are mirrored (B,)."""
     shape = [-1] + [1] * (images.ndim - 1)
     return torch.where(mirrored.view(shape), images.flip(-1), images)

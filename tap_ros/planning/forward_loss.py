@@ -2,14 +2,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """The forward model's training loss: pictures reconstructed along whole rollouts."""
 
-from tap_ros.planning.forward_data import mirror, recolour
+from collections.abc import Collection
+from typing import Protocol
+
+from tap_ros.planning.forward_data import mirror, recolour, Windows
+from tap_ros.planning.forward_model import ForwardModel
 import torch
 from torch.nn import functional as F
 
 MOTION_THRESHOLD = 0.08  # of the range 2: mean channel difference that counts as change
 
 
-def draw_arm_like(model, grippers, mirrored, colours):
+class LossSettings(Protocol):
+    """The settings that the loss takes, of forward_training.ForwardTrainingConfig."""
+
+    @property
+    def motion_factor(self) -> float:
+        """Extra weight of pixels that changed since the window's first picture."""
+
+    @property
+    def still_weight(self) -> float:
+        """Weight of the mean share of the crop that is said to move."""
+
+
+def draw_arm_like(model: ForwardModel, grippers: torch.Tensor, mirrored: torch.Tensor,
+                  colours: torch.Tensor) -> torch.Tensor:
     """
     Draw the arm as it looks in augmented pictures.
 
@@ -21,7 +38,7 @@ def draw_arm_like(model, grippers, mirrored, colours):
     return mirror(recolour(model.draw_arm(plain), colours), mirrored)
 
 
-def motion_weight(target, first, factor):
+def motion_weight(target: torch.Tensor, first: torch.Tensor, factor: float) -> torch.Tensor:
     """
     Weight pixels that differ from the first picture, and their neighbours, by 1 + factor.
 
@@ -34,14 +51,15 @@ def motion_weight(target, first, factor):
     return 1 + factor * F.max_pool2d(changed, 3, 1, 1)
 
 
-def picture_loss(predicted, target, weight):
+def picture_loss(predicted: torch.Tensor, target: torch.Tensor,
+                 weight: torch.Tensor) -> torch.Tensor:
     """
     Weighted l1 at full, half and quarter resolution, so that flow finds objects pixels away.
 
     :param predicted: (B, 3, H, W); target (B, 3, H, W); weight (B, 1, H, W).
     :return: scalar.
     """
-    total = 0
+    total = weight.new_zeros(())
     for scale in range(3):
         if scale:
             predicted, target = F.avg_pool2d(predicted, 2), F.avg_pool2d(target, 2)
@@ -50,7 +68,8 @@ def picture_loss(predicted, target, weight):
     return total / 3
 
 
-def forward_loss(model, batch, picture_steps, config):
+def forward_loss(model: ForwardModel, batch: Windows, picture_steps: Collection[int],
+                 config: LossSettings) -> tuple[torch.Tensor, dict[str, float]]:
     """
     Roll the model along the windows and compare pictures at some of the steps.
 
@@ -64,7 +83,8 @@ def forward_loss(model, batch, picture_steps, config):
     first = batch.images[:, 0]
     scene = model.look(first, arms[:, 3:].detach(), batch.homography)
     flow, gripper = model.still(len(first)), batch.grippers[:, 0]
-    pictures, moving, count = 0, 0, batch.actions.shape[1]
+    pictures = moving = first.new_zeros(())
+    count = batch.actions.shape[1]
     for t in range(1, count + 1):
         action = batch.actions[:, t - 1]
         flow, gripper, masks = model.advance(scene.features, flow, gripper, action)

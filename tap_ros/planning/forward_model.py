@@ -19,11 +19,14 @@ Unlike the authors' ConvLSTM, nothing is decoded per step, and the arm, whose mo
 is not predicted but drawn where its kinematics put it.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 from tap_ros.contract import ACTION_LIMIT, CLEAR, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import ConfigError
-from tap_ros.learning.devices import has_bfloat16
+from tap_ros.learning.devices import has_bfloat16, placed
 from tap_ros.learning.weights import load_weights, make_network
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
 from tap_ros.planning.table import (
@@ -46,15 +49,15 @@ LEAST_MASS = 0.05  # of a carried map, beneath which it is lost
 class ForwardModelConfig:
     """What the forward model is; saved in its weights."""
 
-    table: tuple  # 9 numbers, row-major: homography from table metres to pixels
-    arm: tuple  # 12 numbers, row-major: camera from gripper metres to the arm's pixels
+    table: tuple[float, ...]  # 9 numbers, row-major: homography from table metres to pixels
+    arm: tuple[float, ...]  # 12 numbers, row-major: camera from gripper metres to the arm's pixels
     image_size: int = 64
-    workspace_low: tuple = WORKSPACE_LOW  # m, of the gripper
-    workspace_high: tuple = WORKSPACE_HIGH
+    workspace_low: tuple[float, ...] = WORKSPACE_LOW  # m, of the gripper
+    workspace_high: tuple[float, ...] = WORKSPACE_HIGH
     table_half: float = 0.55  # m, half the side of the table grid
     table_cells: int = 44
     window_cells: int = 26  # of the table grid around the gripper: the crop in any direction
-    crop_cells: tuple = (20, 24)  # along the motion, across it
+    crop_cells: tuple[int, int] = (20, 24)  # along the motion, across it
     crop_cell: float = 0.02  # m
     crop_back: float = 0.14  # m that the crop reaches behind the gripper
     features: int = 8
@@ -63,7 +66,7 @@ class ForwardModelConfig:
     encoder_width: int = 16
     sprite_size: int = 24  # pixels, side of the picture of the arm
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.table) != 9 or len(self.arm) != 12:
             raise ConfigError(
                 f'forward model: expected 9 numbers for table and 12 for arm, got '
@@ -102,7 +105,16 @@ class ForwardModel(nn.Module):
     :param config: ForwardModelConfig.
     """
 
-    def __init__(self, config):
+    homography: torch.Tensor
+    arm_camera: torch.Tensor
+    grid: torch.Tensor
+    ahead: torch.Tensor
+    pixels: torch.Tensor
+    crop: torch.Tensor
+    limits: torch.Tensor
+    move_limit: torch.Tensor
+
+    def __init__(self, config: ForwardModelConfig) -> None:
         super().__init__()
         self.config = config
         self.encoder = SceneEncoder(config.encoder_width, config.features)
@@ -126,19 +138,19 @@ class ForwardModel(nn.Module):
         constant('move_limit', torch.tensor(ACTION_LIMIT))
 
     @property
-    def image_size(self):
+    def image_size(self) -> tuple[int, int]:
         """Return (height, width) of the pictures it takes."""
         return self.config.image_size, self.config.image_size
 
     @property
-    def device(self):
+    def device(self) -> torch.device:
         """Return where its tensors are."""
         return self.grid.device
 
-    def _constant(self, name, value):
+    def _constant(self, name: str, value: torch.Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
 
-    def draw_arm(self, gripper):
+    def draw_arm(self, gripper: torch.Tensor) -> torch.Tensor:
         """
         Draw the arm where its kinematics put it.
 
@@ -155,7 +167,8 @@ class ForwardModel(nn.Module):
         half = (self.config.sprite_size - 1) / 2
         return sample_picture(sprites, self.pixels - centre + half)
 
-    def look(self, image, arm_mask, homography=None):
+    def look(self, image: torch.Tensor, arm_mask: torch.Tensor,
+             homography: torch.Tensor | None = None) -> Look:
         """
         Look at pictures.
 
@@ -171,21 +184,21 @@ class ForwardModel(nn.Module):
         at = project(homography, at).unflatten(1, self.grid.shape[:2])
         return Look(sample_picture(features, at), objects, background)
 
-    def still(self, count):
+    def still(self, count: int) -> torch.Tensor:
         """Return the flow (count, n, n, 2) of a scene in which nothing has moved."""
         return torch.zeros_like(self.grid).expand(count, -1, -1, -1)
 
-    def table_points(self):
+    def table_points(self) -> torch.Tensor:
         """Return the table's cells (n n, 2) in metres."""
         return self.grid.flatten(0, 1) * self.config.table_half
 
-    def move_gripper(self, gripper, action):
+    def move_gripper(self, gripper: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Return where the gripper is after an action: clipped to limits and workspace."""
         step = torch.maximum(torch.minimum(action[:, :3], self.move_limit), -self.move_limit)
         moved = torch.cat([gripper[:, :3] + step, action[:, 3:]], 1)
         return torch.maximum(torch.minimum(moved, self.limits[1]), self.limits[0])
 
-    def gripper_after(self, gripper, actions):
+    def gripper_after(self, gripper: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """
         Return where a sequence of actions leaves the gripper.
 
@@ -197,7 +210,8 @@ class ForwardModel(nn.Module):
             hand = self.move_gripper(hand, action)
         return hand[0].cpu().numpy()
 
-    def advance(self, features, flow, gripper, action):
+    def advance(self, features: torch.Tensor, flow: torch.Tensor, gripper: torch.Tensor,
+                action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """
         Predict one control period.
 
@@ -228,7 +242,7 @@ class ForwardModel(nn.Module):
         moved = back - points + channels_last(sample(channels_first(flow), back))
         return flow.index_put(window, moved), following, masks
 
-    def _window(self, gripper):
+    def _window(self, gripper: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
         """Return the indices (N, m, m) and points (N, m, m, 2) of the cells near the gripper."""
         n, m = self.config.table_cells, self.config.window_cells
         corner = (gripper[:, :2] / self.config.table_half + 1) * ((n - 1) / 2) - (m - 1) / 2
@@ -239,7 +253,8 @@ class ForwardModel(nn.Module):
         first = corner[:, None, None] * (2 / (n - 1))  # (N, 1, 1, 2)
         return (which, rows[:, :, None], columns[:, None]), self.grid[:m, :m] + first
 
-    def _crop_coordinates(self, points, gripper, turn):
+    def _crop_coordinates(self, points: torch.Tensor, gripper: torch.Tensor,
+                          turn: torch.Tensor) -> torch.Tensor:
         """Return where points (N, m, m, 2) lie in the crop, in [-1, 1] if inside."""
         config = self.config
         h, w = config.crop_cells[0] // 2, config.crop_cells[1] // 2
@@ -253,7 +268,7 @@ class ForwardModel(nn.Module):
             shift.flip(-1), points.flatten(1, 2), rows.flip(-1) * config.table_half
         ).view_as(points)
 
-    def carry(self, maps, flow):
+    def carry(self, maps: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
         """
         Carry object maps by the flow.
 
@@ -266,7 +281,8 @@ class ForwardModel(nn.Module):
         mass = carried.sum((-1, -2), keepdim=True)
         return torch.where(mass < LEAST_MASS, 0, carried / mass.clamp_min(LEAST_MASS))
 
-    def picture(self, scene, flow, arm, homography=None):
+    def picture(self, scene: Look, flow: torch.Tensor, arm: torch.Tensor,
+                homography: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
         """
         Compose the picture that the flow leads to, for training and for people.
 
@@ -288,11 +304,11 @@ class ForwardModel(nn.Module):
         picture = arm_mask * arm[:, :3] + object_mask * objects[:, :3] + rest * scene.background
         return picture, torch.stack([arm_mask, object_mask, rest], 1)
 
-    def pixel_table(self):
+    def pixel_table(self) -> torch.Tensor:
         """Return the pixel (n, n, 2) of every cell of the table grid."""
         return project(self.homography, self.table_points()).view_as(self.grid)
 
-    def seed_maps(self, pixels):
+    def seed_maps(self, pixels: torch.Tensor) -> torch.Tensor:
         """
         Put each object's map at its pixel.
 
@@ -304,7 +320,7 @@ class ForwardModel(nn.Module):
             pixels[:, None], torch.ones_like(pixels[:, :1]), self.homography,
             config.table_cells, config.table_half)
 
-    def maps_on_table(self, maps):
+    def maps_on_table(self, maps: torch.Tensor) -> torch.Tensor:
         """Bring maps (K, H, W) of the picture onto the table grid: (K, n, n), each sums to 1."""
         config = self.config
         return splat_on_table(
@@ -312,7 +328,8 @@ class ForwardModel(nn.Module):
             self.homography, config.table_cells, config.table_half)
 
     @torch.inference_mode()
-    def rollout(self, image, gripper, maps, actions, arm_hidden=False):
+    def rollout(self, image: torch.Tensor, gripper: torch.Tensor, maps: torch.Tensor,
+                actions: torch.Tensor, arm_hidden: bool = False) -> torch.Tensor:
         """
         Predict where the objects go under many action sequences.
 
@@ -326,12 +343,14 @@ class ForwardModel(nn.Module):
         table = self.pixel_table().view(-1, 2)
         return torch.stack([m.flatten(2) @ table for m in carried], 1)
 
-    def begin(self, image, gripper, arm_hidden=False):
+    def begin(self, image: torch.Tensor, gripper: torch.Tensor,
+              arm_hidden: bool = False) -> torch.Tensor:
         """Look once at the picture (1, 3, H, W): features (1, C, n, n) for carried_maps."""
         arm_mask = self.draw_arm(gripper)[:, 3:]
         return self.look(image, torch.zeros_like(arm_mask) if arm_hidden else arm_mask).features
 
-    def carried_maps(self, features, gripper, maps, actions, /, every=1):
+    def carried_maps(self, features: torch.Tensor, gripper: torch.Tensor, maps: torch.Tensor,
+                     actions: torch.Tensor, /, every: int = 1) -> Iterator[torch.Tensor]:
         """
         Yield the maps (N, K, n, n) after every so many steps of N action sequences.
 
@@ -357,7 +376,8 @@ class ForwardModel(nn.Module):
                 yield self.carry(maps, flow)
 
 
-def load_forward_model(path, device='cpu', precision='auto'):
+def load_forward_model(path: str | Path, device: torch.device | str = 'cpu',
+                       precision: str = 'auto') -> ForwardModel:
     """
     Load a trained forward model, ready to predict.
 
@@ -374,4 +394,4 @@ def load_forward_model(path, device='cpu', precision='auto'):
         fields = model.push.fields  # geometry stays exact
         model.push.bfloat16()
         model.push.fields = fields
-    return model.to(memory_format=torch.channels_last)
+    return placed(model, device)

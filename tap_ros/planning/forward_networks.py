@@ -9,7 +9,7 @@ from torch.nn import functional as F
 NUM_ACTION_TERMS = 10
 
 
-def convolution(channels_in, channels_out, stride=1):
+def convolution(channels_in: int, channels_out: int, stride: int = 1) -> nn.Sequential:
     """Return conv 3x3, group norm, ReLU."""
     return nn.Sequential(
         nn.Conv2d(channels_in, channels_out, 3, stride, 1),
@@ -19,7 +19,7 @@ def convolution(channels_in, channels_out, stride=1):
 class SceneEncoder(nn.Module):
     """A small U-Net: picture and arm mask in; features, object layer and background out."""
 
-    def __init__(self, width, features):
+    def __init__(self, width: int, features: int) -> None:
         super().__init__()
         self.fine = nn.Sequential(convolution(4, width), convolution(width, width))
         self.middle = nn.Sequential(
@@ -32,7 +32,8 @@ class SceneEncoder(nn.Module):
         self.up_fine = convolution(width, width)
         self.head = nn.Conv2d(width, features + 9, 1)
 
-    def forward(self, image, arm_mask):
+    def forward(self, image: torch.Tensor,
+                arm_mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """
         Look at a picture.
 
@@ -54,7 +55,7 @@ class SceneEncoder(nn.Module):
         return features, torch.cat([objects, mask], 1), background
 
 
-def crop_points(cells, cell, back):
+def crop_points(cells: tuple[int, int], cell: float, back: float) -> torch.Tensor:
     """Return (h, w, 2): along and across the motion, metres from the gripper."""
     along = torch.arange(cells[0]) * cell - back
     across = torch.arange(cells[1]) * cell
@@ -71,7 +72,9 @@ class PushNet(nn.Module):
     :param points: (2h, 2w, 2) places of the crop's cells, metres along and across the motion.
     """
 
-    def __init__(self, features, width, blocks, points):
+    fields: torch.Tensor
+
+    def __init__(self, features: int, width: int, blocks: int, points: torch.Tensor) -> None:
         super().__init__()
         cells = points.shape[0] // 2, points.shape[1] // 2
         self.look = nn.Conv2d(features, width, 3, 2, 1)
@@ -88,7 +91,7 @@ class PushNet(nn.Module):
         nn.init.normal_(self.twists.weight, std=0.01)
         with torch.no_grad():
             self.twists.bias.copy_(torch.tensor([-0.8, 0, 0, -0.8, 0, 0]))
-            self.masks.bias.copy_(torch.tensor([0, 0, 1.0]))
+            self.masks.get_parameter('bias').copy_(torch.tensor([0, 0, 1.0]))
         # each twist's field per unit: along, across, turning (one unit is 10 cm from the gripper)
         at = points[::2, ::2].permute(2, 0, 1) / 0.1
         fields = torch.zeros(3, 2, *cells)
@@ -96,7 +99,8 @@ class PushNet(nn.Module):
         fields[2, 0], fields[2, 1] = -at[1], at[0]
         self.register_buffer('fields', fields, persistent=False)
 
-    def forward(self, crop, action_terms):
+    def forward(self, crop: torch.Tensor,
+                action_terms: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """
         Predict the flow in units of the gripper's displacement.
 
@@ -120,7 +124,8 @@ class PushNet(nn.Module):
         return (masks[:, :2, None] * rigid.view(N, 2, 2, h, w)).sum(1), masks
 
 
-def action_terms(gripper, following, direction, length):
+def action_terms(gripper: torch.Tensor, following: torch.Tensor, direction: torch.Tensor,
+                 length: torch.Tensor) -> torch.Tensor:
     """
     Describe an action and where it happens, in numbers of order 1.
 

@@ -2,15 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """How far the forward model's object maps are from where the objects went."""
 
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
 import numpy as np
 from tap_ros.images import to_float
+from tap_ros.planning.forward_model import ForwardModel
 import torch
+
+if TYPE_CHECKING:
+    from tap_ros.recording.cache import EpisodeStore
 
 SCORED_STEPS = (1, 5, 10, 15)
 MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than this by then
 
 
-def map_errors(model, store, episodes, stride=8, max_windows=400):
+def map_errors(model: ForwardModel, store: 'EpisodeStore', episodes: Iterable[int],
+               stride: int = 8, max_windows: int = 400) -> dict[str, float]:
     """
     Score the maps' expected pixels on recorded episodes, see measure_maps.
 
@@ -27,7 +35,8 @@ def map_errors(model, store, episodes, stride=8, max_windows=400):
 
 
 @torch.no_grad()
-def measure_maps(model, store, episodes, stride=8, max_windows=400):
+def measure_maps(model: ForwardModel, store: 'EpisodeStore', episodes: Iterable[int],
+                 stride: int = 8, max_windows: int = 400) -> dict[int, dict[str, np.ndarray]]:
     """
     Measure how far the maps' expected pixels end from where recorded objects went.
 
@@ -43,7 +52,10 @@ def measure_maps(model, store, episodes, stride=8, max_windows=400):
         `nothing_moves`, how far they moved. Steps at which none moved are left out.
     """
     horizon = SCORED_STEPS[-1]
-    errors, moves, exact, table = [], [], [], model.pixel_table().flatten(0, 1)
+    errors: list[np.ndarray] = []
+    moves: list[np.ndarray] = []
+    exact: list[np.ndarray] = []
+    table = model.pixel_table().flatten(0, 1)
     device = table.device
     for i in episodes:
         episode = store[int(i)]

@@ -15,7 +15,7 @@ import time
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.images import to_uint8
-from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start
+from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.learning.devices import pick_device
 from tap_ros.learning.panels import grey_panels
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
@@ -23,12 +23,13 @@ from tap_ros.learning.schedule import learning_rate
 from tap_ros.learning.split import split_episodes
 from tap_ros.learning.weights import save_weights
 from tap_ros.pictures import grid
-from tap_ros.planning.forward_data import draw_windows
+from tap_ros.planning.forward_data import draw_windows, Windows
 from tap_ros.planning.forward_loss import draw_arm_like, forward_loss
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
 from tap_ros.planning.forward_scores import map_errors
+from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.planning.table import fit_arm, fit_table
-from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.cache import EpisodeStore, open_recordings
 import torch
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -36,7 +37,7 @@ from tqdm import tqdm
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
 
 
-def train(config, stop_at=None, progress=True):
+def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: bool = True) -> str:
     """
     Train a forward model, or go on with a run that was interrupted.
 
@@ -61,7 +62,8 @@ def train(config, stop_at=None, progress=True):
     return str(Path(config.out) / 'forward_model.safetensors')
 
 
-def _train(config, device, store, stop_at, progress):
+def _train(config: ForwardTrainingConfig, device: torch.device, store: EpisodeStore,
+           stop_at: int | None, progress: bool) -> None:
     """Train as the only process in the folder; see train."""
     training, held_out = split_episodes(store, config.test_fraction, config.horizon + 1)
     torch.manual_seed(config.seed)
@@ -101,7 +103,8 @@ def _train(config, device, store, stop_at, progress):
                 save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
 
 
-def model_config(config, store, training):
+def model_config(config: ForwardTrainingConfig, store: EpisodeStore,
+                 training: np.ndarray) -> ForwardModelConfig:
     """
     Say which network the recordings need, fitting its geometry to them.
 
@@ -123,7 +126,8 @@ def model_config(config, store, training):
         image_size=height, width=config.width, features=config.features)
 
 
-def draw_step(config, store, training, step, homography):
+def draw_step(config: ForwardTrainingConfig, store: EpisodeStore, training: np.ndarray, step: int,
+              homography: torch.Tensor) -> tuple[Windows, set[int]]:
     """
     Draw the windows of one step, and which of their pictures are compared.
 
@@ -137,7 +141,9 @@ def draw_step(config, store, training, step, homography):
     return batch, set((rng.permutation(length)[:config.pictures] + 1).tolist())
 
 
-def _report(state, curves, config, store, training, held_out):
+def _report(state: TrainingState[ForwardModel], curves: SummaryWriter,
+            config: ForwardTrainingConfig, store: EpisodeStore, training: np.ndarray,
+            held_out: np.ndarray) -> None:
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
     scores = map_errors(state.average, store, held_out)
     for name, value in scores.items():
@@ -154,7 +160,8 @@ def _report(state, curves, config, store, training, held_out):
 
 
 @torch.no_grad()
-def sample_grid(model, store, episodes, config, rows=6, seed=0):
+def sample_grid(model: ForwardModel, store: EpisodeStore, episodes: np.ndarray,
+                config: ForwardTrainingConfig, rows: int = 6, seed: int = 0) -> np.ndarray:
     """
     Show windows: first picture, its objects' mask and background, then true beside predicted.
 
@@ -164,7 +171,7 @@ def sample_grid(model, store, episodes, config, rows=6, seed=0):
         store, episodes, rows, config.horizon, model.homography.cpu(),
         np.random.default_rng(seed), augment=False).to(model.homography.device)
 
-    def arm(t):
+    def arm(t: int) -> torch.Tensor:
         return draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
 
     scene = model.look(batch.images[:, 0], arm(0)[:, 3:], batch.homography)

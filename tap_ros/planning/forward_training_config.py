@@ -60,7 +60,7 @@ class ForwardTrainingConfig:
     log_every: int = 20
     save_every: int = 500
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse settings that cannot be trained with."""
         for name in ('steps', 'batch_size', 'horizon', 'pictures', 'width', 'features',
                      'log_every', 'save_every'):

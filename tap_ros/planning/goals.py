@@ -5,6 +5,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.errors import PlanningError
 from tap_ros.planning.expected_distance import distances_to_places
 from tap_ros.planning.map_model import MapModel
@@ -27,7 +28,8 @@ class Goal:
         return self is other or torch.equal(self.distances, other.distances)
 
 
-def tabulate(model: MapModel, pixels=None, maps=None) -> Goal:
+def tabulate(model: MapModel, pixels: ArrayLike | None = None,
+             maps: ArrayLike | None = None) -> Goal:
     """
     Tabulate a goal: where each object should be, as pixels or as maps.
 
@@ -45,7 +47,7 @@ def tabulate(model: MapModel, pixels=None, maps=None) -> Goal:
     if pixels is not None:
         goals = check_goal_pixels(pixels, model.image_size)
         distances = torch.cdist(torch.from_numpy(goals).to(cells.device), cells)
-    else:
+    if maps is not None:
         goals = check_goal_maps(maps, model.image_size)
         distances = distances_to_places(torch.from_numpy(goals).to(cells.device), cells)
     return Goal(distances, model.table_points()[distances.argmin(1)].cpu().numpy())

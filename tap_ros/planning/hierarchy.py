@@ -7,17 +7,23 @@ The paper has one subgoal and switches at half the budget ('half'). Switching as
 subgoal is reached ('reached') wastes no steps; several subgoals share the budget equally.
 """
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
-from tap_ros.planning.action_sequences import FULL
+from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.expected_distance import distances_to_all_pixels
 from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import Memory
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
+
+if TYPE_CHECKING:
+    from tap_ros.prediction.predictor import Subgoal
 
 SWITCHES = ('reached', 'half')
 
@@ -36,7 +42,7 @@ class Target:
     maps: np.ndarray | None = None
     free: np.ndarray | None = None
 
-    def distance(self, pixels):
+    def distance(self, pixels: ArrayLike) -> float:
         """
         Return how far the objects at pixels (K, 2) are, in pixels, mean over those not free.
 
@@ -50,17 +56,17 @@ class Target:
         else:
             edges = np.clip(pixels, 0, np.array(self.maps.shape[:0:-1], np.float32) - 1)
             gaps = np.linalg.norm(pixels - edges, axis=1)  # of those outside
-            gaps = [gap + cv2.remap(table, *edge[:, None, None], cv2.INTER_LINEAR).item()
+            gaps = [gap + cv2.remap(table, edge[:1, None], edge[1:, None], cv2.INTER_LINEAR).item()
                     for gap, table, edge in zip(gaps, self._excess, edges, strict=True)]
         return float(np.mean(gaps) if self.free is None else np.asarray(gaps)[~self.free].mean())
 
     @cached_property
-    def _excess(self):
+    def _excess(self) -> np.ndarray:
         """Return the expected distance (K, H, W) of each pixel to the maps, less the least."""
         tables = distances_to_all_pixels(np.asarray(self.maps, np.float32))
         return tables - tables.min((1, 2), keepdims=True)
 
-    def goal(self, pixels):
+    def goal(self, pixels: np.ndarray) -> dict[str, np.ndarray]:
         """Return the arguments of VisualMPC.goal, for objects that are at pixels (K, 2)."""
         if self.maps is not None:
             return {'maps': self.maps}
@@ -83,14 +89,15 @@ class Itinerary:
     :ivar switches: steps at which the second, third ... target began.
     """
 
-    def __init__(self, targets, step_budget, switch='reached', reached=GOAL_TOLERANCE):
+    def __init__(self, targets: Iterable[Target], step_budget: int, switch: str = 'reached',
+                 reached: float = GOAL_TOLERANCE) -> None:
         if switch not in SWITCHES:
             raise ConfigError(f'switch {switch!r} is unknown; expected one of {SWITCHES}')
         self._targets, self._budget = list(targets), step_budget
         self._switch, self._reached = switch, reached
-        self.switches = []
+        self.switches: list[int] = []
 
-    def target(self, step, pixels):
+    def target(self, step: int, pixels: np.ndarray) -> Target:
         """
         Return the Target of this step.
 
@@ -108,7 +115,7 @@ class Itinerary:
         return self._targets[len(self.switches)]
 
 
-def targets_by(subgoals, goal_pixels):
+def targets_by(subgoals: Iterable['Subgoal'], goal_pixels: np.ndarray) -> list[Target]:
     """
     Return the Targets of a way to the goal.
 
@@ -118,14 +125,16 @@ def targets_by(subgoals, goal_pixels):
     return [*(Target(s.expected_pixels, s.object_maps) for s in subgoals), Target(goal_pixels)]
 
 
-def choose_sample(mpc, scene, goal_pixels, subgoals, seed=0, limits=FULL, before_plan=None):
+def choose_sample(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
+                  subgoals: Iterable['Subgoal'], seed: int = 0, limits: Limits = FULL,
+                  before_plan: Callable[[], object] | None = None) -> list['Subgoal']:
     """
     Take the predicted subgoals of one sample; of several samples by choose_subgoals.
 
     :param subgoals: list of prediction.predictor.Subgoal of any samples, earliest first in each.
     :return: those of the sample taken, earliest first. The other parameters are choose_subgoals'.
     """
-    samples = {}
+    samples: dict[int, list[Subgoal]] = {}
     for subgoal in subgoals:
         samples.setdefault(subgoal.sample, []).append(subgoal)
     chains = list(samples.values())
@@ -135,8 +144,10 @@ def choose_sample(mpc, scene, goal_pixels, subgoals, seed=0, limits=FULL, before
     return chains[best]
 
 
-def choose_subgoals(mpc, scene, goal_pixels, candidates, seed=0, limits=FULL,
-                    before_plan=None):
+def choose_subgoals(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
+                    candidates: Sequence[Sequence['Subgoal']], seed: int = 0,
+                    limits: Limits = FULL,
+                    before_plan: Callable[[], object] | None = None) -> tuple[int, np.ndarray]:
     """
     Choose among sampled subgoals by what the planner itself expects them to cost.
 
@@ -162,7 +173,7 @@ def choose_subgoals(mpc, scene, goal_pixels, candidates, seed=0, limits=FULL,
             plan = mpc.plan(seen, target, Memory(seed), limits)
             total += plan.cost
             if subgoal is not None:
-                hand = mpc.model.gripper_after(np.float32(seen.gripper), plan.actions)
+                hand = mpc.model.gripper_after(np.asarray(seen.gripper, np.float32), plan.actions)
                 seen = Scene(subgoal.image, hand, subgoal.expected_pixels)
         costs.append(total)
     return int(np.argmin(costs)), np.array(costs)

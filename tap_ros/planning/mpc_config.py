@@ -3,10 +3,11 @@
 """Settings of the planner, and presets of them."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from tap_ros.contract import CLIMB_LIMIT, MOVE_LIMIT
 from tap_ros.errors import ConfigError
-from tap_ros.planning.action_sequences import HORIZON, SequenceShape
+from tap_ros.planning.action_sequences import HORIZON, Limits, SequenceShape
 from tap_ros.planning.cem import CEMConfig
 
 
@@ -51,7 +52,7 @@ class VisualMPCConfig:
     batch_size: int = 32
     threads: int = 0  # 0: as many as there are cores
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.batch_size < 1:
             raise ConfigError(f'batch_size: expected at least 1, got {self.batch_size}')
         if self.cost_every < 1 or HORIZON % self.cost_every:
@@ -66,7 +67,7 @@ class VisualMPCConfig:
             raise ConfigError(f'proposals: expected 0..{self.search.num_samples} '
                               f'(num_samples), got {self.proposals}')
 
-    def shape(self, limits, phase):
+    def shape(self, limits: Limits, phase: int | None) -> SequenceShape:
         """
         Return the SequenceShape that is searched.
 
@@ -86,7 +87,7 @@ PAPER = VisualMPCConfig(
 PRESETS = {'default': VisualMPCConfig(), 'large': LARGE, 'paper': PAPER}
 
 
-def with_preset(name, **changes):
+def with_preset(name: str, **changes: Any) -> VisualMPCConfig:
     """
     Return a preset with changes.
 

@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the planner is given: checks that name what is wrong."""
 
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.images import check_image, check_pixels, in_picture
 
@@ -25,7 +27,7 @@ class Scene:
     object_pixels: np.ndarray  # (K, 2) as (u, v), where the objects are
 
 
-def check_scene(scene, size):
+def check_scene(scene: Scene, size: Sequence[int]) -> Scene:
     """
     Check what the robot sees.
 
@@ -51,7 +53,7 @@ def check_scene(scene, size):
     return Scene(scene.image, gripper, pixels)
 
 
-def check_goal_pixels(pixels, size):
+def check_goal_pixels(pixels: ArrayLike, size: Sequence[int]) -> np.ndarray:
     """
     Check goal pixels (K, 2); return them as float32.
 
@@ -66,7 +68,7 @@ def check_goal_pixels(pixels, size):
     return pixels
 
 
-def check_goal_maps(maps, size):
+def check_goal_maps(maps: ArrayLike, size: Sequence[int]) -> np.ndarray:
     """
     Check goal maps (K, H, W); return them as float32.
 
@@ -84,7 +86,7 @@ def check_goal_maps(maps, size):
 
 
 @contextmanager
-def _as_planning_error():
+def _as_planning_error() -> Iterator[None]:
     """Raise what is wrong with a picture as a PlanningError."""
     try:
         yield

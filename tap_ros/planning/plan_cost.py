@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the planner minimises, term by term, in pixels."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from tap_ros.planning.action_sequences import HORIZON
 import torch
@@ -10,7 +12,7 @@ NEAR = 3.0  # px; an object nearer to its goal is finished
 LAST_WEIGHT = 10.0  # of the horizon's last step, as the authors' planner has; the others have 1
 
 
-def prices(distances, unfinished):
+def prices(distances: torch.Tensor, unfinished: float) -> torch.Tensor:
     """
     Say what an object costs in every place: its distance, and more while it is not finished.
 
@@ -21,7 +23,8 @@ def prices(distances, unfinished):
     return distances + unfinished * (distances / NEAR).clamp(max=1)
 
 
-def cost_of_maps(carried, prices):
+def cost_of_maps(carried: Iterable[torch.Tensor],
+                 prices: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """
     Sum what the objects are expected to cost, over objects and over the horizon.
 
@@ -41,7 +44,7 @@ def cost_of_maps(carried, prices):
     return before + LAST_WEIGHT * last.sum(1), last.mean(1)
 
 
-def landing_clash(landings, objects, clearance):
+def landing_clash(landings: np.ndarray, objects: np.ndarray, clearance: float) -> np.ndarray:
     """
     Cost of coming down upon an object, which recordings of good pushes do not show.
 

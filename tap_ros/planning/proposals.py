@@ -8,12 +8,13 @@ object pixels and goal pixels, brought to the table by the model's homography.
 """
 
 import numpy as np
-from tap_ros.planning.action_sequences import REPEAT
+from tap_ros.planning.action_sequences import REPEAT, SequenceShape
 
 PACE = 0.9  # of the limits is used, so that the search can still add to it
 
 
-def push_proposals(shape, gripper, objects, goals, count, rng):
+def push_proposals(shape: SequenceShape, gripper: np.ndarray, objects: np.ndarray,
+                   goals: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """
     Propose pushes.
 
@@ -41,7 +42,8 @@ def push_proposals(shape, gripper, objects, goals, count, rng):
     return np.stack(proposals)
 
 
-def _go_and_push(shape, gripper, start, end, target, along):
+def _go_and_push(shape: SequenceShape, gripper: np.ndarray, start: np.ndarray, end: np.ndarray,
+                 target: np.ndarray, along: np.ndarray) -> np.ndarray:
     """
     Return parameters (D,): travel lifted to the start unless already behind, push to the end.
 
@@ -72,7 +74,8 @@ def _go_and_push(shape, gripper, start, end, target, along):
     return shape.join(moves, lifted, phase)
 
 
-def _moving_periods(shape, gripper, lifted, phase):
+def _moving_periods(shape: SequenceShape, gripper: np.ndarray, lifted: int,
+                    phase: int) -> np.ndarray:
     """Return how many control periods of each segment (num_moves,) move sideways."""
     _, (sideways,) = shape.climbs(np.array([lifted]), np.array([phase]), gripper[2])
     return np.bincount(shape.segment([phase])[0], sideways, minlength=shape.num_moves)

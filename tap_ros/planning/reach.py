@@ -16,16 +16,18 @@ visual_mpc_node and the evaluation both drive it, so that they act alike:
             seen = look_again()
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.forward_model import ForwardModel
-from tap_ros.planning.hierarchy import Itinerary
+from tap_ros.planning.goals import Goal
+from tap_ros.planning.hierarchy import Itinerary, Target
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.tracking import ObjectTracker
-from tap_ros.planning.visual_mpc import Memory
+from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
 from tap_ros.text import listing
 
 
@@ -35,7 +37,7 @@ class Seen:
 
     image: np.ndarray  # (H, W, 3) uint8
     gripper: np.ndarray  # (4,) metres and opening
-    names: tuple  # K object names
+    names: tuple[str, ...]  # K object names
     pixels: np.ndarray | None  # (K, 2) (u, v), in the order of the names; None: not looked for
     stamp_ns: int  # of the picture
     received: float = 0.0  # s, on the clock of `now`: when the oldest part of it was received
@@ -66,7 +68,7 @@ class ReachConfig:
     limits: Limits = FULL
     max_age: float = float('inf')
     timeout: float = float('inf')
-    objects: tuple | None = None
+    objects: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Aim:
 class Command:
     """Carry out plan.action, and say so by Reach.sent; what is not carried out is planned anew."""
 
-    plan: object  # visual_mpc.Plan
+    plan: Plan
     stage: int  # index of the target; the last one is the goal
     seen: Seen  # what it answers
 
@@ -98,6 +100,10 @@ class End:
 
     outcome: str
     message: str
+
+
+# What a plan changes: the planner's Memory, Itinerary.switches, ObjectTracker.memory.
+_Kept = tuple[Memory, list[int], tuple[np.ndarray, np.ndarray] | None]
 
 
 class Reach:
@@ -118,28 +124,37 @@ class Reach:
     :ivar switches: steps at which the second, third ... target began.
     """
 
-    def __init__(self, mpc, config, seed=0, now=0.0):
+    def __init__(self, mpc: VisualMPC, config: ReachConfig, seed: int = 0,
+                 now: float = 0.0) -> None:
         self._mpc, self._config, self._seed = mpc, config, seed
-        self._targets = self._itinerary = self._tracker = None
-        self._tabulated = None, None  # a Target, and the planner's Goal for it
-        self._first = self._planned = self._answered = None  # Seen, Command, Command
+        self._targets: list[Target] | None = None
+        self._itinerary: Itinerary | None = None
+        self._tracker: ObjectTracker | None = None
+        self._tabulated: tuple[Target, Goal] | None = None
+        self._first: Seen | None = None
+        self._planned: Command | None = None
+        self._answered: Command | None = None
         self._after_ns = -1  # pictures count that are stamped later than this
-        self._kept = self._before = None  # memories: after the last command, and before it
+        # Memories: after the last command, and before it with what was answered and sent then.
+        self._kept: _Kept | None = None
+        self._before: tuple[_Kept, Command | None, float] | None = None
         self._refusal = ''
         self._sent_at = now  # of the last command, or when there was reason to wait
-        self.steps, self.distance, self.pixels = 0, float('nan'), None
+        self.steps, self.distance = 0, float('nan')
+        self.pixels: np.ndarray | None = None
 
     @property
-    def aimed(self):
+    def aimed(self) -> bool:
         """Tell whether head_for has been called."""
         return self._targets is not None
 
     @property
-    def switches(self):
+    def switches(self) -> list[int]:
         """Return the steps at which the targets after the first one began."""
         return self._itinerary.switches if self._itinerary else []
 
-    def step(self, seen, now=0.0, lacking=''):
+    def step(self, seen: Seen | None, now: float = 0.0,
+             lacking: str = '') -> Aim | Command | Wait | End:
         """
         Answer what is seen.
 
@@ -160,8 +175,10 @@ class Reach:
             self._sent_at += answer.plan.planning_ms / 1e3  # planning is no silence
         return answer
 
-    def _answer(self, seen, now, lacking):
+    def _answer(self, seen: Seen | None, now: float, lacking: str) -> Aim | Command | Wait | End:
         """Answer what is seen, whatever the time that has passed without a command."""
+        if seen is None:
+            return Wait(lacking or 'nothing is seen')
         reason = self._unusable(seen, now, lacking)
         if reason:
             return Wait(reason)
@@ -170,7 +187,7 @@ class Reach:
         self._first = self._first or seen
         return Aim(seen) if self._targets is None else self._plan(seen)
 
-    def interrupted(self, seen):
+    def interrupted(self, seen: Seen | None) -> End | None:
         """
         Return the End if another scene is seen, else None.
 
@@ -182,7 +199,7 @@ class Reach:
                 return End('aborted', f'the scene has changed: {change}')
         return None
 
-    def head_for(self, targets, now=0.0):
+    def head_for(self, targets: Sequence[Target], now: float = 0.0) -> None:
         """
         Say what to go to.
 
@@ -195,11 +212,12 @@ class Reach:
         self._itinerary = Itinerary(targets, self._budget, config.switch, config.reached)
         if config.follower is not None:
             first = self._first
+            assert first is not None and first.pixels is not None, 'an Aim comes first'
             self._tracker = ObjectTracker(
                 config.follower, first.image, first.gripper, first.pixels)
         self._kept, self._sent_at = self._memory(Memory(self._seed)), now
 
-    def sent(self, after_ns=None, now=0.0):
+    def sent(self, after_ns: int | None = None, now: float = 0.0) -> None:
         """
         Say that the last Command is carried out.
 
@@ -208,6 +226,7 @@ class Reach:
         :param now: s.
         """
         command, self._planned = self._planned, None
+        assert command is not None and self._kept is not None, 'a Command comes first'
         self._before = self._kept, self._answered, self._sent_at
         self._sent_at = now
         self._kept, self._answered = self._memory(command.plan.memory), command
@@ -215,7 +234,7 @@ class Reach:
         self.steps += 1
         self._refusal = ''
 
-    def refused(self, stamp_ns, reason):
+    def refused(self, stamp_ns: int, reason: str) -> bool:
         """
         Say that a command was not carried out after all: a newer picture is to be answered.
 
@@ -223,19 +242,17 @@ class Reach:
         :param reason: why; told when no newer picture comes.
         :return: whether it was the last one of this goal.
         """
-        if self._before is None or self._answered.seen.stamp_ns != stamp_ns:
-            return False
         refused = self._answered
+        if self._before is None or refused is None or refused.seen.stamp_ns != stamp_ns:
+            return False
         (self._kept, self._answered, self._sent_at), self._before = self._before, None
         self._after_ns, self._planned = refused.seen.stamp_ns, None
         self.steps -= 1
         self._refusal = reason
         return True
 
-    def _unusable(self, seen, now, lacking):
+    def _unusable(self, seen: Seen, now: float, lacking: str) -> str:
         """Say why there is nothing to plan from; an empty string if there is."""
-        if seen is None:
-            return lacking or 'nothing is seen'
         if seen.stamp_ns <= self._after_ns:
             return (f'the last command was refused: {self._refusal}' if self._refusal
                     else lacking or 'no new picture since the last command')
@@ -246,34 +263,37 @@ class Reach:
             return f'what was seen is {age:.1f} s old' + (f': {lacking}' if lacking else '')
         return ''
 
-    def _plan(self, seen):
+    def _plan(self, seen: Seen) -> Command | End:
         """Plan the next command from a new picture."""
-        config = self._config
+        config, itinerary = self._config, self._itinerary
+        assert self._targets is not None and itinerary is not None and self._kept is not None
         memory = self._recall(self._kept)
-        self.pixels = self._find_objects(seen)
-        chosen = self.pixels if config.objects is None else self.pixels[list(config.objects)]
+        self.pixels = pixels = self._find_objects(seen)
+        chosen = pixels if config.objects is None else pixels[list(config.objects)]
         self.distance = self._targets[-1].distance(chosen)
         if self.distance <= config.reached:
             return End('reached', f'{self.distance:.1f} px from the goal, reached')
         if self.steps >= self._budget:
             return End('spent', f'{self.distance:.1f} px from the goal, '
                                 f'step budget of {self._budget} spent')
-        target = self._itinerary.target(self.steps, chosen)
+        target = itinerary.target(self.steps, chosen)
         limit = np.array(seen.image.shape[1::-1]) - 1
         goal = self._goal(target, np.clip(chosen, 0, limit))
         plan = self._mpc.plan(
             Scene(seen.image, seen.gripper, chosen), goal, memory, config.limits)
-        return Command(plan, len(self._itinerary.switches), seen)
+        return Command(plan, len(itinerary.switches), seen)
 
-    def _goal(self, target, pixels):
+    def _goal(self, target: Target, pixels: np.ndarray) -> Goal:
         """Return the planner's Goal for a target, tabulated once unless objects are free."""
-        if self._tabulated[0] is not target or target.free is not None:
-            self._tabulated = target, self._mpc.goal(**target.goal(pixels))
-        return self._tabulated[1]
+        known = self._tabulated
+        if known is None or known[0] is not target or target.free is not None:
+            known = self._tabulated = target, self._mpc.goal(**target.goal(pixels))
+        return known[1]
 
-    def _find_objects(self, seen):
+    def _find_objects(self, seen: Seen) -> np.ndarray:
         """Return where the objects are, (K, 2)."""
         if self._tracker is None:
+            assert seen.pixels is not None, 'without a follower objects are looked for'
             return seen.pixels
         if self._answered is None:
             return self._tracker.pixels
@@ -281,21 +301,22 @@ class Reach:
         return self._tracker.update(
             before.seen.image, before.seen.gripper, before.plan.action, seen.image, seen.gripper)
 
-    def _memory(self, planned):
+    def _memory(self, planned: Memory) -> _Kept:
         """Return all that a plan changes: the planner's Memory, and what is set back."""
-        return (planned, list(self._itinerary.switches),
+        return (planned, list(self.switches),
                 None if self._tracker is None else self._tracker.memory)
 
-    def _recall(self, memory):
+    def _recall(self, memory: _Kept) -> Memory:
         """Set back what a plan has changed; return the planner's Memory."""
         planned, switches, tracked = memory
-        self._itinerary.switches = list(switches)
-        if self._tracker is not None:
+        if self._itinerary is not None:
+            self._itinerary.switches = list(switches)
+        if self._tracker is not None and tracked is not None:
             self._tracker.memory = tracked
         return planned
 
 
-def scene_change(first, seen):
+def scene_change(first: Seen, seen: Seen) -> str:
     """
     Say in what way the scene is another one; an empty string if it is not.
 

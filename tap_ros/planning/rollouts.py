@@ -4,6 +4,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 import os
+from typing import Any
 
 import numpy as np
 from tap_ros.contract import LOW
@@ -21,7 +22,7 @@ class Rollouts:
     :param threads: on the CPU; 0: as many as there are cores.
     """
 
-    def __init__(self, model: MapModel, batch_size: int, threads: int = 0):
+    def __init__(self, model: MapModel, batch_size: int, threads: int = 0) -> None:
         self.model, self.batch_size = model, batch_size
         # Each thread predicts whole batches: operators split among threads would wait for each
         # other at every one of some thousand small steps, and for anything else that runs.
@@ -29,7 +30,8 @@ class Rollouts:
             (threads or len(os.sched_getaffinity(0))) if model.device.type == 'cpu' else 1,
             initializer=torch.set_num_threads, initargs=(1,))
 
-    def judge(self, start, maps, prices, actions, grippers, every):
+    def judge(self, start: Any, maps: torch.Tensor, prices: torch.Tensor, actions: np.ndarray,
+              grippers: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
         """
         Judge action sequences by plan_cost.cost_of_maps.
 
@@ -42,7 +44,8 @@ class Rollouts:
         size = -(-len(actions) // -(-len(actions) // self.batch_size))  # as even as can be
 
         @torch.inference_mode()
-        def judge(actions, grippers):
+        def judge(actions: torch.Tensor,
+                  grippers: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             count = len(actions)  # the last part is filled up: all go the same way
             actions, grippers = (torch.cat([t, t[-1:].expand(size - count, *t.shape[1:])])
                                  for t in (actions, grippers))
@@ -61,7 +64,7 @@ class Rollouts:
         return costs[back].astype(np.float64).round(2), ends[back]
 
 
-def to_numpy(*tensors):
+def to_numpy(*tensors: torch.Tensor) -> list[np.ndarray]:
     """Bring tensors of one type to numpy in one trip, for each of which a GPU would wait."""
     joined = torch.cat([tensor.flatten() for tensor in tensors]).cpu().numpy()
     ends = np.cumsum([tensor.numel() for tensor in tensors])

@@ -8,14 +8,20 @@ the forward model keeps its flow on a square grid of the table and looks into th
 a homography. Both are fitted from recordings, see fit_table and fit_arm.
 """
 
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import RecordingError
 import torch
 from torch.nn import functional as F
 
+if TYPE_CHECKING:
+    from tap_ros.recording.episode import Episode
 
-def project(matrix, points):
+
+def project(matrix: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     """
     Apply a homography (3, 3) or a camera (3, 4) to points.
 
@@ -27,7 +33,7 @@ def project(matrix, points):
     return rays[..., :2] / rays[..., 2:]
 
 
-def grid_points(cells):
+def grid_points(cells: int) -> torch.Tensor:
     """
     Return the centres (cells, cells, 2) of a square grid, row y, column x, from -1 to 1.
 
@@ -38,13 +44,14 @@ def grid_points(cells):
     return torch.stack([x, y], dim=-1)
 
 
-def pixel_points(size):
+def pixel_points(size: Sequence[int]) -> torch.Tensor:
     """Return the pixel centres (H, W, 2) as (u, v)."""
     v, u = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing='ij')
     return torch.stack([u, v], dim=-1).float()
 
 
-def sample_picture(images, pixels, padding='border'):
+def sample_picture(images: torch.Tensor, pixels: torch.Tensor,
+                   padding: str = 'border') -> torch.Tensor:
     """
     Read pictures at pixel positions, bilinearly.
 
@@ -58,7 +65,7 @@ def sample_picture(images, pixels, padding='border'):
         images, pixels * scale - 1, padding_mode=padding, align_corners=True)
 
 
-def sample(fields, points, padding='border'):
+def sample(fields: torch.Tensor, points: torch.Tensor, padding: str = 'border') -> torch.Tensor:
     """
     Read fields on the table grid at points, bilinearly.
 
@@ -69,17 +76,18 @@ def sample(fields, points, padding='border'):
     return F.grid_sample(fields, points, padding_mode=padding, align_corners=True)
 
 
-def channels_last(x):
+def channels_last(x: torch.Tensor) -> torch.Tensor:
     """View (N, C, h, w) as (N, h, w, C)."""
     return x.permute(0, 2, 3, 1)
 
 
-def channels_first(x):
+def channels_first(x: torch.Tensor) -> torch.Tensor:
     """View (N, h, w, C) as (N, C, h, w)."""
     return x.permute(0, 3, 1, 2)
 
 
-def splat_on_table(pixels, weights, homography, cells, half_size):
+def splat_on_table(pixels: torch.Tensor, weights: torch.Tensor, homography: torch.Tensor,
+                   cells: int, half_size: float) -> torch.Tensor:
     """
     Spread weighted pixel positions bilinearly over the table grid, then blur by one cell.
 
@@ -106,14 +114,14 @@ def splat_on_table(pixels, weights, homography, cells, half_size):
     return maps / maps.sum((-1, -2), keepdim=True).clamp_min(1e-12)
 
 
-def mirror_table(homography, width):
+def mirror_table(homography: torch.Tensor, width: int) -> torch.Tensor:
     """Return the homography of the mirrored picture over the table with x negated."""
     flip_u = homography.new_tensor([[-1.0, 0, width - 1], [0, 1, 0], [0, 0, 1]])
     flip_x = torch.diag(homography.new_tensor([-1.0, 1, 1]))
     return flip_u @ homography @ flip_x
 
 
-def fit_projection(points, pixels, iterations=30):
+def fit_projection(points: np.ndarray, pixels: np.ndarray, iterations: int = 30) -> np.ndarray:
     """
     Fit a projection to matching points: linear start, then robust Gauss-Newton (Huber, 1 px).
 
@@ -143,7 +151,7 @@ def fit_projection(points, pixels, iterations=30):
     return matrix
 
 
-def fit_arm(episodes):
+def fit_arm(episodes: Iterable['Episode']) -> np.ndarray:
     """
     Fit where the arm appears: a camera from gripper positions to the middle of what changes.
 
@@ -175,7 +183,7 @@ def fit_arm(episodes):
     return fit_projection(points.astype(np.float64), np.concatenate(pixels))
 
 
-def fit_table(episodes, arm):
+def fit_table(episodes: Iterable['Episode'], arm: np.ndarray) -> np.ndarray:
     """
     Fit the homography of the plane in which objects slide, table metres to pixels.
 

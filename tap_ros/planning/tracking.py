@@ -11,6 +11,7 @@ and which are hidden by the arm.
 
 import numpy as np
 from tap_ros.images import to_float
+from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.table import project, sample_picture
 import torch
 
@@ -30,7 +31,8 @@ class ObjectTracker:
     :param pixels: (K, 2) where the objects are in it.
     """
 
-    def __init__(self, model, image, gripper, pixels):
+    def __init__(self, model: ForwardModel, image: np.ndarray, gripper: np.ndarray,
+                 pixels: np.ndarray) -> None:
         self._model = model
         self.pixels = np.asarray(pixels, np.float32).copy()
         device = model.grid.device
@@ -48,17 +50,18 @@ class ObjectTracker:
         self._templates, self._weights = templates[:, :3], templates[:, 3] * inside
 
     @property
-    def memory(self):
+    def memory(self) -> tuple[np.ndarray, np.ndarray]:
         """Return where the objects are and how they are turned; it may be set back."""
         return self.pixels, self._angles.copy()
 
     @memory.setter
-    def memory(self, memory):
+    def memory(self, memory: tuple[np.ndarray, np.ndarray]) -> None:
         self.pixels, angles = memory
         self._angles = angles.copy()
 
     @torch.inference_mode()
-    def update(self, before, gripper_before, action, after, gripper):
+    def update(self, before: np.ndarray, gripper_before: np.ndarray, action: np.ndarray,
+               after: np.ndarray, gripper: np.ndarray) -> np.ndarray:
         """
         Follow the objects through one action.
 
@@ -92,7 +95,8 @@ class ObjectTracker:
         self.pixels = expected.astype(np.float32)
         return self.pixels
 
-    def _match(self, k, layers, centre, moved):
+    def _match(self, k: int, layers: torch.Tensor, centre: torch.Tensor,
+               moved: bool) -> tuple[torch.Tensor | None, float]:
         """
         Search object k around a place, coarsely and then finely.
 
@@ -123,18 +127,19 @@ class ObjectTracker:
             radius, turn = radius / 3, turn / 2
         return best, angle
 
-    def _prepare(self, image, gripper):
+    def _prepare(self, image: np.ndarray,
+                 gripper: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the picture (1, 3, H, W) in [-1, 1] and the mask (1, 1, H, W) of the arm."""
         device = self._model.grid.device
         hand = torch.as_tensor(np.asarray(gripper, np.float32), device=device)[None]
         return to_float(image)[None].to(device), self._model.draw_arm(hand)[:, 3:]
 
-    def _table(self, pixels):
+    def _table(self, pixels: np.ndarray) -> torch.Tensor:
         """Return table metres (K, 2) of pixels (K, 2)."""
         pixels = torch.as_tensor(np.asarray(pixels, np.float32), device=self._model.grid.device)
         return project(torch.linalg.inv(self._model.homography), pixels)
 
-    def _place(self, centres, angles):
+    def _place(self, centres: torch.Tensor, angles: torch.Tensor) -> torch.Tensor:
         """Return pixels (S, cells, 2) of the template's cells, turned about centres (S, 2)."""
         angles = angles.to(centres)
         cos, sin = angles.cos()[:, None], angles.sin()[:, None]
@@ -142,6 +147,6 @@ class ObjectTracker:
         turned = torch.stack([cos * x - sin * y, sin * x + cos * y], -1)  # (S, cells, 2)
         return project(self._model.homography, centres[:, None] + turned)
 
-    def _read(self, layers, pixels):
+    def _read(self, layers: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
         """Read layers (1, C, H, W) at pixels (S, cells, 2): (S, C, cells)."""
         return sample_picture(layers, pixels[None])[0].transpose(0, 1)

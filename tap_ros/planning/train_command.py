@@ -34,7 +34,7 @@ class Options(ModelOption):
     training: Training
 
 
-def run(args):
+def run(args: Options) -> None:
     """Train, and print where the weights are and how good."""
     from tap_ros.planning.forward_training import train  # torch takes seconds, --help does without
     path = train(args.training, stop_at=args.stop_at)

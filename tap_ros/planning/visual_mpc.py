@@ -15,9 +15,12 @@ carry the maps, take the one that brings them closest to their goals, execute it
 
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 import time
+from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.errors import PlanningError
 from tap_ros.images import to_float
 from tap_ros.planning.action_sequences import FULL, HORIZON, Limits, SequenceShape
@@ -48,7 +51,7 @@ class Found:
     limits: Limits  # within which it was searched
     age: int = 0  # actions that have passed since the search
 
-    def following(self):
+    def following(self) -> 'Found':
         """Return what is left one action later."""
         return replace(self, shape=self.shape.following(), age=self.age + 1,
                        parameters=self.shape.shift(self.parameters))
@@ -84,7 +87,7 @@ class VisualMPC:
     :param config: VisualMPCConfig.
     """
 
-    def __init__(self, model: MapModel, config: VisualMPCConfig | None = None):
+    def __init__(self, model: MapModel, config: VisualMPCConfig | None = None) -> None:
         self.model, self.config = model, config or VisualMPCConfig()
         on_cpu = model.device.type == 'cpu'  # a GPU predicts all samples at once
         self.rollouts = Rollouts(
@@ -93,7 +96,8 @@ class VisualMPC:
         self._points = model.table_points().cpu().numpy()
 
     @classmethod
-    def load(cls, path, config=None, device='cpu'):
+    def load(cls, path: str | Path, config: VisualMPCConfig | None = None,
+             device: torch.device | str = 'cpu') -> Self:
         """
         Load the forward model's weights.
 
@@ -103,12 +107,12 @@ class VisualMPC:
         return cls(load_forward_model(path, device), config)
 
     @property
-    def image_size(self):
+    def image_size(self) -> tuple[int, int]:
         """Return (height, width) of the pictures it takes."""
         return self.model.image_size
 
     @torch.inference_mode()
-    def goal(self, pixels=None, maps=None) -> Goal:
+    def goal(self, pixels: ArrayLike | None = None, maps: ArrayLike | None = None) -> Goal:
         """Tabulate a goal, given as pixels (K, 2) or as maps (K, H, W), see goals.tabulate."""
         return tabulate(self.model, pixels, maps)
 
@@ -138,7 +142,8 @@ class VisualMPC:
         return Plan(actions[0], found.expected_distance, float(current), milliseconds, actions,
                     found.cost, Memory(memory.seed, memory.count + 1, found.following()))
 
-    def _search(self, scene, maps, here, goal, memory, limits):
+    def _search(self, scene: Scene, maps: torch.Tensor, here: np.ndarray, goal: Goal,
+                memory: Memory, limits: Limits) -> Found:
         """
         Search the best sequence of actions.
 
@@ -154,14 +159,16 @@ class VisualMPC:
         judge = partial(self.rollouts.judge, start, maps)
         price = prices(goal.distances, config.unfinished)
 
-        def cost(samples, grippers=gripper[None]):  # mean over where the gripper begins
+        # mean over where the gripper begins
+        def cost(samples: np.ndarray, grippers: np.ndarray = gripper[None]) -> np.ndarray:
             actions = shape.actions(samples, gripper[2])
             clash = landing_clash(shape.landings(actions, gripper), here, config.clearance)
             costs, _ = judge(price, actions.repeat(len(grippers), 0),
                              np.tile(grippers, (len(samples), 1)), config.cost_every)
             return costs.reshape(len(samples), -1).mean(1) + clash
 
-        def recheck(samples):  # from here and from a little beside
+        # from here and from a little beside
+        def recheck(samples: np.ndarray) -> np.ndarray:
             aside = np.random.default_rng([memory.seed, memory.count, 1])
             grippers = np.tile(gripper, (config.recheck, 1))
             grippers[1:, :2] += aside.normal(0, RECHECK_STD, (config.recheck - 1, 2))

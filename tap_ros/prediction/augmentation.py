@@ -3,6 +3,7 @@
 """Changes of appearance that make few episodes into many."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import torch
@@ -23,7 +24,8 @@ class Augmentation:
     gain: torch.Tensor
 
     @classmethod
-    def draw(cls, batch_size, flip, colour, brightness, rng):
+    def draw(cls, batch_size: int, flip: bool, colour: bool, brightness: float,
+             rng: np.random.Generator) -> Self:
         """
         Draw one for each episode of a batch.
 
@@ -42,15 +44,15 @@ class Augmentation:
         return cls(torch.from_numpy(flips), torch.from_numpy(order),
                    torch.from_numpy(gain.astype(np.float32)))
 
-    def part(self, part):
+    def part(self, part: slice) -> 'Augmentation':
         """Return that of a slice of the episodes."""
         return Augmentation(self.flip[part], self.order[part], self.gain[part])
 
-    def to(self, device):
+    def to(self, device: torch.device | str) -> 'Augmentation':
         """Copy everything to a device."""
         return Augmentation(self.flip.to(device), self.order.to(device), self.gain.to(device))
 
-    def apply(self, images):
+    def apply(self, images: torch.Tensor) -> torch.Tensor:
         """
         Change pictures.
 
@@ -61,7 +63,7 @@ class Augmentation:
         images = (images + 1) * self.gain[:, None, :, None, None] - 1
         return torch.where(self.flip[:, None, None, None, None], images.flip(-1), images)
 
-    def undo(self, images):
+    def undo(self, images: torch.Tensor) -> torch.Tensor:
         """
         Change pictures back.
 
@@ -73,6 +75,6 @@ class Augmentation:
         return _take_channels(images, self.order.argsort(1))
 
 
-def _take_channels(images, order):
+def _take_channels(images: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
     order = order[:, None, :, None, None].expand_as(images)
     return images.gather(2, order)

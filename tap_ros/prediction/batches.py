@@ -7,11 +7,17 @@ A batch depends on nothing but the episodes, the seed and the step: training tha
 and resumed sees the same ones.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.learning.frames import GOAL, MappedFrames
+from tap_ros.learning.frames import Frames, GOAL, MappedFrames
 import torch
+
+if TYPE_CHECKING:
+    from tap_ros.recording.cache import EpisodeStore
+    from tap_ros.recording.episode import Episode
 
 REACHED = 2.0  # px
 
@@ -41,7 +47,7 @@ class Batch:
     valid: torch.Tensor
     video: torch.Tensor | None = None
 
-    def to(self, device):
+    def to(self, device: torch.device | str) -> 'Batch':
         """Copy everything to a device."""
         return Batch(**{name: tensor.to(device, non_blocking=True)
                         for name, tensor in vars(self).items() if tensor is not None})
@@ -75,7 +81,7 @@ class Sampling:
     video_frames: int = 0
 
 
-def episode_order(num_episodes, batch_size, seed, step):
+def episode_order(num_episodes: int, batch_size: int, seed: int, step: int) -> np.ndarray:
     """
     Say which episodes the batch of a step has: shuffled passes over all of them.
 
@@ -91,7 +97,7 @@ def episode_order(num_episodes, batch_size, seed, step):
     return np.array([orders[i // num_episodes][i % num_episodes] for i in at])
 
 
-def target_times(end, margin, forward=False):
+def target_times(end: int, margin: int, forward: bool = False) -> tuple[int, int]:
     """
     Say at which times an episode's targets lie (T of Eq. 2).
 
@@ -107,7 +113,8 @@ def target_times(end, margin, forward=False):
     return 1 + margin, end - 1 - margin
 
 
-def uses_recorded_goal(episode, goal_picture, rng=None):
+def uses_recorded_goal(episode: 'Episode', goal_picture: str,
+                       rng: np.random.Generator | None = None) -> bool:
     """
     Say whether an episode's goal picture is the goal's own rather than its last frame.
 
@@ -121,8 +128,10 @@ def uses_recorded_goal(episode, goal_picture, rng=None):
     :param rng: numpy Generator, drawn from for 'mixed'.
     :return: bool.
     """
-    if goal_picture == 'mixed' and rng.random() < 0.5:
-        return False
+    if goal_picture == 'mixed':
+        assert rng is not None, 'what is mixed is drawn'
+        if rng.random() < 0.5:
+            return False
     if goal_picture == 'last' or episode.goal_frame is None:
         return False
     away = np.linalg.norm(episode.object_pixels[-1] - episode.goal_pixels, axis=-1)
@@ -131,12 +140,14 @@ def uses_recorded_goal(episode, goal_picture, rng=None):
     return episode.outcome == 'success'
 
 
-def fixed_time(fraction, end, first, last):
+def fixed_time(fraction: float, end: int, first: int, last: int) -> int:
     """Return the time, first to last, at a share of an episode that ends at time `end`."""
     return int(np.clip(int(fraction * end + 0.5), first, last))
 
 
-def make_batch(store, episodes, sampling=Sampling(), frames=None, rng=None, part=slice(None)):
+def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
+               sampling: Sampling = Sampling(), frames: Frames | None = None,
+               rng: np.random.Generator | None = None, part: slice = slice(None)) -> Batch:
     """
     Gather context pictures and targets.
 
@@ -163,9 +174,10 @@ def make_batch(store, episodes, sampling=Sampling(), frames=None, rng=None, part
     context, video, bounds = (np.array([getattr(row, name) for row in rows])
                               for name in ('context', 'video', 'bounds'))
     frames = frames or MappedFrames(store)
+    first, last, end = torch.from_numpy(bounds).split(1, dim=1)
     return Batch(
         frames(episodes, context), frames(episodes, shown), torch.from_numpy(times),
-        *torch.from_numpy(bounds).split(1, dim=1), torch.from_numpy(valid),
+        first, last, end, torch.from_numpy(valid),
         frames(episodes, video) if sampling.video_frames else None)
 
 
@@ -174,20 +186,20 @@ class _Row:
     """What is taken from one episode: frame numbers, and times from `start` on."""
 
     start: int
-    context: list  # frame numbers, or GOAL
+    context: list[int]  # frame numbers, or GOAL
     video: np.ndarray  # the same
     times: np.ndarray  # of the targets
-    bounds: tuple  # first and last time that a target could have, time of the goal
+    bounds: tuple[int, int, int]  # first and last time that a target could have, time of the goal
 
 
-def _choose(store, i, sampling, rng):
+def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Generator) -> _Row:
     """Choose a piece of episode i, and its targets."""
     available = length = int(store.lengths[i])
     if sampling.min_crop < 1:
         length = max(3, round(length * rng.uniform(sampling.min_crop, 1)))
     if sampling.max_frames:
         length = min(length, sampling.max_frames)
-    start = rng.integers(available - length + 1) if length < available else 0
+    start = int(rng.integers(available - length + 1)) if length < available else 0
     end = length - 1
     first, last = target_times(end, sampling.margin, sampling.forward)
     times = np.arange(first, last + 1)

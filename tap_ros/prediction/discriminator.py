@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The time-agnostic conditional GAN (section 3.3, appendix A)."""
 
-from tap_ros.prediction.networks import encoder, initialise
+from tap_ros.prediction.networks import encoder, initialise, PredictorConfig
 import torch
 from torch import nn
 from torch.nn import functional
@@ -22,7 +22,7 @@ class Discriminator(nn.Module):
     :param num_times: |T|.
     """
 
-    def __init__(self, config, num_times):
+    def __init__(self, config: PredictorConfig, num_times: int) -> None:
         super().__init__()
         widths = config.widths
         self.encoder = encoder(3 * (config.num_context + 1), widths)
@@ -31,7 +31,7 @@ class Discriminator(nn.Module):
             nn.Conv2d(widths[-1], num_times, 4))
         self.apply(initialise)
 
-    def forward(self, context, image):
+    def forward(self, context: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
         """
         Judge pictures.
 
@@ -44,7 +44,8 @@ class Discriminator(nn.Module):
         return self.head(self.encoder(pictures)).flatten(1).float()
 
 
-def smoothed_labels(step, other_step, alpha=SMOOTHING):
+def smoothed_labels(step: torch.Tensor, other_step: torch.Tensor,
+                    alpha: float = SMOOTHING) -> torch.Tensor:
     """
     Compute the labels l_{t,t'} = max(0, 1 - alpha |t - t'|) of appendix A.
 
@@ -56,7 +57,9 @@ def smoothed_labels(step, other_step, alpha=SMOOTHING):
     return (1 - alpha * (step - other_step).abs().float()).clamp(min=0)
 
 
-def discriminator_loss(real, generated, other, step, other_step, alpha=SMOOTHING):
+def discriminator_loss(real: torch.Tensor, generated: torch.Tensor, other: torch.Tensor,
+                       step: torch.Tensor, other_step: torch.Tensor,
+                       alpha: float = SMOOTHING) -> torch.Tensor:
     """
     Compute the discriminators' loss, to be minimised, at t = step.
 
@@ -80,7 +83,7 @@ def discriminator_loss(real, generated, other, step, other_step, alpha=SMOOTHING
             + entropy(other, smoothed_labels(step, other_step, alpha)))
 
 
-def generator_loss(generated, step):
+def generator_loss(generated: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
     """
     Compute the predictor's side, -log D_t(c, G(c)): Eq. 11 in the form that does not saturate.
 

@@ -2,16 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a network scores by its own method while it is trained."""
 
+from collections.abc import Iterable
 import contextlib
 
 from tap_ros.images import to_float
+from tap_ros.learning.devices import Autocast
+from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import l1_error
+from tap_ros.prediction.networks import Prediction, Predictor
 from tap_ros.prediction.selection import selection_errors, Targets
+from tap_ros.prediction.training_config import TrainingConfig
 import torch
 
 
 @torch.no_grad()
-def matched(network, batch, config, autocast=contextlib.nullcontext):
+def matched(network: Predictor, batch: Batch, config: TrainingConfig,
+            autocast: Autocast = contextlib.nullcontext) -> tuple[Prediction, torch.Tensor]:
     """
     Predict, with z at 0, and find the frames that the method chooses.
 
@@ -29,7 +35,8 @@ def matched(network, batch, config, autocast=contextlib.nullcontext):
 
 
 @torch.no_grad()
-def held_out_scores(network, batches, config, autocast=contextlib.nullcontext):
+def held_out_scores(network: Predictor, batches: Iterable[Batch], config: TrainingConfig,
+                    autocast: Autocast = contextlib.nullcontext) -> dict[str, float]:
     """
     Measure a network by the error at the frames that its method chooses; z is 0.
 

@@ -7,7 +7,9 @@ Errors are per-pixel means of the absolute difference on [0, 1], half of that on
 losses and reported numbers have the same unit.
 """
 
+from collections.abc import Callable, Iterable, Sequence
 import math
+from typing import cast
 
 import torch
 
@@ -16,7 +18,7 @@ _MIN_COPY_DISTANCE = 1e-4
 CHANGED = 0.075  # on [0, 1]; a pixel that differs by more has changed
 
 
-def l1_error(images, targets):
+def l1_error(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     """
     Measure the l1 error of pictures, on [0, 1].
 
@@ -27,7 +29,7 @@ def l1_error(images, targets):
     return (images - targets).abs().mean((-3, -2, -1)) / 2
 
 
-def changed_pixels(targets, context):
+def changed_pixels(targets: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
     """
     Find the pixels of a frame that differ from every input: what copying in place cannot give.
 
@@ -39,7 +41,8 @@ def changed_pixels(targets, context):
     return difference.amin(1) > 2 * CHANGED
 
 
-def weighted_l1_error(images, targets, context, changed_weight):
+def weighted_l1_error(images: torch.Tensor, targets: torch.Tensor, context: torch.Tensor,
+                      changed_weight: float) -> torch.Tensor:
     """
     Measure the l1 error with more weight on changed pixels; not in the paper.
 
@@ -60,7 +63,7 @@ def weighted_l1_error(images, targets, context, changed_weight):
 
 
 @torch.no_grad()
-def l1_errors(images, targets):
+def l1_errors(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     """
     Measure the l1 error of each picture against each target frame, on [0, 1], without gradient.
 
@@ -83,7 +86,7 @@ def l1_errors(images, targets):
     return distances / 255
 
 
-def match_step(selection_error, valid=None):
+def match_step(selection_error: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
     """
     Pick the target with the least selection error, the argmin of Eq. 5.
 
@@ -96,7 +99,8 @@ def match_step(selection_error, valid=None):
     return selection_error.argmin(1)
 
 
-def fixed_time_loss(error, step):
+def fixed_time_loss(error: torch.Tensor | Callable[[torch.Tensor], torch.Tensor],
+                    step: torch.Tensor) -> torch.Tensor:
     """
     Fixed-time loss: the error at a step chosen in advance.
 
@@ -110,7 +114,7 @@ def fixed_time_loss(error, step):
     return error.mean()
 
 
-def minimum_loss(error, valid=None):
+def minimum_loss(error: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
     """
     Minimum-over-time loss: the least error over the targets.
 
@@ -123,7 +127,9 @@ def minimum_loss(error, valid=None):
     return generalized_minimum_loss(error, error, valid)
 
 
-def generalized_minimum_loss(error, selection_error, valid=None):
+def generalized_minimum_loss(error: torch.Tensor | Callable[[torch.Tensor], torch.Tensor],
+                             selection_error: torch.Tensor,
+                             valid: torch.Tensor | None = None) -> torch.Tensor:
     """
     Generalized minimum over time: E at the argmin of E'.
 
@@ -139,7 +145,7 @@ def generalized_minimum_loss(error, selection_error, valid=None):
     return fixed_time_loss(error, match_step(selection_error.detach(), valid))
 
 
-def recursive_loss(losses, counts):
+def recursive_loss(losses: Sequence[torch.Tensor], counts: Sequence[int]) -> torch.Tensor:
     """
     Recursive loss: the sum over levels r of the loss of the prediction from c(r).
 
@@ -150,10 +156,16 @@ def recursive_loss(losses, counts):
     :param counts: for each level, how many those are; level 0 has all of them.
     :return: the sum over levels, as a mean over all episodes.
     """
-    return sum(loss * (count / counts[0]) for loss, count in zip(losses, counts))
+    return total(loss * (count / counts[0]) for loss, count in zip(losses, counts))
 
 
-def remaining_targets(valid, times, matched, forward):
+def total(terms: Iterable[torch.Tensor]) -> torch.Tensor:
+    """Add up terms, of which there is one at least."""
+    return cast(torch.Tensor, sum(terms))
+
+
+def remaining_targets(valid: torch.Tensor, times: torch.Tensor, matched: torch.Tensor,
+                      forward: bool) -> torch.Tensor:
     """
     Say which targets the next level of recursion has, T(r) of Eq. 3.
 
@@ -167,7 +179,8 @@ def remaining_targets(valid, times, matched, forward):
     return valid & (times > matched if forward else times < matched)
 
 
-def bell_preference(times, first, last, edge=2 / 3):
+def bell_preference(times: torch.Tensor, first: torch.Tensor | float, last: torch.Tensor | float,
+                    edge: float = 2 / 3) -> torch.Tensor:
     """
     Prefer the middle: a Gaussian over the target times, 1 in the middle and `edge` at both ends.
 
@@ -186,7 +199,8 @@ def bell_preference(times, first, last, edge=2 / 3):
     return torch.exp(math.log(edge) * position ** 2)
 
 
-def linear_preference(times, last, beta):
+def linear_preference(times: torch.Tensor, last: torch.Tensor | float,
+                      beta: float) -> torch.Tensor:
     """
     Prefer later frames, for forward prediction: w(t) = beta + t / last (section 4).
 
@@ -200,7 +214,7 @@ def linear_preference(times, last, beta):
     return beta + times / last
 
 
-def preferred_error(error, preference):
+def preferred_error(error: torch.Tensor, preference: torch.Tensor) -> torch.Tensor:
     """
     Divide by the time preference, the selection error E'_t = E_t / w(t) of section 3.2.
 
@@ -211,7 +225,8 @@ def preferred_error(error, preference):
     return error / preference
 
 
-def relative_to_copying(error, copy_error, preference):
+def relative_to_copying(error: torch.Tensor, copy_error: torch.Tensor,
+                        preference: torch.Tensor) -> torch.Tensor:
     """
     Measure errors by what copying a context picture would have scored.
 
@@ -228,7 +243,8 @@ def relative_to_copying(error, copy_error, preference):
 
 
 @torch.no_grad()
-def path_length(start, targets, valid=None):
+def path_length(start: torch.Tensor, targets: torch.Tensor,
+                valid: torch.Tensor | None = None) -> torch.Tensor:
     """
     Measure how much changed on the way to each target: a cost of reaching it that pictures show.
 
@@ -248,7 +264,8 @@ def path_length(start, targets, valid=None):
     return length / length[:, -1:].clamp(min=1e-6)
 
 
-def cost_of_reaching(error, cost, preference, weight=1.0):
+def cost_of_reaching(error: torch.Tensor, cost: torch.Tensor, preference: torch.Tensor,
+                     weight: float = 1.0) -> torch.Tensor:
     """
     Prefer states that are cheap to reach, the other preference that section 3.2 names.
 

@@ -42,7 +42,7 @@ class Method:
     selection: str
 
 
-def parse_method(name):
+def parse_method(name: str) -> Method:
     """
     Find out what a method's name stands for.
 

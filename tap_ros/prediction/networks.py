@@ -40,7 +40,7 @@ class PredictorConfig:
     new_pixels: bool = True
     flow_scale: float = 16.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse shapes that the network cannot have."""
         levels = math.log2(self.image_size) if self.image_size > 0 else 0.5
         if self.image_size < 16 or levels != int(levels):
@@ -63,7 +63,7 @@ class PredictorConfig:
                 raise ConfigError(f'{name}: expected at most {most}, got {getattr(self, name)}')
 
     @property
-    def widths(self):
+    def widths(self) -> tuple[int, ...]:
         """Channels from the finest block to the coarsest: (32, 64, 128, 256) in the paper."""
         return tuple(self.base_width * 2 ** i for i in range(int(math.log2(self.image_size)) - 2))
 
@@ -87,13 +87,13 @@ class Prediction:
     new_pixels: torch.Tensor | None
 
 
-def encoder(in_channels, widths):
+def encoder(in_channels: int, widths: tuple[int, ...]) -> nn.Sequential:
     """
     Build the DCGAN discriminator's trunk: 4x4 convolutions that halve the size (appendix C).
 
     As in DCGAN, to which the paper says it is identical, the first block has no batch norm.
     """
-    layers = []
+    layers: list[nn.Module] = []
     for i, width in enumerate(widths):
         layers.append(nn.Conv2d(in_channels, width, 4, stride=2, padding=1, bias=i == 0))
         if i > 0:
@@ -103,7 +103,7 @@ def encoder(in_channels, widths):
     return nn.Sequential(*layers)
 
 
-def decoder(in_features, widths, out_channels):
+def decoder(in_features: int, widths: tuple[int, ...], out_channels: int) -> nn.Sequential:
     """
     Build a decoder: transposed convolution to 4x4, then upsampling-5x5 convolutions (appendix C).
 
@@ -111,8 +111,8 @@ def decoder(in_features, widths, out_channels):
     The activation of the last block is left to the caller.
     """
     width = widths[-1]
-    layers = [nn.ConvTranspose2d(in_features, width, 4, bias=False),
-              nn.BatchNorm2d(width), nn.ReLU()]
+    layers: list[nn.Module] = [
+        nn.ConvTranspose2d(in_features, width, 4, bias=False), nn.BatchNorm2d(width), nn.ReLU()]
     for narrower in widths[-2::-1]:
         layers += [nn.Upsample(scale_factor=2, mode='bilinear', align_corners=False),
                    nn.Conv2d(width, narrower, 5, padding=2, bias=False),
@@ -123,7 +123,7 @@ def decoder(in_features, widths, out_channels):
     return nn.Sequential(*layers)
 
 
-def initialise(module):
+def initialise(module: nn.Module) -> None:
     """Set DCGAN's initial weights: normal(0, .02), batch norm normal(1, .02), biases 0."""
     if isinstance(module, (nn.Conv2d, nn.ConvTranspose2d)):
         nn.init.normal_(module.weight, 0.0, 0.02)
@@ -142,7 +142,7 @@ class Predictor(nn.Module):
     the same shape give the new pixels, the flow and the masks (appendix C, its last figure).
     """
 
-    def __init__(self, config):
+    def __init__(self, config: PredictorConfig) -> None:
         """Build the network with fresh weights."""
         super().__init__()
         self.config = config
@@ -158,9 +158,9 @@ class Predictor(nn.Module):
         self.pixel_decoder = decoder(features, widths, 3) if config.new_pixels else None
         self.apply(initialise)
         # Training starts from copying: flow near 0.
-        nn.init.normal_(self.flow_decoder[-1].weight, 0.0, 0.002)
+        nn.init.normal_(self.flow_decoder[-1].get_parameter('weight'), 0.0, 0.002)
 
-    def forward(self, context, z=None):
+    def forward(self, context: torch.Tensor, z: torch.Tensor | None = None) -> Prediction:
         """
         Predict.
 

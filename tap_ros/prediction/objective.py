@@ -2,21 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the predictor is trained to do: from a batch to its loss."""
 
+from collections.abc import Sequence
 import contextlib
 from dataclasses import dataclass, replace
+from typing import Any, Self
 
 from tap_ros.images import to_float
-from tap_ros.learning.parallel import ALONE
+from tap_ros.learning.devices import Autocast
+from tap_ros.learning.parallel import ALONE, Processes
+from tap_ros.prediction.augmentation import Augmentation
+from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.discriminator import discriminator_loss, generator_loss
 from tap_ros.prediction.losses import (
     fixed_time_loss,
     match_step,
     recursive_loss,
     remaining_targets,
+    total,
 )
 from tap_ros.prediction.networks import Prediction, Predictor
 from tap_ros.prediction.recognition import kl_divergence, Recognition, sample_latent
-from tap_ros.prediction.selection import outer_error, selection_errors, Targets
+from tap_ros.prediction.selection import outer_error, Selection, selection_errors, Targets
+from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
 
@@ -54,7 +61,8 @@ class Draws:
     other: torch.Tensor
 
     @classmethod
-    def make(cls, batch, latent_size, seed, step, processes=ALONE):
+    def make(cls, batch: Batch, latent_size: int, seed: int, step: int,
+             processes: Processes = ALONE) -> Self:
         """
         Draw those of a step, on the batch's device, the same ones whenever asked.
 
@@ -89,12 +97,14 @@ class Outcome:
     loss: torch.Tensor
     match: torch.Tensor
     prediction: Prediction
-    parts: dict
-    judged: dict | None = None
+    parts: dict[str, torch.Tensor]
+    judged: dict[str, Any] | None = None
 
 
-def predictor_loss(networks, batch, augmentation, config, draws=None,
-                   autocast=contextlib.nullcontext, selection=selection_errors):
+def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation | None,
+                   config: ObjectiveSettings, draws: Draws | None = None,
+                   autocast: Autocast = contextlib.nullcontext,
+                   selection: Selection = selection_errors) -> Outcome:
     """
     Compute the predictor's training loss of a batch.
 
@@ -122,11 +132,14 @@ def predictor_loss(networks, batch, augmentation, config, draws=None,
     targets = Targets(batch, augmentation, config)
     context = to_float(batch.context)  # B, C, 3, H, W
     context = augmentation.apply(context) if augmentation else context
-    if networks.recognition is not None and config.posterior == 'frame':
-        return _frame_posterior_loss(
-            networks, targets, context, config, draws, autocast, selection)
-    parts, z = {}, None
+    parts: dict[str, torch.Tensor] = {}
+    z = None
     if networks.recognition is not None:
+        assert draws is not None, 'z is drawn'
+        if config.posterior == 'frame':
+            return _frame_posterior_loss(
+                networks, targets, context, config, draws, autocast, selection)
+        assert batch.video is not None, 'see Sampling.video_frames'
         video = to_float(batch.video)
         with autocast():
             mean, log_variance = networks.recognition(
@@ -139,20 +152,23 @@ def predictor_loss(networks, batch, augmentation, config, draws=None,
     parts['error'] = targets.loss(prediction.image, match, context)
     judged = None
     if networks.discriminator is not None:
+        assert draws is not None, "t' is drawn"
         judged = _judge(networks, prediction, z, targets, context, match, draws, autocast)
         with autocast():
             verdicts = [judge(context, image) for judge, image in judged['pairs']]
-        parts['gan'] = config.gan_weight * sum(
+        parts['gan'] = config.gan_weight * total(
             generator_loss(logits, judged['step']) for logits in verdicts)
     if config.recursion > 1:
         parts['error'] = _recursive_loss(
             networks, prediction, targets, context, match, parts['error'], config, z, autocast,
             selection)
-    return Outcome(sum(parts.values()), match, prediction,
+    return Outcome(total(parts.values()), match, prediction,
                    {name: value.detach() for name, value in parts.items()}, judged)
 
 
-def _judge(networks, prediction, z, targets, context, match, draws, autocast):
+def _judge(networks: Networks, prediction: Prediction, z: torch.Tensor | None, targets: Targets,
+           context: torch.Tensor, match: torch.Tensor, draws: Draws,
+           autocast: Autocast) -> dict[str, Any]:
     """Gather what the discriminators see of this batch."""
     batch = targets.batch
     pairs = [(networks.discriminator, prediction.image)]
@@ -171,7 +187,8 @@ def _judge(networks, prediction, z, targets, context, match, draws, autocast):
             'other_step': batch.times.gather(1, other[:, None])[:, 0] - 1}
 
 
-def discriminators_loss(judged, autocast=contextlib.nullcontext):
+def discriminators_loss(judged: dict[str, Any],
+                        autocast: Autocast = contextlib.nullcontext) -> torch.Tensor:
     """
     Compute the discriminators' own loss (Eq. 11), for predictions without gradient.
 
@@ -184,12 +201,16 @@ def discriminators_loss(judged, autocast=contextlib.nullcontext):
         with autocast():  # one batch each: batch norm must not mix real and generated frames
             logits = [judge(judged['context'], frame)
                       for frame in (judged['real'], image.detach(), judged['other'])]
-        losses.append(discriminator_loss(*logits, judged['step'], judged['other_step']))
-    return sum(losses)
+        real, generated, other = logits
+        losses.append(discriminator_loss(
+            real, generated, other, judged['step'], judged['other_step']))
+    return total(losses)
 
 
-def _recursive_loss(networks, prediction, targets, context, match, loss, config, z, autocast,
-                    selection):
+def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets,
+                    context: torch.Tensor, match: torch.Tensor, loss: torch.Tensor,
+                    config: ObjectiveSettings, z: torch.Tensor | None, autocast: Autocast,
+                    selection: Selection) -> torch.Tensor:
     """Add the levels r > 0 of Eq. 3; gradients flow through the predictions as contexts."""
     batch, valid = targets.batch, targets.batch.valid
     losses, counts = [loss], [len(context)]
@@ -213,11 +234,13 @@ def _recursive_loss(networks, prediction, targets, context, match, loss, config,
         match = targets.match(prediction.image, context, selection, between)
         errors = outer_error(targets.outer_l1(prediction.image, match, context), config)
         losses.append(errors[left].mean())
-        counts.append(left.sum().item())
+        counts.append(int(left.sum().item()))
     return recursive_loss(losses, counts)
 
 
-def _frame_posterior_loss(networks, targets, context, config, draws, autocast, selection):
+def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.Tensor,
+                          config: ObjectiveSettings, draws: Draws, autocast: Autocast,
+                          selection: Selection) -> Outcome:
     """
     Compute the alternative of appendix B: the minimum over time of the whole CVAE loss.
 
@@ -228,6 +251,7 @@ def _frame_posterior_loss(networks, targets, context, config, draws, autocast, s
     """
     batch = targets.batch
     B, T = batch.times.shape
+    assert networks.recognition is not None
     divergences, errors, predictions = [], [], []
     for t in range(T):
         step = torch.full_like(targets.rows, t)
@@ -245,13 +269,13 @@ def _frame_posterior_loss(networks, targets, context, config, draws, autocast, s
         whole, lambda: targets.errors(context), batch, config), batch.valid)
     parts = {'kl': fixed_time_loss(divergences, match),
              'error': fixed_time_loss(outer_error(errors, config), match)}
-    return Outcome(sum(parts.values()), match, _choose(predictions, match),
+    return Outcome(total(parts.values()), match, _choose(predictions, match),
                    {name: value.detach() for name, value in parts.items()})
 
 
-def _choose(predictions, match):
+def _choose(predictions: Sequence[Prediction], match: torch.Tensor) -> Prediction:
     """Put together, for each episode, the prediction of its matched target."""
-    def pick(name):
+    def pick(name: str) -> Any:
         values = [getattr(prediction, name) for prediction in predictions]
         return None if values[0] is None else torch.stack(values, 1)[
             torch.arange(len(match), device=match.device), match]

@@ -2,14 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the network does with a batch, as a picture for people."""
 
+import numpy as np
 from tap_ros.images import to_uint8
 from tap_ros.learning.panels import grey_panels
 from tap_ros.pictures import grid
+from tap_ros.prediction.batches import Batch
+from tap_ros.prediction.networks import Prediction
 import torch
 
 
 @torch.no_grad()
-def sample_grid(batch, prediction, match):
+def sample_grid(batch: Batch, prediction: Prediction, match: torch.Tensor) -> np.ndarray:
     """
     Show a batch: context, prediction, matched frame, one mask for each source, new pixels.
 

@@ -2,14 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The trained predictor: arrays in, arrays out."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 from tap_ros.errors import ConfigError, ImageError, WeightsError
 from tap_ros.images import check_image, check_pixels, to_float, to_uint8
+from tap_ros.learning.devices import placed
 from tap_ros.learning.weights import load_weights, make_network
 from tap_ros.prediction.networks import Predictor, PredictorConfig
-from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
+from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps, WarpedMaps
 from tap_ros.text import escaped
 from tap_ros.weights import find_predictor
 import torch
@@ -61,7 +65,8 @@ class SubgoalPredictor:
     :ivar training: dict saying how the weights were made.
     """
 
-    def __init__(self, network, training=None, source='predictor'):
+    def __init__(self, network: Predictor, training: dict[str, Any] | None = None,
+                 source: str | Path = 'predictor') -> None:
         """
         Take a network into service, and run it once, so that the first request is not slow.
 
@@ -83,7 +88,9 @@ class SubgoalPredictor:
         self._device = next(network.parameters()).device
         grey = np.full((*self.image_size, 3), 128, np.uint8)
         pixels = np.array([[0.25, 0.25], [0.5, 0.5]], np.float32) * self.image_size[::-1]
-        goal = {} if self.mode == 'forward' else {'goal': grey, 'goal_pixels': pixels}
+        goal: dict[str, Any] = {}
+        if self.mode == 'bidirectional':
+            goal = {'goal': grey, 'goal_pixels': pixels}
         subgoal, = self.predict(grey, start_pixels=pixels, **goal)
         if not np.allclose(subgoal.object_maps.sum((1, 2)), 1, atol=1e-3):
             raise WeightsError(
@@ -91,7 +98,7 @@ class SubgoalPredictor:
                 'damaged or were not trained, train them again')
 
     @classmethod
-    def load(cls, path, device='cpu'):
+    def load(cls, path: str | Path, device: torch.device | str = 'cpu') -> Self:
         """
         Load a weights file.
 
@@ -102,8 +109,9 @@ class SubgoalPredictor:
         """
         return cls(*load_network(path, device), source=path)
 
-    def predict(self, start, goal=None, start_pixels=None, goal_pixels=None, num_samples=1,
-                recursion_depth=1, seed=0):
+    def predict(self, start: np.ndarray, goal: np.ndarray | None = None,
+                start_pixels: np.ndarray | None = None, goal_pixels: np.ndarray | None = None,
+                num_samples: int = 1, recursion_depth: int = 1, seed: int = 0) -> list[Subgoal]:
         """
         Predict subgoals.
 
@@ -130,7 +138,7 @@ class SubgoalPredictor:
             start, goal, start_pixels, goal_pixels, num_samples, recursion_depth, seed)])[0]
 
     @torch.inference_mode()
-    def predict_together(self, questions):
+    def predict_together(self, questions: Sequence[Question]) -> list[list[Subgoal]]:
         """
         Answer several questions at once, which takes less time than one after the other.
 
@@ -143,10 +151,10 @@ class SubgoalPredictor:
         :raises ConfigError: likewise.
         """
         scenes = [self._check(question) for question in questions]
-        alike = {}  # number of objects: [index of a question]
+        alike: dict[int, list[int]] = {}  # number of objects: [index of a question]
         for index, (_, pixels) in enumerate(scenes):
             alike.setdefault(pixels.shape[1], []).append(index)
-        answers = [None] * len(questions)
+        answers: list[list[Subgoal]] = [[] for _ in questions]
         for chosen in alike.values():
             chosen.sort(key=lambda index: -questions[index].recursion_depth)
             found = self._predict([questions[i] for i in chosen], [scenes[i] for i in chosen])
@@ -154,7 +162,8 @@ class SubgoalPredictor:
                 answers[index] = subgoals
         return answers
 
-    def _predict(self, questions, scenes):
+    def _predict(self, questions: Sequence[Question],
+                 scenes: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[list[Subgoal]]:
         """Answer questions with equally many objects, the deepest recursion first."""
         latent_size = self.config.latent_size
         counts = [question.num_samples if latent_size else 1 for question in questions]
@@ -164,7 +173,7 @@ class SubgoalPredictor:
         maps = _join([  # rows, C, K, H, W
             one_hot_maps(torch.from_numpy(pixels).to(self._device), self.image_size).expand(
                 N, -1, -1, -1, -1) for N, (_, pixels) in zip(counts, scenes)])
-        levels = [[] for _ in questions]
+        levels: list[list[list[Subgoal]]] = [[] for _ in questions]
         for level in range(1, max(question.recursion_depth for question in questions) + 1):
             # Those that go on are the first rows, since the deepest come first.
             going = sum(question.recursion_depth >= level for question in questions)
@@ -188,7 +197,7 @@ class SubgoalPredictor:
         return [[subgoals[n] for n in range(N) for subgoals in chain]
                 for N, chain in zip(counts, levels)]
 
-    def _check(self, question):
+    def _check(self, question: Question) -> tuple[np.ndarray, np.ndarray]:
         """Check a question; return its pictures (C, H, W, 3) and pixels (C, K, 2)."""
         for name in ('num_samples', 'recursion_depth'):
             if getattr(question, name) < 1:
@@ -197,7 +206,9 @@ class SubgoalPredictor:
         return self._check_context(
             question.start, question.goal, question.start_pixels, question.goal_pixels)
 
-    def _check_context(self, start, goal, start_pixels, goal_pixels):
+    def _check_context(self, start: np.ndarray, goal: np.ndarray | None,
+                       start_pixels: np.ndarray | None,
+                       goal_pixels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Check what a prediction is conditioned on: pictures (C, H, W, 3), pixels (C, K, 2)."""
         check_image(start, 'start', self.image_size)
         start_pixels = check_pixels(start_pixels, 'start_pixels')
@@ -217,7 +228,8 @@ class SubgoalPredictor:
         return np.stack([start, goal]), np.stack([start_pixels, goal_pixels])
 
 
-def load_network(path, device='cpu'):
+def load_network(path: str | Path,
+                 device: torch.device | str = 'cpu') -> tuple[Predictor, dict[str, Any]]:
     """
     Load the network of a weights file, in eval mode.
 
@@ -230,15 +242,16 @@ def load_network(path, device='cpu'):
     values, state, training = load_weights(path, 'predictor')
     network = make_network(Predictor, PredictorConfig, values, state, path)
     network.eval().requires_grad_(False)
-    return network.to(device, memory_format=torch.channels_last), training
+    return placed(network, device), training
 
 
-def _join(parts):
+def _join(parts: list[torch.Tensor]) -> torch.Tensor:
     """Join tensors along their first dimension; one alone stays as it is, to the memory format."""
     return parts[0] if len(parts) == 1 else torch.cat(parts)
 
 
-def _to_subgoals(images, warped, counts, level):
+def _to_subgoals(images: torch.Tensor, warped: WarpedMaps, counts: Sequence[int],
+                 level: int) -> list[list[Subgoal]]:
     """Turn the predictions of one level into lists of Subgoal, counts[i] for question i."""
     images = to_uint8(images)
     maps, mass = warped.maps.cpu().numpy(), warped.mass.cpu().numpy()

@@ -7,10 +7,13 @@ The paper only says that the decoder is first trained "as an unconditional frame
 frames from the training videos". Here that is a DCGAN of single frames.
 """
 
+from collections.abc import Callable, Iterator
 import contextlib
 
+import numpy as np
 from tap_ros.images import to_float
-from tap_ros.prediction.networks import decoder, encoder, initialise
+from tap_ros.learning.devices import Autocast, placed
+from tap_ros.prediction.networks import decoder, encoder, initialise, Predictor, PredictorConfig
 import torch
 from torch import nn
 from torch.nn import functional
@@ -19,8 +22,9 @@ from tqdm import tqdm
 _BETAS = (0.5, 0.999)  # DCGAN's; Adam's own 0.9 makes the two networks swing
 
 
-def pretrain_decoders(network, draw_frames, steps, learning_rate=1e-4, seed=0,
-                      autocast=contextlib.nullcontext, progress=False):
+def pretrain_decoders(network: Predictor, draw_frames: Callable[[int], np.ndarray | torch.Tensor],
+                      steps: int, learning_rate: float = 1e-4, seed: int = 0,
+                      autocast: Autocast = contextlib.nullcontext, progress: bool = False) -> None:
     """
     Train a frame generator of the decoders' shape and copy its weights into the decoders.
 
@@ -39,13 +43,14 @@ def pretrain_decoders(network, draw_frames, steps, learning_rate=1e-4, seed=0,
     :param progress: whether to show a progress bar.
     """
     device = next(network.parameters()).device
-    generator, discriminator = (part.to(device, memory_format=torch.channels_last).train()
+    size = network.config.code_size + network.config.latent_size
+    generator, discriminator = (placed(part, device).train()
                                 for part in frame_gan(network.config, seed))
     optimizers = [torch.optim.Adam(part.parameters(), learning_rate, _BETAS, fused=True)
                   for part in (discriminator, generator)]
     for step in tqdm(range(steps), 'pretraining', unit='step', disable=not progress):
         real = to_float(draw_frames(step)).to(device)
-        z = _latent(len(real), generator[0].in_channels, seed, step).to(device)
+        z = _latent(len(real), size, seed, step).to(device)
         for optimizer, loss in zip(
                 optimizers, _losses(generator, discriminator, real, z, autocast)):
             optimizer.zero_grad()
@@ -54,7 +59,7 @@ def pretrain_decoders(network, draw_frames, steps, learning_rate=1e-4, seed=0,
     _copy(generator, network)
 
 
-def frame_gan(config, seed):
+def frame_gan(config: PredictorConfig, seed: int) -> tuple[nn.Sequential, nn.Sequential]:
     """
     Build the two networks of the pretraining.
 
@@ -71,13 +76,14 @@ def frame_gan(config, seed):
         return generator.apply(initialise), discriminator.apply(initialise)
 
 
-def _latent(batch, size, seed, step):
+def _latent(batch: int, size: int, seed: int, step: int) -> torch.Tensor:
     """Draw latent vectors (B, size, 1, 1) from N(0, I), the same ones whenever asked."""
     numbers = torch.Generator().manual_seed((seed << 32) + step)
     return torch.randn(batch, size, 1, 1, generator=numbers)
 
 
-def _losses(generator, discriminator, real, z, autocast):
+def _losses(generator: nn.Sequential, discriminator: nn.Sequential, real: torch.Tensor,
+            z: torch.Tensor, autocast: Autocast) -> Iterator[torch.Tensor]:
     """Yield the discriminator's loss, then, once that was minimised, the generator's."""
     with autocast():
         fake = torch.tanh(generator(z).float())
@@ -91,10 +97,10 @@ def _losses(generator, discriminator, real, z, autocast):
     yield functional.softplus(-judged.float()).mean()
 
 
-def _copy(generator, network):
+def _copy(generator: nn.Sequential, network: Predictor) -> None:
     """Give the network's decoders the generator's weights and statistics."""
     for part in (network.flow_decoder, network.mask_decoder):
-        for mine, trained in zip(part[:-1], generator[:-1]):
+        for mine, trained in zip(list(part)[:-1], list(generator)[:-1]):
             mine.load_state_dict(trained.state_dict())
     if network.pixel_decoder is not None:
         network.pixel_decoder.load_state_dict(generator.state_dict())

@@ -3,7 +3,7 @@
 """The recognition network q_phi(z | X) of the time-agnostic CVAE (section 3.4, Eq. 9)."""
 
 from tap_ros.errors import ConfigError
-from tap_ros.prediction.networks import encoder, initialise
+from tap_ros.prediction.networks import encoder, initialise, PredictorConfig
 import torch
 from torch import nn
 
@@ -24,7 +24,7 @@ class Recognition(nn.Module):
     :raises ConfigError: if that predictor has no z.
     """
 
-    def __init__(self, config, num_images):
+    def __init__(self, config: PredictorConfig, num_images: int) -> None:
         super().__init__()
         if config.latent_size < 1:
             raise ConfigError('latent_size: a recognition network needs at least 1, got '
@@ -36,7 +36,7 @@ class Recognition(nn.Module):
             nn.Conv2d(widths[-1], 2 * config.latent_size, 4))
         self.apply(initialise)
 
-    def forward(self, images):
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """
         Infer the posterior.
 
@@ -48,7 +48,8 @@ class Recognition(nn.Module):
         return mean, log_variance.clamp(*_LOG_VARIANCE_RANGE)
 
 
-def sample_latent(mean, log_variance, noise):
+def sample_latent(mean: torch.Tensor, log_variance: torch.Tensor,
+                  noise: torch.Tensor) -> torch.Tensor:
     """
     Draw z from the posterior, so that gradients reach its parameters.
 
@@ -60,7 +61,7 @@ def sample_latent(mean, log_variance, noise):
     return mean + torch.exp(log_variance / 2) * noise
 
 
-def kl_divergence(mean, log_variance):
+def kl_divergence(mean: torch.Tensor, log_variance: torch.Tensor) -> torch.Tensor:
     """
     Compute the divergence of the posterior from the prior N(0, I) (Eqs. 8 to 10).
 

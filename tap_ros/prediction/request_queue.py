@@ -3,11 +3,16 @@
 """Requests that wait, and the thread that answers what waits together."""
 
 from collections import deque
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 import threading
 import traceback
+from typing import Generic, TypeVar
 
 from tap_ros.errors import TapError
+
+Request = TypeVar('Request')
+Answer = TypeVar('Answer')
 
 THREAD_NAME = 'request queue'
 PREPARE_TIMEOUT = 8.0  # s that an interrupted start waits for what it was preparing
@@ -17,7 +22,7 @@ class Busy(TapError):
     """A request cannot wait: too many do already, or nobody answers any more."""
 
 
-class RequestQueue:
+class RequestQueue(Generic[Request, Answer]):
     """
     Answer requests in batches, in a thread of its own; every request is answered exactly once.
 
@@ -32,14 +37,16 @@ class RequestQueue:
     :raises Exception: what `prepare` raises.
     """
 
-    def __init__(self, prepare, cost, max_waiting, max_together, max_cost):
+    def __init__(self, prepare: Callable[[], Callable[[list[Request]], Iterable[Answer]]],
+                 cost: Callable[[Request], float], max_waiting: int, max_together: int,
+                 max_cost: float) -> None:
         self._cost = cost
         self._max_waiting = max_waiting
         self._max_together, self._max_cost = max_together, max_cost
-        self._waiting = deque()  # (request, answer)
+        self._waiting: deque[tuple[Request, Callable[[Answer | Exception], object]]] = deque()
         self._changed = threading.Condition()
         self._ending = False
-        prepared = Future()
+        prepared: Future[None] = Future()
         self._thread = threading.Thread(
             target=self._run, args=(prepare, prepared), name=THREAD_NAME, daemon=True)
         try:
@@ -53,11 +60,11 @@ class RequestQueue:
                 self._thread.join(PREPARE_TIMEOUT)
             raise
 
-    def __len__(self):
+    def __len__(self) -> int:
         """Return how many requests wait."""
         return len(self._waiting)
 
-    def put(self, request, answer):
+    def put(self, request: Request, answer: Callable[[Answer | Exception], object]) -> None:
         """
         Let a request wait for its answer.
 
@@ -75,7 +82,7 @@ class RequestQueue:
             self._waiting.append((request, answer))
             self._changed.notify()
 
-    def close(self, timeout_s):
+    def close(self, timeout_s: float) -> None:
         """
         Answer what still waits with Busy, and end the thread after its batch.
 
@@ -90,7 +97,8 @@ class RequestQueue:
             answer(Busy('busy: the node is ending; ask again when it is back'))
         self._thread.join(timeout_s)
 
-    def _run(self, prepare, prepared):
+    def _run(self, prepare: Callable[[], Callable[[list[Request]], Iterable[Answer]]],
+             prepared: Future[None]) -> None:
         try:
             self._work = prepare()
         except BaseException as error:
@@ -109,9 +117,10 @@ class RequestQueue:
                 except Exception:  # else all that wait would wait for ever
                     traceback.print_exc()
 
-    def _take(self):
+    def _take(self) -> list[tuple[Request, Callable[[Answer | Exception], object]]]:
         """Take the oldest requests, as many as go together."""
-        batch, cost = [], 0
+        batch: list[tuple[Request, Callable[[Answer | Exception], object]]] = []
+        cost = 0.0
         while self._waiting and len(batch) < self._max_together:
             cost += self._cost(self._waiting[0][0])
             if batch and cost > self._max_cost:
@@ -119,7 +128,7 @@ class RequestQueue:
             batch.append(self._waiting.popleft())
         return batch
 
-    def _answers(self, requests):
+    def _answers(self, requests: list[Request]) -> Iterable[Answer | Exception]:
         """Yield the answers of a batch, in its order; an exception stands for one that failed."""
         try:
             found = self._work(requests)

@@ -2,7 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which frame a prediction is trained towards: the selection error E' and its argmin (Eq. 5)."""
 
+from collections.abc import Callable
+
 from tap_ros.images import to_float
+from tap_ros.prediction.augmentation import Augmentation
+from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import (
     bell_preference,
     cost_of_reaching,
@@ -16,12 +20,13 @@ from tap_ros.prediction.losses import (
     weighted_l1_error,
 )
 from tap_ros.prediction.methods import DEFAULT_BETA
+from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
 _POWER_OFFSET = 1e-4  # keeps the slope of a power finite at an error of 0
 
 
-def time_preference(batch, config):
+def time_preference(batch: Batch, config: ObjectiveSettings) -> torch.Tensor:
     """
     Compute w(t) for the configured method: linear in forward prediction, else a bell.
 
@@ -36,7 +41,8 @@ def time_preference(batch, config):
     return bell_preference(batch.times, batch.first, batch.last, config.bell_edge)
 
 
-def selection_errors(error, copy_error, batch, config):
+def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor], batch: Batch,
+                     config: ObjectiveSettings) -> torch.Tensor:
     """
     Compute E'_t of Eq. 5 for the configured method.
 
@@ -58,6 +64,11 @@ def selection_errors(error, copy_error, batch, config):
     return preferred_error(error, preference)
 
 
+# The type of selection_errors.
+Selection = Callable[
+    [torch.Tensor, Callable[[], torch.Tensor], Batch, ObjectiveSettings], torch.Tensor]
+
+
 class Targets:
     """
     The frames of a batch that predictions are compared with.
@@ -67,16 +78,18 @@ class Targets:
     :param config: ObjectiveSettings.
     """
 
-    def __init__(self, batch, augmentation, config):
+    def __init__(self, batch: Batch, augmentation: Augmentation | None,
+                 config: ObjectiveSettings) -> None:
         self.batch, self.augmentation, self.config = batch, augmentation, config
         self.rows = torch.arange(len(batch.context), device=batch.context.device)
 
-    def frame(self, step):
+    def frame(self, step: torch.Tensor) -> torch.Tensor:
         """Return the augmented frames (B, 3, H, W) at indices step (B,) into T."""
         frame = to_float(self.batch.targets[self.rows, step])[:, None]
         return (self.augmentation.apply(frame) if self.augmentation else frame)[:, 0]
 
-    def match(self, image, context, selection, batch=None):
+    def match(self, image: torch.Tensor, context: torch.Tensor, selection: Selection,
+              batch: Batch | None = None) -> torch.Tensor:
         """
         Find the target that each prediction is trained towards, the argmin of Eq. 5.
 
@@ -98,13 +111,14 @@ class Targets:
             error, lambda: self.errors(context.detach()), batch, self.config)
         return match_step(selection_error, batch.valid)
 
-    def errors(self, images):
+    def errors(self, images: torch.Tensor) -> torch.Tensor:
         """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
         if self.augmentation:
             images = self.augmentation.undo(images)
         return l1_errors(images, self.batch.targets.movedim(-1, 2))
 
-    def outer_l1(self, image, step, context):
+    def outer_l1(self, image: torch.Tensor, step: torch.Tensor,
+                 context: torch.Tensor) -> torch.Tensor:
         """
         Measure the l1 error of E_t, with the configured weight on changed pixels.
 
@@ -115,13 +129,13 @@ class Targets:
         """
         return weighted_l1_error(image, self.frame(step), context, self.config.changed_weight)
 
-    def loss(self, image, step, context):
+    def loss(self, image: torch.Tensor, step: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
         """Return E_t: the l1 error at step, to the configured power, as a mean."""
         return fixed_time_loss(
             lambda step: outer_error(self.outer_l1(image, step, context), self.config), step)
 
 
-def outer_error(error, config):
+def outer_error(error: torch.Tensor, config: ObjectiveSettings) -> torch.Tensor:
     """
     Raise errors to the configured power; not in the paper, see objective.predictor_loss.
 

@@ -35,14 +35,14 @@ class Options(ModelOption):
     optimizer: OptimizerSettings = OptimizerSettings()
 
     @property
-    def config(self):
+    def config(self) -> TrainingConfig:
         """All of them as a TrainingConfig."""
         parts = (self.run, self.objective, self.data, self.network, self.optimizer)
         return TrainingConfig(**{
             name: value for part in parts for name, value in asdict(part).items()})
 
 
-def run(args):
+def run(args: Options) -> None:
     """Train as the command line says, and print where the weights are."""
     from tap_ros.learning.parallel import local_rank  # torch takes seconds, --help does without
     from tap_ros.prediction.training import train

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training the predictor on recordings (section 3, appendix C)."""
 
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import asdict
@@ -10,19 +11,20 @@ import math
 import os
 from pathlib import Path
 import time
+from typing import Any
 
 import numpy as np
 from tap_ros.errors import ConfigError
-from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start
-from tap_ros.learning.devices import make_autocast, pick_device
-from tap_ros.learning.frames import MappedFrames, ResidentFrames
-from tap_ros.learning.parallel import joined, share_batch_norm
+from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
+from tap_ros.learning.devices import Autocast, make_autocast, pick_device
+from tap_ros.learning.frames import Frames, MappedFrames, ResidentFrames
+from tap_ros.learning.parallel import joined, Processes, share_batch_norm
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
 from tap_ros.learning.schedule import learning_rate
 from tap_ros.learning.split import split_episodes
 from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.augmentation import Augmentation
-from tap_ros.prediction.batches import episode_order, make_batch, Sampling
+from tap_ros.prediction.batches import Batch, episode_order, make_batch, Sampling
 from tap_ros.prediction.discriminator import Discriminator
 from tap_ros.prediction.held_out import held_out_scores, matched
 from tap_ros.prediction.networks import Predictor, PredictorConfig
@@ -30,14 +32,15 @@ from tap_ros.prediction.objective import (
     discriminators_loss,
     Draws,
     Networks,
+    Outcome,
     predictor_loss,
 )
 from tap_ros.prediction.pictures import sample_grid
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.pretraining import pretrain_decoders
 from tap_ros.prediction.recognition import Recognition
-from tap_ros.prediction.training_config import DEFAULTS
-from tap_ros.recording.cache import open_recordings
+from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
+from tap_ros.recording.cache import EpisodeStore, open_recordings
 import torch
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -45,7 +48,8 @@ from tqdm import tqdm
 _SHOWN = 8  # episodes in a sample picture
 
 
-def train(config, stop_at=None, minutes=None, progress=True):
+def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | None = None,
+          progress: bool = True) -> str:
     """
     Train a predictor, or go on with a run that was interrupted.
 
@@ -75,7 +79,8 @@ def train(config, stop_at=None, minutes=None, progress=True):
     return str(Path(config.out) / 'predictor.safetensors')
 
 
-def _train(config, device, processes, store, stop_at, deadline, progress):
+def _train(config: TrainingConfig, device: torch.device, processes: Processes, store: EpisodeStore,
+           stop_at: int | None, deadline: float, progress: bool) -> None:
     """Train as the only run in the folder; see train."""
     training, held_out = split_episodes(store, config.test_fraction)
     torch.manual_seed(config.seed)
@@ -101,17 +106,17 @@ def _train(config, device, processes, store, stop_at, deadline, progress):
         state.average.load_state_dict(state.network.state_dict())
         if processes.first:
             save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
-    compiled = torch.compile if config.compile else lambda module: module
+    compiled: Callable[[Any], Any] = (
+        torch.compile if config.compile else lambda module: module)
     networks = Networks(compiled(state.network), **{
         name: compiled(helper) for name, helper in state.helpers.items()})
     last = min(config.steps, stop_at or config.steps)
-    writes = processes.first
     report = partial(_report, config=config, store=store, frames=frames, training=training,
                      held_out=held_out, autocast=autocast)
     bar = tqdm(total=config.steps, initial=state.step, desc=config.method, unit='step',
                disable=not progress)
-    curves = SummaryWriter(config.out, purge_step=state.step) if writes else nullcontext()
-    with curves, bar:
+    curves = SummaryWriter(config.out, purge_step=state.step) if processes.first else None
+    with curves or nullcontext(), bar:
         began = time.monotonic() - state.seconds
         for step, batch, augmentation in _batches(
                 store, frames, training, config, processes, state.step, last):
@@ -130,12 +135,13 @@ def _train(config, device, processes, store, stop_at, deadline, progress):
             bar.update()
             if state.step % config.log_every == 0:
                 values = _values(outcome, batch, processes)
-                if writes:
+                if curves is not None:
                     _log(curves, bar, state.step, values, norm,
                          state.optimizers[0].param_groups[0]['lr'])
             late = math.isfinite(deadline) and processes.agree(
                 time.monotonic() > deadline, device)
-            if writes and (state.step % config.save_every == 0 or state.step == last or late):
+            if curves is not None and (
+                    state.step % config.save_every == 0 or state.step == last or late):
                 state.seconds = time.monotonic() - began
                 report(state, curves)  # first: a run that is stopped in between reports again
                 save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
@@ -143,7 +149,7 @@ def _train(config, device, processes, store, stop_at, deadline, progress):
                 break
 
 
-def network_config(config, image_size):
+def network_config(config: TrainingConfig, image_size: tuple[int, int]) -> PredictorConfig:
     """
     Say which network a training run needs.
 
@@ -162,7 +168,7 @@ def network_config(config, image_size):
                            new_pixels=config.new_pixels, flow_scale=config.flow_scale)
 
 
-def _begin_with(network, weights):
+def _begin_with(network: Predictor, weights: str) -> None:
     """Copy the weights of another training into a fresh network."""
     other, _ = load_network(weights)
     if other.config != network.config:
@@ -173,7 +179,9 @@ def _begin_with(network, weights):
     network.load_state_dict(other.state_dict())
 
 
-def _step(state, networks, batch, augmentation, draws, config, processes, autocast):
+def _step(state: TrainingState[Predictor], networks: Networks, batch: Batch,
+          augmentation: Augmentation, draws: Draws, config: TrainingConfig, processes: Processes,
+          autocast: Autocast) -> tuple[Outcome, torch.Tensor]:
     """Do one step of the predictor, then one of the discriminators; return (Outcome, norm)."""
     state.network.train()
     state.helpers.train()
@@ -200,9 +208,11 @@ def _step(state, networks, batch, augmentation, draws, config, processes, autoca
     return outcome, norm
 
 
-def _helpers(config, shape, store):
+def _helpers(config: TrainingConfig, shape: PredictorConfig,
+             store: EpisodeStore) -> dict[str, torch.nn.Module]:
     """Make the networks that the method needs for its training alone."""
-    helpers, method = {}, config.chosen
+    helpers: dict[str, torch.nn.Module] = {}
+    method = config.chosen
     longest = int(store.lengths.max())
     if method.vae:
         images = (config.video_frames if config.posterior == 'video'
@@ -215,14 +225,17 @@ def _helpers(config, shape, store):
     return helpers
 
 
-def _single_frames(store, frames, episodes, config, step):
+def _single_frames(store: EpisodeStore, frames: Frames, episodes: np.ndarray,
+                   config: TrainingConfig, step: int) -> torch.Tensor:
     """Draw single frames of the training episodes, for the decoders' pretraining."""
     rng = np.random.default_rng([config.seed, 3, step])
     chosen = rng.choice(episodes, config.batch_size)
     return frames(chosen, rng.integers(store.lengths[chosen])[:, None])[:, 0]
 
 
-def _batches(store, frames, episodes, config, processes, first, last):
+def _batches(store: EpisodeStore, frames: Frames, episodes: np.ndarray, config: TrainingConfig,
+             processes: Processes, first: int,
+             last: int) -> Iterator[tuple[int, Batch, Augmentation]]:
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
     whole = config.chosen.vae and config.posterior == 'video'
     sampling = Sampling(
@@ -232,7 +245,7 @@ def _batches(store, frames, episodes, config, processes, first, last):
 
     part = processes.part(config.batch_size)
 
-    def make(step):
+    def make(step: int) -> tuple[int, Batch, Augmentation]:
         rng = np.random.default_rng([config.seed, 2, step])
         chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
         batch = make_batch(store, chosen, sampling, frames, rng, part)
@@ -248,26 +261,29 @@ def _batches(store, frames, episodes, config, processes, first, last):
             yield ahead.pop(0).result()
 
 
-def _values(outcome, batch, processes):
+def _values(outcome: Outcome, batch: Batch, processes: Processes) -> dict[str, float]:
     """Return what the curves show of a step, by name: means over the whole batch."""
     fraction = batch.times.gather(1, outcome.match[:, None]) / batch.end
     values = {'loss': outcome.loss, 'match_fraction': fraction.mean(),
               'match_fraction_square': fraction.square().mean(),
               **{f'loss_{name}': value for name, value in outcome.parts.items()}}
     means = processes.mean(torch.stack([value.detach().float() for value in values.values()]))
-    values = dict(zip(values, means.tolist()))
-    variance = values.pop('match_fraction_square') - values['match_fraction'] ** 2
-    return values | {'match_fraction_std': math.sqrt(max(variance, 0))}
+    shown: dict[str, float] = dict(zip(values, means.tolist()))
+    variance = shown.pop('match_fraction_square') - shown['match_fraction'] ** 2
+    return shown | {'match_fraction_std': math.sqrt(max(variance, 0))}
 
 
-def _log(curves, bar, step, values, norm, rate):
+def _log(curves: SummaryWriter, bar: tqdm, step: int, values: dict[str, float], norm: torch.Tensor,
+         rate: float) -> None:
     """Add a point to the curves and to the progress bar."""
     for name, value in {**values, 'gradient_norm': norm.item(), 'learning_rate': rate}.items():
         curves.add_scalar(f'train/{name}', value, step)
     bar.set_postfix(loss=f'{values["loss"]:.4f}', match=f'{values["match_fraction"]:.2f}')
 
 
-def _report(state, curves, config, store, frames, training, held_out, autocast):
+def _report(state: TrainingState[Predictor], curves: SummaryWriter, config: TrainingConfig,
+            store: EpisodeStore, frames: Frames, training: np.ndarray, held_out: np.ndarray,
+            autocast: Autocast) -> None:
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
     device = next(state.average.parameters()).device
 
@@ -275,7 +291,7 @@ def _report(state, curves, config, store, frames, training, held_out, autocast):
         config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
         forward=config.forward, fraction=config.chosen.fraction)
 
-    def batch(episodes):
+    def batch(episodes: np.ndarray) -> Batch:
         return make_batch(store, episodes, sampling, frames).to(device)
 
     scores = {}

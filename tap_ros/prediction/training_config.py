@@ -9,11 +9,11 @@ one flat list.
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import get_args, Literal
+from typing import Any, get_args, Literal
 
 from tap_ros.errors import ConfigError
 from tap_ros.learning.split import TEST_FRACTION
-from tap_ros.prediction.methods import Mode, parse_method
+from tap_ros.prediction.methods import Method, Mode, parse_method
 
 GoalPicture = Literal['last', 'recorded', 'mixed']
 Posterior = Literal['video', 'frame']
@@ -48,7 +48,7 @@ class RunSettings:
     log_every: int = 20
     save_every: int = 500
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse settings that cannot be run with."""
         if not self.recordings:
             raise ConfigError('recordings: expected at least one .mcap file or bag folder')
@@ -90,7 +90,7 @@ class ObjectiveSettings:
     kl_weight: float = 1e-4
     posterior: Posterior = 'video'
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a loss that there is not."""
         _check_choice(self, mode=Mode, posterior=Posterior)
         _check_least(self, 1, 'recursion')
@@ -109,12 +109,12 @@ class ObjectiveSettings:
                               'recursion')
 
     @cached_property
-    def chosen(self):
+    def chosen(self) -> Method:
         """The Method that `method` names."""
         return parse_method(self.method)
 
     @property
-    def forward(self):
+    def forward(self) -> bool:
         """Whether the start picture is all of the context."""
         return self.mode == 'forward'
 
@@ -144,7 +144,7 @@ class DataSettings:
     colour: bool = True
     brightness: float = 0.2
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse what cannot be taken from episodes."""
         _check_choice(self, goal_picture=GoalPicture)
         _check_least(self, 0, 'margin', 'num_targets', 'max_frames')
@@ -177,7 +177,7 @@ class NetworkSettings:
     initial_weights: str = ''
     pretrain_steps: int = 0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse networks that there are not."""
         if self.initial_weights and self.pretrain_steps:
             raise ConfigError('initial_weights: they have decoders already; expected '
@@ -209,7 +209,7 @@ class OptimizerSettings:
     gradient_clip: float = 1.0
     average_decay: float = 0.999
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse what cannot be optimised with."""
         _check_least(self, 1, 'steps', 'batch_size')
         _check_least(self, 0, 'warmup')
@@ -222,17 +222,17 @@ class TrainingConfig(
         OptimizerSettings, NetworkSettings, DataSettings, ObjectiveSettings, RunSettings):
     """All that a training run is made from: the fields of its parts."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse settings that cannot be trained with."""
         for part in PARTS:
             part.__post_init__(self)
 
 
-PARTS = TrainingConfig.__bases__
+PARTS: tuple[type[Any], ...] = TrainingConfig.__bases__
 DEFAULTS = {field.name: field.default for field in fields(TrainingConfig)}
 
 
-def _check_choice(config, **choices):
+def _check_choice(config: object, **choices: Any) -> None:
     """Refuse a field that is none of its choices, a Literal."""
     for name, valid in choices.items():
         if getattr(config, name) not in get_args(valid):
@@ -240,7 +240,7 @@ def _check_choice(config, **choices):
                               f'got {getattr(config, name)!r}')
 
 
-def _check_least(config, least, *names):
+def _check_least(config: object, least: float, *names: str) -> None:
     """Refuse fields that are less than they can be."""
     for name in names:
         if getattr(config, name) < least:
@@ -248,7 +248,7 @@ def _check_least(config, least, *names):
             raise ConfigError(f'{name}: expected {wanted}, got {getattr(config, name)}')
 
 
-def _check_range(config, **ranges):
+def _check_range(config: object, **ranges: tuple[float, float]) -> None:
     """Refuse fields outside their range."""
     for name, (low, high) in ranges.items():
         if not low <= getattr(config, name) <= high:

@@ -7,6 +7,7 @@ A flow (du, dv) in pixels at pixel (u, v) says that the output there is read fro
 (u + du, v + dv). Pixel (0, 0) is the centre of the top-left pixel.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,7 +31,7 @@ class WarpedMaps:
     mass: torch.Tensor
 
 
-def warp(images, flow):
+def warp(images: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
     """
     Read each pixel of the output where the flow points to, bilinearly.
 
@@ -49,7 +50,8 @@ def warp(images, flow):
     return warped.unflatten(0, (B, C))
 
 
-def combine(warped, masks, new_pixels=None):
+def combine(warped: torch.Tensor, masks: torch.Tensor,
+            new_pixels: torch.Tensor | None = None) -> torch.Tensor:
     """
     Blend warped pictures, and new pixels if there are any, by masks.
 
@@ -63,7 +65,7 @@ def combine(warped, masks, new_pixels=None):
     return image if new_pixels is None else image + masks[:, C] * new_pixels
 
 
-def one_hot_maps(pixels, size):
+def one_hot_maps(pixels: torch.Tensor, size: Sequence[int]) -> torch.Tensor:
     """
     Draw each position as a map that sums to 1 and has its mean there.
 
@@ -83,7 +85,7 @@ def one_hot_maps(pixels, size):
     return along_v[..., :, None] * along_u[..., None, :]
 
 
-def expected_pixels(maps):
+def expected_pixels(maps: torch.Tensor) -> torch.Tensor:
     """
     Take the mean position under each map.
 
@@ -96,7 +98,8 @@ def expected_pixels(maps):
     return torch.stack([u, v], -1)
 
 
-def warp_object_maps(maps, flow, masks, min_mass=MIN_MASS):
+def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor, masks: torch.Tensor,
+                     min_mass: float = MIN_MASS) -> WarpedMaps:
     """
     Find where a prediction puts each object, by its own flow and masks (appendix E).
 
@@ -126,7 +129,7 @@ def warp_object_maps(maps, flow, masks, min_mass=MIN_MASS):
     return WarpedMaps(warped / warped.sum((-2, -1), keepdim=True), mass)
 
 
-def blur(maps, sigma=1.0):
+def blur(maps: torch.Tensor, sigma: float = 1.0) -> torch.Tensor:
     """
     Blur maps by a Gaussian; at the border mass stays inside.
 

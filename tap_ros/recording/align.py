@@ -7,14 +7,16 @@ By the marks on /episode, by header stamps where messages have them and by log t
 not: a frame belongs to an episode whose marks enclose its stamp, and that is nearest in the log.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import warnings
 
 import numpy as np
-from tap_ros.recording.columns import pad_objects
+from numpy.typing import DTypeLike
+from tap_ros.recording.columns import Columns, pad_objects
 from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.losses import EVERYTHING, FAR, seconds
-from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans
+from tap_ros.recording.spans import assign, in_gaps, Mark, MAX_JITTER_NS, read_spans, Span
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
 _LOOKED_AT = 4096  # messages looked at together
@@ -38,23 +40,23 @@ _EMPTY = {
 class EpisodeTable:
     """The episodes of files that follow each other; F frames in E episodes, K objects at most."""
 
-    parts: list  # of Columns, one a file
+    parts: Sequence[Columns]  # one a file
     starts: np.ndarray  # (E + 1,) int64: episode i has the rows starts[i] to starts[i + 1]
-    spans: list  # of E spans
+    spans: list[Span]  # E
     file: np.ndarray  # (F,) int64, index into parts
     row: np.ndarray  # (F,) int64, index into the frames of that part
     stamps: np.ndarray  # (F,) int64
     actions: np.ndarray  # (F, 4) float32
     grippers: np.ndarray  # (F, 4) float32
     objects: np.ndarray  # (F, K, 9) float64: u, v, pose
-    names: list  # of E tuples
-    goals: list  # of E pairs (index into parts, index into goal_frames), or None
+    names: list[tuple[str, ...]]  # E
+    goals: list[tuple[int, int] | None]  # E: index into parts, index into goal_frames
     goal_objects: np.ndarray  # (E, K, 9) float64
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.spans)
 
-    def frames(self, i):
+    def frames(self, i: int) -> np.ndarray:
         """Return the frames of episode i, (T, H, W, 3) uint8, a view unless it is in two files."""
         rows = slice(self.starts[i], self.starts[i + 1])
         file, row = self.file[rows], self.row[rows]
@@ -64,11 +66,13 @@ class EpisodeTable:
             for f, r in zip(np.split(file, runs), np.split(row, runs), strict=True)]
         return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
-    def episode(self, i):
+    def episode(self, i: int) -> Episode:
         """Return episode i."""
         rows, K = slice(self.starts[i], self.starts[i + 1]), len(self.names[i])
         objects, goal_objects = self.objects[rows, :K], self.goal_objects[i, :K]
-        goal, span = self.goals[i], self.spans[i]
+        goal, goal_frame, span = self.goals[i], None, self.spans[i]
+        if goal is not None and (known := self.parts[goal[0]].goal_frames) is not None:
+            goal_frame = known[goal[1]]
         with np.errstate(over='ignore'):  # absurd pixels become infinite
             pixels, goal_pixels = (
                 a[..., :2].astype(np.float32) for a in (objects, goal_objects))
@@ -76,25 +80,24 @@ class EpisodeTable:
             frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
             grippers=self.grippers[rows], object_names=self.names[i],
             object_pixels=pixels, object_poses=objects[..., 2:],
-            goal_frame=None if goal is None else self.parts[goal[0]].goal_frames[goal[1]],
-            goal_pixels=goal_pixels, goal_poses=goal_objects[:, 2:],
-            task=span.task, seed=span.seed, outcome=span.outcome)
+            goal_frame=goal_frame, goal_pixels=goal_pixels, goal_poses=goal_objects[:, 2:],
+            task=span.task, seed=span.seed, outcome=span.outcome or '')
 
 
-def follows(before, after):
+def follows(before: Columns, after: Columns) -> bool:
     """
     Tell whether one file goes on where another ends, as the files of a split bag do.
 
     :param before, after: Columns.
     """
-    def times(columns):
+    def times(columns: Columns) -> tuple[list[int], list[int]]:
         logs = [a for k, a in columns.arrays.items() if k.endswith('_log') and len(a)]
         return [log[0] for log in logs], [log[-1] for log in logs]
     (_, ends), (starts, _) = times(before), times(after)
     return not ends or not starts or min(starts) >= max(ends) - MAX_JITTER_NS
 
 
-def assemble(parts):
+def assemble(parts: Sequence[Columns]) -> EpisodeTable:
     """
     Cut files that follow each other into episodes.
 
@@ -138,7 +141,7 @@ def assemble(parts):
 class _Clock:
     """One increasing time over all frames: the episodes laid end to end with room between."""
 
-    def __init__(self, spans, starts, stamps):
+    def __init__(self, spans: list[Span], starts: np.ndarray, stamps: np.ndarray) -> None:
         self.spans, self.starts, self.stamps = spans, starts, stamps
         counts = np.diff(starts)
         self.owner = np.repeat(np.arange(len(counts)), counts)  # (F,) episode of each frame
@@ -150,7 +153,7 @@ class _Clock:
         self.base = np.cumsum(room) - room
         self.frames = self.base[self.owner] + stamps - self.first[self.owner]  # (F,) increasing
 
-    def rows(self, log, stamps):
+    def rows(self, log: np.ndarray, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (times, rows): of the messages that belong to an episode, sorted by time."""
         if not len(self.spans):
             return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -162,7 +165,7 @@ class _Clock:
         order = np.argsort(times, kind='stable')
         return times[order], rows[order]
 
-    def nearest_rows(self, log, stamps):
+    def nearest_rows(self, log: np.ndarray, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (rows, found): for each frame the message nearest in time, or the newest."""
         times, rows = self.rows(log, stamps)
         if not len(times):
@@ -174,7 +177,8 @@ class _Clock:
         best = np.where(nearer, after, before)
         return rows[best], np.abs(times[best] - self.frames) <= self.match
 
-    def nearest(self, log, stamps, values, dtype):
+    def nearest(self, log: np.ndarray, stamps: np.ndarray, values: np.ndarray,
+                dtype: DTypeLike) -> np.ndarray:
         """Return the nearest values, NaN where none is near."""
         rows, found = self.nearest_rows(log, stamps)
         out = np.full((len(rows), *values.shape[1:]), np.nan, dtype)
@@ -182,10 +186,14 @@ class _Clock:
         return out
 
 
-def _join(parts):
+def _join(parts: Sequence[Columns]) -> tuple[
+        dict[str, np.ndarray], list[tuple[str, ...]], list[Mark]]:
     """Put the columns of several files one behind the other."""
-    data = {key: [] for key in (*_EMPTY, 'frame_file', 'frame_row', 'goal_file')}
-    numbers, marks, newest = {}, [], -FAR
+    data: dict[str, list[np.ndarray]] = {
+        key: [] for key in (*_EMPTY, 'frame_file', 'frame_row', 'goal_file')}
+    numbers: dict[tuple[str, ...], int] = {}
+    marks: list[Mark] = []
+    newest = -FAR
     for index, part in enumerate(parts):
         arrays = {k: part.arrays.get(k, np.empty(s, d)) for k, (s, d) in _EMPTY.items()}
         local = np.array(
@@ -211,7 +219,7 @@ def _join(parts):
     return {key: np.concatenate(value) for key, value in data.items()}, list(numbers), marks
 
 
-def _owner(spans, data, parts):
+def _owner(spans: list[Span], data: dict[str, np.ndarray], parts: Sequence[Columns]) -> np.ndarray:
     """Return (F,) int64: the episode of each frame, -1 for none; count those nobody knows."""
     owner = assign(spans, data['frame_log'], data['frame_stamp'])
     unsure = np.array([span.outcome is None for span in spans])[owner]
@@ -226,7 +234,7 @@ def _owner(spans, data, parts):
     return np.where(unsure, -1, owner)
 
 
-def _drop_stops(data):
+def _drop_stops(data: dict[str, np.ndarray]) -> None:
     """
     Leave out zero twists without a stamp among stamped ones: they say stop, and answer no frame.
 
@@ -238,7 +246,7 @@ def _drop_stops(data):
             data[key] = data[key][~stops]
 
 
-def _stamp_unstamped(data, name):
+def _stamp_unstamped(data: dict[str, np.ndarray], name: str) -> None:
     """Give messages without a stamp that of the newest frame logged before."""
     stamps, frames = data[f'{name}_stamp'], data['frame_stamp']
     if len(frames) and (stamps == 0).any():
@@ -246,7 +254,7 @@ def _stamp_unstamped(data, name):
         data[f'{name}_stamp'] = np.where(stamps == 0, frames[np.maximum(newest, 0)], stamps)
 
 
-def _actions(data, clock, frame_log):
+def _actions(data: dict[str, np.ndarray], clock: _Clock, frame_log: np.ndarray) -> np.ndarray:
     """
     Return (F, 4) float32: row t is what was sent between frame t and frame t + 1, the last wins.
 
@@ -269,7 +277,7 @@ def _actions(data, clock, frame_log):
     return actions
 
 
-def _begins(clock, frame_log):
+def _begins(clock: _Clock, frame_log: np.ndarray) -> np.ndarray:
     """Return (E,) log times from which commands count: of the first frame, cut off or not."""
     begins = frame_log[clock.starts[:-1]]
     for i, span in enumerate(clock.spans):
@@ -281,7 +289,7 @@ def _begins(clock, frame_log):
     return begins
 
 
-def _newest(data, name, span):
+def _newest(data: dict[str, np.ndarray], name: str, span: Span) -> int:
     """
     Return the row of the last message up to the end of an episode, -1 for none.
 
@@ -300,7 +308,7 @@ def _newest(data, name, span):
     return -1
 
 
-def _pick_names(data, clock):
+def _pick_names(data: dict[str, np.ndarray], clock: _Clock) -> tuple[np.ndarray, np.ndarray]:
     """Return the number of each episode's object names and the row of its goal objects, or -1."""
     rows, found = clock.nearest_rows(data['object_log'], data['object_stamp'])
     seen = np.where(found, data['object_names'][rows] if len(data['object_names']) else -1, -1)
@@ -317,7 +325,8 @@ def _pick_names(data, clock):
     return picked, goal_rows
 
 
-def _by_name(rows, found, values, numbers, names, wanted):
+def _by_name(rows: np.ndarray, found: np.ndarray, values: np.ndarray, numbers: np.ndarray,
+             names: Sequence[tuple[str, ...]], wanted: np.ndarray) -> np.ndarray:
     """
     Return (N, K, 9): the values of picked messages with their objects in the wanted order.
 

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the bags at a path, their files and their topics; say what is wrong with them."""
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 import warnings
 
 from tap_ros.errors import RecordingError
 from tap_ros.recording import topics
-from tap_ros.recording.container import McapFile
+from tap_ros.recording.columns import Columns
+from tap_ros.recording.container import Channel, McapFile
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.losses import describe
 from tap_ros.recording.messages import check_schema
@@ -15,7 +17,7 @@ from tap_ros.recording.metadata import bag_files, FILE_NAME
 from tap_ros.text import escaped
 
 
-def find_bags(path):
+def find_bags(path: str | Path) -> list[list[Path]]:
     """
     Return the bags at a path: a list of lists of .mcap files, in playing order.
 
@@ -41,7 +43,7 @@ def find_bags(path):
     return bags
 
 
-def find_topics(files, image_topic=None):
+def find_topics(files: Sequence[Path], image_topic: str | None = None) -> dict[str, str]:
     """
     Find the topics of a bag.
 
@@ -49,7 +51,8 @@ def find_topics(files, image_topic=None):
     :param image_topic: as in open_recordings.
     :return: as topics.resolve.
     """
-    channels, damage = {}, []
+    channels: dict[str, Channel] = {}
+    damage = []
     for path in files:
         file = McapFile(path)
         channels |= file.topics()
@@ -72,12 +75,12 @@ def find_topics(files, image_topic=None):
     return found
 
 
-def check_sizes(parts):
+def check_sizes(parts: Sequence[Columns]) -> None:
     """Refuse recordings whose images differ in size, naming them."""
-    sizes = {}
+    sizes: dict[tuple[int, int], str] = {}
     for part in parts:
         if part.image_size is not None:
-            sizes.setdefault(tuple(part.image_size), part.source)
+            sizes.setdefault(part.image_size, part.source)
     if not sizes:
         why = next((f'{part.source}: {part.damage[0]}' for part in parts if part.damage), '')
         raise RecordingError(
@@ -89,17 +92,17 @@ def check_sizes(parts):
             f'images of different sizes (width x height): {listing}; open them separately')
 
 
-def warn_of_damage(part):
+def warn_of_damage(part: Columns) -> None:
     """Say what could not be used of a file, in one warning a cause."""
     for line in part.damage:
         warnings.warn(f'{escaped(part.source)}: {line}', RecordingWarning, stacklevel=3)
 
 
-def _is_bag(path):
+def _is_bag(path: Path) -> bool:
     return path.is_dir() and ((path / FILE_NAME).exists() or any(path.glob('*.mcap')))
 
 
-def list_paths(paths):
+def list_paths(paths: Iterable[str | Path]) -> str:
     """Name the first of several files and how many more there are."""
-    paths = [str(path) for path in paths]
-    return paths[0] + (f' and {len(paths) - 1} more' if len(paths) > 1 else '')
+    names = [str(path) for path in paths]
+    return names[0] + (f' and {len(names) - 1} more' if len(names) > 1 else '')

@@ -18,11 +18,12 @@ and no goal pictures. What the records do not say, and how the recordings fill i
 - The gripper's opening. It is NaN in /joint_states.
 """
 
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 import re
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -52,12 +53,12 @@ class Shard:
     split: str  # 'train' or 'test'
     numbers: range  # of its trajectories
 
-    def target(self, folder):
+    def target(self, folder: str | Path) -> Path:
         """Return the path of the recording that it becomes."""
         return Path(folder, self.split, f'{self.split}_{self.numbers.start}.mcap')
 
 
-def find_shards(paths):
+def find_shards(paths: Iterable[str | Path]) -> list[Shard]:
     """
     Find the files of the data set, in the order of division and number.
 
@@ -81,7 +82,7 @@ def find_shards(paths):
     return shards
 
 
-def import_bair(paths, folder, progress=True):
+def import_bair(paths: Iterable[str | Path], folder: str | Path, progress: bool = True) -> int:
     """
     Import files of the data set, or go on with an import that was interrupted.
 
@@ -116,14 +117,14 @@ def import_bair(paths, folder, progress=True):
     return done
 
 
-def _describe(bags):
+def _describe(bags: Iterable[Path]) -> None:
     """Write metadata.yaml of the bags that have files."""
     for bag in bags:
         if any(bag.glob('*.mcap')):
             write_metadata(bag)
 
 
-def read_episode(data, seed):
+def read_episode(data: bytes, seed: int) -> Episode:
     """
     Decode one record.
 
@@ -166,7 +167,7 @@ class Options:
     out: Folder
 
 
-def run(args):
+def run(args: Options) -> None:
     """Import and say what was imported."""
     count = import_bair(args.paths, args.out)
     if count:
@@ -175,7 +176,7 @@ def run(args):
         print(f'{args.out}: all episodes were there already')
 
 
-def _shard(path):
+def _shard(path: Path) -> Shard:
     """Say what a file of the data set holds, by its name."""
     match = _NAME.fullmatch(path.name)
     numbers = range(int(match[1]), int(match[2]) + 1) if match else ()
@@ -187,7 +188,7 @@ def _shard(path):
     return Shard(path, split, numbers)
 
 
-def _import_shard(shard, target, bar):
+def _import_shard(shard: Shard, target: Path, bar: tqdm) -> None:
     """Import one file, wholly or not at all."""
     target.parent.mkdir(parents=True, exist_ok=True)
     count = 0
@@ -206,7 +207,7 @@ def _import_shard(shard, target, bar):
                 f'{"more" if count > len(shard.numbers) else count}; fetch the file again')
 
 
-def _picture(features, name):
+def _picture(features: Mapping[str, Any], name: str) -> np.ndarray:
     """Return a frame, (64, 64, 3) uint8 rgb."""
     value = features.get(name)
     if not isinstance(value, list) or len(value) != 1:
@@ -227,7 +228,7 @@ def _picture(features, name):
     return frame
 
 
-def _floats(features, name, count):
+def _floats(features: Mapping[str, Any], name: str, count: int) -> np.ndarray:
     """Return a vector, (count,) float32."""
     value = features.get(name)
     if not isinstance(value, np.ndarray) or value.shape != (count,):

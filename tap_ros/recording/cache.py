@@ -7,6 +7,7 @@ Each MCAP file has a folder in the cache, named after the SHA-256 of its content
 as one uint8 array and all else as columns. Any number of processes may build and read it at once.
 """
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -18,14 +19,16 @@ from pathlib import Path
 import shutil
 import tempfile
 import threading
+from typing import BinaryIO
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 from tap_ros.errors import RecordingError
-from tap_ros.recording.align import assemble, follows
+from tap_ros.recording.align import assemble, EpisodeTable, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_paths, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
+from tap_ros.recording.episode import Episode
 from tqdm import tqdm
 
 FORMAT = 2  # of a cache folder; another number makes all files be decoded again
@@ -43,7 +46,7 @@ class EpisodeStore:
     :param file_hashes: hex digests of the files, in order.
     """
 
-    def __init__(self, tables, file_hashes):
+    def __init__(self, tables: Sequence[EpisodeTable], file_hashes: Iterable[str]) -> None:
         self._index = [(table, i) for table in tables for i in range(len(table))]
         lengths = [np.diff(table.starts) for table in tables]
         self.lengths = np.concatenate([np.empty(0, np.int64), *lengths])  # (E,) frames
@@ -52,22 +55,23 @@ class EpisodeStore:
             part.image_size for table in tables for part in table.parts if part.image_size)
         self.data_hash = hashlib.sha256(''.join(file_hashes).encode()).hexdigest()
 
-    def __len__(self):
+    def __len__(self) -> int:
         """Return the number of episodes."""
         return len(self._index)
 
-    def __getitem__(self, i):
+    def __getitem__(self, i: int) -> Episode:
         """Return Episode i."""
         table, local = self._index[i]
         return table.episode(local)
 
-    def frames(self, i):
+    def frames(self, i: int) -> np.ndarray:
         """Return the frames of episode i, (T, H, W, 3) uint8."""
         table, local = self._index[i]
         return table.frames(local)
 
 
-def open_recordings(paths, cache_dir=None, progress=True, image_topic=None):
+def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | Path | None = None,
+                    progress: bool = True, image_topic: str | None = None) -> EpisodeStore:
     """
     Open recordings, decoding what is not in the cache yet.
 
@@ -95,7 +99,7 @@ def open_recordings(paths, cache_dir=None, progress=True, image_topic=None):
     unread = next((job.folder for job, part in loaded.items() if part is None), None)
     if unread is not None:
         raise RecordingError(f'{unread}: the cache cannot be read back; is the disk full?')
-    columns = [[loaded[job] for job in bag] for bag in jobs]
+    columns = [[part for job in bag if (part := loaded[job]) is not None] for bag in jobs]
     check_sizes([part for bag in columns for part in bag])
     for part in (part for bag in columns for part in bag):
         warn_of_damage(part)
@@ -113,13 +117,14 @@ class _Job:
     path: Path
     size: int
     digest: str
-    found: tuple  # pairs of a name in topics and the file's topic
+    found: tuple[tuple[str, str], ...]  # pairs of a name in topics and the file's topic
     folder: Path  # of the cache
 
 
-def _jobs(bags, found, cache_dir):
+def _jobs(bags: Sequence[Sequence[Path]], found: Sequence[Mapping[str, str]],
+          cache_dir: Path) -> list[list[_Job]]:
     """Return a list of _Job for each bag."""
-    def job(path, names):
+    def job(path: Path, names: Mapping[str, str]) -> _Job:
         with open(path, 'rb') as stream:
             digest = hashlib.file_digest(stream, 'sha256').hexdigest()
         key = hashlib.sha256(json.dumps([FORMAT, sorted(names.items())]).encode()).hexdigest()[:8]
@@ -131,12 +136,12 @@ def _jobs(bags, found, cache_dir):
         return [[task.result() for task in bag] for bag in waiting]
 
 
-def _workers():
+def _workers() -> int:
     """Return the number of files decoded at once."""
     return len(os.sched_getaffinity(0))
 
 
-def _built(jobs):
+def _built(jobs: Iterable[_Job]) -> Iterator[_Job]:
     """
     Decode files into their cache folders; yield the jobs that are done.
 
@@ -163,9 +168,9 @@ def _built(jobs):
         yield job
 
 
-def _runs(parts):
+def _runs(parts: Iterable[Columns]) -> list[list[Columns]]:
     """Split the files of a bag where one does not go on where the one before ended."""
-    runs = []
+    runs: list[list[Columns]] = []
     for part in parts:
         if runs and follows(runs[-1][-1], part):
             runs[-1].append(part)
@@ -174,7 +179,7 @@ def _runs(parts):
     return runs
 
 
-def _build(job):
+def _build(job: _Job) -> None:
     """Decode a file into its cache folder, which appears complete or not at all."""
     path, folder = job.path, job.folder
     try:
@@ -187,7 +192,8 @@ def _build(job):
     try:
         with open(part / 'frames.npy', 'wb') as stream:
             _empty(stream)
-            columns = decode_file(path, dict(job.found), stream.write, lambda: _empty(stream))
+            columns = decode_file(path, dict(job.found), lambda pixels: stream.write(pixels.data),
+                                  lambda: _empty(stream))
             _write_header(stream, columns)
         _sort_frames(part / 'frames.npy', columns.arrays)
         arrays = {k: np.ascontiguousarray(a) for k, a in columns.arrays.items()}
@@ -201,7 +207,7 @@ def _build(job):
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _put(part, folder, path):
+def _put(part: Path, folder: Path, path: Path) -> None:
     """Give a finished folder its name; one that is there stays, unless it cannot be read."""
     if folder.exists() and _load(folder, path) is None:
         broken = Path(tempfile.mkdtemp(prefix=folder.name + '.', dir=folder.parent))
@@ -217,14 +223,14 @@ def _put(part, folder, path):
             raise
 
 
-def _empty(stream):
+def _empty(stream: BinaryIO) -> None:
     """Keep but the room for the header."""
     stream.seek(0)
     stream.truncate()
     stream.write(bytes(_NPY_HEADER))
 
 
-def _write_header(stream, columns):
+def _write_header(stream: BinaryIO, columns: Columns) -> None:
     """Put the header of an .npy file in front of the frames."""
     shape = (len(columns.arrays.get('frame_log', ())), *(columns.image_size or (0, 0)), 3)
     text = repr({'descr': '|u1', 'fortran_order': False, 'shape': shape})
@@ -234,7 +240,7 @@ def _write_header(stream, columns):
     stream.write(magic + length.to_bytes(2, 'little') + text.ljust(length - 1).encode() + b'\n')
 
 
-def _sort_frames(path, arrays):
+def _sort_frames(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Bring the frames into the order of their log times, which they nearly always have."""
     order = arrays.pop('frame_order', None)
     if order is not None and (np.diff(order) != 1).any():
@@ -242,14 +248,14 @@ def _sort_frames(path, arrays):
         np.save(path, frames[order], allow_pickle=False)
 
 
-def _map_frames(path):
+def _map_frames(path: Path) -> np.ndarray:
     """Map the frames of a cache folder."""
     # numpy reads the header with ast, which now and then fails when threads do so at once.
     with _PARSING:
         return np.load(path, mmap_mode='r')
 
 
-def _load(folder, source):
+def _load(folder: Path, source: Path) -> Columns | None:
     """Return the Columns of a cache folder, or None when it is not there or not complete."""
     try:
         arrays = load_file(folder / 'columns.safetensors')
@@ -258,7 +264,7 @@ def _load(folder, source):
             about = json.loads(json.loads(stream.read(length))['__metadata__']['columns'])
         count = len(arrays.get('frame_log', ()))
         frames = _map_frames(folder / 'frames.npy') if count else None
-        if count and frames.shape != (count, *about['image_size'], 3):
+        if frames is not None and frames.shape != (count, *about['image_size'], 3):
             return None
     except (OSError, EOFError, SafetensorError, ValueError, KeyError):
         return None

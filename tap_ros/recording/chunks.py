@@ -4,19 +4,22 @@
 
 from io import BytesIO
 import struct
+from typing import TypeVar
 import zlib
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.records import Chunk
+from mcap.records import Chunk, McapRecord
 from tap_ros.errors import RecordingError
 import zstandard
+
+Record = TypeVar('Record', bound=McapRecord)
 
 MAX_CHUNK_BYTES = 256 * 2**20  # a chunk that claims to unpack to more is refused
 DAMAGE = (McapError, struct.error, ValueError, OverflowError)  # what mcap raises for damaged bytes
 
 
-def read_record(kind, content, whole=False):
+def read_record(kind: type[Record], content: bytes | memoryview, whole: bool = False) -> Record:
     """
     Read the content of a record.
 
@@ -28,7 +31,7 @@ def read_record(kind, content, whole=False):
     """
     stream = ReadDataStream(BytesIO(content))
     try:
-        record = kind.read(stream)
+        record: Record = kind.read(stream)  # type: ignore[attr-defined]  # of each, not of all
     except DAMAGE as error:
         raise RecordingError(f'damaged {kind.__name__.lower()} record') from error
     if whole and stream.count != len(content):
@@ -36,7 +39,7 @@ def read_record(kind, content, whole=False):
     return record
 
 
-def read_chunk(content):
+def read_chunk(content: bytes | memoryview) -> Chunk:
     """
     Read the content of a chunk record without unpacking it.
 
@@ -55,7 +58,7 @@ def read_chunk(content):
     return chunk
 
 
-def unpack(chunk):
+def unpack(chunk: Chunk) -> bytes:
     """
     Return the checked bytes of a chunk, which never take more memory than it claims.
 
@@ -72,7 +75,7 @@ def unpack(chunk):
     return data
 
 
-def _decompress(compression, data, size):
+def _decompress(compression: str, data: bytes, size: int) -> bytes:
     if compression == '':
         return data
     if compression == 'zstd':

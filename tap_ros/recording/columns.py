@@ -9,8 +9,11 @@ episode goes on in the next one. A message that cannot be used is left out and n
 
 from array import array
 from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
@@ -20,6 +23,7 @@ from tap_ros.recording.container import McapFile
 from tap_ros.recording.losses import describe, EVERYTHING, FRAMES, gaps, Loss, NOTHING
 from tap_ros.recording.messages import decode
 from tap_ros.recording.pictures import read_pixels
+from tap_ros.recording.spans import Mark
 from tap_ros.text import escaped
 
 _ENDINGS = ('_log', '_stamp', '_names', '_event', '_index')  # of column names
@@ -49,22 +53,24 @@ class Columns:
     """
 
     source: str  # what messages call the file
-    image_size: tuple | None = None  # (H, W); None without any image
+    image_size: tuple[int, int] | None = None  # (H, W); None without any image
     frames: np.ndarray | None = None  # (F, H, W, 3) uint8, rows belong to frame_log
     goal_frames: np.ndarray | None = None  # (G, H, W, 3) uint8
-    arrays: dict = field(default_factory=dict)
-    names: list = field(default_factory=list)  # tuples of object names
-    marks: list = field(default_factory=list)  # (task, seed, outcome) by row of mark_log
-    damage: list = field(default_factory=list)  # lines: what could not be used, and why
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    names: list[tuple[str, ...]] = field(default_factory=list)  # of objects
+    marks: list[Mark] = field(default_factory=list)  # by row of mark_log
+    damage: list[str] = field(default_factory=list)  # lines: what could not be used, and why
 
-    def describe(self):
+    def describe(self) -> str:
         """Return all that is not an array as JSON text."""
         return json.dumps({
             'image_size': self.image_size, 'names': self.names, 'marks': self.marks,
             'damage': self.damage})
 
 
-def decode_file(path, found, write_frame, restart):
+def decode_file(path: str | Path, found: dict[str, str],
+                write_frame: Callable[[np.ndarray], object],
+                restart: Callable[[], object]) -> Columns:
     """
     Read a file from front to back.
 
@@ -99,17 +105,21 @@ def decode_file(path, found, write_frame, restart):
 class _Decoder:
     """Collects the columns of a file message by message; camera images are passed on at once."""
 
-    def __init__(self, file, found, write_frame, size):
+    def __init__(self, file: McapFile, found: dict[str, str],
+                 write_frame: Callable[[np.ndarray], object],
+                 size: tuple[int, int] | None) -> None:
         self.file = file
         self.found = found
         self.write_frame = write_frame
         self.columns = Columns(str(file.path), size)
-        self.sizes = Counter()  # (H, W) -> camera images
-        self.losses = []
-        self.integers = defaultdict(lambda: array('q'))  # column -> one a message
-        self.numbers = defaultdict(lambda: array('d'))  # column -> as many as its rows have
-        self.names = {}  # tuple of object names -> number
-        self.goals = []
+        self.sizes: Counter[tuple[int, int]] = Counter()  # (H, W) -> camera images
+        self.losses: list[Loss] = []
+        self.integers: defaultdict[str, array[int]] = defaultdict(
+            lambda: array('q'))  # column -> one a message
+        self.numbers: defaultdict[str, array[float]] = defaultdict(
+            lambda: array('d'))  # column -> as many as its rows have
+        self.names: dict[tuple[str, ...], int] = {}  # tuple of object names -> number
+        self.goals: list[np.ndarray] = []
         self.state_bytes = 0  # of messages that are no pictures
         self.most_state_bytes = _FREE_STATES + _STATES_PER_BYTE * len(file.data)
         decoders = {
@@ -122,7 +132,7 @@ class _Decoder:
         for name, topic in found.items():
             self.decoders[topic].append((name, decoders[name]))
 
-    def take(self, topic, log, data):
+    def take(self, topic: str, log: int, data: memoryview) -> None:
         """Take a message; note it when it cannot be used."""
         for name, decoder in self.decoders[topic]:
             state = name not in (topics.IMAGE, topics.GOAL_IMAGE)
@@ -139,7 +149,7 @@ class _Decoder:
                 elif name == topics.GOAL_OBJECTS:
                     self._add_objects('goal_object', log, 0, (), ())
 
-    def most_frequent_size(self):
+    def most_frequent_size(self) -> tuple[int, int] | None:
         """Return the size of more than half of the camera images, None without any."""
         if not self.sizes:
             return None
@@ -151,7 +161,7 @@ class _Decoder:
                 f'height): {listing}; one recording has one size')
         return size
 
-    def finish(self):
+    def finish(self) -> Columns:
         """Make arrays, rows in the order of their log times."""
         self._drop_goals()
         arrays = {key: np.array(column, np.int64) for key, column in self.integers.items()}
@@ -182,11 +192,11 @@ class _Decoder:
             columns.goal_frames = np.stack(self.goals)
         return columns
 
-    def _drop_goals(self):
+    def _drop_goals(self) -> None:
         """Take back goal pictures that are not of the size of the others, or of the camera's."""
         size = self.columns.image_size or (self.goals[0].shape[:2] if self.goals else None)
         kept = [goal for goal in self.goals if goal.shape[:2] == size]
-        if len(kept) == len(self.goals):
+        if size is None or len(kept) == len(self.goals):
             return
         logs, index, number = self.integers['goal_log'], self.integers['goal_index'], 0
         for row, old in enumerate(index):
@@ -199,12 +209,12 @@ class _Decoder:
                     f'a goal of another size than {size[1]}x{size[0]} pixels'))
         self.goals = kept
 
-    def _lose(self, name, log, error):
+    def _lose(self, name: str, log: int, error: RecordingError) -> None:
         """Note a message that cannot be used."""
         self.losses.append(Loss(
             str(error), f'topic {self.found[name]}', None, log, log, _CUTS.get(name, NOTHING)))
 
-    def _charge(self, size):
+    def _charge(self, size: int) -> None:
         """Refuse files with more than any recording of this size holds, as decoding takes time."""
         self.state_bytes += size
         if self.state_bytes > self.most_state_bytes:
@@ -212,13 +222,13 @@ class _Decoder:
                 f'more than {self.most_state_bytes} bytes of messages that are no pictures; no '
                 'recording of its size has so many')
 
-    def _add(self, name, log, numbers=(), **integers):
+    def _add(self, name: str, log: int, numbers: Iterable[float] = (), **integers: int) -> None:
         """Append a row to the columns of a name."""
         for key, value in {'log': log, **integers}.items():
             self.integers[f'{name}_{key}'].append(value)
         self.numbers[name].extend(numbers)
 
-    def _image(self, log, message):
+    def _image(self, log: int, message: Any) -> None:
         pixels, columns = read_pixels(message), self.columns
         size = pixels.shape[:2]
         if 0 in size:
@@ -232,7 +242,7 @@ class _Decoder:
         self.write_frame(pixels)
         self._add('frame', log, stamp=_stamp(message))
 
-    def _goal_image(self, log, message):
+    def _goal_image(self, log: int, message: Any) -> None:
         pixels = read_pixels(message)
         if 0 in pixels.shape:
             self._add('goal', log, stamp=_stamp(message), index=-1)
@@ -240,37 +250,38 @@ class _Decoder:
             self._add('goal', log, stamp=_stamp(message), index=len(self.goals))
             self.goals.append(pixels.copy())
 
-    def _twist(self, log, message):
+    def _twist(self, log: int, message: Any) -> None:
         linear = message.twist.linear
         self._add('twist', log, (linear.x, linear.y, linear.z), stamp=_stamp(message))
 
-    def _command(self, log, message):
+    def _command(self, log: int, message: Any) -> None:
         self._add('command', log, (message.data,))
 
-    def _joints(self, log, message):
+    def _joints(self, log: int, message: Any) -> None:
         known = dict(zip(message.name, message.position.tolist(), strict=False))
         if known.keys() & set(GRIPPER_JOINTS):
             self._add('joint', log, [known.get(name, np.nan) for name in GRIPPER_JOINTS],
                       stamp=_stamp(message))
 
-    def _objects(self, column, log, message):
-        numbers = []
+    def _objects(self, column: str, log: int, message: Any) -> None:
+        numbers: list[float] = []
         for one in message.objects:
             place, turn = one.pose.position, one.pose.orientation
             numbers += (one.u, one.v, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
         names = tuple(one.name for one in message.objects)
         self._add_objects(column, log, _stamp(message), names, numbers)
 
-    def _add_objects(self, column, log, stamp, names, numbers):
+    def _add_objects(self, column: str, log: int, stamp: int, names: tuple[str, ...],
+                     numbers: Sequence[float]) -> None:
         number = self.names.setdefault(names, len(self.names))
         self._add(column, log, numbers, stamp=stamp, names=number, count=len(names))
 
-    def _mark(self, log, message):
+    def _mark(self, log: int, message: Any) -> None:
         self._add('mark', log, stamp=_stamp(message), event=message.event)
         self.columns.marks.append((message.task, message.seed, message.outcome))
 
 
-def pad_objects(values, counts):
+def pad_objects(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """
     Give each message as many objects as the one with the most has, NaN for those not there.
 
@@ -290,6 +301,6 @@ def pad_objects(values, counts):
     return padded
 
 
-def _stamp(message):
+def _stamp(message: Any) -> int:
     """Return the time in the header of a message, ns."""
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec

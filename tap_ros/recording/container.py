@@ -10,19 +10,22 @@ summary says, is noted as a loss.
 
 from array import array
 from collections import Counter
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 import mmap
 import os
+from pathlib import Path
 import stat
 import struct
 
 from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema
 from tap_ros.errors import RecordingError
 from tap_ros.recording.chunks import read_chunk, read_record, unpack
 from tap_ros.recording.losses import FAR, Loss, NOTHING
 from tap_ros.recording.records import in_order, OTHERS, Records, TOPIC_RECORDS
-from tap_ros.recording.summary import MAGIC, read_summary, RECORD
+from tap_ros.recording.summary import ChunkEntry, MAGIC, read_summary, RECORD
 from tap_ros.text import escaped
 
 # Bounds on what a file may unpack to, far above what recordings of its size hold.
@@ -50,15 +53,16 @@ class McapFile:
     :raises RecordingError: when it is missing, empty, no regular file, or not MCAP.
     """
 
-    def __init__(self, path):
+    def __init__(self, path: str | Path) -> None:
         self.path = path
-        self.channels = {}  # id -> Channel; grows while messages are read
-        self.losses = []  # of Loss, complete when all messages are read
-        self._schemas = {}
-        self._pending = []  # losses whose end is the first message that comes
-        self._newest = None  # log time so far
+        self.channels: dict[int, Channel] = {}  # by id; grows while messages are read
+        self.losses: list[Loss] = []  # complete when all messages are read
+        self._schemas: dict[int, Schema] = {}
+        # Losses whose end is the first message that comes.
+        self._pending: list[tuple[str, str, int]] = []
+        self._newest: int | None = None  # log time so far
         self._unpacked = self._records = 0
-        self._counts = Counter()  # channel -> messages read
+        self._counts: Counter[int] = Counter()  # channel -> messages read
         try:
             mode = os.stat(path).st_mode  # opening a FIFO would wait for its writer
             if not stat.S_ISREG(mode):
@@ -81,7 +85,7 @@ class McapFile:
         self._most_bytes = FREE_BYTES + BYTES_PER_BYTE * len(self.data)
         self._most_records = FREE_RECORDS + len(self.data) // BYTES_PER_RECORD
 
-    def topics(self):
+    def topics(self) -> dict[str, Channel]:
         """
         Return what the file holds.
 
@@ -95,7 +99,7 @@ class McapFile:
                 pass
         return {channel.topic: channel for channel in self.channels.values()}
 
-    def messages(self, wanted):
+    def messages(self, wanted: Collection[str]) -> Iterator[tuple[str, int, memoryview]]:
         """
         Yield the messages of some topics in the order of the file.
 
@@ -130,9 +134,11 @@ class McapFile:
         self._pending = []
         self._compare(records, wanted)
 
-    def _scan(self, data):
+    def _scan(self, data: memoryview) -> 'array[int]':
         """Check records, take notice of topics, and return where messages start, array of int."""
-        places, counts, logs, position = array('q'), Counter(), {}, 0
+        places, position = array('q'), 0
+        counts: Counter[int] = Counter()
+        logs: dict[int, tuple[int, int]] = {}
         try:
             while position < len(data):
                 kind, length = RECORD.unpack_from(data, position)
@@ -169,11 +175,11 @@ class McapFile:
             for number, (first, last) in logs.items() if number not in self.channels]
         return places
 
-    def _read_topic(self, kind, content):
+    def _read_topic(self, kind: int, content: memoryview) -> None:
         """Take notice of the content of a schema or channel record."""
         self._define(read_record(TOPIC_RECORDS[kind], content, whole=True))
 
-    def _define(self, record):
+    def _define(self, record: Schema | ChannelRecord) -> None:
         """Take notice of a schema or channel; the first of a number holds."""
         if isinstance(record, Schema):
             self._schemas.setdefault(record.id, record)
@@ -183,7 +189,7 @@ class McapFile:
                 record.topic, schema.name, record.message_encoding, schema.encoding,
                 schema.data.decode(errors='replace'))
 
-    def _charge(self, size):
+    def _charge(self, size: int) -> None:
         """Refuse to unpack more than any recording of this size holds."""
         self._unpacked += size
         if self._unpacked > self._most_bytes:
@@ -191,14 +197,14 @@ class McapFile:
                 f'it is not unpacked: more than {self._most_bytes} bytes in all, from a file of '
                 f'{len(self.data)}')
 
-    def _lose(self, why, what, byte, entry=None):
+    def _lose(self, why: str, what: str, byte: int, entry: ChunkEntry | None = None) -> None:
         """Note what cannot be read: at the log times of entry, or between the messages around."""
         if entry is not None:
             self.losses.append(Loss(why, what, byte, entry.start, entry.end))
         else:
             self._pending.append((why, what, byte))
 
-    def _place(self, first, last):
+    def _place(self, first: int, last: int) -> None:
         """Note the log times of messages; what was lost before ends with the first of them."""
         for loss in self._pending:
             start = first if self._newest is None else min(self._newest, first)
@@ -206,7 +212,7 @@ class McapFile:
         self._pending = []
         self._newest = last if self._newest is None else max(last, self._newest)
 
-    def _compare(self, records, wanted):
+    def _compare(self, records: Records, wanted: Collection[str]) -> None:
         """Compare what was read with the summary."""
         counts = self._summary.counts if self._summary else None
         for entry in in_order(records.missing):

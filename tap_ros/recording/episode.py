@@ -37,12 +37,12 @@ class Episode:
     seed: int = 0
     outcome: str = ''  # one of OUTCOMES
 
-    def __len__(self):
+    def __len__(self) -> int:
         """Return the number of frames T."""
         return len(self.frames)
 
 
-def check_episode(episode):
+def check_episode(episode: Episode) -> None:
     """
     Accept an episode or say what is wrong with it.
 

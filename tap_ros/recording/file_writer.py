@@ -10,6 +10,7 @@ from contextlib import suppress
 from functools import cache
 import os
 from pathlib import Path
+from typing import Any
 
 from mcap.writer import CompressionType, IndexType, Writer
 from tap_ros.errors import RecordingError
@@ -36,7 +37,8 @@ class FileWriter:
     :raises RecordingError: for an unknown compression or a file that exists.
     """
 
-    def __init__(self, path, name=None, compression='zstd', chunk_bytes=CHUNK_BYTES):
+    def __init__(self, path: str | Path, name: str | None = None, compression: str = 'zstd',
+                 chunk_bytes: int = CHUNK_BYTES) -> None:
         if compression not in _COMPRESSIONS:
             raise RecordingError(
                 f'compression: expected zstd, lz4 or none, got {compression!r}')
@@ -50,12 +52,13 @@ class FileWriter:
             self._stream, chunk_size=chunk_bytes, compression=_COMPRESSIONS[compression],
             index_types=IndexType.ALL)
         self._writer.start(profile='ros2', library=LIBRARY)
-        self._schemas = {}  # type -> id
-        self._channels = {}  # topic -> id
-        self._info = {
+        self._schemas: dict[str, int] = {}  # type -> id
+        self._channels: dict[str, int] = {}  # topic -> id
+        self._info: dict[str, Any] = {
             'path': self._name, 'start': 0, 'end': 0, 'message_count': 0, 'topics': {}}
 
-    def write_raw(self, topic, type_name, data, log_time_ns, publish_time_ns=None, qos=None):
+    def write_raw(self, topic: str, type_name: str, data: bytes, log_time_ns: int,
+                  publish_time_ns: int | None = None, qos: topics.Qos | None = None) -> None:
         """
         Append one message.
 
@@ -85,12 +88,12 @@ class FileWriter:
         total['end'] = max(total['end'], log_time_ns)
         total['message_count'] += 1
 
-    def flush(self):
+    def flush(self) -> None:
         """Finish the chunk in progress, so that what was written so far can be read."""
         with storage_errors(self.path):
             self._writer.flush()
 
-    def close(self):
+    def close(self) -> dict[str, Any]:
         """
         Finish the file.
 
@@ -109,12 +112,12 @@ class FileWriter:
                 self.abandon()
         return self._info
 
-    def abandon(self):
+    def abandon(self) -> None:
         """Close without finishing the file; what was flushed is readable."""
         with suppress(OSError):  # what a full disk refuses again
             self._stream.close()
 
-    def _open_topic(self, topic, type_name, qos):
+    def _open_topic(self, topic: str, type_name: str, qos: topics.Qos) -> int:
         """Register a topic, and its type when it is new."""
         if type_name not in self._schemas:
             self._schemas[type_name] = self._writer.register_schema(
@@ -130,5 +133,5 @@ class FileWriter:
 
 
 @cache
-def _qos_text(qos):
+def _qos_text(qos: topics.Qos) -> str:
     return metadata.to_yaml([qos.profile()]).strip()

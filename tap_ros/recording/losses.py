@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What of a file could not be used: counted, placed in the log, and put in words."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,29 +31,29 @@ class Loss:
     end: int | None = None
     cuts: int = EVERYTHING
 
-    def place(self):
+    def place(self) -> str:
         """Return where it is, in words."""
         words = [] if self.byte is None else [f'at byte {self.byte}']
         if self.start is not None and self.start > -FAR:
-            end = '' if self.end == self.start else f' to {seconds(self.end)}'
+            end = '' if self.end is None or self.end == self.start else f' to {seconds(self.end)}'
             words.append(f'log time {seconds(self.start)}{end} s')
         return ', '.join(words)
 
 
-def seconds(time):
+def seconds(time: int) -> str:
     """Return a time in nanoseconds as seconds, all digits."""
     sign, time = ('-', -time) if time < 0 else ('', time)
     return f'{sign}{time // 10**9}.{time % 10**9:09d}'
 
 
-def describe(losses):
+def describe(losses: Iterable[Loss]) -> list[str]:
     """
     Put losses in words.
 
     :param losses: list of Loss.
     :return: list of lines, one a cause, with the number of its losses and the first places.
     """
-    groups = {}
+    groups: dict[tuple[str, str], list[Loss]] = {}
     for loss in losses:
         groups.setdefault((loss.what, loss.why), []).append(loss)
     lines = [_line(*key, group) for key, group in list(groups.items())[:CAUSES]]
@@ -62,7 +63,7 @@ def describe(losses):
     return lines
 
 
-def gaps(losses):
+def gaps(losses: Iterable[Loss]) -> np.ndarray:
     """
     Return where episodes are cut.
 
@@ -75,7 +76,7 @@ def gaps(losses):
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
-def _line(what, why, group):
+def _line(what: str, why: str, group: Sequence[Loss]) -> str:
     places = [place for loss in group if (place := loss.place())]
     more = f' and {len(places) - EXAMPLES} more' if len(places) > EXAMPLES else ''
     where = '; '.join(places[:EXAMPLES]) + more

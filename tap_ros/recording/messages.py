@@ -10,11 +10,13 @@ tap_msgs is not installed. Others are looked up in the ROS installation, as rosb
 from functools import cache
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores, TypesysError
+from rosbags.typesys.store import Typestore
 from tap_ros.errors import RecordingError
 
 DEFINITIONS = {
@@ -55,17 +57,17 @@ _NUMBERS = {'bool': np.bool_, 'byte': np.uint8, 'char': np.uint8}  # else the na
 
 
 @cache
-def typestore():
+def typestore() -> Typestore:
     """Return rosbags' type store with the types of Jazzy and ours; takes 0.1 s the first time."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    types = {}
+    types: dict[str, Any] = {}
     for name, text in DEFINITIONS.items():
         types |= get_types_from_msg(text, name)
     store.register(types)
     return store
 
 
-def encode(type_name, message):
+def encode(type_name: str, message: dict[str, Any]) -> bytes:
     """
     Serialize a message.
 
@@ -77,7 +79,7 @@ def encode(type_name, message):
     return bytes(typestore().serialize_cdr(_build(type_name, message), type_name))
 
 
-def decode(type_name, data):
+def decode(type_name: str, data: bytes | memoryview) -> Any:
     """
     Read one message.
 
@@ -93,7 +95,7 @@ def decode(type_name, data):
 
 
 @cache
-def schema_text(type_name):
+def schema_text(type_name: str) -> str:
     """
     Return the ros2msg schema of a message type: its definition and those of all types within.
 
@@ -105,7 +107,7 @@ def schema_text(type_name):
 
 
 @cache
-def type_hash(type_name):
+def type_hash(type_name: str) -> str:
     """
     Return ROS 2's hash (REP 2011) of a message type.
 
@@ -117,7 +119,7 @@ def type_hash(type_name):
 
 
 @cache
-def check_schema(type_name, text):
+def check_schema(type_name: str, text: str) -> None:
     """
     Accept the schema of a recording if its messages can be read with our definitions.
 
@@ -141,9 +143,10 @@ def check_schema(type_name, text):
                 f'message type {name}: recorded with the fields {theirs}; expected {ours}')
 
 
-def _look_up(type_name):
+def _look_up(type_name: str) -> None:
     """Read definitions that rosbags does not know from the ROS installation."""
-    store, found, waiting = typestore(), {}, [type_name]
+    found: dict[str, Any] = {}
+    store, waiting = typestore(), [type_name]
     while waiting:
         name = waiting.pop()
         if name in store.fielddefs or name in found:
@@ -167,7 +170,7 @@ def _look_up(type_name):
         store.register(found)
 
 
-def _find_in_ros(type_name):
+def _find_in_ros(type_name: str) -> Path | None:
     """Return the path of a definition in the ROS installation, or None."""
     package, _, name = type_name.partition('/msg/')
     for prefix in filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)):
@@ -177,15 +180,15 @@ def _find_in_ros(type_name):
     return None
 
 
-def _build(type_name, values):
+def _build(type_name: str, values: dict[str, Any]) -> Any:
     """Return a message of rosbags' from a nested dict."""
     store = typestore()
-    known = {name: _value(*kind, values.get(name))
-             for name, kind in store.fielddefs[type_name][1]}
+    known = {name: _value(kind, detail, values.get(name))
+             for name, (kind, detail) in store.fielddefs[type_name][1]}
     return store.types[type_name](**(values | known))
 
 
-def _value(kind, detail, value):
+def _value(kind: Nodetype, detail: Any, value: Any) -> Any:
     """Return the value of a field, 0, '' or empty for None."""
     if kind == Nodetype.NAME:
         return _build(detail, value or {})

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The metadata.yaml of a bag: written as by rosbag2 of Jazzy (version 9), read in any version."""
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 import re
+from typing import Any
 
 from tap_ros.errors import RecordingError
 from tap_ros.files import write_atomically
@@ -19,7 +21,7 @@ _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _KEY = 'rosbag2_bagfile_information'
 
 
-def bag_information(files):
+def bag_information(files: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """
     Describe a bag.
 
@@ -29,7 +31,7 @@ def bag_information(files):
     """
     filled = [f for f in files if f['message_count']] or [{'start': 0, 'end': 0}]
     start, end = min(f['start'] for f in filled), max(f['end'] for f in filled)
-    topics = {}
+    topics: dict[str, dict[str, Any]] = {}
     for file in files:
         for topic, info in file['topics'].items():
             merged = topics.setdefault(topic, {**info, 'count': 0})
@@ -63,12 +65,12 @@ def bag_information(files):
     }
 
 
-def to_yaml(value):
+def to_yaml(value: Any) -> str:
     """Return a value as the YAML text that rosbag2 would write."""
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
 
 
-def _from_yaml(text):
+def _from_yaml(text: str) -> Any:
     """Parse YAML; raise ValueError or another of _UNUSABLE when it is not, or is a bomb."""
     if len(text) > MAX_BYTES:
         raise ValueError(f'it has more than {MAX_BYTES} bytes')
@@ -83,14 +85,14 @@ def _from_yaml(text):
     return yaml.load(text, Loader=_LOADER)
 
 
-class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):
+class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
     """Writes equal values in full; rosbag2 knows no anchors."""
 
-    def ignore_aliases(self, data):
+    def ignore_aliases(self, data: object) -> bool:
         return True
 
 
-def save(folder, files):
+def save(folder: str | Path, files: Sequence[dict[str, Any]]) -> None:
     """
     Write metadata.yaml atomically.
 
@@ -100,12 +102,12 @@ def save(folder, files):
     write_atomically(Path(folder, FILE_NAME), to_yaml({_KEY: bag_information(files)}))
 
 
-def files_by_number(folder):
+def files_by_number(folder: str | Path) -> list[Path]:
     """Return the .mcap files of a folder in the order of the numbers in their names."""
     return sorted(Path(folder).glob('*.mcap'), key=_natural)
 
 
-def bag_files(folder):
+def bag_files(folder: str | Path) -> list[Path]:
     """
     Return the .mcap files of a bag in playing order.
 
@@ -154,7 +156,7 @@ def bag_files(folder):
     return files
 
 
-def _read(path):
+def _read(path: Path) -> str:
     """Return the text of a file, a character too much when it is too long."""
     if not _is_file(path):  # opening a FIFO would wait for its writer
         raise RecordingError(f'{path}: not a regular file')
@@ -165,7 +167,7 @@ def _read(path):
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
 
 
-def _is_file(path):
+def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
     except OSError:  # a name that is too long
@@ -173,7 +175,7 @@ def _is_file(path):
 
 
 @cache
-def qos_from_text(text):
+def qos_from_text(text: str) -> list[Any]:
     """Return the offered QoS profiles that stand in a channel's metadata; [] when unknown."""
     try:
         profiles = _from_yaml(text) if text else []
@@ -182,6 +184,6 @@ def qos_from_text(text):
     return profiles if isinstance(profiles, list) else []
 
 
-def _natural(path):
+def _natural(path: Path) -> list[int | str]:
     """Sort push2_10 behind push2_2."""
     return [int(p) if p.isdigit() else p for p in re.split(r'(\d+)', path.name)]

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pixels of sensor_msgs/Image messages, whatever their encoding and padding."""
 
+from typing import Any
+
 import numpy as np
 from tap_ros.contract import ENCODINGS, PICTURE_ENCODING
 from tap_ros.errors import RecordingError
 
 
-def read_pixels(message):
+def read_pixels(message: Any) -> np.ndarray:
     """
     Return the pixels of an image message, (H, W, 3) uint8 rgb; H = W = 0 when it holds none.
 
@@ -16,10 +18,10 @@ def read_pixels(message):
     """
     height, width, step, encoding = message.height, message.width, message.step, message.encoding
     length = len(message.data)
-    channels, order = ENCODINGS.get(encoding, (None, None))
+    channels, order = ENCODINGS.get(encoding, (0, (0, 0, 0)))
     if length == height * width == 0:
         return np.empty((0, 0, 3), np.uint8)
-    if channels is None:
+    if not channels:
         raise RecordingError(
             f'encoding {encoding[:40]!r} cannot be read; choose one of {", ".join(ENCODINGS)}')
     if height * width == 0 or step < width * channels or length != height * step:

@@ -2,18 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read recordings once, episode by episode, without a cache."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from tap_ros.recording.align import assemble, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
+from tap_ros.recording.episode import Episode
 from tap_ros.recording.losses import EVERYTHING
 
+_NO_EVENT = np.empty(0, np.int64)
 _NO_GAP = np.empty((0, 3), np.int64)
 
 
-def iter_episodes(path, image_topic=None):
+def iter_episodes(path: str | Path, image_topic: str | None = None) -> Iterator[Episode]:
     """
     Yield the episodes of a recording; at most about one file is in memory at a time.
 
@@ -24,7 +28,8 @@ def iter_episodes(path, image_topic=None):
     """
     for files in find_bags(path):
         found = find_topics(files, image_topic)
-        waiting, checked = [], []
+        waiting: list[Columns] = []
+        checked: list[Columns] = []
         for file in files:
             part = _decode(file, found)
             checked.append(Columns(part.source, part.image_size, damage=part.damage))
@@ -41,33 +46,33 @@ def iter_episodes(path, image_topic=None):
         check_sizes(checked)
 
 
-def _decode(file, found):
+def _decode(file: Path, found: dict[str, str]) -> Columns:
     """Return the Columns of a file, frames in memory."""
-    pieces = []
+    pieces: list[bytes] = []
     part = decode_file(
         file, found, lambda pixels: pieces.append(pixels.tobytes()), pieces.clear)
     order = part.arrays.pop('frame_order', None)
-    if pieces:
+    if pieces and order is not None and part.image_size is not None:
         frames = np.frombuffer(b''.join(pieces), np.uint8).reshape(-1, *part.image_size, 3)
         part.frames = frames if (np.diff(order) == 1).all() else frames[order]
     warn_of_damage(part)
     return part
 
 
-def _episodes(parts):
+def _episodes(parts: Sequence[Columns]) -> Iterator[Episode]:
     table = assemble(parts)
     for i in range(len(table)):
         yield table.episode(i)
 
 
-def _closed(part):
+def _closed(part: Columns) -> bool:
     """Tell whether the last mark in a file is the end of an episode, and nothing is lost later."""
-    events, gap = part.arrays.get('mark_event', ()), part.arrays.get('gap', _NO_GAP)
+    events, gap = part.arrays.get('mark_event', _NO_EVENT), part.arrays.get('gap', _NO_GAP)
     return len(events) > 0 and events[-1] == 1 and not (
         gap[gap[:, 2] == EVERYTHING, 1] >= part.arrays['mark_log'][-1]).any()
 
 
-def _kept(parts):
+def _kept(parts: list[Columns]) -> list[Columns]:
     """Return what later files need to know of those before: their marks, goals and gaps."""
     kept = parts[-1:]
     for key in ('goal_log', 'goal_object_log', 'gap'):

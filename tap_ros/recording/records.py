@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the chunks and messages of an MCAP file lie, damaged or not."""
 
+from collections.abc import Callable, Iterable, Iterator
 import struct
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from tap_ros.errors import RecordingError
 from tap_ros.recording.losses import FAR
-from tap_ros.recording.summary import MAGIC, RECORD
+from tap_ros.recording.summary import ChunkEntry, MAGIC, RECORD, Summary
 
-TOPIC_RECORDS = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
+TOPIC_RECORDS: dict[int, type[Schema] | type[Channel]] = {
+    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
 OTHERS = 0x80  # opcodes from here on belong to others, and are skipped
 _RUN_BYTES = 2**20  # of messages outside of chunks that are taken together
 
@@ -25,12 +27,14 @@ class Records:
     :param lose: function(why, what, byte) called for records that are not understood.
     """
 
-    def __init__(self, data, summary, define, lose):
+    def __init__(self, data: memoryview, summary: Summary | None,
+                 define: Callable[[int, memoryview], object],
+                 lose: Callable[[str, str, int], object]) -> None:
         self.data, self.summary, self.define, self.lose = data, summary, define, lose
-        self.missing = set(summary.chunks if summary else ())  # not found so far
-        self.cut_off = None  # the byte where an unfinished file ends
+        self.missing: set[ChunkEntry] = set(summary.chunks if summary else ())  # not found so far
+        self.cut_off: int | None = None  # the byte where an unfinished file ends
 
-    def parts(self, indexed):
+    def parts(self, indexed: bool) -> Iterator[tuple[int, int, int, ChunkEntry | None]]:
         """
         Yield (opcode, start, end, entry) of chunks and of runs of messages outside of them.
 
@@ -52,8 +56,9 @@ class Records:
                     end = entry.offset + entry.length
                     yield Opcode.CHUNK, entry.offset + RECORD.size, end, entry
 
-    def _walk(self):
-        position, run, entries = len(MAGIC), None, {}
+    def _walk(self) -> Iterator[tuple[int, int, int, ChunkEntry | None]]:
+        position, run = len(MAGIC), None
+        entries: dict[tuple[int, int, int], list[ChunkEntry]] = {}
         for entry in in_order(self.missing):
             entries.setdefault((entry.length, entry.start, entry.end), []).append(entry)
         limit = self.summary.start if self.summary else len(self.data)
@@ -86,14 +91,15 @@ class Records:
                 self.lose('it is not understood', 'record', position)
             position = end
 
-    def _is_other(self, kind, start, end):
+    def _is_other(self, kind: int, start: int, end: int) -> bool:
         """Tell whether a record is one of those that hold no messages."""
         if kind == Opcode.MESSAGE_INDEX:  # a damaged chunk may look like one
             return end - start >= 6 and struct.unpack_from(
                 '<I', self.data, start + 2)[0] == end - start - 6
         return kind in (Opcode.HEADER, Opcode.ATTACHMENT, Opcode.METADATA) or kind >= OTHERS
 
-    def _find(self, start, end, entries):
+    def _find(self, start: int, end: int,
+              entries: dict[tuple[int, int, int], list[ChunkEntry]]) -> ChunkEntry | None:
         """Take the entry of a chunk out of those of the summary; return None without one."""
         if end - start < 16:
             return None
@@ -105,6 +111,6 @@ class Records:
         return same.pop(0)
 
 
-def in_order(entries):
+def in_order(entries: Iterable[ChunkEntry]) -> list[ChunkEntry]:
     """Sort entries of the summary as their chunks lie in the file."""
     return sorted(entries, key=lambda entry: entry.offset)

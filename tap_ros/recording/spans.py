@@ -14,10 +14,13 @@ end follows; without such an end they are left out.
 """
 
 from bisect import bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from tap_ros.recording.losses import EVERYTHING, FAR
+
+Mark = tuple[str, int, str]  # task, seed, outcome
 
 MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
 
@@ -36,7 +39,7 @@ class Span:
     first_cut: int | None = None  # log time of the gap where the first part of this one ends
 
 
-def read_spans(data, marks):
+def read_spans(data: dict[str, np.ndarray], marks: Sequence[Mark]) -> list[Span]:
     """
     Read the marks: a list of spans in the order of the log.
 
@@ -51,7 +54,7 @@ def read_spans(data, marks):
     return spans or [Span(outcome=None)]
 
 
-def in_gaps(gaps, log):
+def in_gaps(gaps: np.ndarray, log: np.ndarray) -> np.ndarray:
     """
     Tell which times lie where messages of any topic may be missing, ends included.
 
@@ -66,14 +69,15 @@ def in_gaps(gaps, log):
     return log <= ends[before]
 
 
-def _marked(data, marks, gaps):
+def _marked(data: dict[str, np.ndarray], marks: Sequence[Mark],
+            gaps: list[list[int]]) -> list[Span]:
     """Return the spans between marks; where marks may be lost nothing is known until the next."""
     # At the same time starts come before gaps and ends behind: what cannot be told is left out.
-    events = [
+    events: list[tuple[int, int, int, int, Mark]] = [
         (log, 2 * (event != 0), stamp, event, about) for log, stamp, event, about in zip(
             data['mark_log'].tolist(), data['mark_stamp'].tolist(), data['mark_event'].tolist(),
             marks, strict=True)]
-    events += [(start, 1, end, 0, None) for start, end, cuts in gaps if cuts == EVERYTHING]
+    events += [(start, 1, end, 0, ('', 0, '')) for start, end, cuts in gaps if cuts == EVERYTHING]
     spans, current, last_end = [], None, -FAR
     for log, order, stamp, event, about in sorted(events, key=lambda e: e[:2]):
         unsure = current is not None and current.outcome is None
@@ -102,7 +106,7 @@ def _marked(data, marks, gaps):
     return spans
 
 
-def _cut(span, gaps):
+def _cut(span: Span, gaps: list[list[int]]) -> Iterator[Span]:
     """Yield the parts of a span between gaps."""
     interrupted = 'interrupted' if span.task or span.outcome else span.outcome
     first = bisect_right(gaps, span.start_log, key=lambda gap: gap[0])
@@ -114,7 +118,7 @@ def _cut(span, gaps):
     yield span
 
 
-def assign(spans, log, stamps):
+def assign(spans: Sequence[Span], log: np.ndarray, stamps: np.ndarray) -> np.ndarray:
     """Return (N,) int64: the episode of each message, -1 for none."""
     start_log, end_log, start_stamp, end_stamp = np.array(
         [(s.start_log, s.end_log, s.start_stamp, s.end_stamp) for s in spans],

@@ -35,12 +35,12 @@ class Summary:
 
     start: int  # where it begins in the file
     placed: bool  # whether that is where it should, so that offsets hold
-    topics: list  # its schemas and channels, of mcap.records
-    chunks: list  # of ChunkEntry, empty when it lists none
-    counts: dict | None  # channel -> number of messages; None when it does not say
+    topics: list[Schema | Channel]  # of mcap.records
+    chunks: list[ChunkEntry]  # empty when it lists none
+    counts: dict[int, int] | None  # channel -> number of messages; None when it does not say
 
 
-def read_summary(data):
+def read_summary(data: bytes | memoryview) -> tuple[Summary | None, str]:
     """
     Read the summary of a file.
 
@@ -71,7 +71,7 @@ def read_summary(data):
         return None, DAMAGED
 
 
-def _holds(data, start, footer, crc):
+def _holds(data: memoryview, start: int, footer: int, crc: int) -> bool:
     """Tell whether a summary lies between two places."""
     if not len(MAGIC) < start <= footer:
         return False
@@ -83,7 +83,7 @@ def _holds(data, start, footer, crc):
     return position == footer
 
 
-def _data_end(data):
+def _data_end(data: memoryview) -> int | None:
     """Return where the data of a file end by its records, None when they do not."""
     position = len(MAGIC)
     while position + RECORD.size <= len(data):
@@ -94,7 +94,7 @@ def _data_end(data):
     return None
 
 
-def _parse(data, start, placed):
+def _parse(data: memoryview, start: int, placed: bool) -> Summary:
     topics, chunks, counts = [], [], None
     for record in StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records:
         if isinstance(record, (Schema, Channel)):

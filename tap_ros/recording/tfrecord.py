@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read TFRecord files of tf.train.Example messages, without TensorFlow."""
 
+from collections.abc import Iterator
+from pathlib import Path
 import struct
+from typing import Any
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
 import google_crc32c
@@ -12,7 +15,7 @@ from tap_ros.errors import RecordingError
 _REMEDY = 'fetch the file again or leave it out'
 
 
-def read_records(path):
+def read_records(path: str | Path) -> Iterator[bytes]:
     """
     Yield the records of a TFRecord file, each checked against its CRC.
 
@@ -43,7 +46,7 @@ def read_records(path):
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
 
 
-def parse_example(data):
+def parse_example(data: bytes) -> dict[str, list[bytes] | np.ndarray]:
     """
     Decode one tf.train.Example (or the context of a tf.train.SequenceExample).
 
@@ -64,13 +67,13 @@ def parse_example(data):
     return features
 
 
-def _masked_crc(data):
+def _masked_crc(data: bytes) -> int:
     """Return the CRC-32C as TFRecord files store it."""
     crc = google_crc32c.value(data)
     return ((crc >> 15 | crc << 17) + 0xa282ead8) & 0xffffffff
 
 
-def _example_class():
+def _example_class() -> Any:
     """Declare the messages of tensorflow/core/example/{example,feature}.proto."""
     file = descriptor_pb2.FileDescriptorProto(
         name='tap_ros/example.proto', package='tap_ros', syntax='proto3')
@@ -95,7 +98,8 @@ def _example_class():
     return message_factory.GetMessageClass(pool.FindMessageTypeByName('tap_ros.Example'))
 
 
-def _add_message(owner, name, number, kind, label='LABEL_OPTIONAL', **options):
+def _add_message(owner: descriptor_pb2.DescriptorProto, name: str, number: int, kind: str,
+                 label: str = 'LABEL_OPTIONAL', **options: Any) -> None:
     """Add a field that holds a message."""
     owner.field.add(name=name, number=number, type='TYPE_MESSAGE', label=label,
                     type_name=f'.tap_ros.{kind}', **options)

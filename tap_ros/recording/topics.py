@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics of a recording: names, types, quality of service, and how they are found again."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from tap_ros.errors import RecordingError
 from tap_ros.text import listing
@@ -41,7 +43,7 @@ class Qos:
     reliability: str = 'reliable'  # or 'best_effort'
     durability: str = 'volatile'  # or 'transient_local'
 
-    def profile(self):
+    def profile(self) -> dict[str, Any]:
         """Return what rosbag2 writes about it."""
         infinite = {'sec': 9223372036, 'nsec': 854775807}
         return {
@@ -51,14 +53,15 @@ class Qos:
             'avoid_ros_namespace_conventions': False}
 
 
-def default_qos(topic):
+def default_qos(topic: str) -> Qos:
     """Return the Qos of a topic of this package, in any namespace."""
     if any(topic == name or topic.endswith(name) for name in LATCHED):
         return Qos(depth=1, durability='transient_local')
     return Qos()
 
 
-def resolve(available, source, image_topic=None):
+def resolve(available: Mapping[str, str], source: str,
+            image_topic: str | None = None) -> dict[str, str]:
     """
     Find the topics of a recording, in whatever namespace they are.
 

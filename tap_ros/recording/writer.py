@@ -6,20 +6,23 @@ Write recordings: MCAP files and bags as rosbag2 would write them with `ros2 bag
 `BagWriter` writes the messages of a running system, `EpisodeWriter` finished episodes.
 """
 
+from collections.abc import Sequence
 from contextlib import suppress
 import os
 from pathlib import Path
 import struct
 import time
+from typing import Any, Self
 
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
+from numpy.typing import ArrayLike
 from tap_ros.contract import CAMERA_FRAME, GRIPPER_JOINTS, PICTURE_ENCODING, WORLD_FRAME
-from tap_ros.errors import RecordingError
+from tap_ros.errors import RecordingError, StorageError
 from tap_ros.files import storage_errors
 from tap_ros.recording import metadata, topics
-from tap_ros.recording.episode import check_episode
+from tap_ros.recording.episode import check_episode, Episode
 from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode, typestore
 from tap_ros.text import escaped
@@ -38,7 +41,8 @@ class BagWriter:
     :raises RecordingError: when the folder holds something, or cannot be made.
     """
 
-    def __init__(self, folder, compression='zstd', flush_seconds=1.0, split_bytes=None):
+    def __init__(self, folder: str | Path, compression: str = 'zstd', flush_seconds: float = 1.0,
+                 split_bytes: int | None = None) -> None:
         self.folder = Path(folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -50,26 +54,28 @@ class BagWriter:
         self._compression = compression
         self._flush_seconds = flush_seconds
         self._split_bytes = split_bytes
-        self._finished = []
+        self._finished: list[dict[str, Any]] = []
         typestore()  # takes a moment, which no message should wait for
-        self._file = self._open()
+        self._file: FileWriter | None = self._open()
 
-    def write_raw(self, topic, type_name, data, log_time_ns, publish_time_ns=None, qos=None):
+    def write_raw(self, topic: str, type_name: str, data: bytes, log_time_ns: int,
+                  publish_time_ns: int | None = None, qos: topics.Qos | None = None) -> None:
         """Append one message; see FileWriter.write_raw."""
         if time.monotonic() - self._flushed > self._flush_seconds:
             self.flush()
-            if self._split_bytes and self._file.path.stat().st_size >= self._split_bytes:
-                file, self._file = self._file, None
+            file = self._current()
+            if self._split_bytes and file.path.stat().st_size >= self._split_bytes:
+                self._file = None
                 self._finished.append(file.close())
                 self._file = self._open()
-        self._file.write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
+        self._current().write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
 
-    def flush(self):
+    def flush(self) -> None:
         """Write all that was received so far to the file."""
-        self._file.flush()
+        self._current().flush()
         self._flushed = time.monotonic()
 
-    def close(self):
+    def close(self) -> None:
         """
         Finish the bag: its last file and metadata.yaml.
 
@@ -80,19 +86,25 @@ class BagWriter:
             self._finished.append(file.close())
             metadata.save(self.folder, self._finished)
 
-    def abandon(self):
+    def abandon(self) -> None:
         """Write no more, after an error; what was flushed before is readable."""
         if self._file is not None:
             self._file.abandon()
             self._file = None
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self):
+    def _current(self) -> FileWriter:
+        """Return the file that is being written."""
+        if self._file is None:
+            raise StorageError(f'{self.folder}: its last file is closed; start a new recording')
+        return self._file
+
+    def _open(self) -> FileWriter:
         self._flushed = time.monotonic()
         name = f'{self.folder.resolve().name}_{len(self._finished)}.mcap'
         return FileWriter(self.folder / name, compression=self._compression)
@@ -111,7 +123,8 @@ class EpisodeWriter:
     :param camera_matrix: (3, 3) intrinsics for /camera/camera_info; None: uncalibrated (zeros).
     """
 
-    def __init__(self, path, compression='zstd', camera_matrix=None):
+    def __init__(self, path: str | Path, compression: str = 'zstd',
+                 camera_matrix: ArrayLike | None = None) -> None:
         self.path = Path(path)
         self._part = self.path.with_name(self.path.name + '.part')
         with storage_errors(self.path):
@@ -121,13 +134,13 @@ class EpisodeWriter:
         self._camera = {
             'distortion_model': 'plumb_bob', 'd': np.zeros(5), 'k': K, 'r': np.eye(3),
             'p': np.hstack([K, np.zeros((3, 1))])}
-        self._last_log = None
+        self._last_log: int | None = None
         self._goal_known = self._goal_objects_known = False
 
-    def __enter__(self):
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind, *_):
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             if kind is None:
                 self._file.close()
@@ -138,7 +151,7 @@ class EpisodeWriter:
             with suppress(OSError):  # on a disk that is gone
                 self._part.unlink(missing_ok=True)
 
-    def write(self, episode):
+    def write(self, episode: Episode) -> None:
         """
         Append an episode.
 
@@ -158,7 +171,7 @@ class EpisodeWriter:
         self._mark(episode, last, event=1)
         self._last_log = last + shift
 
-    def _step(self, episode, t, stamp):
+    def _step(self, episode: Episode, t: int, stamp: int) -> None:
         """Write all messages of one time step."""
         frame = episode.frames[t]
         camera = {
@@ -181,28 +194,29 @@ class EpisodeWriter:
                 'twist': {'linear': {'x': x, 'y': y, 'z': z}}})
             self._put(topics.GRIPPER_COMMAND, stamp, {'data': opening})
 
-    def _goal(self, episode, stamp):
+    def _goal(self, episode: Episode, stamp: int) -> None:
         """Write the goal; an empty one takes back that of the episode before."""
         known = episode.goal_frame is not None
         if known or self._goal_known:
-            frame = episode.goal_frame if known else np.zeros((0, 0, 3), np.uint8)
-            self._put(topics.GOAL_IMAGE, stamp, _image(frame, stamp))
+            frame = episode.goal_frame
+            self._put(topics.GOAL_IMAGE, stamp, _image(
+                np.zeros((0, 0, 3), np.uint8) if frame is None else frame, stamp))
         if episode.object_names or self._goal_objects_known:
             self._put(topics.GOAL_OBJECTS, stamp, _objects(
                 stamp, episode.object_names, episode.goal_pixels, episode.goal_poses))
         self._goal_known, self._goal_objects_known = known, bool(episode.object_names)
 
-    def _mark(self, episode, stamp, event):
+    def _mark(self, episode: Episode, stamp: int, event: int) -> None:
         self._put(topics.EPISODE, stamp, {
             'header': _header(stamp, ''), 'event': event, 'task': episode.task,
             'seed': int(episode.seed), 'outcome': episode.outcome if event else ''})
 
-    def _put(self, topic, stamp, message):
+    def _put(self, topic: str, stamp: int, message: dict[str, Any]) -> None:
         kind = topics.TYPES[topic]
         self._file.write_raw(topic, kind, encode(kind, message), stamp + self._shift)
 
 
-def write_metadata(folder):
+def write_metadata(folder: str | Path) -> None:
     """
     Write metadata.yaml of a bag anew from its finished .mcap files.
 
@@ -215,7 +229,7 @@ def write_metadata(folder):
     metadata.save(folder, [_describe(path) for path in files])
 
 
-def count_episodes(path):
+def count_episodes(path: Path) -> int:
     """
     Count the episodes in a finished file, by the marks of their starts and ends.
 
@@ -225,7 +239,7 @@ def count_episodes(path):
     return marks['count'] // 2
 
 
-def _describe(path):
+def _describe(path: Path) -> dict[str, Any]:
     """Describe a finished file as FileWriter.close does."""
     try:
         with open(path, 'rb') as stream:
@@ -250,22 +264,23 @@ def _describe(path):
         'message_count': summary.statistics.message_count, 'topics': found}
 
 
-def _time(stamp):
+def _time(stamp: int) -> dict[str, int]:
     return {'sec': stamp // 10**9, 'nanosec': stamp % 10**9}
 
 
-def _header(stamp, frame_id):
+def _header(stamp: int, frame_id: str) -> dict[str, Any]:
     return {'stamp': _time(stamp), 'frame_id': frame_id}
 
 
-def _image(frame, stamp):
+def _image(frame: np.ndarray, stamp: int) -> dict[str, Any]:
     height, width, _ = frame.shape
     return {
         'header': _header(stamp, CAMERA_FRAME), 'height': height, 'width': width,
         'encoding': PICTURE_ENCODING, 'step': 3 * width, 'data': frame}
 
 
-def _objects(stamp, names, pixels, poses):
+def _objects(stamp: int, names: Sequence[str], pixels: np.ndarray,
+             poses: np.ndarray) -> dict[str, Any]:
     states = []
     for name, (u, v), pose in zip(names, pixels.tolist(), poses.tolist(), strict=True):
         states.append({

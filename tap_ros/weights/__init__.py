@@ -11,7 +11,7 @@ PREDICTORS = {path.stem.removeprefix('predictor_'): path
 DEFAULT_PREDICTOR = 'push2'
 
 
-def find_predictor(text):
+def find_predictor(text: str | Path) -> Path:
     """
     Find weights of a predictor.
 

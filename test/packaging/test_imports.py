@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+import tap_ros
 
 ROOT = Path(__file__).parents[2]
 OWN = ('tap_ros', 'sim_bridge', 'experiments')
@@ -134,6 +135,13 @@ def test_threads_do_not_spin_for_long_unless_the_user_wants_it(chosen, found):
         [sys.executable, '-c', 'import os, tap_ros; print(os.environ.get("GOMP_SPINCOUNT"))'],
         cwd=ROOT, env=kept | chosen, capture_output=True, text=True, check=True).stdout
     assert output.strip() == found
+
+
+def test_type_checkers_are_told_of_what_is_exported():
+    stub = ast.parse((ROOT / 'tap_ros' / '__init__.pyi').read_text())
+    told = {alias.asname: node.module for node in stub.body if isinstance(node, ast.ImportFrom)
+            for alias in node.names}
+    assert told == tap_ros._EXPORTS
 
 
 def test_what_is_exported_is_there_and_is_loaded_only_when_asked_for():

@@ -4,6 +4,7 @@
 
 import ast
 import configparser
+from distutils.core import run_setup
 from importlib import metadata
 import os
 from pathlib import Path
@@ -92,6 +93,15 @@ def test_launch_files_and_parameters_are_installed():
     for pattern in ('config/*.yaml', 'launch/*.launch.py'):
         here = {path.name for path in ROOT.glob(pattern)}
         assert here and here <= {path.name for path in share.glob(pattern)}
+
+
+def test_types_are_shipped(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    # Read, not built: setuptools of late adds these by itself, that of Ubuntu 24.04 does not.
+    data = run_setup('setup.py', stop_after='commandline').package_data
+    shipped = {str(path.relative_to(ROOT)) for package, patterns in data.items()
+               for pattern in patterns for path in (ROOT / package).glob(pattern)}
+    assert {'tap_ros/py.typed', 'tap_ros/__init__.pyi', 'sim_bridge/py.typed'} <= shipped
 
 
 def test_manifests_are_valid_and_of_one_version():

@@ -1,0 +1,11 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The names of __all__ for type checkers, which cannot see what __init__.py exports lazily."""
+
+from sim_bridge.simulator import Simulator as Simulator
+from tap_ros.errors import TapError as TapError
+from tap_ros.planning.visual_mpc import VisualMPC as VisualMPC
+from tap_ros.prediction.predictor import SubgoalPredictor as SubgoalPredictor
+from tap_ros.recording.cache import open_recordings as open_recordings
+from tap_ros.recording.reader import iter_episodes as iter_episodes
+from tap_ros.recording.writer import EpisodeWriter as EpisodeWriter
