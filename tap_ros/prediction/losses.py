@@ -195,8 +195,38 @@ def bell_preference(times: torch.Tensor, first: torch.Tensor | float, last: torc
     """
     half_range = ((last - first) / 2)
     half_range = torch.as_tensor(half_range, dtype=torch.float32).clamp(min=0.5)
-    position = (times - (last + first) / 2) / half_range  # -1..1
+    return bell((times - (last + first) / 2) / half_range, edge)
+
+
+def bell(position: torch.Tensor, edge: float) -> torch.Tensor:
+    """
+    Compute the Gaussian that is 1 at 0 and `edge` at -1 and 1.
+
+    :param position: any shape.
+    :param edge: above 0 and at most 1.
+    :return: the same shape.
+    """
     return torch.exp(math.log(edge) * position ** 2)
+
+
+def picture_progress(copy_error: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
+    """
+    Say how far a frame is on the way from start to goal, by what the pictures show.
+
+    q_t = (d_0 - d_T) / (d_0 + d_T), with d_0 and d_T the l1 distances of frame t to the start and
+    the goal picture, rescaled so that the targets of each episode range from -1 to 1. Not in the
+    paper, whose preference is over time: the bottleneck of an episode need not be at its middle.
+
+    :param copy_error: (B, 2, T), errors of start and goal picture against the targets.
+    :param valid: bool (B, T), False where an episode is padded; None: all are valid.
+    :return: (B, T), -1 to 1 for valid targets.
+    """
+    to_start, to_goal = copy_error.unbind(1)
+    progress = (to_start - to_goal) / (to_start + to_goal).clamp(min=_MIN_COPY_DISTANCE)
+    valid = torch.ones_like(progress, dtype=torch.bool) if valid is None else valid
+    low = progress.masked_fill(~valid, math.inf).amin(1, keepdim=True)
+    high = progress.masked_fill(~valid, -math.inf).amax(1, keepdim=True)
+    return 2 * (progress - low) / (high - low).clamp(min=_MIN_COPY_DISTANCE) - 1
 
 
 def linear_preference(times: torch.Tensor, last: torch.Tensor | float,

@@ -10,13 +10,14 @@ from tap_ros.errors import ConfigError
 
 Mode = Literal['bidirectional', 'forward']
 MODES = get_args(Mode)
-SELECTIONS = ('time_preference', 'relative_to_copying', 'cost_of_reaching')
+SELECTIONS = ('time_preference', 'relative_to_copying', 'cost_of_reaching', 'picture_progress')
 DEFAULT_BETA = 4.0  # of plain genmin in forward prediction; in the paper 2, 4 and 7 did best
 NAMES = ('fix, fix0.25 ... fix1.00 (a share of the episode), min, genmin, genmin<beta> (forward), '
-         'each with -wo-gan, -vae or -vae-gan, and genmin with +relative or +reach')
+         'each with -wo-gan, -vae or -vae-gan, and genmin with +relative, +reach or '
+         '+progress (bidirectional)')
 _NAME = re.compile(
     r'(?P<loss>fix|min|genmin)(?P<number>\d+(\.\d+)?|inf)?'
-    r'(?P<model>-wo-gan|-vae-gan|-vae)?(?P<selection>\+relative|\+reach)?')
+    r'(?P<model>-wo-gan|-vae-gan|-vae)?(?P<selection>\+relative|\+reach|\+progress)?')
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,9 @@ def parse_method(name: str) -> Method:
     Find out what a method's name stands for.
 
     As in the paper's tables, fix, min and genmin alone are trained with l1 and GAN; -wo-gan is l1
-    only, -vae the CVAE without GAN, -vae-gan both. +relative and +reach are not in the paper: they
-    select by relative_to_copying and by cost_of_reaching (see losses).
+    only, -vae the CVAE without GAN, -vae-gan both. +relative, +reach and +progress are not in the
+    paper: they select by relative_to_copying, by cost_of_reaching and with the preference over
+    picture_progress (see losses).
 
     :param name: for example 'fix0.25', 'genmin4', 'genmin-vae-gan', 'genmin-wo-gan+relative'.
     :return: Method.
@@ -74,4 +76,4 @@ def parse_method(name: str) -> Method:
         beta=number if loss == 'genmin' else None,
         gan=model in (None, '-vae-gan'), vae=model in ('-vae', '-vae-gan'),
         selection={None: SELECTIONS[0], '+relative': SELECTIONS[1],
-                   '+reach': SELECTIONS[2]}[found['selection']])
+                   '+reach': SELECTIONS[2], '+progress': SELECTIONS[3]}[found['selection']])

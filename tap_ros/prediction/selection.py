@@ -8,6 +8,7 @@ from tap_ros.images import to_float
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import (
+    bell,
     bell_preference,
     cost_of_reaching,
     fixed_time_loss,
@@ -15,6 +16,7 @@ from tap_ros.prediction.losses import (
     linear_preference,
     match_step,
     path_length,
+    picture_progress,
     preferred_error,
     relative_to_copying,
     weighted_l1_error,
@@ -58,6 +60,9 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
     preference = time_preference(batch, config)
     if config.chosen.selection == 'relative_to_copying':
         return relative_to_copying(error, copy_error(), preference)
+    if config.chosen.selection == 'picture_progress':
+        progress = picture_progress(copy_error(), batch.valid)
+        return preferred_error(error, bell(progress, config.bell_edge))
     if config.chosen.selection == 'cost_of_reaching':
         cost = path_length(batch.context[:, 0], batch.targets, batch.valid)
         return cost_of_reaching(error, cost, preference)

@@ -68,7 +68,7 @@ class ObjectiveSettings:
         l1 and GAN; fix0.25 with its target at a quarter of the episode; genmin2 with beta = 2, in
         forward prediction; -wo-gan is l1 alone, -vae adds z (Eq. 9), -vae-gan both (Eq. 10);
         with +relative the error relative to copying selects, with +reach the cost of reaching
-        does (losses.py).
+        does, with +progress the preference is over what the pictures show of the way (losses.py).
     :param bell_edge: w at both ends of the targets; 2/3 in the paper.
     :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
     :param changed_weight: how much more pixels of the target weigh in the outer error that differ
@@ -100,6 +100,9 @@ class ObjectiveSettings:
         if method.beta is not None and not self.forward:
             raise ConfigError(f'method: {method.name} has the linear preference of forward '
                               "prediction; give --mode forward, or 'genmin'")
+        if method.selection == 'picture_progress' and self.forward:
+            raise ConfigError(f'method: {method.name} needs a goal picture; give --mode '
+                              'bidirectional')
         if self.recursion > 1 and method.loss == 'fix':
             raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
                               f'method {method.name}')

@@ -66,8 +66,8 @@ def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
         run, stages = acts_like(
             loop, 'sampling:samples3', weights, num_samples=3, step_budget=2)
         loop.reset()
-        handle = send_goal(loop.reach_client, ReachGoal.Goal(num_samples=100), 30)
-        threading.Event().wait(3)  # it would make 200 plans before it moves
+        handle = send_goal(loop.reach_client, ReachGoal.Goal(num_samples=32), 30)
+        threading.Event().wait(3)  # it would make 64 plans before it moves
         cancel_goal(handle)
         status, result = wait_for_result(handle, 20)
         assert status == GoalStatus.STATUS_CANCELED and result.steps == 0

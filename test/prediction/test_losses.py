@@ -6,6 +6,7 @@ import math
 
 import pytest
 from tap_ros.prediction.losses import (
+    bell,
     bell_preference,
     changed_pixels,
     cost_of_reaching,
@@ -17,6 +18,7 @@ from tap_ros.prediction.losses import (
     match_step,
     minimum_loss,
     path_length,
+    picture_progress,
     preferred_error,
     recursive_loss,
     relative_to_copying,
@@ -128,6 +130,52 @@ def test_linear_is_the_papers():
     assert preference[0, 0].allclose(torch.tensor(0.5 + 1 / 15))
     assert preference[0, -1].allclose(torch.tensor(1.5))
     assert linear_preference(times, 15, math.inf).eq(1).all()
+
+
+def distances(B=5, T=7, seed=0):
+    """Return errors (B, 2, T) of start and goal pictures on ways that never turn back."""
+    steps = torch.rand(B, T, generator=torch.Generator().manual_seed(seed)) + 0.01
+    way = steps.cumsum(1) / steps.sum(1, keepdim=True)
+    return torch.stack([0.2 * way + 0.01, 0.2 * (1 - way) + 0.01], 1)
+
+
+def test_progress_goes_from_minus_1_to_1_and_never_back():
+    progress = picture_progress(distances())
+    assert progress[:, 0].tolist() == pytest.approx([-1] * 5, abs=1e-5)
+    assert progress[:, -1].tolist() == pytest.approx([1] * 5, abs=1e-5)
+    assert (progress.diff() > 0).all()
+
+
+def test_progress_does_not_depend_on_how_fast_the_pictures_change():
+    slow = distances()
+    held = slow.repeat_interleave(torch.tensor([4, 1, 1, 1, 1, 1, 6]), 2)  # waits at both ends
+    assert torch.allclose(picture_progress(held)[:, [0, 4, 5, 6, 7, 8, 9]],
+                          picture_progress(slow), atol=1e-5)
+
+
+def test_progress_of_the_reversed_episode_is_the_opposite():
+    error = distances()
+    assert torch.allclose(picture_progress(error.flip(1, 2)), -picture_progress(error).flip(1),
+                          atol=1e-5)
+
+
+def test_half_way_between_the_pictures_is_preferred_most():
+    way = torch.tensor([[0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9, 1]])  # most of it is late
+    error = torch.stack([way, 1 - way], 1) + 0.01
+    assert bell(picture_progress(error), 0.4).argmax().item() == 6
+
+
+def test_padding_is_not_on_the_way():
+    error, valid = distances(), torch.ones(5, 7, dtype=torch.bool)
+    valid[:, 5:] = False
+    padded = error.clone()
+    padded[:, :, 5:] = torch.tensor([[9.0], [0.0]])
+    assert picture_progress(padded, valid)[:, :5].equal(picture_progress(error[..., :5]))
+
+
+def test_a_single_target_and_pictures_that_are_all_alike_are_finite():
+    for error in (torch.full((2, 2, 1), 0.1), torch.zeros(2, 2, 4)):
+        assert bell(picture_progress(error), 1e-6).isfinite().all()
 
 
 def test_copying_is_worth_the_same_everywhere():

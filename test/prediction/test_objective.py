@@ -388,3 +388,19 @@ def test_draws_are_those_of_the_step():
     assert first.prior.equal(again.prior) and first.other.equal(again.other)
     assert not first.prior.equal(other.prior)
     assert not first.prior.equal(first.posterior[:, 0])
+
+
+def test_progress_matches_the_frame_half_way_in_the_pictures():
+    """An episode that is done late: of two targets that fit alike, the one half way wins."""
+    start, goal = torch.zeros(8, 8, 3), torch.full((8, 8, 3), 200)
+    shares = torch.tensor([0.02, 0.04, 0.06, 0.08, 0.1, 0.5, 0.9])
+    targets = (start + shares[:, None, None, None] * (goal - start))[None].byte()
+    T = len(shares)
+    column = torch.ones(1, 1, dtype=torch.int64)
+    batch = Batch(torch.stack([start, goal])[None].byte(), targets, torch.arange(1, T + 1)[None],
+                  column, column * T, column * (T + 1), torch.ones(1, T, dtype=torch.bool))
+    image = (to_float(targets[:, 3]) + to_float(targets[:, 5])) / 2  # as near to either
+    matches = {method: predictor_loss(showing(image), batch, None, replace(
+        CONFIG, method=method, bell_edge=0.01)).match.item()
+        for method in ('genmin-wo-gan', 'genmin-wo-gan+progress')}
+    assert matches == {'genmin-wo-gan': 3, 'genmin-wo-gan+progress': 5}

@@ -95,6 +95,7 @@ def test_seed_decides(config, tmp_path):
 @pytest.mark.parametrize('mode, method', [
     ('bidirectional', 'fix'), ('bidirectional', 'min'), ('bidirectional', 'genmin'),
     ('bidirectional', 'genmin-wo-gan+relative'), ('bidirectional', 'genmin+reach'),
+    ('bidirectional', 'genmin-wo-gan+progress'),
     ('bidirectional', 'genmin-vae'), ('bidirectional', 'genmin-vae-gan'), ('forward', 'fix1.00'),
     ('forward', 'genmin2')])
 def test_every_method_learns(config, mode, method):
@@ -261,7 +262,8 @@ def test_learning_rate_rises_and_falls():
     {'recordings': ()}, {'method': 'max'}, {'outer_power': 2.0}, {'mode': 'sideways'},
     {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
     {'bell_edge': 0.0}, {'max_frames': 2}, {'method': 'genmin2'}, {'method': 'fix1.5'},
-    {'method': 'min+relative'}, {'recursion': 2, 'method': 'fix'},
+    {'method': 'min+relative'}, {'method': 'genmin+progress', 'mode': 'forward'},
+    {'recursion': 2, 'method': 'fix'},
     {'posterior': 'frame', 'method': 'genmin-vae-gan'},
     {'posterior': 'frame', 'method': 'genmin-wo-gan'}, {'gan_weight': -1.0}])
 def test_settings_that_make_no_sense_are_refused_by_name(values):
