@@ -23,6 +23,7 @@ from experiments.paper.places import (
 from experiments.paper.runs import paper_runs, PaperRun
 from experiments.paper.shipping import ship
 from experiments.paper.sweep import find_state, sweep
+from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.engine import Engine
@@ -31,8 +32,6 @@ from tap_ros.files import locked
 from tap_ros.learning.split import split_episodes
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import Episode
-from tap_ros.recording.writer import EpisodeWriter, write_metadata
 
 ROOT = Path(__file__).parents[2]
 SEEDS = (122, 142, *range(6))  # the first two are held out
@@ -42,45 +41,24 @@ RUN = PaperRun('push2', 'bidirectional', 'genmin-wo-gan', new_pixels=False, epis
                steps=2)
 
 
-def make_episode(seed, task='push2', length=7, size=16):
-    """Two squares that move one after the other."""
-    rng = np.random.default_rng(seed)
-    start = rng.uniform(3, size - 9, (2, 2))
-    share = np.linspace(0, 2, length)[:, None]
-    done = np.concatenate([share.clip(0, 1), (share - 1).clip(0, 1)], 1)  # T, K
-    pixels = (start + done[..., None] * 5).astype(np.float32)
-    frames = np.full((length, size, size, 3), 40, np.uint8)
-    for t, k in np.ndindex(length, 2):
-        u, v = np.rint(pixels[t, k]).astype(int)
-        frames[t, v - 1:v + 2, u - 1:u + 2] = (200, 60 + 90 * k, 20)
-    poses = np.zeros((length, 2, 7))
-    return Episode(
-        frames=frames, stamps=np.arange(length) * 250_000_000 + (seed + 1) * 10 ** 11,
-        actions=np.zeros((length, 4), np.float32), grippers=np.zeros((length, 4), np.float32),
-        object_names=('object_0', 'object_1'), object_pixels=pixels, object_poses=poses,
-        goal_frame=frames[-1], goal_pixels=pixels[-1], goal_poses=poses[-1], task=task,
-        seed=seed, outcome='success')
-
-
-def write_bag(folder, seeds):
-    folder.mkdir(parents=True, exist_ok=True)
-    with EpisodeWriter(folder / f'{folder.name}_0.mcap') as writer:
-        for seed in seeds:
-            writer.write(make_episode(seed, folder.name))
-    write_metadata(folder)
+def write_squares(folder, seeds):
+    """Write episodes of two squares that move one after the other."""
+    start = [np.random.default_rng(seed).uniform(3, 7, (2, 2)) for seed in seeds]
+    write_bag(folder, [
+        move_squares(at, at + 5, length=7, size=16, half=1, seed=seed, task=folder.name)
+        for at, seed in zip(start, seeds)])
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    """Keep decoded recordings out of the user's cache; let jobs find the package."""
-    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path_factory.getbasetemp() / 'cache'))
+def package(monkeypatch):
+    """Let jobs find the package."""
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
         [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]))
 
 
 @pytest.fixture
 def places(tmp_path):
-    write_bag(tmp_path / 'bags' / 'push2', SEEDS)
+    write_squares(tmp_path / 'bags' / 'push2', SEEDS)
     return Places(*(str(tmp_path / name) for name in ('bags', 'runs', 'results')))
 
 
@@ -181,7 +159,7 @@ def test_a_recording_is_complete_when_all_its_episodes_are_there(places):
 
 @pytest.mark.slow
 def test_one_failed_run_does_not_stop_the_others(places):
-    write_bag(Path(places.recordings) / 'grasp', [0])  # one episode: none can be held out
+    write_squares(Path(places.recordings) / 'grasp', [0])  # one episode: none can be held out
     bad = replace(RUN, task='grasp')
     calls = []
     ends = sweep([bad, RUN], places, Engine(workers=2), on_done=lambda: calls.append(1),
@@ -205,7 +183,7 @@ def test_what_cannot_be_collected_fails_and_is_tried_once(places):
 
 
 def test_three_objects_begin_with_the_weights_for_two(places):
-    write_bag(Path(places.recordings) / 'push3', SEEDS_3)
+    write_squares(Path(places.recordings) / 'push3', SEEDS_3)
     run = replace(RUN, task='push3')
     assert [(end.name, end.kind) for end in sweep([run], places, progress=False)] == [
         (run.name, 'failed')]  # those are not trained
@@ -228,15 +206,15 @@ def test_three_objects_begin_with_the_weights_for_two(places):
     places.result(run).unlink()
     assert find_state(run, places, hashes).kind == 'partial'  # trained, not scored
     places.result(run).write_text(kept)
-    write_bag(Path(places.recordings) / 'push2', SEEDS[1:])
+    write_squares(Path(places.recordings) / 'push2', SEEDS[1:])
     assert find_state(run, places, hashes).kind == 'other'  # trained on another push2
     assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
 
 
 def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path):
     bags = tmp_path / 'bags'
-    write_bag(bags / 'push2', [0])  # one episode: none can be held out
-    write_bag(bags / 'push3', SEEDS_3)
+    write_squares(bags / 'push2', [0])  # one episode: none can be held out
+    write_squares(bags / 'push3', SEEDS_3)
     run = replace(RUN, task='push3')
     ends = sweep([run, run.before], Places(str(bags), str(tmp_path / 'runs'), str(
         tmp_path / 'results')), progress=False)

@@ -12,7 +12,6 @@ from tap_msgs.msg import ObjectStates
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.nodes import image_messages, object_messages
 
-pytestmark = pytest.mark.ros
 STAMP = Time(sec=3, nanosec=7)
 
 

@@ -11,8 +11,6 @@ from sensor_msgs.msg import Image, JointState
 from tap_ros.nodes.observations import DEPTH, Observations, PROOF, reception_time
 from tap_ros.nodes.topics import to_nanoseconds, to_stamp
 
-pytestmark = pytest.mark.ros
-
 
 def stamped(kind, nanoseconds):
     message = kind()
