@@ -4,6 +4,7 @@
 
 import argparse
 from dataclasses import replace
+from functools import partial
 import json
 import os
 from pathlib import Path
@@ -13,6 +14,7 @@ import sys
 import time
 
 from experiments.paper import command
+from experiments.paper import sweep as sweep_module
 from experiments.paper.job import BUSY, DONE, perform, UNFINISHED
 from experiments.paper.places import (
     collect_command,
@@ -20,7 +22,7 @@ from experiments.paper.places import (
     Places,
     recording_hash,
 )
-from experiments.paper.runs import paper_runs, PaperRun
+from experiments.paper.runs import paper_runs, PaperRun, SCALES
 from experiments.paper.shipping import ship
 from experiments.paper.sweep import find_state, sweep
 from made_episodes import move_squares, write_bag
@@ -57,12 +59,23 @@ def package(monkeypatch):
 
 
 @pytest.fixture
+def small(monkeypatch):
+    """Train small networks, in this process: pools of processes have tests of their own."""
+    def run_here(tasks, *_):
+        for task in tasks:
+            yield task, partial(task.function, *task.args)
+    monkeypatch.setattr(sweep_module, 'run_tasks', run_here)
+    monkeypatch.setitem(SCALES, 'small', replace(SCALES['small'], settings={
+        'base_width': 4, 'batch_size': 4, 'threads': 1}))
+
+
+@pytest.fixture
 def places(tmp_path):
     write_squares(tmp_path / 'bags' / 'push2', SEEDS)
     return Places(*(str(tmp_path / name) for name in ('bags', 'runs', 'results')))
 
 
-def test_a_run_leaves_a_number_for_every_held_out_episode(places):
+def test_a_run_leaves_a_number_for_every_held_out_episode(places, small):
     assert find_state(RUN, places).kind == 'missing'
     assert perform(RUN, places) == DONE
     state = find_state(RUN, places, {'push2': recording_hash(places.recording('push2'))})
@@ -85,7 +98,7 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places):
     assert result['name'] == RUN.name and RUN.name in result['command']
 
 
-def test_samples_and_forward_prediction_are_scored(places):
+def test_samples_and_forward_prediction_are_scored(places, small):
     vae = replace(RUN, method='genmin-vae', new_pixels=True)
     forward = replace(RUN, mode='forward', method='genmin2')
     assert perform(vae, places) == perform(forward, places) == DONE
@@ -100,7 +113,7 @@ def test_samples_and_forward_prediction_are_scored(places):
     assert 'copy-start' in scores and 'copy-goal' not in scores
 
 
-def test_other_settings_or_recordings_are_not_done(places, tmp_path):
+def test_other_settings_or_recordings_are_not_done(places, tmp_path, small):
     perform(RUN, places)
     path, data_hash = places.result(RUN), recording_hash(places.recording('push2'))
     assert find_state(replace(RUN, steps=3), places).kind == 'other'
@@ -115,7 +128,7 @@ def test_other_settings_or_recordings_are_not_done(places, tmp_path):
     assert find_state(RUN, places, {'push2': data_hash}).kind == 'partial'
 
 
-def test_a_training_goes_on_where_it_stopped(places):
+def test_a_training_goes_on_where_it_stopped(places, small):
     longer = replace(RUN, steps=3)
     assert perform(longer, places, minutes=1e-9) == UNFINISHED
     assert find_state(longer, places).steps == 1
@@ -182,12 +195,12 @@ def test_what_cannot_be_collected_fails_and_is_tried_once(places):
     assert 'other settings' in ends[0].reason
 
 
-def test_three_objects_begin_with_the_weights_for_two(places):
+def test_three_objects_begin_with_the_weights_for_two(places, small):
     write_squares(Path(places.recordings) / 'push3', SEEDS_3)
     run = replace(RUN, task='push3')
     assert [(end.name, end.kind) for end in sweep([run], places, progress=False)] == [
         (run.name, 'failed')]  # those are not trained
-    ends = sweep([run, run.before], places, engine=Engine(workers=2), progress=False)
+    ends = sweep([run, run.before], places, progress=False)
     assert [(end.name, end.kind) for end in ends] == [
         (RUN.name, 'done'), (run.name, 'done')]
     result = json.loads(places.result(run).read_text())
@@ -211,7 +224,7 @@ def test_three_objects_begin_with_the_weights_for_two(places):
     assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
 
 
-def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path):
+def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path, small):
     bags = tmp_path / 'bags'
     write_squares(bags / 'push2', [0])  # one episode: none can be held out
     write_squares(bags / 'push3', SEEDS_3)
@@ -288,7 +301,7 @@ def test_bad_options_are_refused(places, options, named):
         command.run(arguments(places, *options))
 
 
-def test_shipped_weights_predict_the_same_and_their_card_says_what_they_are(places, tmp_path):
+def test_shipped_weights_predict_the_same_and_their_card_says_so(places, tmp_path, small):
     assert perform(RUN, places) == DONE
     file = tmp_path / 'shipped' / 'predictor_push2.safetensors'
     card = ship(RUN, file, places).read_text()
