@@ -25,6 +25,8 @@ def main():
                         help='only mutants with this in their name; writes no page')
     parser.add_argument('--again', action='store_true',
                         help='try those again that were not killed, with the tests of now')
+    parser.add_argument('--jobs', type=int, default=1, metavar='N',
+                        help='mutants at a time (default: %(default)s)')
     parser.add_argument('--page-only', action='store_true', help='try nothing, write the page')
     args = parser.parse_args()
     os.environ['OMP_NUM_THREADS'] = '1'
@@ -35,7 +37,7 @@ def main():
                 and (mutant.status == OPEN or args.again and not mutant.killed)]
         print(f'{len(chosen)} mutants, {len(left)} to try', flush=True)
         if left:
-            try_mutants(left)
+            try_mutants(left, args.jobs)
     if not args.only:
         # Not above: processes that test mutants must not inherit the package without mutants.
         from experiments.mutants.page import write_page

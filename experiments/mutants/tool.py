@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import accumulate
 from pathlib import Path
 
 import libcst
@@ -19,6 +20,8 @@ from mutmut.workers.isolation import ForkServerRunner
 
 VERSION = version('mutmut')
 MODES = ('torch.inference_mode()', 'torch.no_grad()')
+STATS = Path('mutants/mutmut-stats.json')  # which tests reach what, and how long they take
+BUDGET_S = 20  # of tests for one mutant, by their time without it; one is always run
 KILLED = ('killed', 'timeout', 'segfault')
 OPEN = 'not checked'
 
@@ -52,16 +55,24 @@ class Mutant:
 
 
 def generate():
-    """Write the mutants of every file; results of functions that changed are forgotten."""
+    """
+    Write the mutants of every file; results of functions that changed are forgotten.
+
+    Where a source or a test has changed, all tests are run again before mutants are tried.
+    """
     Path('mutants').mkdir(exist_ok=True)
+    newest = max(path.stat().st_mtime for folder in ('tap_ros', 'test')
+                 for path in Path(folder).rglob('*.py'))
+    if STATS.exists() and STATS.stat().st_mtime < newest:
+        STATS.unlink()
     copy_src_dir()
     copy_also_copy_files()
     mutmut.create_mutants(1)
 
 
-def try_mutants(names):
+def try_mutants(names, jobs):
     """Run the tests that reach each of these mutants, the fastest first, until one fails."""
-    mutmut.cli(['run', '--max-children', '1', *names], standalone_mode=False)
+    mutmut.cli(['run', '--max-children', str(jobs), *names], standalone_mode=False)
 
 
 def load_mutants():
@@ -96,15 +107,28 @@ def _mutate_below_modes():
 
 
 def _run_fast_tests_first():
-    """Sort the tests of a mutant by their duration, which mutmut does in one of its modes only."""
+    """Run the tests of a mutant by their duration, until the next would go beyond BUDGET_S."""
     submit = ForkServerRunner.submit
 
-    def submit_sorted(self, mutant_name, tests, *limits):
+    def submit_fast(self, mutant_name, tests, *limits):
         durations = state().duration_by_test
-        submit(self, mutant_name, sorted(tests, key=lambda test: (durations[test], test)), *limits)
+        tests = sorted(tests, key=lambda test: (durations[test], test))
+        ends = accumulate(durations[test] for test in tests)
+        within = sum(end <= BUDGET_S for end in ends)
+        submit(self, mutant_name, tests[:max(1, within)], *limits)
 
-    ForkServerRunner.submit = submit_sorted
+    ForkServerRunner.submit = submit_fast
+
+
+def _run_clean_tests_once():
+    """
+    Leave out the run of all tests without mutants that mutmut begins with.
+
+    The one that finds which tests reach what is such a run, and see generate.
+    """
+    ForkServerRunner.run_clean_tests = lambda self, tests: 0
 
 
 _mutate_below_modes()
 _run_fast_tests_first()
+_run_clean_tests_once()
