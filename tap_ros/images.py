@@ -76,7 +76,7 @@ def check_pixels(pixels, name):
     if unknown:
         raise ImageError(f'{name}: unknown (not finite) for objects {unknown}; give (u, v) in '
                          'pixels for every object, or leave those out')
-    return pixels
+    return np.ascontiguousarray(pixels)  # torch takes no flipped views
 
 
 def in_picture(pixels, size):

@@ -48,7 +48,7 @@ def check_scene(scene, size):
         raise PlanningError(
             f'gripper: {GRIPPER_PARTS[at]} is {gripper[at]:g}; expected {GRIPPER_LOW[at]:g} to '
             f'{GRIPPER_HIGH[at]:g} (metres from the middle of the table, opening 0 to 1)')
-    return Scene(scene.image, gripper, pixels)
+    return Scene(np.ascontiguousarray(scene.image), np.ascontiguousarray(gripper), pixels)
 
 
 def check_goal_pixels(pixels, size):
@@ -80,7 +80,7 @@ def check_goal_maps(maps, size):
     if not np.isfinite(maps).all() or (maps < 0).any() or (mass <= 0).any():
         raise PlanningError('goal_maps: expected finite values of at least 0 and a positive sum '
                             f'for each object, got sums {mass.tolist()}')
-    return maps
+    return np.ascontiguousarray(maps)
 
 
 @contextmanager

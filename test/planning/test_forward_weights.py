@@ -11,6 +11,7 @@ from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
@@ -89,3 +90,17 @@ def test_goals_are_equal_when_the_objects_should_be_in_the_same_places(episodes)
     goal = mpc.goal(pixels)
     assert goal.equals(goal) and goal.equals(mpc.goal(pixels.copy())) and len(goal) == 2
     assert not goal.equals(mpc.goal(pixels + 0.1)) and not goal.equals(mpc.goal(pixels[::-1].copy()))
+
+
+def test_pictures_and_positions_may_be_views(episodes):
+    mpc = VisualMPC.load(FORWARD_MODEL, VisualMPCConfig(search=CEMConfig(4, 1, 2), proposals=2))
+    seen = episodes[0]
+    views = (seen.frames[0][:, ::-1], seen.grippers[0][::-1][::-1], seen.object_pixels[0][::-1],
+             seen.goal_pixels[::-1])
+    plans = []
+    for image, gripper, pixels, goals in (views, [view.copy() for view in views]):
+        plans.append(mpc.plan(Scene(image, gripper, pixels), mpc.goal(goals)))
+    assert np.array_equal(plans[0].actions, plans[1].actions)
+    maps = np.random.default_rng(0).random((2, 64, 64))
+    views = mpc.goal(maps=maps[::-1]), mpc.goal(maps=maps[::-1].copy())
+    assert views[0].equals(views[1])
