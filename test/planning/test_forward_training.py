@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the forward model's windows, augmentation, loss and training."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.torch import load_file
 from tap_ros.errors import ConfigError
+from tap_ros.learning.split import split_episodes
 from tap_ros.planning.forward_data import (
     augment_windows,
     COLOUR_ORDERS,
@@ -22,6 +22,7 @@ from tap_ros.planning.forward_loss import (
     motion_weight,
     picture_loss,
 )
+from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training import (
     draw_step,
@@ -31,6 +32,7 @@ from tap_ros.planning.forward_training import (
 )
 from tap_ros.planning.table import project
 from tap_ros.recording.cache import open_recordings
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 from toy_world import make_episode, TABLE, to_pixels
 
@@ -194,7 +196,8 @@ def test_every_part_of_the_model_learns(model):
 def config_for(bag, out, **changes):
     config = ForwardTrainingConfig(
         recordings=(str(bag),), out=str(out), steps=4, batch_size=2, horizon=3, pictures=2,
-        width=16, features=4, warmup=2, test_fraction=0.1, device='cpu', threads=1, save_every=2)
+        width=16, features=4, warmup=2, test_fraction=0.1, device='cpu', threads=1, save_every=2,
+        log_every=2)
     return replace(config, **changes)
 
 
@@ -206,8 +209,37 @@ def test_resumed_training_equals_uninterrupted_training(bag, tmp_path):
     assert first.keys() == second.keys()
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
-    run = json.loads((Path(tmp_path) / 'a' / 'run.json').read_text())
+    run, config, scores = (json.loads((tmp_path / 'a' / f'{name}.json').read_text())
+                           for name in ('run', 'config', 'scores'))
     assert run['steps'] == 4 and run['episodes'] + run['held_out'] == 60
+    assert config == json.loads(json.dumps(asdict(config_for(bag, tmp_path / 'a'))))
+    curves = EventAccumulator(str(tmp_path / 'b')).Reload()
+    assert {tag: [event.step for event in curves.Scalars(tag)]
+            for tag in curves.Tags()['scalars']} == {
+        'train/picture': [2, 4], 'train/moving': [2, 4],
+        **{f'held_out/{name}': [2, 4] for name in scores}}
+    assert {tag: [event.step for event in curves.Images(tag)]
+            for tag in curves.Tags()['images']} == {'training': [2, 4], 'held_out': [2, 4]}
+    told = {tag: curves.Scalars(f'held_out/{tag}')[-1].value for tag in scores}
+    assert told == pytest.approx(scores)
+
+
+def test_learning_rate_clip_and_averaging_say_how_far_a_step_goes(bag, tmp_path):
+    def distance(name, **changes):
+        config = config_for(bag, tmp_path / name, steps=2, warmup=0, **changes)
+        trained = load_file(train(config, progress=False))
+        store = open_recordings([bag], progress=False)
+        training, _ = split_episodes(store, config.test_fraction, config.horizon + 1)
+        torch.manual_seed(config.seed)
+        first = ForwardModel(model_config(config, store, training)).state_dict()
+        assert first.keys() == trained.keys()
+        return max(float((trained[key] - first[key]).abs().max()) for key in first)
+
+    far = distance('as usual', average_decay=0.0)
+    assert 1e-3 < far < 2 * 2e-3 * 1.01  # two steps of Adam
+    assert distance('no rate', learning_rate=0.0) == 0
+    assert distance('clipped', gradient_clip=1e-13, average_decay=0.0) < 1e-3 * far
+    assert 0 < distance('averaged', average_decay=0.9) < far
 
 
 @pytest.mark.parametrize('where', ['save_weights', 'save_checkpoint'])
