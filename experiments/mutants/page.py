@@ -8,7 +8,7 @@ from pathlib import Path
 import tomllib
 
 from experiments.faults.results import describe_machine
-from experiments.mutants.tool import VERSION
+from experiments.mutants.tool import BUDGET_S, VERSION
 from tap_ros.files import write_atomically
 
 FOLDER = Path('docs/results')
@@ -25,7 +25,8 @@ Made by `make mutants{arguments}` with [mutmut](https://mutmut.readthedocs.io) {
 
 A mutant is one small change of one function: another operator, number, name, argument or string.
 It is killed when a test fails with it, or never ends. Only tests that reach the function are run,
-without those marked `slow`.
+without those marked `slow`, the fastest first and for at most {budget} s in all, by their time
+without a mutant; one is always run.
 
 Left out, by rule: what an error says (all below `raise`), calls of `len` and `isinstance`, code
 outside functions, `train_command.py` (names and help of options), and functions with decorators
@@ -94,8 +95,9 @@ def make_page(found):
              if sampled else 'These are all there are.') + rest
     arguments = f' ARGS="--sample {found["chosen"]} --seed {found["seed"]}"' if sampled else ''
     return PAGE.format(
-        arguments=arguments, version=found['tool'].split()[1], commit=found['commit'],
-        date=found['date'], killed=found['killed'], tried=found['tried'], scope=scope,
+        arguments=arguments, budget=BUDGET_S, version=found['tool'].split()[1],
+        commit=found['commit'], date=found['date'],
+        killed=found['killed'], tried=found['tried'], scope=scope,
         rate=share(found['killed'], found['tried'], found['mutants']),
         rows='\n'.join(f'| `{row["file"]}` | {row["mutants"]} | {row["tried"]} | {row["killed"]} '
                        f'| {share(row["killed"], row["tried"], row["mutants"])} |'
