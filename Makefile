@@ -46,7 +46,7 @@ demo: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros demo $(if $(SCENES),--scenes $(SCENES)) $(ARGS)
 
 test: build
-	@$(ENTER); $(DOMAIN); python -m pytest $(if $(JOBS),-n $(JOBS) --dist loadgroup) $(ARGS)
+	@$(ENTER); $(DOMAIN); python -m pytest $(if $(JOBS),-n $(JOBS)) $(ARGS)
 
 mutants: build
 	@$(ENTER); $(DOMAIN); python -m experiments.mutants.run $(ARGS)

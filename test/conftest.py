@@ -17,13 +17,17 @@ if 'PYTEST_XDIST_WORKER' in os.environ:  # workers share the cores
     os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config, items):
-    """Give all tests of real nodes to one of several workers, and those of a file to one."""
-    if config.pluginmanager.hasplugin('xdist'):
-        for item in items:
-            alone = item.get_closest_marker('ros')
-            item.add_marker(pytest.mark.xdist_group('ros' if alone else str(item.path)))
+@pytest.hookimpl(optionalhook=True)  # of xdist, for make test JOBS=2
+def pytest_xdist_make_scheduler(config, log):
+    """Give the tests of a file to one worker, and all tests of real nodes to one."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            file = nodeid.split('::', 1)[0]
+            return 'nodes' if 'nodes' in file else file
+
+    return Scheduling(config, log)
 
 
 @pytest.fixture(autouse=True)

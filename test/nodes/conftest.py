@@ -2,17 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """All tests of this folder need ROS; nodes and clients for them."""
 
-from pathlib import Path
-
 import pytest
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
+def pytest_itemcollected(item):
     """Mark the tests of this folder."""
-    for item in items:
-        if Path(__file__).parent in item.path.parents:
-            item.add_marker(pytest.mark.ros)
+    item.add_marker(pytest.mark.ros)
 
 
 @pytest.fixture
