@@ -71,7 +71,11 @@ def generate():
 
 
 def try_mutants(names, jobs):
-    """Run the tests that reach each of these mutants, the fastest first, until one fails."""
+    """
+    Run the tests that reach each of these mutants, the fastest first, until one fails.
+
+    :param names: of mutants; jobs: how many at a time.
+    """
     mutmut.cli(['run', '--max-children', str(jobs), *names], standalone_mode=False)
 
 
