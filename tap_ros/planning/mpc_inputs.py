@@ -38,7 +38,7 @@ def check_scene(scene, size):
         pixels = check_pixels(scene.object_pixels, 'object_pixels')
     if not len(pixels):
         raise PlanningError('object_pixels: no objects; give the position of one at least')
-    gripper = np.asarray(scene.gripper, np.float32)
+    gripper = np.ascontiguousarray(scene.gripper, np.float32)  # torch takes no flipped views
     if gripper.shape != (4,) or not np.isfinite(gripper).all():
         raise PlanningError(
             f'gripper: expected 4 finite numbers (x, y, z in m, opening), got {gripper}')
@@ -48,7 +48,7 @@ def check_scene(scene, size):
         raise PlanningError(
             f'gripper: {GRIPPER_PARTS[at]} is {gripper[at]:g}; expected {GRIPPER_LOW[at]:g} to '
             f'{GRIPPER_HIGH[at]:g} (metres from the middle of the table, opening 0 to 1)')
-    return Scene(np.ascontiguousarray(scene.image), np.ascontiguousarray(gripper), pixels)
+    return Scene(scene.image, gripper, pixels)
 
 
 def check_goal_pixels(pixels, size):
@@ -72,7 +72,7 @@ def check_goal_maps(maps, size):
 
     :raises PlanningError: for a wrong shape, negative or not finite values, or an empty map.
     """
-    maps = np.asarray(maps, np.float32)
+    maps = np.ascontiguousarray(maps, np.float32)
     if maps.ndim != 3 or maps.shape[1:] != tuple(size):
         raise PlanningError(f'goal_maps: expected shape (K, {size[0]}, {size[1]}), one map for '
                             f'each object, got {maps.shape}')
@@ -80,7 +80,7 @@ def check_goal_maps(maps, size):
     if not np.isfinite(maps).all() or (maps < 0).any() or (mass <= 0).any():
         raise PlanningError('goal_maps: expected finite values of at least 0 and a positive sum '
                             f'for each object, got sums {mass.tolist()}')
-    return np.ascontiguousarray(maps)
+    return maps
 
 
 @contextmanager
