@@ -14,7 +14,7 @@ from tap_ros.files import write_atomically
 FOLDER = Path('docs/results')
 REASONS = Path(__file__).with_name('reasons.toml')
 Z = 1.96  # of a 95% interval
-NO_REASON = 'no reason noted: a test is missing'
+NO_REASON = 'a test is missing'
 PAGE = """\
 # Which changes of the code the tests notice
 
@@ -91,7 +91,8 @@ def make_page(found):
     sampled = found['seed'] is not None
     rest = '' if found['tried'] == found['chosen'] else (
         f' Not tried yet: {found["chosen"] - found["tried"]}.')
-    scope = (f'They were drawn at random, with seed {found["seed"]}, from {found["mutants"]}.'
+    scope = (f'They were drawn at random, with seed {found["seed"]}, from {found["mutants"]}. Once '
+             'tests are written for the survivors of a draw, another seed tells the rate.'
              if sampled else 'These are all there are.') + rest
     arguments = f' ARGS="--sample {found["chosen"]} --seed {found["seed"]}"' if sampled else ''
     return PAGE.format(
@@ -114,7 +115,7 @@ def share(killed, tried, total):
         return words
     middle = (killed + Z ** 2 / 2) / (tried + Z ** 2)
     half = Z / (tried + Z ** 2) * (killed * (tried - killed) / tried + Z ** 2 / 4) ** 0.5
-    return f'{words} ({middle - half:.0%} to {min(middle + half, 1):.0%})'
+    return f'{words} ({max(middle - half, 0):.0%} to {min(middle + half, 1):.0%})'
 
 
 def _survivor(row):
