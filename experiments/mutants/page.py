@@ -91,8 +91,8 @@ def make_page(found):
     sampled = found['seed'] is not None
     rest = '' if found['tried'] == found['chosen'] else (
         f' Not tried yet: {found["chosen"] - found["tried"]}.')
-    scope = (f'They were drawn at random, with seed {found["seed"]}, from {found["mutants"]}. Once '
-             'tests are written for the survivors of a draw, another seed tells the rate.'
+    scope = (f'They were drawn at random, with seed {found["seed"]}, from {found["mutants"]}. '
+             'Once tests are written for the survivors of a draw, another seed tells the rate.'
              if sampled else 'These are all there are.') + rest
     arguments = f' ARGS="--sample {found["chosen"]} --seed {found["seed"]}"' if sampled else ''
     return PAGE.format(
