@@ -22,12 +22,14 @@ $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 # Two processes share two cores best when each takes one.
 paper: export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test paper faults build lint bench clean
+.PHONY: help demo test mutants paper faults build lint bench clean
 
 help:
 	@echo 'make demo    push two objects to where a goal picture shows them, three scenes'
 	@echo '             SCENES=20: that many scenes; ARGS=...: more options of the demo'
-	@echo 'make test    all tests; ARGS="-k warp" chooses'
+	@echo 'make test    all tests; ARGS="-k warp" chooses; JOBS=2: in two processes'
+	@echo 'make mutants change the code a little, thousands of times, and see whether a test fails, in'
+	@echo '             docs/results: hours; goes on; ARGS="--sample 300": so many, drawn at random'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
 	@echo 'make faults  inject every fault into real nodes and files, in docs/results: five hours;'
@@ -44,7 +46,10 @@ demo: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros demo $(if $(SCENES),--scenes $(SCENES)) $(ARGS)
 
 test: build
-	@$(ENTER); $(DOMAIN); python -m pytest $(ARGS)
+	@$(ENTER); $(DOMAIN); python -m pytest $(if $(JOBS),-n $(JOBS)) $(ARGS)
+
+mutants: build
+	@$(ENTER); $(DOMAIN); python -m experiments.mutants.run $(ARGS)
 
 paper: build
 	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(if $(SCALE),--scale $(SCALE)) $(ARGS)

@@ -83,7 +83,7 @@ def check_pixels(pixels: ArrayLike | None, name: str) -> np.ndarray:
     if unknown:
         raise ImageError(f'{name}: unknown (not finite) for objects {unknown}; give (u, v) in '
                          'pixels for every object, or leave those out')
-    return pixels
+    return np.ascontiguousarray(pixels)  # torch takes no flipped views
 
 
 def in_picture(pixels: np.ndarray, size: Sequence[int]) -> np.ndarray | np.bool_:

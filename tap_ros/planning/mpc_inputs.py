@@ -40,7 +40,7 @@ def check_scene(scene: Scene, size: Sequence[int]) -> Scene:
         pixels = check_pixels(scene.object_pixels, 'object_pixels')
     if not len(pixels):
         raise PlanningError('object_pixels: no objects; give the position of one at least')
-    gripper = np.asarray(scene.gripper, np.float32)
+    gripper = np.ascontiguousarray(scene.gripper, np.float32)  # torch takes no flipped views
     if gripper.shape != (4,) or not np.isfinite(gripper).all():
         raise PlanningError(
             f'gripper: expected 4 finite numbers (x, y, z in m, opening), got {gripper}')
@@ -74,7 +74,7 @@ def check_goal_maps(maps: ArrayLike, size: Sequence[int]) -> np.ndarray:
 
     :raises PlanningError: for a wrong shape, negative or not finite values, or an empty map.
     """
-    maps = np.asarray(maps, np.float32)
+    maps = np.ascontiguousarray(maps, np.float32)
     if maps.ndim != 3 or maps.shape[1:] != tuple(size):
         raise PlanningError(f'goal_maps: expected shape (K, {size[0]}, {size[1]}), one map for '
                             f'each object, got {maps.shape}')

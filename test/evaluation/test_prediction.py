@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import product
 import json
 
+from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
@@ -23,29 +24,9 @@ from tap_ros.options import parse
 from tap_ros.prediction.batches import fixed_time, make_batch, Sampling
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
-from tap_ros.recording.episode import Episode
-from tap_ros.recording.writer import EpisodeWriter
 import torch
 
 SIZE = 32
-
-
-def make_episode(start, goal, length=9):
-    """Object 0 moves in the first half of the time, object 1 in the second."""
-    start, goal = np.array(start, np.float32), np.array(goal, np.float32)
-    share = np.linspace(0, 2, length)[:, None]
-    done = np.concatenate([share.clip(0, 1), (share - 1).clip(0, 1)], 1)  # T, K
-    pixels = start + done[..., None] * (goal - start)
-    frames = np.full((length, SIZE, SIZE, 3), 40, np.uint8)
-    for t, k in np.ndindex(length, 2):
-        u, v = np.rint(pixels[t, k]).astype(int)
-        frames[t, v - 2:v + 3, u - 2:u + 3] = (200, 60 + 90 * k, 20)
-    return Episode(
-        frames=frames, stamps=np.arange(length), actions=np.zeros((length, 4), np.float32),
-        grippers=np.zeros((length, 4), np.float32), object_names=('a', 'b'),
-        object_pixels=pixels.astype(np.float32), object_poses=np.zeros((length, 2, 7)),
-        goal_frame=frames[0], goal_pixels=goal, goal_poses=np.zeros((2, 7)), task='push2',
-        seed=0, outcome='success')
 
 
 class Store(list):
@@ -77,8 +58,8 @@ class Pasting(torch.nn.Module):
 
 
 # Object 0 stays in the left half, object 1 in the right one.
-EPISODES = Store(make_episode([[6, 6], [24, y]], [[12, 10], [27, y - 9]])
-                 for y in (16, 20, 24))
+EPISODES = Store(move_squares([[6, 6], [24, y]], [[12, 10], [27, y - 9]], seed=seed)
+                 for seed, y in enumerate((16, 20, 24)))
 
 
 def test_bottleneck_is_either_object_first_and_the_sum_over_objects():
@@ -182,7 +163,7 @@ def test_margin_keeps_matches_away_from_the_context():
 
 
 def test_episodes_in_which_an_object_stays_do_not_count_as_bottlenecks():
-    still = make_episode([[6, 6], [24, 16]], [[12, 10], [24, 16 + MIN_MOTION / 2]])
+    still = move_squares([[6, 6], [24, 16]], [[12, 10], [24, 16 + MIN_MOTION / 2]])
     scores = evaluate(Pasting(), Store([*EPISODES, still]), range(4))['prediction']
     assert np.isnan(scores.bottleneck).tolist() == [False, False, False, True]
     assert scores.summary()['bottleneck_episodes'] == 3
@@ -274,16 +255,12 @@ def test_pictures_are_written(tmp_path):
 
 @pytest.mark.parametrize('options', [
     {}, {'latent_size': 8}, {'num_context': 1, 'new_pixels': True}])
-def test_the_command_scores_what_training_held_out(tmp_path, monkeypatch, capsys, options):
-    with EpisodeWriter(tmp_path / 'bag_0.mcap') as writer:
-        for i, episode in enumerate(EPISODES):
-            stamps = np.arange(9) * 10 ** 8 + (i + 1) * 10 ** 10
-            writer.write(replace(episode, seed=i, stamps=stamps))
-    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
+def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
+    bag = write_bag(tmp_path / 'bag', EPISODES)
     made = network(**options)
     weights = tmp_path / 'weights.safetensors'
     save_weights(weights, made, 'predictor', made.config, {'settings': {'test_fraction': 0.0}})
-    common = ['--weights', str(weights), '--recordings', str(tmp_path / 'bag_0.mcap')]
+    common = ['--weights', str(weights), '--recordings', str(bag)]
     with pytest.raises(ConfigError, match='--all'):
         run(parse(Options, common))
     run(parse(Options, [*common, '--all', '--samples', '3', '--out', str(tmp_path / 'out')]))

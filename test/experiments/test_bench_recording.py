@@ -7,12 +7,6 @@ import pytest
 from tap_ros.cli import main
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    """Keep decoded recordings out of the user's cache."""
-    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
-
-
 def test_all_contenders_see_all_frames():
     results = recording.measure(episodes=5, files=2, repeats=1, image_size=16)
     assert set(results) == {'none', 'zstd'}

@@ -3,6 +3,7 @@
 """Laws of the sweep, with tiny recordings and a few steps of training."""
 
 from dataclasses import replace
+from functools import partial
 import json
 import os
 from pathlib import Path
@@ -12,6 +13,7 @@ import sys
 import time
 
 from experiments.paper import command
+from experiments.paper import sweep as sweep_module
 from experiments.paper.job import BUSY, DONE, perform, UNFINISHED
 from experiments.paper.places import (
     collect_command,
@@ -19,9 +21,10 @@ from experiments.paper.places import (
     Places,
     recording_hash,
 )
-from experiments.paper.runs import paper_runs, PaperRun
+from experiments.paper.runs import paper_runs, PaperRun, SCALES
 from experiments.paper.shipping import ship
 from experiments.paper.sweep import find_state, sweep
+from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.engine import Engine
@@ -31,8 +34,6 @@ from tap_ros.learning.split import split_episodes
 from tap_ros.options import parse
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import Episode
-from tap_ros.recording.writer import EpisodeWriter, write_metadata
 
 ROOT = Path(__file__).parents[2]
 SEEDS = (122, 142, *range(6))  # the first two are held out
@@ -42,49 +43,39 @@ RUN = PaperRun('push2', 'bidirectional', 'genmin-wo-gan', new_pixels=False, epis
                steps=2)
 
 
-def make_episode(seed, task='push2', length=7, size=16):
-    """Two squares that move one after the other."""
-    rng = np.random.default_rng(seed)
-    start = rng.uniform(3, size - 9, (2, 2))
-    share = np.linspace(0, 2, length)[:, None]
-    done = np.concatenate([share.clip(0, 1), (share - 1).clip(0, 1)], 1)  # T, K
-    pixels = (start + done[..., None] * 5).astype(np.float32)
-    frames = np.full((length, size, size, 3), 40, np.uint8)
-    for t, k in np.ndindex(length, 2):
-        u, v = np.rint(pixels[t, k]).astype(int)
-        frames[t, v - 1:v + 2, u - 1:u + 2] = (200, 60 + 90 * k, 20)
-    poses = np.zeros((length, 2, 7))
-    return Episode(
-        frames=frames, stamps=np.arange(length) * 250_000_000 + (seed + 1) * 10 ** 11,
-        actions=np.zeros((length, 4), np.float32), grippers=np.zeros((length, 4), np.float32),
-        object_names=('object_0', 'object_1'), object_pixels=pixels, object_poses=poses,
-        goal_frame=frames[-1], goal_pixels=pixels[-1], goal_poses=poses[-1], task=task,
-        seed=seed, outcome='success')
-
-
-def write_bag(folder, seeds):
-    folder.mkdir(parents=True, exist_ok=True)
-    with EpisodeWriter(folder / f'{folder.name}_0.mcap') as writer:
-        for seed in seeds:
-            writer.write(make_episode(seed, folder.name))
-    write_metadata(folder)
+def write_squares(folder, seeds):
+    """Write episodes of two squares that move one after the other."""
+    start = [np.random.default_rng(seed).uniform(3, 7, (2, 2)) for seed in seeds]
+    write_bag(folder, [
+        move_squares(at, at + 5, length=7, size=16, half=1, seed=seed, task=folder.name)
+        for at, seed in zip(start, seeds)])
 
 
 @pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    """Keep decoded recordings out of the user's cache; let jobs find the package."""
-    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path_factory.getbasetemp() / 'cache'))
+def package(monkeypatch):
+    """Let jobs find the package."""
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(
         [str(ROOT), *filter(None, [os.environ.get('PYTHONPATH')])]))
 
 
 @pytest.fixture
+def small(monkeypatch):
+    """Train small networks, in this process: pools of processes have tests of their own."""
+    def run_here(tasks, *_):
+        for task in tasks:
+            yield task, partial(task.function, *task.args)
+    monkeypatch.setattr(sweep_module, 'run_tasks', run_here)
+    monkeypatch.setitem(SCALES, 'small', replace(SCALES['small'], settings={
+        'base_width': 4, 'batch_size': 4, 'threads': 1}))
+
+
+@pytest.fixture
 def places(tmp_path):
-    write_bag(tmp_path / 'bags' / 'push2', SEEDS)
+    write_squares(tmp_path / 'bags' / 'push2', SEEDS)
     return Places(*(str(tmp_path / name) for name in ('bags', 'runs', 'results')))
 
 
-def test_a_run_leaves_a_number_for_every_held_out_episode(places):
+def test_a_run_leaves_a_number_for_every_held_out_episode(places, small):
     assert find_state(RUN, places).kind == 'missing'
     assert perform(RUN, places) == DONE
     state = find_state(RUN, places, {'push2': recording_hash(places.recording('push2'))})
@@ -107,7 +98,7 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places):
     assert result['name'] == RUN.name and RUN.name in result['command']
 
 
-def test_samples_and_forward_prediction_are_scored(places):
+def test_samples_and_forward_prediction_are_scored(places, small):
     vae = replace(RUN, method='genmin-vae', new_pixels=True)
     forward = replace(RUN, mode='forward', method='genmin2')
     assert perform(vae, places) == perform(forward, places) == DONE
@@ -122,7 +113,7 @@ def test_samples_and_forward_prediction_are_scored(places):
     assert 'copy-start' in scores and 'copy-goal' not in scores
 
 
-def test_other_settings_or_recordings_are_not_done(places, tmp_path):
+def test_other_settings_or_recordings_are_not_done(places, tmp_path, small):
     perform(RUN, places)
     path, data_hash = places.result(RUN), recording_hash(places.recording('push2'))
     assert find_state(replace(RUN, steps=3), places).kind == 'other'
@@ -137,7 +128,7 @@ def test_other_settings_or_recordings_are_not_done(places, tmp_path):
     assert find_state(RUN, places, {'push2': data_hash}).kind == 'partial'
 
 
-def test_a_training_goes_on_where_it_stopped(places):
+def test_a_training_goes_on_where_it_stopped(places, small):
     longer = replace(RUN, steps=3)
     assert perform(longer, places, minutes=1e-9) == UNFINISHED
     assert find_state(longer, places).steps == 1
@@ -181,7 +172,7 @@ def test_a_recording_is_complete_when_all_its_episodes_are_there(places):
 
 @pytest.mark.slow
 def test_one_failed_run_does_not_stop_the_others(places):
-    write_bag(Path(places.recordings) / 'grasp', [0])  # one episode: none can be held out
+    write_squares(Path(places.recordings) / 'grasp', [0])  # one episode: none can be held out
     bad = replace(RUN, task='grasp')
     calls = []
     ends = sweep([bad, RUN], places, Engine(workers=2), on_done=lambda: calls.append(1),
@@ -204,12 +195,12 @@ def test_what_cannot_be_collected_fails_and_is_tried_once(places):
     assert 'other settings' in ends[0].reason
 
 
-def test_three_objects_begin_with_the_weights_for_two(places):
-    write_bag(Path(places.recordings) / 'push3', SEEDS_3)
+def test_three_objects_begin_with_the_weights_for_two(places, small):
+    write_squares(Path(places.recordings) / 'push3', SEEDS_3)
     run = replace(RUN, task='push3')
     assert [(end.name, end.kind) for end in sweep([run], places, progress=False)] == [
         (run.name, 'failed')]  # those are not trained
-    ends = sweep([run, run.before], places, engine=Engine(workers=2), progress=False)
+    ends = sweep([run, run.before], places, progress=False)
     assert [(end.name, end.kind) for end in ends] == [
         (RUN.name, 'done'), (run.name, 'done')]
     result = json.loads(places.result(run).read_text())
@@ -228,15 +219,15 @@ def test_three_objects_begin_with_the_weights_for_two(places):
     places.result(run).unlink()
     assert find_state(run, places, hashes).kind == 'partial'  # trained, not scored
     places.result(run).write_text(kept)
-    write_bag(Path(places.recordings) / 'push2', SEEDS[1:])
+    write_squares(Path(places.recordings) / 'push2', SEEDS[1:])
     assert find_state(run, places, hashes).kind == 'other'  # trained on another push2
     assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
 
 
-def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path):
+def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path, small):
     bags = tmp_path / 'bags'
-    write_bag(bags / 'push2', [0])  # one episode: none can be held out
-    write_bag(bags / 'push3', SEEDS_3)
+    write_squares(bags / 'push2', [0])  # one episode: none can be held out
+    write_squares(bags / 'push3', SEEDS_3)
     run = replace(RUN, task='push3')
     ends = sweep([run, run.before], Places(str(bags), str(tmp_path / 'runs'), str(
         tmp_path / 'results')), progress=False)
@@ -308,7 +299,7 @@ def test_bad_options_are_refused(places, options, named):
         command.run(arguments(places, *options))
 
 
-def test_shipped_weights_predict_the_same_and_their_card_says_what_they_are(places, tmp_path):
+def test_shipped_weights_predict_the_same_and_their_card_says_so(places, tmp_path, small):
     assert perform(RUN, places) == DONE
     file = tmp_path / 'shipped' / 'predictor_push2.safetensors'
     card = ship(RUN, file, places).read_text()

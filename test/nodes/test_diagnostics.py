@@ -3,28 +3,15 @@
 """What /diagnostics says of a node's inputs and work."""
 
 import math
-from pathlib import Path
 import resource
-import sys
 from threading import Thread
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-import pytest
+from processes import NodeProcess
 from sensor_msgs.msg import JointState
 from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.topics import STREAM
-
-sys.path.insert(0, str(Path(__file__).parent))
-from processes import Client, NodeProcess  # noqa: E402
-
-pytestmark = pytest.mark.ros
-
-
-@pytest.fixture
-def client():
-    with Client() as node:
-        yield node
 
 
 def statuses(message):

@@ -12,7 +12,6 @@ from tap_msgs.msg import ObjectStates
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.nodes import image_messages, object_messages
 
-pytestmark = pytest.mark.ros
 STAMP = Time(sec=3, nanosec=7)
 
 
@@ -81,6 +80,61 @@ def test_a_frame_id_without_end_is_refused():
         image_messages.decode_image(message, 'goal')
 
 
+def test_what_is_just_within_the_limits_is_taken():
+    message = image_messages.encode_image(picture(), STAMP, image_messages.MAX_FRAME_ID * 'x')
+    assert np.array_equal(image_messages.decode_image(message, 'goal'), picture())
+    step = image_messages.MAX_BYTES
+    message = Image(height=1, width=1, step=step, encoding='rgb8')
+    message.data = array.array('B', bytes([1, 2, 3]) + bytes(step - 3))
+    assert image_messages.decode_image(message, 'goal').tolist() == [[[1, 2, 3]]]
+    names = [str(k) for k in range(object_messages.MAX_OBJECTS - 1)]
+    names.append(object_messages.MAX_NAME * 'x')
+    message = objects(len(names) * [[1, 2]], names)
+    assert object_messages.decode_objects(message, 'objects')[0] == tuple(names)
+
+
+@pytest.mark.parametrize('change, empty', [
+    ({}, True), ({'step': 3, 'encoding': 'rgb8'}, True), ({'width': 1}, False),
+    ({'height': 1}, False), ({'data': array.array('B', [0])}, False)])
+def test_only_a_picture_without_size_and_data_is_empty(change, empty):
+    assert image_messages.is_empty(Image(**change)) == empty
+
+
+def test_everything_says_when_and_where_it_was_seen():
+    for message in (image_messages.encode_image(picture(), STAMP, 'here'),
+                    image_messages.encode_map(np.zeros((5, 7)), STAMP, 'here'),
+                    object_messages.encode_objects(
+                        ['red'], [[1, 2]], np.zeros((1, 7)), STAMP, 'here', 1),
+                    object_messages.encode_gripper([0, 0, 0, 1], STAMP, 'here'),
+                    object_messages.encode_camera_info(np.eye(3), (5, 7), STAMP, 'here')):
+        assert message.header.stamp == STAMP and message.header.frame_id == 'here'
+
+
+def test_the_camera_is_described_by_its_intrinsics_and_size():
+    K = [[50.0, 0, 3.5], [0, 60, 2.5], [0, 0, 1]]
+    info = object_messages.encode_camera_info(np.array(K), (5, 7), STAMP, 'eye')
+    assert (info.height, info.width, info.distortion_model) == (5, 7, 'plumb_bob')
+    assert np.reshape(info.k, (3, 3)).tolist() == K
+    assert np.reshape(info.p, (3, 4)).tolist() == [[*row, 0] for row in K]
+    assert np.reshape(info.r, (3, 3)).tolist() == np.eye(3).tolist()
+    assert list(info.d) == 5 * [0.0]
+
+
+def test_an_even_picture_stays_even_and_no_column_is_passed_over_when_resizing():
+    even = np.full((9, 7, 3), (200, 3, 77), np.uint8)
+    for size in ((4, 3), (9, 14), (31, 2)):
+        resized = image_messages.resize_image(even, size)
+        assert resized.shape == (*size, 3) and resized.dtype == np.uint8
+        assert (resized == even[0, 0]).all()
+    lines = np.zeros((8, 32, 3), np.uint8)
+    lines[:, 0::4] = lines[:, 3::4] = 240  # what lies between the places looked at, too, counts
+    resized = image_messages.resize_image(lines, (8, 8))
+    assert np.ptp(resized[:, 1:-1]) == 0 and 60 < resized[4, 4, 0] < 140
+    step = np.zeros((1, 4, 3), np.uint8)
+    step[:, 2:] = 255
+    assert (np.diff(image_messages.resize_image(step, (1, 16))[0, :, 0].astype(int)) >= 0).all()
+
+
 def test_another_size_is_refused_unless_resizing_is_allowed():
     message = image_messages.encode_image(picture(6, 8), STAMP, 'camera')
     with pytest.raises(ImageError, match='expected 4x3 .* got 8x6'):
@@ -131,7 +185,11 @@ def objects(pixels, names=('red', 'blue')):
 def test_objects_survive_the_round_trip_and_are_matched_by_name():
     pixels = np.array([[1.25, 2.5], [3, -4]], np.float32)
     message = objects(pixels)
-    assert message.objects[1].pose.orientation.w == 13
+    pose = message.objects[1].pose
+    assert (pose.position.x, pose.position.y, pose.position.z) == (7, 8, 9)
+    turned = pose.orientation
+    assert (turned.x, turned.y, turned.z, turned.w) == (10, 11, 12, 13)
+    assert message.source == ObjectStates.SOURCE_TRACKED
     names, decoded = object_messages.decode_objects(message, 'objects')
     assert names == ('red', 'blue') and np.array_equal(decoded, pixels)
     matched = object_messages.match_objects(('blue',), names, decoded, 'start', 'goal')

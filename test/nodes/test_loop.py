@@ -3,14 +3,14 @@
 """The whole loop over DDS: simulate, predict a subgoal, plan, push, record; all of it real."""
 
 from collections import Counter
-from pathlib import Path
-import sys
 import threading
 
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
+from loop import SEED
 from mcap.reader import make_reader
 import numpy as np
+from processes import Client, NodeProcess
 import pytest
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
@@ -24,11 +24,7 @@ from tap_ros.nodes.topics import STREAM, to_stamp
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
-from loop import SEED  # noqa: E402
-from processes import Client, NodeProcess  # noqa: E402
-
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 
 def positions(message):

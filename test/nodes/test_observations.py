@@ -8,10 +8,8 @@ import time
 
 import pytest
 from sensor_msgs.msg import Image, JointState
-from tap_ros.nodes.observations import DEPTH, Observations, PROOF, reception_time
-from tap_ros.nodes.topics import to_nanoseconds, to_stamp
-
-pytestmark = pytest.mark.ros
+from tap_ros.nodes.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
+from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
 
 
 def stamped(kind, nanoseconds):
@@ -97,6 +95,58 @@ def test_a_stray_that_comes_first_is_found_out():
     assert stamp_of(seen.newest('image', 'joints')) == (PROOF + 1) * 10**9
 
 
+def test_a_stamp_is_believed_at_once_up_to_ten_seconds_ahead():
+    for ahead, believed in ((JUMP_NS, True), (JUMP_NS + 1, False)):
+        seen = Observations('image', 'joints')
+        put(seen, 100, 'joints')
+        put(seen, 100 + ahead, 'image')
+        assert (seen.newest('image') is not None) == believed
+        assert seen.ages(('image',), 0.0)['image'] < inf if believed else (
+            seen.missing(('image',)) == ['image'])
+
+
+def test_strays_that_do_not_follow_each_other_prove_nothing():
+    for strays in ((10**17, 5 * 10**17) * PROOF, (3, 2) * PROOF, (10**17, 3) * PROOF):
+        seen = Observations('image')
+        put(seen, 10**9, 'image')
+        for stray in strays:
+            put(seen, stray, 'image')
+        assert stamp_of(seen.newest('image')) == 10**9 and seen.jumps == 0
+
+
+def test_a_message_that_is_believed_clears_the_suspicion():
+    seen = Observations('image')
+    put(seen, 10**9, 'image')
+    for _ in range(3):
+        put(seen, 10**17, 'image')
+        put(seen, 10**17 + 1, 'image')
+        put(seen, 10**9, 'image')
+    assert seen.jumps == 0 and stamp_of(seen.newest('image')) == 10**9
+
+
+def test_after_a_jump_the_new_clock_counts_and_can_jump_again():
+    seen = Observations('image', 'joints')
+    put(seen, 10**9, 'image', 'joints')
+    for jump, clock in enumerate((10**17, 10**8, 10**15), 1):
+        for step in range(PROOF):
+            put(seen, clock + step, 'image')
+        assert seen.jumps == jump and stamp_of(seen.newest('image')) == clock + PROOF - 1
+        assert seen.newest('joints') is None
+        put(seen, clock + PROOF, 'image', 'joints')
+        assert stamp_of(seen.newest('image', 'joints')) == clock + PROOF
+
+
+def test_so_many_stamps_are_remembered_for_each_topic():
+    for stamps, found in ((2 * DEPTH, True), (2 * DEPTH + 1, False)):
+        seen = Observations('image', 'joints', latched=True)
+        put(seen, 0, 'joints')
+        for stamp in range(1, stamps):
+            put(seen, stamp, 'image')
+        put(seen, 0, 'image')
+        assert (seen.newest('image', 'joints') is not None) == found
+        assert seen.count == stamps + 1
+
+
 def test_what_comes_now_and_then_may_have_any_stamp():
     seen = Observations('image', 'objects', latched=True)
     for stamp in (5, 10**18, 0):
@@ -122,6 +172,40 @@ def test_time_in_a_queue_makes_a_message_older():
     assert now - 3.5 < late <= time.monotonic() - 3
     assert reception_time({}) >= now
     assert reception_time({'received_timestamp': time.time_ns() + 10**12}) >= now
+
+
+def test_who_waits_for_a_change_is_woken_by_messages_and_by_wake():
+    seen = Observations('image')
+    for change in (seen.wake, lambda: put(seen, 5, 'image')):
+        count = seen.count
+        timer = threading.Timer(0.05, change)
+        timer.start()
+        seen.wait_for_change(60, count)
+        assert seen.count == count + 1
+        timer.join()
+        seen.wait_for_change(60, count)  # it has come already
+    seen.wait_for_change(0.01, seen.count)
+
+
+def test_topics_that_are_subscribed_to_are_put_together(client):
+    seen, told = Observations('image', 'joints'), []
+    types = {'image': (Image, 'eye/image'), 'joints': (JointState, 'arm/joints')}
+    seen.subscribe(client, types, STREAM, on_message=told.append)
+    quiet = Observations('image')
+    quiet.subscribe(client, {'image': types['image']}, STREAM)
+    publishers = [client.create_publisher(kind, name, STREAM) for kind, name in types.values()]
+    begun = time.monotonic()
+    for stamp in range(1, 600):
+        for publisher, (kind, _) in zip(publishers, types.values()):
+            publisher.publish(stamped(kind, stamp))
+        if seen.wait(('image', 'joints'), 0.1) and quiet.wait(('image',), 0.1):
+            break
+    moment = seen.moment(('image', 'joints'))
+    assert begun <= moment.received <= time.monotonic()
+    assert {topic: type(message) for topic, message in moment.messages.items()} == {
+        'image': Image, 'joints': JointState}
+    assert set(told) == {'eye/image', 'arm/joints'}
+    assert isinstance(quiet.newest('image')['image'], Image)
 
 
 def test_memory_does_not_grow():

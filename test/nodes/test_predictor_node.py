@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """predict_subgoal in all its modes, asked over DDS of real nodes with small untrained networks."""
 
-from pathlib import Path
-import sys
 
+from lively import lively_network
 import numpy as np
+from processes import Client, NodeProcess
 import pytest
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
@@ -15,11 +15,7 @@ from tap_ros.nodes.image_messages import decode_image, encode_image
 from tap_ros.nodes.object_messages import encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, to_stamp
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
-from lively import lively_network  # noqa: E402
-from processes import Client, NodeProcess  # noqa: E402
-
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 NAMES = ('cup', 'box')
 STAMP = to_stamp(2_500_000_000)
 PICTURES = np.random.default_rng(0).integers(0, 256, (2, 32, 32, 3), np.uint8)

@@ -3,12 +3,12 @@
 """The action reach_goal: the same acts as in one process, limits, and every way to stop."""
 
 from contextlib import suppress
-from pathlib import Path
 import signal
-import sys
 import threading
 
 from action_msgs.msg import GoalStatus
+from lively import lively_network
+from loop import acts_like, SEED
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
@@ -24,11 +24,7 @@ from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / 'prediction')]
-from lively import lively_network  # noqa: E402
-from loop import acts_like, SEED  # noqa: E402
-
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 
 def test_the_nodes_act_as_the_same_classes_do_in_one_process(loop):

@@ -4,12 +4,12 @@
 
 from pathlib import Path
 import resource
-import sys
 from time import sleep
 import warnings
 
 from mcap.reader import make_reader
 import numpy as np
+from processes import NodeProcess
 import pytest
 from rclpy.duration import Duration
 from rclpy.qos import qos_profile_sensor_data
@@ -22,11 +22,6 @@ from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.messages import decode
 from tap_ros.recording.reader import iter_episodes
 
-sys.path.insert(0, str(Path(__file__).parent))
-from processes import Client, NodeProcess  # noqa: E402
-
-pytestmark = pytest.mark.ros
-
 
 def read(folder):
     """Return [(topic, type, decoded message)] of the only file in a bag, CRCs checked."""
@@ -35,12 +30,6 @@ def read(folder):
         reader = make_reader(stream, validate_crcs=True)
         return [(channel.topic, schema.name, decode(schema.name, message.data))
                 for schema, channel, message in reader.iter_messages()]
-
-
-@pytest.fixture
-def client():
-    with Client() as node:
-        yield node
 
 
 @pytest.fixture

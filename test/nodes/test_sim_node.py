@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the simulator's topics and services promise."""
 
-from pathlib import Path
-import sys
 from time import sleep
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
+from processes import Client, NodeProcess
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -22,10 +21,6 @@ from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.object_messages import decode_gripper
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 
-sys.path.insert(0, str(Path(__file__).parent))
-from processes import Client, NodeProcess  # noqa: E402
-
-pytestmark = pytest.mark.ros
 PERIOD_NS = 250_000_000
 
 

@@ -38,6 +38,21 @@ def test_what_was_encoded_is_decoded_in_the_order_asked_for():
             assert got.expected_pixels.dtype == np.float32
 
 
+def test_a_subgoal_and_its_parts_carry_the_stamp_and_frame_of_the_picture():
+    message = encode_subgoal(subgoal(0, 1), NAMES, to_stamp(5), 'eye')
+    for part in (message, message.image, *message.object_maps):
+        assert part.header.stamp == to_stamp(5) and part.header.frame_id == 'eye'
+    assert list(message.object_names) == list(NAMES)
+
+
+def test_the_mass_of_a_subgoal_that_was_sent_is_unknown_and_it_may_have_no_objects():
+    decoded, = decode_subgoals(answer([subgoal(2, 1)]), NAMES[:1], SIZE)
+    assert decoded.mass.shape == (1,) and np.isnan(decoded.mass).all()
+    assert decoded.mass.dtype == decoded.object_maps.dtype == np.float32
+    decoded, = decode_subgoals(answer([subgoal(2, 1)]), (), SIZE)
+    assert decoded.object_maps.shape == (0, *SIZE) and decoded.expected_pixels.shape == (0, 2)
+
+
 def test_answers_that_lack_something_are_refused_with_what():
     good = [subgoal(0, 1)]
     with pytest.raises(PlanningError, match='0 subgoals'):
@@ -45,6 +60,14 @@ def test_answers_that_lack_something_are_refused_with_what():
     response = answer(good)
     response.level = []
     with pytest.raises(PlanningError, match='1 subgoals, 1 entries of sample and 0 of level'):
+        decode_subgoals(response, NAMES, SIZE)
+    response = answer(good)
+    response.sample = [0, 1]
+    with pytest.raises(PlanningError, match='1 subgoals, 2 entries of sample and 1 of level'):
+        decode_subgoals(response, NAMES, SIZE)
+    response = answer(good)
+    response.subgoals[0].object_maps = response.subgoals[0].object_maps[:1]
+    with pytest.raises(PlanningError, match='1 object_maps and 2 expected_pixels for 2'):
         decode_subgoals(response, NAMES, SIZE)
     response = answer(good)
     response.subgoals[0].expected_pixels = response.subgoals[0].expected_pixels[:1]

@@ -45,6 +45,16 @@ def test_percentiles_are_those_of_the_last_minute_only():
     assert np.isnan(percentiles(window.newest(now + 60.0)[1])).all()
 
 
+def test_a_number_counts_for_exactly_so_many_seconds():
+    window = Window(2.0, 10)
+    for now, value in enumerate((5.0, 6.0, 7.0)):
+        window.add(now, value)
+    assert [part.tolist() for part in window.newest(2.0)] == [[0, 1, 2], [5, 6, 7]]
+    assert [part.tolist() for part in window.newest(2.5)] == [[1, 2], [6, 7]]
+    window.add(3.0)
+    assert window.newest(5.0)[1].tolist() == [0.0]
+
+
 def test_memory_is_bounded_whatever_the_rate():
     window = Window(60.0, 1000)
     window.add(0.0, 0)

@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of the toy world, and a forward model that fits it."""
 
+from made_episodes import write_bag
 import pytest
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
-from tap_ros.recording.writer import EpisodeWriter, write_metadata
 import torch
 from toy_world import ARM, make_episode, SIZE, TABLE
 
@@ -12,13 +12,7 @@ from toy_world import ARM, make_episode, SIZE, TABLE
 @pytest.fixture(scope='session')
 def bag(tmp_path_factory):
     """Write 60 episodes of the toy world into a bag folder."""
-    folder = tmp_path_factory.mktemp('bags') / 'toy'
-    folder.mkdir()
-    with EpisodeWriter(folder / 'toy_0.mcap') as writer:
-        for seed in range(60):
-            writer.write(make_episode(seed))
-    write_metadata(folder)
-    return folder
+    return write_bag(tmp_path_factory.mktemp('bags') / 'toy', map(make_episode, range(60)))
 
 
 @pytest.fixture

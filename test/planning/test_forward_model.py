@@ -4,8 +4,9 @@
 
 import pytest
 from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.learning.devices import has_bfloat16
 from tap_ros.learning.weights import save_weights
-from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig, load_forward_model
+from tap_ros.planning.forward_model import ForwardModelConfig, load_forward_model
 from tap_ros.prediction.warp import one_hot_maps
 import torch
 from toy_world import ARM, TABLE
@@ -119,6 +120,18 @@ def test_weights_round_trip(model, image, tmp_path):
         half.rollout(image, GRIPPER, maps, actions), before, atol=0.2, rtol=0)
 
 
+def test_only_the_push_net_loses_precision_and_only_where_it_is_wanted(model, tmp_path):
+    path = tmp_path / 'forward.safetensors'
+    save_weights(path, model, 'forward_model', model.config, {})
+    auto = 'bfloat16' if has_bfloat16('cpu') else 'float32'
+    for precision, used in (('float32', 'float32'), ('bfloat16', 'bfloat16'), ('auto', auto)):
+        loaded = load_forward_model(path, precision=precision)
+        kinds = {name.split('.')[0]: value.dtype for name, value in loaded.named_parameters()}
+        assert kinds['push'] == getattr(torch, used)
+        assert kinds['encoder'] == kinds['sprite'] == loaded.push.fields.dtype == torch.float32
+        assert not loaded.training and not any(p.requires_grad for p in loaded.parameters())
+
+
 def test_weights_of_another_kind_are_refused(model, tmp_path):
     path = tmp_path / 'predictor.safetensors'
     save_weights(path, model, 'predictor', model.config, {})
@@ -126,8 +139,50 @@ def test_weights_of_another_kind_are_refused(model, tmp_path):
         load_forward_model(path)
 
 
-def test_impossible_settings_are_named():
-    with pytest.raises(ConfigError, match='image_size 30'):
-        ForwardModel(ForwardModelConfig(TABLE, ARM, image_size=30))
-    with pytest.raises(ConfigError, match='9 numbers'):
-        ForwardModelConfig(TABLE[:6], ARM)
+@pytest.mark.parametrize('named, good, bad', [
+    ('9 numbers', [{}], [{'table': TABLE[:6]}, {'arm': ARM[:9]}]),
+    ('multiple of 4', [{'image_size': 32}], [{'image_size': 30}, {'image_size': 34}]),
+    ('even', [{'crop_cells': (2, 4)}], [{'crop_cells': (3, 4)}, {'crop_cells': (4, 3)}]),
+    ('crop_cells', [{'crop_cells': (1024, 2)}], [
+        {'crop_cells': (0, 2)}, {'crop_cells': (2, 1026)}, {'crop_cells': (2, 2, 2)},
+        {'crop_cells': (2.0, 2)}, {'crop_cells': (2,)}]),
+    ('window_cells', [{'window_cells': 2}, {'window_cells': 44}], [
+        {'window_cells': 1}, {'window_cells': 45}]),
+    ('image_size: expected', [{'image_size': 1024}], [{'image_size': 1028}, {'image_size': 0}]),
+    *((f'{name}: expected', [{name: 1}, {name: 1024}], [{name: 0}, {name: 1025}])
+      for name in ('features', 'width', 'blocks', 'encoder_width', 'sprite_size'))])
+def test_impossible_settings_are_named(named, good, bad):
+    for changes in good:
+        ForwardModelConfig(**{'table': TABLE, 'arm': ARM, **changes})
+    for changes in bad:
+        with pytest.raises(ConfigError, match=named):
+            ForwardModelConfig(**{'table': TABLE, 'arm': ARM, **changes})
+
+
+def test_objects_lose_themselves_only_with_nearly_all_of_their_mass(model):
+    maps = model.seed_maps(PIXELS)[None]
+    flow = model.still(1).clone()
+    torch.testing.assert_close(model.carry(maps, flow), maps)
+    flow[..., 0] = 4.0  # from beyond the table
+    assert not model.carry(maps, flow).any()
+    weak = 0.06 * maps
+    torch.testing.assert_close(model.carry(weak, model.still(1)), maps)
+    assert not model.carry(0.04 * maps, model.still(1)).any()
+
+
+def test_the_arm_is_drawn_where_its_camera_says_and_nowhere_else(model):
+    size = model.config.sprite_size
+    grippers = torch.tensor([[0.1, 0.2, 0.0, 0.0], [-0.2, -0.1, 0.1, 1.0]])
+    drawn = model.draw_arm(grippers)
+    assert drawn.shape == (2, 4, 32, 32)
+    v, u = torch.meshgrid(torch.arange(32), torch.arange(32), indexing='ij')
+    camera = torch.tensor(ARM).view(3, 4)
+    for arm, gripper in zip(drawn, grippers):
+        ray = camera @ torch.cat([gripper[:3], torch.ones(1)])
+        at = ray[:2] / ray[2]
+        mask = arm[3]
+        middle = torch.stack([(mask * u).sum(), (mask * v).sum()]) / mask.sum()
+        torch.testing.assert_close(middle, at, atol=0.1, rtol=0)
+        away = torch.maximum((u - at[0]).abs(), (v - at[1]).abs())
+        assert mask.max() > 0.7 and mask[away > 6].max() < 0.05
+        assert mask[away > size / 2].max() < 1e-4 and arm[:3].abs().max() < 1e-6

@@ -318,3 +318,13 @@ def test_the_model_is_told_whether_the_arm_is_hidden(model, hidden):
     puppets = Puppets(model, dives)
     plan(puppets, replace(PLAIN, arm_hidden=hidden))
     assert puppets.arm_hidden is hidden
+
+
+@pytest.mark.parametrize('warm, changes', [(True, [2, 5, 8, 11, 14]), (False, [3, 6, 9, 12])])
+def test_segments_go_on_where_the_last_plan_left_them(model, warm, changes):
+    config = replace(PLAIN, free_phase=False, upright=False, warm_start=warm)
+    first = plan(steady(model, away(5, 5)), config)
+    puppets = steady(model, away(5, 5))
+    plan(puppets, config, GRIPPER + np.append(first.action[:3], 0), memory=first.memory)
+    changed = np.abs(np.diff(puppets.judged[0][..., :2], axis=1)).max((0, 2)) > 1e-6
+    assert (np.flatnonzero(changed) + 1).tolist() == changes

@@ -208,3 +208,40 @@ def test_limits_hold_for_every_command_of_a_goal(mpc):
 def test_names_in_another_order_are_the_same_scene(mpc):
     reach = begun(mpc)
     assert isinstance(reach.step(look(1, names=('b', 'a'))), Command)
+
+
+def test_only_the_chosen_objects_are_brought_to_their_goals(mpc):
+    goal = Target(GOAL.pixels[1:])
+    reach = Reach(mpc, ReachConfig(10, objects=(1,)), 3)
+    reach.step(look(0))
+    reach.head_for([goal])
+    command = reach.step(look(0))
+    seen = look(0)
+    alone = mpc.plan(Scene(seen.image, seen.gripper, START[1:]), mpc.goal(GOAL.pixels[1:]),
+                     Memory(3))
+    np.testing.assert_array_equal(command.plan.actions, alone.actions)
+    assert reach.distance == 4.0 and reach.pixels is seen.pixels
+    end = reach.step(look(1, np.stack([START[0], GOAL.pixels[1]])))
+    assert isinstance(end, End) and end.outcome == 'reached'
+
+
+def test_a_command_says_which_target_it_is_for(mpc):
+    reach = Reach(mpc, ReachConfig(10), 3)
+    reach.step(look(0))
+    reach.head_for([Target(START + 2), GOAL])
+    stages = []
+    for t in range(4):
+        stages.append(reach.step(look(t, START + t)).stage)
+        reach.sent()
+    assert stages[0] == 0 and stages[-1] == 1 and stages == sorted(stages)
+    assert reach.switches == [stages.index(1)]
+
+
+def test_what_is_too_old_says_what_else_is_lacking(mpc):
+    reach = begun(mpc)
+    old = look(1, received=-9.0)
+    assert reach.step(old, now=1.0).reason == 'what was seen is 10.0 s old'
+    assert reach.step(old, now=1.0, lacking='no joints').reason == (
+        'what was seen is 10.0 s old: no joints')
+    just = begun(mpc).step(look(1, received=-4.0), now=1.0)  # as old as it may be
+    assert isinstance(just, Command)

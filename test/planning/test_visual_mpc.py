@@ -189,6 +189,22 @@ def test_impossible_settings_are_named(wrong, name):
         VisualMPCConfig(**wrong)
 
 
+@pytest.mark.parametrize('right', [
+    {'cost_every': 1}, {'cost_every': HORIZON}, {'replan_every': 1}, {'replan_every': HORIZON},
+    {'recheck': 0}, {'batch_size': 1}, {'proposals': 0},
+    {'proposals': VisualMPCConfig().search.num_samples}])
+def test_the_least_and_the_most_are_allowed(right):
+    VisualMPCConfig(**right)
+
+
+@pytest.mark.parametrize('preset', PRESETS)
+def test_changes_of_a_preset_change_that_alone(preset):
+    changed = with_preset(preset, clearance=0.125, arm_hidden=True)
+    assert (changed.clearance, changed.arm_hidden) == (0.125, True)
+    assert replace(changed, clearance=PRESETS[preset].clearance,
+                   arm_hidden=False) == PRESETS[preset]
+
+
 def test_paper_preset_has_the_papers_numbers():
     paper = with_preset('paper')
     assert (paper.search.num_samples, paper.search.num_iterations, paper.search.num_elites) == (

@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags to read."""
 
-from made_episodes import make_episode
+from made_episodes import make_episode, write_bag
 import pytest
-from tap_ros.recording.writer import EpisodeWriter, write_metadata
 
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """Keep decoded recordings out of the user's cache."""
+    """Return a cache that each test has for itself."""
     monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
     return tmp_path / 'cache'
 
@@ -23,11 +22,4 @@ def episodes():
 @pytest.fixture
 def bag(tmp_path, episodes):
     """Write the episodes into a bag of two files."""
-    folder = tmp_path / 'push2'
-    folder.mkdir()
-    for number, part in enumerate((episodes[:4], episodes[4:])):
-        with EpisodeWriter(folder / f'push2_{number}.mcap') as writer:
-            for episode in part:
-                writer.write(episode)
-    write_metadata(folder)
-    return folder
+    return write_bag(tmp_path / 'push2', episodes[:4], episodes[4:])

@@ -1,0 +1,36 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What all tests share.
+
+Modules beside this file (made_episodes, lively) can be imported by every test.
+"""
+
+import os
+
+import pytest
+
+# Nodes and clients of these tests talk among themselves only.
+os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+if 'PYTEST_XDIST_WORKER' in os.environ:  # workers share the cores
+    os.environ.setdefault('OMP_NUM_THREADS', '1')
+
+
+@pytest.hookimpl(optionalhook=True)  # of xdist, for make test JOBS=2
+def pytest_xdist_make_scheduler(config, log):
+    """Give the tests of a file to one worker, and all tests of real nodes to one."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            file = nodeid.split('::', 1)[0]
+            return 'nodes' if 'nodes' in file else file
+
+    return Scheduling(config, log)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    """Keep decoded recordings out of the user's cache."""
+    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path_factory.getbasetemp() / 'cache'))
