@@ -46,10 +46,17 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
     :return: exit code: 1 when the node could not be started, or close says so by returning 1.
     """
     stop = threading.Event()
+
+    def end(*_: Any) -> None:
+        # Not KeyboardInterrupt: after one that leaves an exec(), as in making a dataclass, Python
+        # ends by SIGINT even where it was caught.
+        stop.set()
+        raise _Ended
+
     node = executor = heartbeat = None
     code = 0
     try:
-        _handle_signals(_end)
+        _handle_signals(end)
         configure_fast_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
@@ -63,13 +70,16 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
     except (_Ended, KeyboardInterrupt, ExternalShutdownException):
         pass
     except TapError as error:
-        rclpy.logging.get_logger(name).fatal(escaped(error, 1000))
-        code = 1
-    except RuntimeError as error:  # what follows --ros-args cannot be parsed
-        if node is not None or rclpy.ok():
-            raise
-        print(f'{name}: {escaped(error, 1000)}', file=sys.stderr)
-        code = 1
+        if not stop.is_set():  # else it is what the signal has broken
+            rclpy.logging.get_logger(name).fatal(escaped(error, 1000))
+            code = 1
+    except RuntimeError as error:
+        if not stop.is_set():
+            if node is not None or rclpy.ok():
+                raise
+            # What follows --ros-args cannot be parsed.
+            print(f'{name}: {escaped(error, 1000)}', file=sys.stderr)
+            code = 1
     finally:
         _handle_signals(lambda *_: None)  # it is ending already
         if node is not None:
@@ -102,12 +112,6 @@ def answering(node: 'Node', callback: Callable[[Any, Any], Any]) -> Callable[[An
                 message=f'internal error: {type(error).__name__}: {escaped(error)}')
 
     return answer
-
-
-def _end(*_: Any) -> None:
-    # Not KeyboardInterrupt: after one that leaves an exec(), as in making a dataclass, Python ends
-    # by SIGINT even where it was caught.
-    raise _Ended
 
 
 def _handle_signals(handler: Callable[[int, Any], Any]) -> None:

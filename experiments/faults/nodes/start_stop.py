@@ -80,7 +80,7 @@ def _one(folder, name, trial, early_s, late_s):
     if 'Traceback' in node.text:
         return f'a traceback after {number.name}: {node.last_line()}', seconds
     if code != 0:
-        return f'{describe_exit(code)} after {number.name}', seconds
+        return f'{describe_exit(code)} after {number.name}: {node.last_line()}', seconds
     return '', seconds
 
 
