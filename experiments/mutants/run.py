@@ -7,28 +7,44 @@ What is changed and which tests are run stands in pyproject.toml, under tool.mut
 run goes on. The results are in docs/results/mutants.md and mutants.json.
 """
 
-import argparse
 from collections import Counter
+from dataclasses import dataclass
 import os
 import random
+import sys
 
 from experiments.mutants.tool import generate, load_mutants, OPEN, try_mutants
+from tap_ros.errors import UsageError
+from tap_ros.options import Flag, parse
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of `make mutants`.
+
+    :param sample: try so many mutants, drawn at random; 0: all.
+    :param seed: of the draw.
+    :param only: only mutants with this in their name; writes no page.
+    :param again: try those again that were not killed, with the tests of now.
+    :param jobs: mutants at a time.
+    :param page_only: try nothing, write the page.
+    """
+
+    sample: int = 0
+    seed: int = 0
+    only: str = ''
+    again: Flag = False
+    jobs: int = 1
+    page_only: Flag = False
 
 
 def main():
     """Try mutants and write the page."""
-    parser = argparse.ArgumentParser(prog='make mutants', description=__doc__)
-    parser.add_argument('--sample', type=int, metavar='N',
-                        help='try N mutants drawn at random, not all')
-    parser.add_argument('--seed', type=int, default=0, help='of the draw (default: %(default)s)')
-    parser.add_argument('--only', default='', metavar='TEXT',
-                        help='only mutants with this in their name; writes no page')
-    parser.add_argument('--again', action='store_true',
-                        help='try those again that were not killed, with the tests of now')
-    parser.add_argument('--jobs', type=int, default=1, metavar='N',
-                        help='mutants at a time (default: %(default)s)')
-    parser.add_argument('--page-only', action='store_true', help='try nothing, write the page')
-    args = parser.parse_args()
+    try:
+        args = parse(Options, sys.argv[1:], 'make mutants', (__doc__ or '').strip())
+    except UsageError as error:
+        sys.exit(f'error: {error}')
     os.environ['OMP_NUM_THREADS'] = '1'
     generate()
     chosen = draw(load_mutants(), args.sample, args.seed)
@@ -51,11 +67,11 @@ def draw(mutants, number, seed):
     Return the mutants to try, by name; the same ones for the same seed and code.
 
     :param mutants: {name: Mutant}.
-    :param number: how many; all if None.
+    :param number: how many; all if 0.
     :param seed: of the draw.
     """
     names = sorted(mutants)
-    if number is not None and number < len(names):
+    if 0 < number < len(names):
         names = sorted(random.Random(seed).sample(names, number))
     return [mutants[name] for name in names]
 
