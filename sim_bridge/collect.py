@@ -20,7 +20,8 @@ from sim_bridge.expert import ExpertConfig, run_episode
 from sim_bridge.grasp_expert import GraspConfig
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import get_task
-from tap_ros.engine import Engine, LOCAL, run_tasks, Task
+from tap_ros.engines.run import run_tasks
+from tap_ros.engines.task import Engine, LOCAL, Task
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.episode import Episode

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from sim_bridge.collect import collect, CollectConfig, CollectSettings
 from sim_bridge.tasks import TASKS
-from tap_ros.engine_options import EngineOptions
+from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Folder, one_of
 
 

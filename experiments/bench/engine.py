@@ -11,7 +11,8 @@ import time
 
 from experiments.pages import number, render
 import pandas as pd
-from tap_ros.engine import Engine, EngineName, ENGINES, run_tasks, Task
+from tap_ros.engines.run import run_tasks
+from tap_ros.engines.task import Engine, EngineName, ENGINES, Task
 from tap_ros.files import write_atomically, write_rows
 from tap_ros.options import Flag
 

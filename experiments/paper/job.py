@@ -21,7 +21,7 @@ from experiments.paper.places import (
     read_json,
 )
 import numpy as np
-from tap_ros.engine import LOCAL
+from tap_ros.engines.task import LOCAL
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.files import locked, write_atomically
 

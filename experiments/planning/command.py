@@ -14,7 +14,7 @@ from experiments.planning.page import make_page
 from experiments.planning.results import load_results, make_rows
 from experiments.planning.runs import Job, run_jobs
 from tap_ros.contract import step_budget
-from tap_ros.engine_options import EngineOptions
+from tap_ros.engines.options import EngineOptions
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import forward
 from tap_ros.files import write_atomically, write_rows

@@ -13,7 +13,8 @@ import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
-from tap_ros.engine import LOCAL, run_tasks, Task
+from tap_ros.engines.run import run_tasks
+from tap_ros.engines.task import LOCAL, Task
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.files import write_atomically
 from tap_ros.learning.weights import stored_digest

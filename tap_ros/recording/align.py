@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 from tap_ros.recording.columns import Columns, pad_objects
 from tap_ros.recording.episode import Episode, RecordingWarning
-from tap_ros.recording.losses import EVERYTHING, FAR, seconds
+from tap_ros.recording.lost import EVERYTHING, FAR, seconds
 from tap_ros.recording.spans import assign, in_gaps, Mark, MAX_JITTER_NS, read_spans, Span
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time

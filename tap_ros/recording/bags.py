@@ -11,7 +11,7 @@ from tap_ros.recording import topics
 from tap_ros.recording.columns import Columns
 from tap_ros.recording.container import Channel, McapFile
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.losses import describe
+from tap_ros.recording.lost import describe
 from tap_ros.recording.messages import check_schema
 from tap_ros.recording.metadata import bag_files, FILE_NAME
 from tap_ros.text import escaped

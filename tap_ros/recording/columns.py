@@ -20,7 +20,7 @@ from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import RecordingError
 from tap_ros.recording import topics
 from tap_ros.recording.container import McapFile
-from tap_ros.recording.losses import describe, EVERYTHING, FRAMES, gaps, Loss, NOTHING
+from tap_ros.recording.lost import describe, EVERYTHING, FRAMES, gaps, Loss, NOTHING
 from tap_ros.recording.messages import decode
 from tap_ros.recording.pictures import read_pixels
 from tap_ros.recording.spans import Mark

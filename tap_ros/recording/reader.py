@@ -11,7 +11,7 @@ from tap_ros.recording.align import assemble, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.losses import EVERYTHING
+from tap_ros.recording.lost import EVERYTHING
 
 _NO_EVENT = np.empty(0, np.int64)
 _NO_GAP = np.empty((0, 3), np.int64)

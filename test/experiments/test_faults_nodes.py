@@ -32,7 +32,7 @@ def rig(tmp_path_factory):
 
 @pytest.mark.parametrize('name', FEW)
 def test_a_fault_is_borne(name, rig, tmp_path):
-    from experiments.faults.nodes.groups import GROUPS
+    from experiments.faults.nodes.all_faults import GROUPS
     count = {fault.name: fault.count for faults in GROUPS.values() for fault in faults}[name]
     row, = run_faults(GROUPS, tmp_path, [name], FEW[name] / count, rig=rig, progress=False,
                       patience=8.0)  # other tests, and other programs, run meanwhile

@@ -27,7 +27,7 @@ from experiments.paper.sweep import find_state, sweep
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
-from tap_ros.engine import Engine
+from tap_ros.engines.task import Engine
 from tap_ros.errors import ConfigError
 from tap_ros.files import locked
 from tap_ros.learning.split import split_episodes

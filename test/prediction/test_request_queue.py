@@ -4,6 +4,7 @@
 
 import _thread
 from collections import Counter
+import signal
 import threading
 import time
 
@@ -193,6 +194,10 @@ def test_an_interrupted_start_leaves_no_thread_at_work():
         prepared.set()
         return lambda batch: batch
 
-    with pytest.raises(KeyboardInterrupt):
-        RequestQueue(prepare, len, 1, 1, 1)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            RequestQueue(prepare, len, 1, 1, 1)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert prepared.is_set() and not threads[0].is_alive()

@@ -7,7 +7,7 @@ import os
 import signal
 from typing import Annotated
 
-from experiments.faults.nodes.groups import GROUPS
+from experiments.faults.nodes.all_faults import GROUPS
 from experiments.faults.nodes.rig import Rig
 from experiments.faults.runner import choose, run_faults
 from tap_ros.options import Flag, Folder

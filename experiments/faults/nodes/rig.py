@@ -9,8 +9,8 @@ import tempfile
 import time
 
 from action_msgs.msg import GoalStatus
+from experiments.faults.nodes.arm_log import Commands
 from experiments.faults.nodes.attacked import Attacked
-from experiments.faults.nodes.commands import Commands
 from experiments.faults.nodes.world import goal_fields, predict_fields, World
 from rclpy.action import ActionClient
 from rclpy.context import Context

@@ -10,10 +10,11 @@ import sys
 import time
 
 import pytest
-from tap_ros.engine import Engine, run_tasks, Task, TRIES
+from tap_ros.engines.run import run_tasks
+from tap_ros.engines.task import Engine, Task, TRIES
 from tap_ros.errors import ConfigError, EngineError, RecordingError
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def square(number):
@@ -82,16 +83,21 @@ def test_after_a_stop_no_task_begins():
     assert begun == ['0', '1']
 
 
+def hear_interrupts():
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs ignore them
+
+
 def test_an_interrupted_run_leaves_no_worker(tmp_path):
-    script = ('import sys; sys.path[:0] = [sys.argv[2], sys.argv[2] + "/test"]\n'
-              'from test_engine import write_slowly\n'
-              'from tap_ros.engine import Engine, run_tasks, Task\n'
+    script = ('import sys; sys.path[:0] = [sys.argv[2], sys.argv[2] + "/test/engines"]\n'
+              'from test_engines import write_slowly\n'
+              'from tap_ros.engines.run import run_tasks\n'
+              'from tap_ros.engines.task import Engine, Task\n'
               'if __name__ == "__main__":\n'
               '    list(run_tasks([Task("slow", write_slowly, (sys.argv[1], 300.0))], Engine()))')
     (tmp_path / 'script.py').write_text(script)
     path = tmp_path / 'file'
     process = subprocess.Popen([sys.executable, tmp_path / 'script.py', path, ROOT],
-                               stderr=subprocess.PIPE)
+                               stderr=subprocess.PIPE, preexec_fn=hear_interrupts)
     while not (begun := list(tmp_path.glob('file.*'))) and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)

@@ -5,7 +5,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from tap_ros.engine import Engine, EngineName
+from tap_ros.engines.task import Engine, EngineName
 from tap_ros.options import default_text
 from tyro import conf
 
