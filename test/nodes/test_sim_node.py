@@ -264,7 +264,9 @@ def test_in_real_time_a_command_that_has_run_out_moves_nothing(tmp_path):
             for timeout in (0.02, 5.0):  # simulated seconds
                 timeouts.publish(Float64(data=timeout))
                 first = images.wait(20)
-                images.wait(20, lambda m, old=first: m.header.stamp != old.header.stamp)
+                # A whole tick, so that the node has the time-out before the command.
+                images.wait(20, lambda m, old=first: to_nanoseconds(m.header.stamp)
+                            >= to_nanoseconds(old.header.stamp) + 2 * PERIOD_NS)
                 before = joints.wait(10)
                 command = TwistStamped(header=images.wait(1).header)
                 command.twist.linear.x = 0.05 if before.position[0] < 0 else -0.05
