@@ -74,6 +74,16 @@ def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
     assert stages == ['subgoal', 'goal'] and run.subgoals[0].sample > 0
 
 
+def begin_moving(loop):
+    """Start a scene and a goal; return its handle once the arm was moved."""
+    loop.reset()
+    moving = threading.Event()
+    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
+                       lambda feedback: moving.set())
+    assert moving.wait(120)
+    return handle
+
+
 def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
     loop.reset()
     moving = threading.Event()
@@ -115,11 +125,7 @@ def test_a_bad_goal_is_aborted_with_the_reason_and_moves_nothing(loop, fields, w
 
 @pytest.mark.parametrize('_', range(5))
 def test_a_goal_right_after_a_cancel_or_a_reset_is_served(loop, _):
-    loop.reset()
-    moving = threading.Event()
-    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
-                       lambda feedback: moving.set())
-    assert moving.wait(120)
+    handle = begin_moving(loop)
     cancel_goal(handle)
     status, _ = wait_for_result(handle, 60)
     assert status == GoalStatus.STATUS_CANCELED
@@ -132,11 +138,7 @@ def test_a_goal_right_after_a_cancel_or_a_reset_is_served(loop, _):
 
 
 def test_a_reset_during_a_goal_aborts_it(loop):
-    loop.reset()
-    moving = threading.Event()
-    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
-                       lambda feedback: moving.set())
-    assert moving.wait(120)
+    handle = begin_moving(loop)
     call(loop.reset_client, ResetScene.Request(task='push2', seed=SEED + 1), 30)
     status, result = wait_for_result(handle, 60)
     assert status == GoalStatus.STATUS_ABORTED and 'the scene has changed' in result.message
@@ -144,11 +146,7 @@ def test_a_reset_during_a_goal_aborts_it(loop):
 
 
 def test_a_second_camera_during_a_goal_aborts_it(loop):
-    loop.reset()
-    moving = threading.Event()
-    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
-                       lambda feedback: moving.set())
-    assert moving.wait(120)
+    handle = begin_moving(loop)
     publisher = loop.node.create_publisher(Image, 'camera/image_raw', STREAM)
     try:
         status, result = wait_for_result(handle, 60)

@@ -84,20 +84,37 @@ def predictor(job):
             job.record(not why, why, None if noticed and seconds == float('inf') else seconds)
 
 
-def planner(job):
-    """Kill the planner while it moves an arm in real time; then start it again."""
+def _moving_goals(job):
+    """Yield each trial with a goal by which the arm moves, in real time."""
     rig = job.rig
-    rig.need('visual_mpc_node', sim='real')
-    victim, watch = rig.processes['visual_mpc_node'], rig.alive['visual_mpc_node']
     for trial in job.trials():
         rig.reset(trial % 10)
         rig.commands.forget()
         begin = time.monotonic()
         handle, why = outcome(rig.begin, mode='direct', step_budget=1000)
-        if handle is None or not rig.commands.wait_for_moves(begin, 2, 20.0):
+        if handle is not None and rig.commands.wait_for_moves(begin, 2, 20.0):
+            yield trial, handle
+        else:
             job.record(False, why or 'the goal before the kill did not move')
             rig.need('visual_mpc_node', sim='real')
-            continue
+
+
+def _first_goal(rig):
+    """Send the first goal after a restart; say what was wrong with its end."""
+    handle, why = outcome(rig.begin, 10.0, mode='direct', step_budget=1)
+    if handle is not None:
+        end, why = outcome(rig.result, handle, 20.0)
+        if end is not None and not end.startswith('succeeded'):
+            why = f'it {end}'
+    return why and f'first goal after the restart: {why}'
+
+
+def planner(job):
+    """Kill the planner while it moves an arm in real time; then start it again."""
+    rig = job.rig
+    rig.need('visual_mpc_node', sim='real')
+    victim, watch = rig.processes['visual_mpc_node'], rig.alive['visual_mpc_node']
+    for _, handle in _moving_goals(job):
         moment = victim.kill()
         _, told = outcome(rig.result, handle, 4.0)
         took = time.monotonic() - moment
@@ -110,12 +127,8 @@ def planner(job):
         drift = float(np.abs(np.array(rig.joints.wait(5.0).position[:3]) - before).max())
         moved = f'the arm still moved {1000 * drift:.0f} mm' if drift > 2e-3 else ''
         restart(victim, watch)
-        handle, lost = outcome(rig.begin, 10.0, mode='direct', step_budget=1)
-        if handle is not None:
-            end, lost = outcome(rig.result, handle, 20.0)
-            if end is not None and not end.startswith('succeeded'):
-                lost = f'it {end}'
-        why = joined(noticed, moved, told, lost and f'first goal after the restart: {lost}')
+        lost = _first_goal(rig)
+        why = joined(noticed, moved, told, lost)
         job.record(not why, why, None if seconds == float('inf') else seconds)
 
 
@@ -124,15 +137,7 @@ def simulator(job):
     rig = job.rig
     rig.need('visual_mpc_node', sim='real')
     victim, watch = rig.processes['sim_node'], rig.alive['sim_node']
-    for trial in job.trials():
-        rig.reset(trial % 10)
-        rig.commands.forget()
-        begin = time.monotonic()
-        handle, why = outcome(rig.begin, mode='direct', step_budget=1000)
-        if handle is None or not rig.commands.wait_for_moves(begin, 2, 20.0):
-            job.record(False, why or 'the goal before the kill did not move')
-            rig.need('visual_mpc_node', sim='real')
-            continue
+    for trial, handle in _moving_goals(job):
         moment = victim.kill()
         noticed, seconds = judge_notice(job, watch, moment)
         time.sleep(max(0.0, moment + 1.0 - time.monotonic()))
@@ -141,13 +146,8 @@ def simulator(job):
         told = f'the goal {end}' if end is not None and not end.startswith('aborted') else ''
         restart(victim, watch)
         answer, unanswered = outcome(rig.reset, trial % 10)
-        handle, again = outcome(rig.begin, 10.0, mode='direct', step_budget=1)
-        if handle is not None:
-            end, again = outcome(rig.result, handle, 20.0)
-            if end is not None and not end.startswith('succeeded'):
-                again = f'it {end}'
-        why = joined(noticed, stopped, lost, told, unanswered,
-                     again and f'first goal after the restart: {again}')
+        again = _first_goal(rig)
+        why = joined(noticed, stopped, lost, told, unanswered, again)
         job.record(not why, why, None if seconds == float('inf') else seconds)
 
 

@@ -44,12 +44,13 @@ def _seconds_to_start(folder, name):
     nodes = [
         Attacked(name, folder / f'usual{number}.log', _parameters(folder, name, number)).start()
         for number in range(SIDE_BY_SIDE)]
-    for node in nodes:
-        node.wait_until_ready()
-    seconds = time.monotonic() - begin
-    for node in nodes:
-        node.kill()
-    return seconds
+    try:
+        for node in nodes:
+            node.wait_until_ready()
+        return time.monotonic() - begin
+    finally:
+        for node in nodes:
+            node.kill()
 
 
 def _parameters(folder, name, number):
