@@ -27,7 +27,7 @@ paper: export OMP_NUM_THREADS ?= 1
 help:
 	@echo 'make demo    push two objects to where a goal picture shows them, three scenes'
 	@echo '             SCENES=20: that many scenes; ARGS=...: more options of the demo'
-	@echo 'make test    all tests; ARGS="-k warp" chooses; JOBS=2: in two processes'
+	@echo 'make test    all tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'
 	@echo 'make mutants change the code a little, thousands of times, and see whether a test fails, in'
 	@echo '             docs/results: hours; goes on; ARGS="--sample 300": so many, drawn at random'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
@@ -46,7 +46,7 @@ demo: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros demo $(if $(SCENES),--scenes $(SCENES)) $(ARGS)
 
 test: build
-	@$(ENTER); $(DOMAIN); python -m pytest $(if $(JOBS),-n $(JOBS)) $(ARGS)
+	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) $(ARGS)
 
 mutants: build
 	@$(ENTER); $(DOMAIN); python -m experiments.mutants.run $(ARGS)

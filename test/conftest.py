@@ -17,7 +17,7 @@ if 'PYTEST_XDIST_WORKER' in os.environ:  # workers share the cores
     os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 
-@pytest.hookimpl(optionalhook=True)  # of xdist, for make test JOBS=2
+@pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_make_scheduler(config, log):
     """Give the tests of a file to one worker, and all tests of real nodes to one."""
     from xdist.scheduler import LoadFileScheduling
