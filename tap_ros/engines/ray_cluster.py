@@ -32,6 +32,7 @@ class RayWorkers:
         ray, engine = self._ray, self._engine
         _check_answers(engine.address)
         options = {'address': engine.address} if engine.address else {
+            'address': 'local',  # not one that happens to run here
             'num_cpus': engine.workers or len(os.sched_getaffinity(0)),
             'include_dashboard': False}
         try:

@@ -88,8 +88,9 @@ def test_a_folder_is_never_mixed_with_other_settings(tmp_path):
 
 
 @pytest.mark.slow
-def test_files_do_not_depend_on_the_engine(tmp_path):
+def test_files_do_not_depend_on_the_engine(tmp_path, monkeypatch):
     pytest.importorskip('ray')
+    monkeypatch.setenv('RAY_ADDRESS', '127.0.0.1:1')  # a cluster that was not asked for
     config = CollectConfig(episodes=3, episodes_per_file=1, seed=11)
     for name in ('local', 'ray'):
         collect(tmp_path / name / 'push', config, Engine(name), progress=False)
