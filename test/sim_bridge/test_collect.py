@@ -104,7 +104,7 @@ def test_the_file_of_a_killed_worker_is_collected_again(tmp_path):
     process = subprocess.Popen(
         [sys.executable, '-m', 'tap_ros', 'collect', '--out', str(folder), '--episodes', '4',
          '--episodes-per-file', '2', '--seed', '5', '--workers', '1'], stderr=subprocess.DEVNULL)
-    while not list(folder.glob('*.part')) and process.poll() is None:
+    while not list(folder.glob('*.mcap.part')) and process.poll() is None:
         time.sleep(0.02)
     children = Path(f'/proc/{process.pid}/task/{process.pid}/children').read_text().split()
     worker, = (pid for pid in children
