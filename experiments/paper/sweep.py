@@ -19,7 +19,6 @@ from experiments.paper.places import is_collected, read_json, recording_hash
 from tap_ros.engines.run import run_tasks
 from tap_ros.engines.task import LOCAL, Task
 from tap_ros.errors import EngineError, TapError
-from tap_ros.learning.checkpoints import FREE
 from tap_ros.prediction.training_config import DEFAULTS
 from tqdm import tqdm
 
@@ -117,6 +116,7 @@ def trained_steps(run, places):
 
 def _same(settings, config):
     """Compare settings of a run, all that training depends on; new ones count as the default."""
+    from tap_ros.learning.checkpoints import FREE  # torch takes seconds, --help does without
     wanted = _comparable(json.loads(json.dumps(asdict(config))))
     settings = _comparable({**DEFAULTS, **settings})
     return all(settings[name] == value for name, value in wanted.items() if name not in FREE)

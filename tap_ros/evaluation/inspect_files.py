@@ -10,7 +10,6 @@ from typing import Annotated
 
 import numpy as np
 from tap_ros.files import write_atomically
-from tap_ros.learning.weights import load_tensors
 from tap_ros.options import File
 from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.recording.cache import open_recordings
@@ -36,6 +35,7 @@ class Options:
 def run(args: Options) -> None:
     """Print a summary; write a picture when asked to."""
     if Path(args.path).suffix == '.safetensors':
+        from tap_ros.learning.weights import load_tensors  # torch takes seconds
         _, about = load_tensors(args.path)
         print(json.dumps(about, indent=2))
         return
