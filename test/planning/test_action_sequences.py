@@ -121,6 +121,29 @@ def test_a_gripper_already_behind_the_object_is_not_lifted():
     assert (proposals[:, -1] == 0).mean() > 0.7
 
 
+class Means:
+    """A Generator that draws the mean of every distribution."""
+
+    def choice(self, options, count, p):
+        return np.full(count, np.argmax(p))
+
+    def normal(self, mean, _):
+        return mean
+
+    def uniform(self, low, high):
+        return (low + high) / 2
+
+
+@pytest.mark.parametrize('shape', [SHAPE, FREE])
+@pytest.mark.parametrize('distance', [0.03, 0.06, 0.15])  # the first takes a single period
+def test_a_push_ends_with_the_object_in_its_place_however_few_periods_it_takes(shape, distance):
+    gripper, goal = np.array([-0.06, 0.0, LOW, 0.0]), np.array([[distance, 0.0]])
+    proposal = push_proposals(shape, gripper, np.zeros((1, 2)), goal, 1, Means())
+    actions, = shape.actions(shape.clip(proposal), LOW)
+    end = gripper[:2] + actions[:, :2].sum(0)
+    np.testing.assert_allclose(end, [distance + 0.07 - 0.135, 0], atol=1e-6)
+
+
 def test_nothing_is_proposed_when_all_is_in_place():
     places = np.array([[0.1, 0.1]])
     rng = np.random.default_rng(0)

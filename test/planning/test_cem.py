@@ -97,6 +97,25 @@ def test_the_elites_are_judged_once_more():
     assert cost == quadratic(best[None])[0]
 
 
+def test_the_next_gaussian_has_mean_and_deviation_of_the_elites():
+    judged, config = [], CEMConfig(num_samples=12, num_iterations=2, num_elites=3)
+    search(config, cost=lambda samples: judged.append(samples) or quadratic(samples))
+    elites = judged[0][np.argsort(quadratic(judged[0]))[:3]]
+    noise = np.random.default_rng(0).standard_normal((2, 12, 3))[1]
+    spread = np.sqrt(((elites - elites.mean(0)) ** 2).mean(0))
+    np.testing.assert_allclose(judged[1], elites.mean(0) + spread * noise)
+
+
+def test_the_first_of_equals_wins():
+    judged = []
+    best, _ = search(CEMConfig(), cost=lambda s: judged.append(s) or np.arange(len(s)) % 2)
+    np.testing.assert_array_equal(best, judged[0][0])
+
+
+def test_one_elite_and_all_samples_as_elites_are_possible():
+    assert CEMConfig(5, 1, 1).num_elites == 1 and CEMConfig(5, 1, 5).num_elites == 5
+
+
 @pytest.mark.parametrize('wrong, name', [
     ({'num_elites': 0}, 'num_elites'), ({'num_elites': 300}, 'num_elites'),
     ({'num_iterations': 0}, 'num_iterations')])

@@ -84,6 +84,26 @@ def test_objects_beyond_the_crop_stay(model, image):
     torch.testing.assert_close(expected, far.expand(1, 3, 1, 2), atol=0.01, rtol=0)
 
 
+@pytest.mark.parametrize('step', [(0.06, 0.0), (0.0, -0.06), (-0.036, 0.048)])
+def test_the_crop_reaches_as_far_as_it_should_and_turns_with_the_motion(model, image, step):
+    pushing(model)
+    step = torch.tensor(step)
+    ahead = step / step.norm()
+    beside = torch.stack([-ahead[1], ahead[0]])
+    # metres along and across the motion: within the crop and beyond it, but in the window
+    within = torch.tensor([[-0.1, 0.0], [0.12, 0.0], [0.0, 0.18], [0.0, -0.18]])
+    beyond = torch.tensor([[-0.28, 0.0], [0.3, 0.0], [0.0, 0.31], [0.0, -0.31]])
+    table = torch.tensor(TABLE).view(3, 3)
+    places = GRIPPER[0, :2] + torch.cat([within, beyond]) @ torch.stack([ahead, beside])
+    pixels = places @ table[:2, :2].T + table[:2, 2]
+    maps, actions = model.seed_maps(pixels), torch.tensor([[[*step, 0.0, 0.0]]])
+    carried, = model.carried_maps(model.begin(image, GRIPPER), GRIPPER, maps, actions)
+    cells = model.pixel_table().flatten(0, 1)
+    moved = (carried[0] - maps).flatten(1) @ cells
+    expected = torch.cat([(table[:2, :2] @ step).expand(4, 2), torch.zeros(4, 2)])
+    torch.testing.assert_close(moved, expected, atol=0.25, rtol=0)
+
+
 def test_picture_masks_sum_to_one(model, image):
     arm = model.draw_arm(GRIPPER)
     scene = model.look(image, arm[:, 3:])

@@ -77,6 +77,8 @@ def test_a_map_is_reached_where_its_expected_distance_is_least():
     assert target.distance(places) == pytest.approx(0, abs=0.05)
     assert target.distance(places + [[3.0, 4.0], [0.0, 1.0]]) == pytest.approx(3, abs=0.05)
     assert target.distance(places - [[5.0, 0.0], [0.0, 25.0]]) == pytest.approx(15, abs=0.05)
+    # beyond the right and the lower end of the picture
+    assert target.distance(places + [[30.0, 0.0], [0.0, 25.0]]) == pytest.approx(27.5, abs=0.05)
     held = Target(places, maps, free=np.array([False, True]))
     assert held.distance(places + [[3.0, 4.0], [9.0, 9.0]]) == pytest.approx(5, abs=0.05)
     assert np.isnan(target.distance(places * np.nan))

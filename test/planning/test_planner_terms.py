@@ -11,6 +11,7 @@ from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.plan_cost import cost_of_maps, landing_clash, prices
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 import torch
 from toy_world import SIZE, to_pixels
@@ -328,3 +329,21 @@ def test_segments_go_on_where_the_last_plan_left_them(model, warm, changes):
     plan(puppets, config, GRIPPER + np.append(first.action[:3], 0), memory=first.memory)
     changed = np.abs(np.diff(puppets.judged[0][..., :2], axis=1)).max((0, 2)) > 1e-6
     assert (np.flatnonzero(changed) + 1).tolist() == changes
+
+
+def test_an_unfinished_object_costs_all_of_its_price_from_3_px_on():
+    cost = prices(torch.tensor([[0.0, 1.5, 3.0, 6.0]]), 4.0)
+    torch.testing.assert_close(cost, torch.tensor([[0.0, 3.5, 7.0, 10.0]]))
+
+
+@pytest.mark.parametrize('seen', [2, 3, 5, HORIZON])
+def test_what_stands_costs_the_same_however_often_it_is_looked_at(seen):
+    maps = torch.full((1, 2, 1, 2), 0.5)  # two objects, each half in either cell
+    cost, last = cost_of_maps([maps] * seen, torch.tensor([[1.0, 3.0], [4.0, 8.0]]))
+    assert cost.item() == pytest.approx((14 + 10) * (2 + 6)) and last.item() == 4
+
+
+def test_landing_too_near_costs_100_px_and_10_for_each_missing_centimetre():
+    landings = np.array([[0.0, 0.0], [0.125, 0.0], [0.25, 0.0], [0.9, 1.0], [np.nan, np.nan]])
+    cost = landing_clash(landings, np.array([[0.0, 0.0], [1.0, 1.0]]), 0.25)
+    np.testing.assert_allclose(cost, [350, 225, 0, 250, 0])

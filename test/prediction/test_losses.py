@@ -252,3 +252,24 @@ def test_what_is_there_with_a_chance_of_a_third_is_painted_from_a_weight_of_1_on
     assert (shown < left_out) == painted
     if weight == 0:
         assert left_out == l1_error(table, targets).mean()
+
+
+def test_a_pixel_has_changed_from_a_difference_of_0_075_on():
+    frame = torch.zeros(1, 3, 1, 2)
+    frame[..., 0], frame[..., 1] = 2 * 0.074, 2 * 0.076
+    assert changed_pixels(frame, torch.zeros(1, 1, 3, 1, 2)).tolist() == [[[[False, True]]]]
+
+
+def test_the_bell_has_its_edge_at_both_of_two_targets():
+    assert bell_preference(torch.tensor([[4, 5]]), 4, 5, 0.3).allclose(torch.tensor(0.3))
+
+
+def test_a_cost_of_1_adds_the_weight():
+    error, cost, preference = torch.tensor([[0.2]]), torch.tensor([[0.5]]), torch.tensor([[0.5]])
+    assert cost_of_reaching(error, cost, preference).item() == pytest.approx(0.6)
+    assert cost_of_reaching(error, cost, preference, 2).item() == pytest.approx(0.8)
+
+
+def test_copying_is_worth_1_where_hardly_anything_changed_too():
+    little = torch.tensor([[0.001, 0.0005]])
+    assert relative_to_copying(little, little[:, None], torch.ones(1, 2)).allclose(torch.ones(2))

@@ -23,7 +23,7 @@ from tap_ros.prediction.objective import (
     Networks,
     predictor_loss,
 )
-from tap_ros.prediction.selection import selection_errors
+from tap_ros.prediction.selection import selection_errors, time_preference
 from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
@@ -404,3 +404,33 @@ def test_progress_matches_the_frame_half_way_in_the_pictures():
         CONFIG, method=method, bell_edge=0.01)).match.item()
         for method in ('genmin-wo-gan', 'genmin-wo-gan+progress')}
     assert matches == {'genmin-wo-gan': 3, 'genmin-wo-gan+progress': 5}
+
+
+@pytest.mark.parametrize('kind', ['', '+progress', '+reach', '+relative'])
+def test_padding_changes_no_selection_error(kind):
+    whole, copy_error = make_batch(T=6), torch.rand(4, 2, 6)
+    config = replace(CONFIG, method='genmin-wo-gan' + kind)
+    padded = replace(whole, valid=whole.times <= 4)
+    short = replace(whole, targets=whole.targets[:, :4], times=whole.times[:, :4],
+                    valid=whole.valid[:, :4])
+    found = selection_errors(torch.ones(4, 6), lambda: copy_error, padded, config)[:, :4]
+    expected = selection_errors(torch.ones(4, 4), lambda: copy_error[..., :4], short, config)
+    assert found.allclose(expected)
+
+
+def test_the_way_begins_at_the_start_picture():
+    batch = make_batch()
+    batch = replace(batch, targets=batch.context[:, :1].expand(-1, 6, -1, -1, -1).clone())
+    batch.targets[:, 3:] = batch.context[:, 1:]  # stands, then jumps to the goal
+    config = replace(CONFIG, method='genmin-wo-gan+reach')
+    found = selection_errors(torch.ones(4, 6), None, batch, config)
+    way = found * time_preference(batch, config) - 1
+    assert way.allclose(torch.tensor([0.0, 0, 0, 1, 1, 1]), atol=1e-5)
+
+
+def test_preferences_are_those_of_the_settings():
+    batch = make_batch()
+    bell = time_preference(batch, replace(CONFIG, method='genmin-wo-gan', bell_edge=0.25))
+    assert bell[:, [0, -1]].allclose(torch.tensor(0.25))
+    forward = time_preference(batch, replace(CONFIG, method='genmin2-wo-gan', mode='forward'))
+    assert forward[:, [0, -1]].allclose(2 + torch.tensor([1 / 7, 6 / 7]))

@@ -154,3 +154,27 @@ def test_blur_keeps_the_mass_even_at_the_border():
     assert blurred.sum((-2, -1)).allclose(torch.ones(2))
     assert expected_pixels(blurred)[1].allclose(torch.tensor([12.0, 9.0]), atol=1e-4)
     assert blurred.max() < 0.8
+
+
+def test_an_object_that_the_flow_jumps_over_on_its_way_arrives_with_what_is_around_it():
+    flow = constant_flow(0, 0)
+    columns = torch.arange(30.0)
+    flow[:, :, 0] = torch.where(columns >= 15, -4.0, -6.0)  # nothing reads columns 8.01..10.99
+    maps = one_hot_maps(torch.tensor([[10.0, 8.0]]), SIZE).expand(1, 2, 1, *SIZE)
+    warped = warp_object_maps(maps, flow, masks_for([0.5, 0.5]))
+    assert warped.mass < 0.05
+    assert (expected_pixels(warped.maps)[0] - torch.tensor([15.0, 8.0])).norm() < 1
+
+
+@pytest.mark.parametrize('sigma', [1.0, 2.0])
+def test_blur_has_its_deviation_in_both_directions(sigma):
+    blurred = blur(one_hot_maps(torch.tensor([15.0, 10.0]), SIZE), sigma)
+    for dim, middle in ((0, 15.0), (1, 10.0)):
+        share = blurred.sum(dim)
+        variance = (share * (torch.arange(len(share)) - middle) ** 2).sum()
+        assert variance.sqrt().item() == pytest.approx(sigma, abs=0.01)
+
+
+def test_blur_is_by_one_pixel_unless_told():
+    maps = one_hot_maps(torch.tensor([15.0, 10.0]), SIZE)
+    assert blur(maps).equal(blur(maps, 1.0))

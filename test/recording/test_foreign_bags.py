@@ -232,6 +232,17 @@ def test_states_are_those_nearest_to_the_frame(tmp_path):
     assert np.isnan(episode.grippers[3]).all()
 
 
+@pytest.mark.parametrize('off, known', [(0.5, True), (0.5 + 1e-9, False)])
+def test_states_hold_for_half_a_frames_time_and_no_longer(tmp_path, off, known):
+    def state(t):
+        return ('/joint_states', 'sensor_msgs/msg/JointState',
+                joints(round(t * SECOND), ['gripper_x'], [t]), round(t * SECOND))
+    record(tmp_path / 'bag', [state(3 - off), *map(camera, (3, 4, 5)), state(5 + off)])
+    (episode,) = iter_episodes(tmp_path / 'bag')
+    expected = [3 - off, np.nan, 5 + off] if known else [np.nan] * 3
+    np.testing.assert_allclose(episode.grippers[:, 0], expected, rtol=1e-6)
+
+
 def test_states_of_other_joints_are_no_gripper_states(tmp_path):
     def state(t, name, log):
         return ('/joint_states', 'sensor_msgs/msg/JointState',

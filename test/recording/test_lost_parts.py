@@ -265,6 +265,23 @@ def test_a_goal_that_cannot_be_used_takes_back_the_one_before(tmp_path):
         assert caught or changes == BAD['empty']  # an empty one says that there is no goal
 
 
+def test_a_goal_does_not_hold_beyond_a_file_that_is_cut_off(tmp_path):
+    late = 2 * SECOND + 1  # the next nanosecond, in the next file
+    goal = '/goal/image', *image(1, 50)[1:]
+    for number, messages in enumerate((
+            [mark(1, 0), goal, image(2, 2)],
+            [(*image(3, 3)[:3], late), (*mark(3, 1, 'success')[:3], late)])):
+        folder = record(tmp_path / str(number), messages)
+        (folder / f'{number}_0.mcap').rename(tmp_path / f'bag_{number}.mcap')
+    cut = tmp_path / 'bag_0.mcap'
+    data = cut.read_bytes()
+    cut.write_bytes(data[:records(data)[-1][1]])
+    with pytest.warns(RecordingWarning, match='cut off'):
+        first, second = iter_episodes(tmp_path)
+    assert first.goal_frame[0, 0, 0] == 50
+    assert second.frames[:, 0, 0, 0].tolist() == [3] and second.goal_frame is None
+
+
 def test_goal_objects_that_cannot_be_used_take_back_those_before(tmp_path):
     kind = 'tap_msgs/msg/ObjectStates'
     data = encode(kind, {'header': {'stamp': {'sec': 1}}, 'objects': [{'name': 'a', 'u': 5}]})
