@@ -7,6 +7,7 @@ import contextlib
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
+import numpy as np
 from tap_ros.images import to_float
 from tap_ros.learning.devices import Autocast
 from tap_ros.learning.parallel import ALONE, Processes
@@ -80,7 +81,8 @@ class Draws:
         draws = (torch.randn(B, T, latent_size, generator=generator),
                  torch.randn(B, latent_size, generator=generator),
                  torch.rand(B, T, generator=generator),
-                 torch.rand(B, levels, T, generator=generator))
+                 torch.from_numpy(np.random.default_rng([seed, 4, step]).random(
+                     (B, levels, T), np.float32)))
         part = processes.part(B)
         return cls(*(draw[part].to(batch.times.device) for draw in draws))
 

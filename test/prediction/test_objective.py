@@ -385,7 +385,7 @@ def test_heat_moves_the_match_of_every_level_but_never_to_padding(method, poster
     config = replace(CONFIG, method=method, posterior=posterior)
     if posterior == 'video':
         config = replace(config, recursion=2)
-        shown = to_float(batch.targets[:, 4])
+        shown = 0.9 * to_float(batch.targets[:, 4])
         networks = Networks(Moving(shown, shown, shown, shown))
     else:
         networks = Networks(Shade(), Brightness(1))
