@@ -49,7 +49,7 @@ _SHOWN = 8  # episodes in a sample picture
 
 
 def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | None = None,
-          progress: bool = True) -> str:
+          progress: bool = True, after_step: Callable[[int], object] | None = None) -> str:
     """
     Train a predictor, or go on with a run that was interrupted.
 
@@ -61,6 +61,7 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
     :param stop_at: stop (and save) at this step instead of the last.
     :param minutes: stop (and save) after so many minutes; None: never.
     :param progress: whether to show a progress bar.
+    :param after_step: called with the number of steps done, after each of them.
     :return: path of the weights file.
     :raises ConfigError: if the folder holds a run with other settings or recordings.
     :raises RecordingError: if the recordings cannot be trained on.
@@ -75,12 +76,13 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
         progress = progress and processes.first
         store = open_recordings(list(config.recordings), progress=progress)
         with run_folder(config.out) if processes.first else nullcontext():
-            _train(config, device, processes, store, stop_at, deadline, progress)
+            _train(config, device, processes, store, stop_at, deadline, progress, after_step)
     return str(Path(config.out) / 'predictor.safetensors')
 
 
 def _train(config: TrainingConfig, device: torch.device, processes: Processes, store: EpisodeStore,
-           stop_at: int | None, deadline: float, progress: bool) -> None:
+           stop_at: int | None, deadline: float, progress: bool,
+           after_step: Callable[[int], object] | None) -> None:
     """Train as the only run in the folder; see train."""
     training, held_out = split_episodes(store, config.test_fraction)
     torch.manual_seed(config.seed)
@@ -142,6 +144,8 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
                 if curves is not None:
                     _log(curves, bar, state.step, values, norm,
                          state.optimizers[0].param_groups[0]['lr'])
+            if after_step is not None:
+                after_step(state.step)
             late = math.isfinite(deadline) and processes.agree(
                 time.monotonic() > deadline, device)
             if curves is not None and (
