@@ -196,8 +196,9 @@ class Predictor(nn.Module):
         :return: a Prediction.
         """
         B, C, _, H, W = context.shape
-        levels = self._encode(context)
-        code = self.head(levels[-1])                            # B, 128, 1, 1
+        levels = self._encode(context.flatten(0, 1))
+        features = levels[-1].unflatten(0, (B, C))              # B, C, 256, 4, 4
+        code = self.head(features.flatten(1, 2))                # B, 128, 1, 1
         if self.config.latent_size:
             if z is None:
                 z = code.new_zeros(B, self.config.latent_size)
@@ -210,15 +211,14 @@ class Predictor(nn.Module):
         image = combine(warp(context.float(), flow), masks, new_pixels)
         return Prediction(image, flow, masks, new_pixels)
 
-    def _encode(self, context: torch.Tensor) -> list[torch.Tensor]:
-        """Return the features of the blocks, fine to coarse, those of all pictures in a row."""
-        x, levels = context.flatten(0, 1), []                   # B*C, 3, 64, 64
+    def _encode(self, pictures: torch.Tensor) -> list[torch.Tensor]:
+        """Return what the encoder's blocks find, fine to coarse; without skips, the last alone."""
+        x, levels = pictures, []                                # B*C, 3, 64, 64
         for layer in self.encoder:
             x = layer(x)
             if isinstance(layer, nn.LeakyReLU):                 # the end of a block
                 levels.append(x)
-        wanted = levels if self.config.skips else levels[-1:]
-        return [level.unflatten(0, context.shape[:2]).flatten(1, 2) for level in wanted]
+        return levels if self.config.skips else levels[-1:]
 
     def _decode(self, code: torch.Tensor, levels: Sequence[torch.Tensor],
                 context: torch.Tensor) -> Sequence[torch.Tensor]:

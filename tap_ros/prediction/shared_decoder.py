@@ -46,7 +46,7 @@ class SharedDecoder(nn.Module):
 
         :param code: (B, in_features, 1, 1).
         :param levels: for the skips: what the encoder's blocks found, fine to coarse, each
-            (B, pictures * width, h, w).
+            (B * pictures, width, h, w).
         :param pictures: (B, pictures, 3, H, W).
         :return: for each output (B, channels, H, W), before its activation.
         """
@@ -54,12 +54,17 @@ class SharedDecoder(nn.Module):
         for i, block in enumerate(self.blocks):
             x = _double(x)
             if self.skips is not None:
-                x = x + self.skips[i](levels[-2 - i])
+                x = x + self.skips[i](_joined(levels[-2 - i], len(pictures)))
             x = block(x)
         x = _double(x)
         if self.skips is not None:
-            x = torch.cat([x, pictures.flatten(1, 2).to(x.dtype)], 1)
+            x = torch.cat([x, _joined(pictures.flatten(0, 1), len(pictures)).to(x.dtype)], 1)
         return self.end(x).split(self.outputs, 1)
+
+
+def _joined(features: torch.Tensor, batch: int) -> torch.Tensor:
+    """Put the channels of the pictures of an episode in a row, in the format channels_last."""
+    return features.unflatten(0, (batch, -1)).permute(0, 3, 4, 1, 2).flatten(3).permute(0, 3, 1, 2)
 
 
 def _double(x: torch.Tensor) -> torch.Tensor:
