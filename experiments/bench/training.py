@@ -1,28 +1,37 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Benchmark of training: samples a second of each kind of method, and the share of the peak.
+Benchmark of training: what each method costs, and what makes it faster than the first row.
 
-The peak is the rate of a large matrix product in the precision of the training, measured in the
-same run.
+A CPU second is one of one core, all threads of the process together: what else the machine does
+matters little. The share is of the rate of a large matrix product in the precision of the
+training, measured in the same run.
 """
 
 from dataclasses import dataclass, replace
 import os
 import tempfile
+import time
 from typing import Annotated
 
 from experiments.bench.speed import matrix_rate, matrix_side
-from tap_ros.learning.devices import make_autocast, pick_device
+from tap_ros.learning.devices import pick_device, pick_precision
 from tap_ros.options import Bags, Flag
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 from tyro import conf
 
 METHODS = ('genmin-wo-gan', 'genmin', 'genmin-vae', 'genmin-vae-gan')
+# One change after the other; `auto` is bfloat16 where that is faster.
+LADDER = (
+    {'method': 'genmin', 'precision': 'float32'},
+    {'method': 'genmin-wo-gan', 'precision': 'float32'},
+    {'method': 'genmin-wo-gan', 'precision': 'float32', 'decoder': 'shared'},
+    {'method': 'genmin-wo-gan', 'precision': 'float32', 'decoder': 'shared', 'skips': True},
+    {'method': 'genmin-wo-gan', 'precision': 'auto', 'decoder': 'shared'},
+    {'method': 'genmin-wo-gan', 'precision': 'auto', 'decoder': 'shared', 'skips': True})
 
 
 @dataclass(frozen=True)
@@ -31,7 +40,7 @@ class Options:
     Options of this benchmark.
 
     :param recordings: to train on.
-    :param methods: each as --method of train.
+    :param methods: further rows: each as --method of train, in the precision `auto`.
     :param steps: how many to time.
     :param base_width: as for train.
     :param batch_size: as for train.
@@ -50,30 +59,49 @@ class Options:
     compile: Flag = False
 
 
+@dataclass(frozen=True)
+class Cost:
+    """
+    What a step of training takes.
+
+    :param seconds: time that passes.
+    :param cpu_seconds: time of all cores together.
+    """
+
+    seconds: float
+    cpu_seconds: float
+
+
 def run(args):
-    """Train each method for some steps in a temporary folder, and print how fast that was."""
+    """Train in each way for some steps in a temporary folder, and print how fast that was."""
     device = pick_device(args.device)
-    with make_autocast('auto', device)():
-        half = torch.is_autocast_enabled(device.type)
-    dtype = torch.bfloat16 if half else torch.float32
     torch.set_num_threads(args.threads or len(os.sched_getaffinity(0)))
-    peak = matrix_rate(device, dtype)
+    chosen = pick_precision('auto', device)
+    peaks = {name: matrix_rate(device, getattr(torch, name)) for name in {'float32', chosen}}
     print(f'batch {args.batch_size}, base width {args.base_width}, new pixels, {device.type}'
           + (f', {torch.get_num_threads()} threads' if device.type == 'cpu' else '')
-          + f'; peak: {peak / 1e12:.2f} T operations/s, '
-          f'a {dtype} product of {matrix_side(device)}')
-    print(f'{"method":<20}{"samples/s":>12}{"G operations a sample":>24}{"share of peak":>16}')
-    for method in args.methods:
+          + f'; auto is {chosen}; peak: ' + ', '.join(
+              f'{peak / 1e12:.2f} T operations/s in {name}' for name, peak in peaks.items())
+          + f', a product of {matrix_side(device)}')
+    print(f'{"method":<16}{"decoder":<16}{"precision":<10}{"samples/s":>10}'
+          f'{"samples/CPU s":>15}{"ratio":>7}{"G operations a sample":>23}{"share of peak":>15}')
+    first = None
+    for row in (*LADDER, *({'method': method} for method in args.methods)):
         with tempfile.TemporaryDirectory() as folder:
             config = TrainingConfig(
-                recordings=tuple(args.recordings), out=folder, method=method, new_pixels=True,
+                recordings=tuple(args.recordings), out=folder, new_pixels=True,
                 margin=0, outer_power=1.0, goal_picture='last', base_width=args.base_width,
                 batch_size=args.batch_size, device=args.device, threads=args.threads,
-                compile=args.compile, save_every=10 ** 9)
-            rate = args.batch_size / time_step(config, args.steps)
+                compile=args.compile, save_every=10 ** 9, **row)
+            cost = time_step(config, args.steps)
             operations = count_operations(config) / args.batch_size
-        print(f'{method:<20}{rate:>12.0f}{operations / 1e9:>24.2f}'
-              f'{rate * operations / peak:>16.0%}')
+        rate, efficiency = (args.batch_size / each for each in (cost.seconds, cost.cpu_seconds))
+        first = first or efficiency
+        precision = pick_precision(config.precision, device)
+        print(f'{config.method:<16}{config.decoder + " + skips" * config.skips:<16}'
+              f'{precision:<10}{rate:>10.0f}{efficiency:>15.0f}{efficiency / first:>7.2f}'
+              f'{operations / 1e9:>23.2f}{rate * operations / peaks[precision]:>15.0%}',
+              flush=True)
 
 
 def time_step(config, steps):
@@ -82,12 +110,16 @@ def time_step(config, steps):
 
     :param config: TrainingConfig, of a run that has not begun.
     :param steps: how many to average over, after as many to warm up and to compile.
-    :return: seconds.
+    :return: Cost.
     """
+    times = {}
+
+    def note(step):
+        times[step] = (time.perf_counter(), time.process_time())
+
     # A point of the curves waits for the GPU.
-    train(replace(config, log_every=steps), stop_at=2 * steps, progress=False)
-    first, last = EventAccumulator(config.out).Reload().Scalars('train/loss')
-    return (last.wall_time - first.wall_time) / steps
+    train(replace(config, log_every=steps), stop_at=2 * steps, progress=False, after_step=note)
+    return Cost(*((end - begin) / steps for begin, end in zip(times[steps], times[2 * steps])))
 
 
 def count_operations(config):
@@ -100,6 +132,7 @@ def count_operations(config):
     counts = []
     for steps in (1, 2):  # the difference is one step without what surrounds it
         with tempfile.TemporaryDirectory() as folder, FlopCounterMode(display=False) as counter:
-            train(replace(config, out=folder, compile=False), stop_at=steps, progress=False)
+            train(replace(config, out=folder, compile=False, precision='float32'),  # without trial
+                  stop_at=steps, progress=False)
         counts.append(counter.get_total_flops())
     return counts[1] - counts[0]

@@ -39,6 +39,7 @@ class TrainingState(Generic[Trained]):
         there are discriminators, theirs.
     :param step: number of steps done.
     :param seconds: time they took, over all sessions.
+    :param precision: what the networks run in, 'float32' or 'bfloat16'; '': nothing was chosen.
     """
 
     network: Trained
@@ -47,6 +48,7 @@ class TrainingState(Generic[Trained]):
     optimizers: list[torch.optim.Optimizer]
     step: int = 0
     seconds: float = 0.0
+    precision: str = ''
 
     @torch.no_grad()
     def update_average(self, decay: float) -> None:
@@ -107,7 +109,7 @@ def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
             tensors |= {f'optimizer.{k}.{i}.{name}': value for name, value in values.items()}
     save_tensors(path, tensors, {
         'kind': 'checkpoint', 'step': state.step, 'seconds': state.seconds,
-        'settings': settings, 'data_hash': data_hash})
+        'precision': state.precision, 'settings': settings, 'data_hash': data_hash})
 
 
 def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mapping[str, Any],
@@ -128,7 +130,8 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     tensors, about = load_tensors(path)
     if (about.get('kind') != 'checkpoint' or not isinstance(about.get('settings'), dict)
             or not isinstance(about.get('step'), int)
-            or not isinstance(about.get('seconds'), (int, float))):
+            or not isinstance(about.get('seconds'), (int, float))
+            or about.get('precision', '') not in ('', 'float32', 'bfloat16')):
         raise WeightsError(f'{escaped(path)}: is no checkpoint; {_REMEDY}')
     for name, value in settings.items():
         before = about['settings'].get(name, defaults.get(name))
@@ -145,6 +148,7 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
         raise WeightsError(f'{escaped(path)}: is a checkpoint of something else '
                            f'({escaped(error)}); {_REMEDY}') from error
     state.step, state.seconds = about['step'], about['seconds']
+    state.precision = about.get('precision', '')
 
 
 def _put_back(state: TrainingState[Any], tensors: Mapping[str, torch.Tensor]) -> None:

@@ -51,7 +51,8 @@ def run_facts(state: TrainingState[Any], seed: int, store: 'EpisodeStore', train
     :return: dict that JSON can hold.
     """
     device = device_name(next(state.network.parameters()).device)
-    return {
+    chosen = {'precision': state.precision} if state.precision else {}
+    return chosen | {
         'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': seed,
         'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
         'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device}',

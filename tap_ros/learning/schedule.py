@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The learning rate over a training."""
+"""What changes over a training: the learning rate, and the temperature of the match."""
 
 import math
 
@@ -18,3 +18,16 @@ def learning_rate(step: int, steps: int, warmup: int, highest: float) -> float:
     rise = min(1.0, (step + 1) / (warmup + 1))
     fall = 0.5 + 0.5 * math.cos(math.pi * step / steps)
     return highest * rise * (0.02 + 0.98 * fall)
+
+
+def match_temperature(step: int, steps: int, highest: float, share: float) -> float:
+    """
+    Compute a step's temperature of the match: a linear fall to 0, where it stays.
+
+    :param step: from 0 on.
+    :param steps: length of the training.
+    :param highest: the temperature of step 0.
+    :param share: of the training, after which it is 0.
+    :return: the temperature.
+    """
+    return highest * max(0.0, 1 - step / (share * steps))

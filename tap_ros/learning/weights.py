@@ -15,7 +15,7 @@ import math
 import os
 from pathlib import Path
 import stat
-from typing import Any, get_origin, TypeVar
+from typing import Any, get_origin, Literal, TypeVar
 
 from safetensors import SafetensorError
 from safetensors.torch import load, save
@@ -26,6 +26,8 @@ import torch
 
 Config = TypeVar('Config')  # a dataclass
 Network = TypeVar('Network', bound=torch.nn.Module)
+
+LATER = {'later': True}  # metadata of a field that files of earlier versions lack
 
 _FORMAT = 'tap_ros 2'  # 1 had no SHA-256
 _MAX_HEADER = 2 ** 22  # bytes; names, shapes and description of the largest networks need 1%
@@ -104,17 +106,19 @@ def make_config(config_class: type[Config], values: Mapping[str, Any], path: str
     """
     Turn the configuration found in a file back into its dataclass.
 
-    :param config_class: the dataclass, of fields that are bool, int, float or tuple of numbers.
+    :param config_class: the dataclass, of fields that are bool, int, float, tuple of numbers or
+        Literal of words. Files of earlier versions lack those whose metadata says LATER.
     :param values: the dict of load_weights.
     :param path: the file, for the message.
     :return: the dataclass.
     :raises WeightsError: for a key that this version does not know or that is missing, and for
         a value of another type, that is not finite, or that cannot be used.
     """
+    described = fields(config_class)  # type: ignore[arg-type]
     known: dict[str, Any] = {
-        field.name: get_origin(field.type) or field.type
-        for field in fields(config_class)}  # type: ignore[arg-type]
-    unknown, missing = sorted(set(values) - set(known)), sorted(set(known) - set(values))
+        field.name: get_origin(field.type) or field.type for field in described}
+    needed = {field.name for field in described if not LATER.items() <= field.metadata.items()}
+    unknown, missing = sorted(set(values) - set(known)), sorted(needed - set(values))
     if unknown or missing:
         what = f'unknown configuration {listing(unknown)}' if unknown else (
             f'lacks the configuration {listing(missing)}')
@@ -133,7 +137,7 @@ def make_config(config_class: type[Config], values: Mapping[str, Any], path: str
 
 
 _EXPECTED = {bool: 'true or false', int: 'a whole number', float: 'a finite number',
-             tuple: 'a list of finite numbers'}
+             tuple: 'a list of finite numbers', Literal: 'a word'}
 
 
 def _is_a(value: object, kind: Any) -> bool:
@@ -142,6 +146,8 @@ def _is_a(value: object, kind: Any) -> bool:
         return isinstance(value, list) and all(_is_a(each, float) for each in value)
     if isinstance(value, bool) or kind is bool:
         return isinstance(value, bool) and kind is bool
+    if isinstance(value, str) or kind is Literal:
+        return isinstance(value, str) and kind is Literal
     if isinstance(value, int):
         return abs(value) < 2 ** 31
     return kind is float and isinstance(value, float) and math.isfinite(value)

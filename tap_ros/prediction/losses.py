@@ -86,17 +86,33 @@ def l1_errors(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     return distances / 255
 
 
-def match_step(selection_error: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
+def match_step(selection_error: torch.Tensor, valid: torch.Tensor | None = None,
+               temperature: float = 0.0, chance: torch.Tensor | None = None) -> torch.Tensor:
     """
     Pick the target with the least selection error, the argmin of Eq. 5.
 
+    With a temperature above 0, which is not in the paper, the target is drawn with probabilities
+    softmax((1 - E'_t / min E') / temperature). Early in a training the argmin keeps to what the
+    network happens to show first, mostly an input; a temperature that falls lets the match settle
+    slowly, as in annealed multiple choice learning (Perera et al. 2024, Victorletzelter/
+    annealed_mcl, losses.py; a soft match of frames also in orybkin/video-gcp, adaptive.py).
+
     :param selection_error: (B, T), E'_t.
     :param valid: bool (B, T), False where an episode is padded; None: all are valid.
+    :param temperature: of the softmax; 0: the argmin, infinity: any valid target.
+    :param chance: (B, T) uniform in 0..1, to draw with; needed with a temperature.
     :return: int64 (B,), indices into T; never a padded one.
     """
     if valid is not None:
         selection_error = selection_error.masked_fill(~valid, math.inf)
-    return selection_error.argmin(1)
+    if temperature == 0:
+        return selection_error.argmin(1)
+    assert chance is not None, 'the target is drawn'
+    excess = selection_error / selection_error.amin(1, keepdim=True).clamp(min=1e-12) - 1
+    # The largest logit with Gumbel noise is a draw from the softmax.
+    noise = -torch.log(-torch.log(chance.clamp(1e-12, 1 - 1e-7)))
+    score = noise - excess / temperature
+    return score.masked_fill(selection_error.isinf(), -math.inf).argmax(1)
 
 
 def fixed_time_loss(error: torch.Tensor | Callable[[torch.Tensor], torch.Tensor],

@@ -1,17 +1,23 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The predictor G of appendix C.
+The predictor G of appendix C, and with the one decoder of ours instead of its three.
 
 Pictures go in and out as NCHW float32 in [-1, 1]. Everything works in either memory format; on a
 CPU `channels_last` is the faster one.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 import math
+from typing import get_args
 
 from tap_ros.errors import ConfigError
+from tap_ros.learning.weights import LATER
+from tap_ros.prediction.shared_decoder import SharedDecoder
+from tap_ros.prediction.training_config import Decoder
 from tap_ros.prediction.warp import combine, warp
+from tap_ros.text import escaped
 import torch
 from torch import nn
 from torch.nn import functional
@@ -30,6 +36,10 @@ class PredictorConfig:
     :param new_pixels: whether there is a decoder for pixels that cannot be copied. Object maps
         need the variant without (appendix E).
     :param flow_scale: pixels of flow for an output of 1 of the flow decoder; not in the paper.
+    :param decoder: 'separate': three decoders of 5x5 convolutions (appendix C). 'shared': one of
+        3x3 convolutions, with all outputs at its end; not in the paper, two to three times faster.
+    :param skips: whether the shared decoder also sees what the encoder's blocks found, and the
+        pictures themselves, each at its own size (U-Net). What is small gets lost in the code.
     """
 
     image_size: int = 64
@@ -39,9 +49,16 @@ class PredictorConfig:
     latent_size: int = 0
     new_pixels: bool = True
     flow_scale: float = 16.0
+    decoder: Decoder = field(default='separate', metadata=LATER)
+    skips: bool = field(default=False, metadata=LATER)
 
     def __post_init__(self) -> None:
         """Refuse shapes that the network cannot have."""
+        if self.decoder not in get_args(Decoder):
+            raise ConfigError(f'decoder: expected one of {", ".join(get_args(Decoder))}, '
+                              f'got {escaped(repr(self.decoder), 60)}')
+        if self.skips and self.decoder != 'shared':
+            raise ConfigError("skips: they go with decoder 'shared'; appendix C has none")
         levels = math.log2(self.image_size) if self.image_size > 0 else 0.5
         if self.image_size < 16 or levels != int(levels):
             raise ConfigError(f'image_size: expected a power of two from 16 on, such as 64, '
@@ -139,7 +156,8 @@ class Predictor(nn.Module):
     Predict one frame between context pictures: warped pictures and new pixels, blended by masks.
 
     One encoder reads each context picture; their features are concatenated. Three decoders of
-    the same shape give the new pixels, the flow and the masks (appendix C, its last figure).
+    the same shape give the new pixels, the flow and the masks (appendix C, its last figure), or
+    one gives all of them (`decoder='shared'`).
     """
 
     def __init__(self, config: PredictorConfig) -> None:
@@ -147,18 +165,27 @@ class Predictor(nn.Module):
         super().__init__()
         self.config = config
         widths, features = config.widths, config.code_size + config.latent_size
+        C = config.num_context
         self.encoder = encoder(3, widths)
         # Kernel sizes of the head are ours: the paper says convolution-ReLU-convolution.
         self.head = nn.Sequential(
-            nn.Conv2d(config.num_context * widths[-1], widths[-1], 3, padding=1),
+            nn.Conv2d(C * widths[-1], widths[-1], 3, padding=1),
             nn.ReLU(),
             nn.Conv2d(widths[-1], config.code_size, 4))
-        self.flow_decoder = decoder(features, widths, 2 * config.num_context)
-        self.mask_decoder = decoder(features, widths, config.num_context + config.new_pixels)
-        self.pixel_decoder = decoder(features, widths, 3) if config.new_pixels else None
+        if config.decoder == 'shared':
+            self.shared_decoder = SharedDecoder(
+                features, widths, (2 * C, C + config.new_pixels, 3 * config.new_pixels),
+                C if config.skips else 0)
+            flow = self.shared_decoder.end.weight
+        else:
+            self.flow_decoder = decoder(features, widths, 2 * C)
+            self.mask_decoder = decoder(features, widths, C + config.new_pixels)
+            self.pixel_decoder = decoder(features, widths, 3) if config.new_pixels else None
+            flow = self.flow_decoder[-1].get_parameter('weight')
         self.apply(initialise)
         # Training starts from copying: flow near 0.
-        nn.init.normal_(self.flow_decoder[-1].get_parameter('weight'), 0.0, 0.002)
+        with torch.no_grad():
+            flow[:2 * C].normal_(0.0, 0.002)
 
     def forward(self, context: torch.Tensor, z: torch.Tensor | None = None) -> Prediction:
         """
@@ -169,17 +196,34 @@ class Predictor(nn.Module):
         :return: a Prediction.
         """
         B, C, _, H, W = context.shape
-        features = self.encoder(context.flatten(0, 1))          # B*C, 256, 4, 4
-        code = self.head(features.unflatten(0, (B, C)).flatten(1, 2))  # B, 128, 1, 1
+        levels = self._encode(context.flatten(0, 1))
+        features = levels[-1].unflatten(0, (B, C))              # B, C, 256, 4, 4
+        code = self.head(features.flatten(1, 2))                # B, 128, 1, 1
         if self.config.latent_size:
             if z is None:
                 z = code.new_zeros(B, self.config.latent_size)
             code = torch.cat([code, z[:, :, None, None].to(code.dtype)], 1)
+        flow, masks, new = self._decode(code, levels, context)
         # Positions need more digits than half precision has: blend in float32.
-        flow = self.flow_decoder(code).float().unflatten(1, (C, 2)) * self.config.flow_scale
-        masks = functional.softmax(self.mask_decoder(code).float(), 1)[:, :, None]
-        new_pixels = None
-        if self.pixel_decoder is not None:
-            new_pixels = torch.tanh(self.pixel_decoder(code).float())
+        flow = flow.float().unflatten(1, (C, 2)) * self.config.flow_scale
+        masks = functional.softmax(masks.float(), 1)[:, :, None]
+        new_pixels = torch.tanh(new.float()) if self.config.new_pixels else None
         image = combine(warp(context.float(), flow), masks, new_pixels)
         return Prediction(image, flow, masks, new_pixels)
+
+    def _encode(self, pictures: torch.Tensor) -> list[torch.Tensor]:
+        """Return what the encoder's blocks find, fine to coarse; without skips, the last alone."""
+        x, levels = pictures, []                                # B*C, 3, 64, 64
+        for layer in self.encoder:
+            x = layer(x)
+            if isinstance(layer, nn.LeakyReLU):                 # the end of a block
+                levels.append(x)
+        return levels if self.config.skips else levels[-1:]
+
+    def _decode(self, code: torch.Tensor, levels: Sequence[torch.Tensor],
+                context: torch.Tensor) -> Sequence[torch.Tensor]:
+        """Return flow, masks and new pixels before their activations."""
+        if self.config.decoder == 'shared':
+            return self.shared_decoder(code, levels, context)
+        parts = (self.flow_decoder, self.mask_decoder, self.pixel_decoder)
+        return [code if part is None else part(code) for part in parts]

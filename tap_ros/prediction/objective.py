@@ -7,6 +7,7 @@ import contextlib
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
+import numpy as np
 from tap_ros.images import to_float
 from tap_ros.learning.devices import Autocast
 from tap_ros.learning.parallel import ALONE, Processes
@@ -15,7 +16,6 @@ from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.discriminator import discriminator_loss, generator_loss
 from tap_ros.prediction.losses import (
     fixed_time_loss,
-    match_step,
     recursive_loss,
     remaining_targets,
     total,
@@ -54,15 +54,17 @@ class Draws:
         'frame', else the first.
     :param prior: (B, latent_size) normal.
     :param other: (B, T) in 0..1, to draw t' of Eq. 11.
+    :param match: (B, R, T) in 0..1, to draw the matches of R levels of recursion.
     """
 
     posterior: torch.Tensor
     prior: torch.Tensor
     other: torch.Tensor
+    match: torch.Tensor
 
     @classmethod
     def make(cls, batch: Batch, latent_size: int, seed: int, step: int,
-             processes: Processes = ALONE) -> Self:
+             processes: Processes = ALONE, levels: int = 1) -> Self:
         """
         Draw those of a step, on the batch's device, the same ones whenever asked.
 
@@ -70,6 +72,7 @@ class Draws:
         :param latent_size: of z.
         :param seed: of the training; step: number of the step.
         :param processes: Processes that share the batch.
+        :param levels: of recursion.
         :return: Draws.
         """
         generator = torch.Generator().manual_seed((seed << 32) + step)
@@ -77,7 +80,9 @@ class Draws:
         B *= processes.count
         draws = (torch.randn(B, T, latent_size, generator=generator),
                  torch.randn(B, latent_size, generator=generator),
-                 torch.rand(B, T, generator=generator))
+                 torch.rand(B, T, generator=generator),
+                 torch.from_numpy(np.random.default_rng([seed, 4, step]).random(
+                     (B, levels, T), np.float32)))
         part = processes.part(B)
         return cls(*(draw[part].to(batch.times.device) for draw in draws))
 
@@ -104,7 +109,7 @@ class Outcome:
 def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation | None,
                    config: ObjectiveSettings, draws: Draws | None = None,
                    autocast: Autocast = contextlib.nullcontext,
-                   selection: Selection = selection_errors) -> Outcome:
+                   selection: Selection = selection_errors, temperature: float = 0.0) -> Outcome:
     """
     Compute the predictor's training loss of a batch.
 
@@ -124,12 +129,13 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
     :param batch: batches.Batch.
     :param augmentation: Augmentation, or None.
     :param config: ObjectiveSettings.
-    :param draws: Draws; needed with GAN or VAE.
+    :param draws: Draws; needed with GAN, VAE or a temperature.
     :param autocast: makes the context manager to run the networks in.
     :param selection: function as selection.selection_errors: any preference.
+    :param temperature: of the match at this step, see losses.match_step.
     :return: Outcome.
     """
-    targets = Targets(batch, augmentation, config)
+    targets = Targets(batch, augmentation, config, temperature, draws.match if draws else None)
     context = to_float(batch.context)  # B, C, 3, H, W
     context = augmentation.apply(context) if augmentation else context
     parts: dict[str, torch.Tensor] = {}
@@ -211,10 +217,15 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
                     context: torch.Tensor, match: torch.Tensor, loss: torch.Tensor,
                     config: ObjectiveSettings, z: torch.Tensor | None, autocast: Autocast,
                     selection: Selection) -> torch.Tensor:
-    """Add the levels r > 0 of Eq. 3; gradients flow through the predictions as contexts."""
+    """
+    Add the levels r > 0 of Eq. 3; gradients flow through the predictions as contexts.
+
+    With detach_recursion, which is not in the paper, they do not: the loss of a later level cannot
+    bend a picture that serves for itself into one that is easy to go on from.
+    """
     batch, valid = targets.batch, targets.batch.valid
     losses, counts = [loss], [len(context)]
-    for _ in range(config.recursion - 1):
+    for level in range(1, config.recursion):
         matched = batch.times.gather(1, match[:, None])
         valid = remaining_targets(valid, batch.times, matched, config.forward)
         left = valid.any(1)
@@ -222,6 +233,8 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
             break
         # The prediction takes the place of the start (forward) or of the goal.
         following = prediction.image[:, None]
+        if config.detach_recursion:  # unlike Eq. 3
+            following = following.detach()
         context = following if config.forward else torch.cat([context[:, :1], following], 1)
         with autocast():
             prediction = networks.predictor(context, z)
@@ -231,7 +244,7 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
             end = torch.where(left[:, None], matched, batch.end)
             between = replace(between, end=end, last=torch.where(
                 left[:, None], matched - 1, batch.last))
-        match = targets.match(prediction.image, context, selection, between)
+        match = targets.match(prediction.image, context, selection, between, level)
         errors = outer_error(targets.outer_l1(prediction.image, match, context), config)
         losses.append(errors[left].mean())
         counts.append(int(left.sum().item()))
@@ -265,7 +278,7 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
         predictions.append(prediction)
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
     whole = (divergences + errors).detach()
-    match = match_step(selection(
+    match = targets.choose(selection(
         whole, lambda: targets.errors(context), batch, config), batch.valid)
     parts = {'kl': fixed_time_loss(divergences, match),
              'error': fixed_time_loss(outer_error(errors, config), match)}

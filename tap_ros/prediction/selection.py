@@ -81,11 +81,15 @@ class Targets:
     :param batch: batches.Batch.
     :param augmentation: Augmentation of all pictures that networks see, or None.
     :param config: ObjectiveSettings.
+    :param temperature: of the match, see losses.match_step.
+    :param chances: (B, R, T) uniform in 0..1, to draw the matches of R levels of recursion with;
+        needed with a temperature.
     """
 
-    def __init__(self, batch: Batch, augmentation: Augmentation | None,
-                 config: ObjectiveSettings) -> None:
+    def __init__(self, batch: Batch, augmentation: Augmentation | None, config: ObjectiveSettings,
+                 temperature: float = 0.0, chances: torch.Tensor | None = None) -> None:
         self.batch, self.augmentation, self.config = batch, augmentation, config
+        self.temperature, self.chances = temperature, chances
         self.rows = torch.arange(len(batch.context), device=batch.context.device)
 
     def frame(self, step: torch.Tensor) -> torch.Tensor:
@@ -94,7 +98,7 @@ class Targets:
         return (self.augmentation.apply(frame) if self.augmentation else frame)[:, 0]
 
     def match(self, image: torch.Tensor, context: torch.Tensor, selection: Selection,
-              batch: Batch | None = None) -> torch.Tensor:
+              batch: Batch | None = None, level: int = 0) -> torch.Tensor:
         """
         Find the target that each prediction is trained towards, the argmin of Eq. 5.
 
@@ -106,6 +110,7 @@ class Targets:
         :param selection: function as selection_errors.
         :param batch: with the valid targets and the bounds of the preference, where these are not
             the batch's own.
+        :param level: of recursion, from 0.
         :return: int64 (B,), indices into T.
         """
         if self.config.chosen.loss == 'fix':
@@ -114,7 +119,13 @@ class Targets:
         error = self.errors(image.detach()[:, None])[:, 0]
         selection_error = selection(
             error, lambda: self.errors(context.detach()), batch, self.config)
-        return match_step(selection_error, batch.valid)
+        return self.choose(selection_error, batch.valid, level)
+
+    def choose(self, selection_error: torch.Tensor, valid: torch.Tensor,
+               level: int = 0) -> torch.Tensor:
+        """Return the match of a level from E' (B, T), see losses.match_step."""
+        chance = None if self.chances is None else self.chances[:, level]
+        return match_step(selection_error, valid, self.temperature, chance)
 
     def errors(self, images: torch.Tensor) -> torch.Tensor:
         """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""

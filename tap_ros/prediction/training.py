@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
-from tap_ros.learning.devices import Autocast, make_autocast, pick_device
+from tap_ros.learning.devices import Autocast, make_autocast, pick_device, pick_precision
 from tap_ros.learning.frames import Frames, MappedFrames, ResidentFrames
 from tap_ros.learning.parallel import joined, Processes, share_batch_norm
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
-from tap_ros.learning.schedule import learning_rate
+from tap_ros.learning.schedule import learning_rate, match_temperature
 from tap_ros.learning.split import split_episodes
 from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.augmentation import Augmentation
@@ -49,7 +49,7 @@ _SHOWN = 8  # episodes in a sample picture
 
 
 def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | None = None,
-          progress: bool = True) -> str:
+          progress: bool = True, after_step: Callable[[int], object] | None = None) -> str:
     """
     Train a predictor, or go on with a run that was interrupted.
 
@@ -61,6 +61,7 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
     :param stop_at: stop (and save) at this step instead of the last.
     :param minutes: stop (and save) after so many minutes; None: never.
     :param progress: whether to show a progress bar.
+    :param after_step: called with the number of steps done, after each of them.
     :return: path of the weights file.
     :raises ConfigError: if the folder holds a run with other settings or recordings.
     :raises RecordingError: if the recordings cannot be trained on.
@@ -75,12 +76,13 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
         progress = progress and processes.first
         store = open_recordings(list(config.recordings), progress=progress)
         with run_folder(config.out) if processes.first else nullcontext():
-            _train(config, device, processes, store, stop_at, deadline, progress)
+            _train(config, device, processes, store, stop_at, deadline, progress, after_step)
     return str(Path(config.out) / 'predictor.safetensors')
 
 
 def _train(config: TrainingConfig, device: torch.device, processes: Processes, store: EpisodeStore,
-           stop_at: int | None, deadline: float, progress: bool) -> None:
+           stop_at: int | None, deadline: float, progress: bool,
+           after_step: Callable[[int], object] | None) -> None:
     """Train as the only run in the folder; see train."""
     training, held_out = split_episodes(store, config.test_fraction)
     torch.manual_seed(config.seed)
@@ -93,7 +95,10 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
         share_batch_norm(module, processes)
     state = start(network, config.learning_rate, device, helpers)
     load_checkpoint(checkpoint, state, asdict(config), store.data_hash, DEFAULTS)
-    autocast = make_autocast(config.precision, device)
+    # A run keeps what it began with. Processes of other machines may find otherwise: one decides.
+    state.precision = state.precision or ('bfloat16' if processes.agree(
+        pick_precision(config.precision, device) == 'bfloat16', device) else 'float32')
+    autocast = make_autocast(state.precision, device)
     # Decoding and copying would be most of the time of a step on a GPU.
     frames = (ResidentFrames(store, device, progress) if device.type == 'cuda'
               else MappedFrames(store))
@@ -113,8 +118,8 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
     last = min(config.steps, stop_at or config.steps)
     report = partial(_report, config=config, store=store, frames=frames, training=training,
                      held_out=held_out, autocast=autocast)
-    bar = tqdm(total=config.steps, initial=state.step, desc=config.method, unit='step',
-               disable=not progress)
+    bar = tqdm(total=config.steps, initial=state.step, unit='step', disable=not progress,
+               desc=f'{config.method}, {state.precision}')
     curves = SummaryWriter(config.out, purge_step=state.step) if processes.first else None
     with curves or nullcontext(), bar:
         began = time.monotonic() - state.seconds
@@ -126,7 +131,8 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
                     group['lr'] = learning_rate(
                         step, config.steps, config.warmup, highest)
             batch, augmentation = batch.to(device), augmentation.to(device)
-            draws = Draws.make(batch, config.latent_size, config.seed, step, processes)
+            draws = Draws.make(
+                batch, config.latent_size, config.seed, step, processes, config.recursion)
             outcome, norm = _step(state, networks, batch, augmentation, draws, config, processes,
                                   autocast)
             state.update_average(config.average_decay)
@@ -138,6 +144,8 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
                 if curves is not None:
                     _log(curves, bar, state.step, values, norm,
                          state.optimizers[0].param_groups[0]['lr'])
+            if after_step is not None:
+                after_step(state.step)
             late = math.isfinite(deadline) and processes.agree(
                 time.monotonic() > deadline, device)
             if curves is not None and (
@@ -165,7 +173,8 @@ def network_config(config: TrainingConfig, image_size: tuple[int, int]) -> Predi
     return PredictorConfig(image_size=height, base_width=config.base_width,
                            num_context=1 if config.forward else 2,
                            latent_size=config.latent_size if config.chosen.vae else 0,
-                           new_pixels=config.new_pixels, flow_scale=config.flow_scale)
+                           new_pixels=config.new_pixels, flow_scale=config.flow_scale,
+                           decoder=config.decoder, skips=config.skips)
 
 
 def _begin_with(network: Predictor, weights: str) -> None:
@@ -189,7 +198,10 @@ def _step(state: TrainingState[Predictor], networks: Networks, batch: Batch,
               if judge is not None]  # a compiled network has no truth value
     for judge in judges:
         judge.requires_grad_(False)
-    outcome = predictor_loss(networks, batch, augmentation, config, draws, autocast)
+    temperature = match_temperature(
+        state.step, config.steps, config.match_temperature, config.match_share)
+    outcome = predictor_loss(
+        networks, batch, augmentation, config, draws, autocast, temperature=temperature)
     state.optimizers[0].zero_grad()
     outcome.loss.backward()
     processes.average_gradients(state.optimizers[0].param_groups[0]['params'])

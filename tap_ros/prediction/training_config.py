@@ -15,6 +15,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.learning.split import TEST_FRACTION
 from tap_ros.prediction.methods import Method, Mode, parse_method
 
+Decoder = Literal['separate', 'shared']
 GoalPicture = Literal['last', 'recorded', 'mixed']
 Posterior = Literal['video', 'frame']
 Precision = Literal['auto', 'float32', 'bfloat16']
@@ -30,7 +31,8 @@ class RunSettings:
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, batches and augmentation.
     :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
-    :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 where it is fast.
+    :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 where a short trial
+        finds it faster. The choice stays for the whole run.
     :param threads: of the CPU; 0: as many as there are.
     :param compile: use torch.compile; slow to start, results differ in the last digits.
     :param log_every: steps between curve points.
@@ -73,7 +75,12 @@ class ObjectiveSettings:
     :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
     :param changed_weight: how much more pixels of the target weigh in the outer error that differ
         from every input; 0 in the paper, see losses.weighted_l1_error.
+    :param match_temperature: draw the target of min and genmin by a softmax of this temperature
+        at the start of the training, see losses.match_step; 0, the paper: the least error.
+    :param match_share: share of the training over which the temperature falls to 0.
     :param recursion: levels of Eq. 3; 1: none. The GAN's and the VAE's terms stand at the first.
+    :param detach_recursion: a level's prediction is an input of the next one without gradient; the
+        paper: with it, see objective.py.
     :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
     :param kl_weight: of the KL divergence beside it.
     :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
@@ -85,7 +92,10 @@ class ObjectiveSettings:
     bell_edge: float = 2 / 3
     outer_power: float = 0.5
     changed_weight: float = 0.0
+    match_temperature: float = 0.0
+    match_share: float = 0.5
     recursion: int = 1
+    detach_recursion: bool = False
     gan_weight: float = 5e-5
     kl_weight: float = 1e-4
     posterior: Posterior = 'video'
@@ -95,7 +105,8 @@ class ObjectiveSettings:
         _check_choice(self, mode=Mode, posterior=Posterior)
         _check_least(self, 1, 'recursion')
         _check_least(self, 0, 'changed_weight', 'gan_weight', 'kl_weight')
-        _check_range(self, bell_edge=(1e-6, 1), outer_power=(0.1, 1))
+        _check_range(self, bell_edge=(1e-6, 1), outer_power=(0.1, 1),
+                     match_temperature=(0, 1e6), match_share=(1e-6, 1))
         method = self.chosen
         if method.beta is not None and not self.forward:
             raise ConfigError(f'method: {method.name} has the linear preference of forward '
@@ -103,6 +114,9 @@ class ObjectiveSettings:
         if method.selection == 'picture_progress' and self.forward:
             raise ConfigError(f'method: {method.name} needs a goal picture; give --mode '
                               'bidirectional')
+        if self.match_temperature and method.loss == 'fix':
+            raise ConfigError('match_temperature: a fixed target is not drawn; expected 0 with '
+                              f'method {method.name}')
         if self.recursion > 1 and method.loss == 'fix':
             raise ConfigError('recursion: the targets of Eq. 3 follow the match; expected 1 with '
                               f'method {method.name}')
@@ -164,6 +178,9 @@ class NetworkSettings:
     :param new_pixels: whether the network may paint; object maps are best without.
     :param base_width: the network's width; 32 in the paper.
     :param flow_scale: pixels of flow for an output of 1 of the flow decoder.
+    :param decoder: 'separate': three decoders, one an output (appendix C); 'shared': one of
+        smaller convolutions for all outputs, faster.
+    :param skips: the shared decoder also sees what the encoder's blocks found (U-Net).
     :param latent_size: length of z, for the methods that have it.
     :param video_frames: the recognition network sees the video at so many moments; the paper: all.
     :param initial_weights: begin with these instead of fresh ones: a file, or the name of shipped
@@ -175,6 +192,8 @@ class NetworkSettings:
     new_pixels: bool = False
     base_width: int = 16
     flow_scale: float = 16.0
+    decoder: Decoder = 'separate'
+    skips: bool = False
     latent_size: int = 32
     video_frames: int = 16
     initial_weights: str = ''
@@ -185,6 +204,12 @@ class NetworkSettings:
         if self.initial_weights and self.pretrain_steps:
             raise ConfigError('initial_weights: they have decoders already; expected '
                               f'pretrain_steps 0, got {self.pretrain_steps}')
+        _check_choice(self, decoder=Decoder)
+        if self.skips and self.decoder != 'shared':
+            raise ConfigError("skips: they go with decoder 'shared'; give --decoder shared, too")
+        if self.pretrain_steps and self.decoder != 'separate':
+            raise ConfigError("pretrain_steps: only the decoders of appendix C are pretrained; "
+                              "expected 0 with decoder 'shared'")
         _check_least(self, 1, 'base_width', 'latent_size', 'video_frames')
         _check_least(self, 0, 'pretrain_steps')
 

@@ -8,6 +8,7 @@ import time
 
 from experiments.bench.training import count_operations, time_step
 import pytest
+from tap_ros.prediction import training
 from tap_ros.prediction.training_config import TrainingConfig
 import torch
 
@@ -34,5 +35,18 @@ def test_the_time_of_a_step_leaves_out_what_surrounds_it(config, monkeypatch):
 
     monkeypatch.setattr('tap_ros.prediction.training.pick_device', slow)
     began = time.monotonic()
-    seconds = time_step(config, 3)
-    assert 0 < seconds < (time.monotonic() - began - 0.5) / 3
+    cost = time_step(config, 3)
+    assert 0 < cost.seconds < (time.monotonic() - began - 0.5) / 3
+    assert 0 < cost.cpu_seconds
+
+
+def test_cpu_seconds_leave_out_what_waits(config, monkeypatch):
+    step = training._step
+
+    def slow(*args):
+        time.sleep(0.5)
+        return step(*args)
+
+    monkeypatch.setattr(training, '_step', slow)
+    cost = time_step(config, 1)
+    assert cost.cpu_seconds < cost.seconds - 0.4

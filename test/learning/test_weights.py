@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of weights files, and what is said about files that are none."""
 
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -81,6 +82,42 @@ def test_somebody_elses_safetensors(tmp_path):
     save_file({'weight': torch.zeros(2)}, tmp_path / 'other.safetensors')
     with pytest.raises(WeightsError, match='other.safetensors: written by format None'):
         load_weights(tmp_path / 'other.safetensors', 'predictor')
+
+
+@pytest.mark.parametrize('config', [
+    CONFIG, replace(CONFIG, decoder='shared'), replace(CONFIG, decoder='shared', skips=True)])
+def test_a_network_comes_back_with_its_decoder(tmp_path, config):
+    network = Predictor(config).eval()
+    save_weights(tmp_path / 'weights', network, 'predictor', config, {})
+    other, _ = load_network(tmp_path / 'weights')
+    context = torch.rand(1, 2, 3, 16, 16)
+    assert other.config == config
+    assert other(context).image.allclose(network(context).image, atol=1e-5)
+
+
+def test_files_of_earlier_versions_lack_the_decoder_and_are_the_same_network(path):
+    values, state, _ = load_weights(path, 'predictor')
+    old = {name: value for name, value in values.items() if name not in ('decoder', 'skips')}
+    assert make_config(PredictorConfig, old, path) == CONFIG
+    save_weights(path.with_name('old'), state, 'predictor', old, {})
+    context = torch.rand(1, 2, 3, 16, 16)
+    before, after = (load_network(name)[0](context).image
+                     for name in (path, path.with_name('old')))
+    assert before.equal(after)
+    for name in old:  # all the others are needed
+        with pytest.raises(WeightsError, match=f'lacks the configuration {name}'):
+            make_config(PredictorConfig, {k: v for k, v in old.items() if k != name}, path)
+
+
+@pytest.mark.parametrize('values, expected', [
+    ({'decoder': 3}, 'expected a word'), ({'decoder': ['shared']}, 'expected a word'),
+    ({'decoder': 'x' * 10 ** 6}, 'expected one of separate, shared'),
+    ({'decoder': 'separate', 'skips': True}, 'skips'), ({'base_width': '4'}, 'a whole number')])
+def test_a_configuration_of_wrong_words_is_refused_in_one_line(path, values, expected):
+    known = load_weights(path, 'predictor')[0]
+    with pytest.raises(WeightsError, match=expected) as error:
+        make_config(PredictorConfig, known | values, path)
+    assert str(error.value).isprintable() and len(str(error.value)) < 500
 
 
 def test_unknown_configuration(path):

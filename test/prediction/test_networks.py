@@ -2,12 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the predictor network."""
 
+from dataclasses import replace
+
 import pytest
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 import torch
 
 SMALL = PredictorConfig(base_width=4)
+SHARED = PredictorConfig(base_width=4, decoder='shared')
+SKIPS = PredictorConfig(base_width=4, decoder='shared', skips=True)
+EVERY = pytest.mark.parametrize('config', [SMALL, SHARED, SKIPS], ids=['paper', 'shared', 'skips'])
 
 
 def contexts(batch, config=SMALL, seed=0):
@@ -31,10 +36,11 @@ def test_blocks_have_the_sizes_of_appendix_c():
     assert network.head[0].in_channels == 512
 
 
+@EVERY
 @pytest.mark.parametrize('new_pixels', [True, False])
 @pytest.mark.parametrize('image_size', [32, 64])
-def test_outputs_have_the_promised_shapes(new_pixels, image_size):
-    config = PredictorConfig(image_size=image_size, base_width=4, new_pixels=new_pixels)
+def test_outputs_have_the_promised_shapes(new_pixels, image_size, config):
+    config = replace(config, image_size=image_size, new_pixels=new_pixels)
     answer = Predictor(config)(contexts(3, config))
     S = image_size
     assert answer.image.shape == (3, 3, S, S)
@@ -48,19 +54,22 @@ def test_outputs_have_the_promised_shapes(new_pixels, image_size):
         assert answer.new_pixels is None
 
 
-def test_fresh_weights_hardly_move_anything():
-    assert Predictor(SMALL)(contexts(4)).flow.abs().mean() < 1
+@EVERY
+def test_fresh_weights_hardly_move_anything(config):
+    assert Predictor(config)(contexts(4)).flow.abs().mean() < 1
 
 
-def test_equal_context_pictures_are_all_that_a_warp_only_network_can_show():
+@EVERY
+def test_equal_context_pictures_are_all_that_a_warp_only_network_can_show(config):
     # Blending warped copies of one flat colour gives that colour.
-    network = Predictor(PredictorConfig(base_width=4, new_pixels=False))
+    network = Predictor(replace(config, new_pixels=False))
     context = torch.full((2, 2, 3, 64, 64), 0.3)
     assert network(context).image.allclose(torch.full((2, 3, 64, 64), 0.3), atol=1e-5)
 
 
-def test_one_at_a_time_equals_a_batch_in_eval_mode():
-    network = Predictor(SMALL)
+@EVERY
+def test_one_at_a_time_equals_a_batch_in_eval_mode(config):
+    network = Predictor(config)
     for seed in range(3):
         network(contexts(8, seed=seed))  # statistics of batch norm
     network.eval()
@@ -72,33 +81,80 @@ def test_one_at_a_time_equals_a_batch_in_eval_mode():
         assert alone.flow[0].allclose(together.flow[b], atol=1e-3)
 
 
-def test_memory_format_changes_no_number():
-    network = Predictor(SMALL).eval()
+@EVERY
+def test_memory_format_changes_no_number(config):
+    network = Predictor(config).eval()
     expected = network(contexts(2)).image
     network.to(memory_format=torch.channels_last)
     assert network(contexts(2)).image.allclose(expected, atol=1e-5)
 
 
-def test_z_makes_a_difference_and_its_mean_is_the_default():
-    config = PredictorConfig(base_width=4, latent_size=32)
+@EVERY
+def test_z_makes_a_difference_and_its_mean_is_the_default(config):
+    config = replace(config, latent_size=32)
     network = Predictor(config).eval()
-    assert network.flow_decoder[0].in_channels == 160  # section App. C: 128 + 32
+    firsts = [layer for layer in network.modules() if isinstance(layer, torch.nn.ConvTranspose2d)]
+    assert {layer.in_channels for layer in firsts} == {160}  # section App. C: 128 + 32
     context = contexts(2, config)
     default = network(context).image
     assert network(context, torch.zeros(2, 32)).image.equal(default)
     assert not network(context, torch.ones(2, 32)).image.allclose(default)
 
 
-def test_every_weight_gets_a_gradient():
-    network = Predictor(PredictorConfig(base_width=4, new_pixels=True))
+@EVERY
+def test_every_weight_gets_a_gradient(config):
+    network = Predictor(config)
     network(contexts(2)).image.square().mean().backward()
     without = [name for name, weight in network.named_parameters()
                if weight.grad is None or not weight.grad.abs().sum() > 0]
     assert without == []
 
 
+def set_outputs(network, bias):
+    """Let the shared decoder answer the same everywhere."""
+    end = network.shared_decoder.end
+    with torch.no_grad():
+        end.weight.zero_()
+        end.bias.copy_(torch.tensor(bias))
+
+
+@pytest.mark.parametrize('config', [SHARED, SKIPS], ids=['shared', 'skips'])
+def test_outputs_of_the_shared_decoder_are_flow_then_masks_then_new_pixels(config):
+    network, context = Predictor(config).eval(), contexts(2)
+    flow, start, goal, painted = [0.0] * 4, [30.0, 0, 0], [0, 30.0, 0], [0, 0, 30.0]
+    for masks, expected in ((start, context[:, 0]), (goal, context[:, 1])):
+        set_outputs(network, flow + masks + [0.0] * 3)
+        assert network(context).image.allclose(expected, atol=1e-5)
+    set_outputs(network, flow + painted + [9.0, -9.0, 0.0])
+    colour = torch.tensor([1.0, -1.0, 0.0])[:, None, None].expand(2, 3, 64, 64)
+    assert network(context).image.allclose(colour, atol=1e-5)
+    set_outputs(network, [0.125, 0.0, 0.0, 0.0] + start + [0.0] * 3)  # 2 pixels to the right
+    assert network(context).image[..., :-2].allclose(context[:, 0, ..., 2:], atol=1e-5)
+
+
+@pytest.mark.parametrize('config', [SHARED, SKIPS], ids=['shared', 'skips'])
+def test_one_pixel_reaches_the_outputs_past_the_code_by_skips_alone(config):
+    network = Predictor(config).eval()
+    with torch.no_grad():
+        network.head[-1].weight.zero_()  # the code says nothing
+    context = contexts(1)
+    changed = context.clone()
+    changed[0, 0, :, 5, 60] += 1.0
+    moved = (network(context).flow != network(changed).flow).any(2).any(1)[0]
+    assert moved[5, 60] == config.skips and moved.any() == config.skips
+    assert not moved.all()  # skips tell what is near
+
+
+def test_a_shared_decoder_has_fewer_weights_than_those_of_the_paper():
+    def weights(config):
+        return sum(weight.numel() for name, weight in Predictor(config).named_parameters()
+                   if 'decoder' in name)
+    assert weights(SHARED) < weights(SMALL) / 3
+
+
 @pytest.mark.parametrize('values', [{'image_size': 48}, {'image_size': 8}, {'image_size': 0},
-                                    {'base_width': 0}, {'latent_size': -1}])
+                                    {'base_width': 0}, {'latent_size': -1},
+                                    {'decoder': 'none'}, {'skips': True}])
 def test_impossible_shapes_are_refused_by_name(values):
     with pytest.raises(ConfigError, match=next(iter(values))):
         PredictorConfig(**values)

@@ -239,7 +239,8 @@ class Watching(Judge):
 def still_draws(batch, prior=0.0):
     """Make draws with the posterior's own mean and a fixed sample of the prior."""
     B, T = batch.times.shape
-    return Draws(torch.zeros(B, T, 1), torch.full((B, 1), prior), torch.rand(B, T))
+    return Draws(torch.zeros(B, T, 1), torch.full((B, 1), prior), torch.rand(B, T),
+                 torch.rand(B, 1, T))
 
 
 def test_eq_10_l1_and_one_judge_see_the_posterior_the_other_judge_the_prior():
@@ -339,11 +340,12 @@ class Following(torch.nn.Module):
 
     def __init__(self, image):
         super().__init__()
-        self.image = image
+        self.image, self.share = image, torch.nn.Parameter(torch.tensor(0.5))
 
     def forward(self, context, z=None):
         image, self.image = self.image, None
-        return Prediction(context[:, -1] / 2 if image is None else image, None, None, None)
+        shown = context[:, -1] * self.share if image is None else image
+        return Prediction(shown, None, None, None)
 
 
 def test_gradients_pass_through_predictions_as_inputs():
@@ -356,6 +358,43 @@ def test_gradients_pass_through_predictions_as_inputs():
     predictor_loss(Networks(Following(image)), batch, None, replace(
         CONFIG, method='genmin-wo-gan', recursion=2), selection=first_two).loss.backward()
     assert image.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize('mode', ['bidirectional', 'forward'])
+def test_detached_levels_learn_and_leave_the_first_prediction_alone(mode):
+    batch = make_batch()
+    config = replace(CONFIG, method='min-wo-gan', mode=mode)
+    found = {}
+    for recursion, detached in ((1, False), (2, False), (2, True)):
+        image = (0.9 * to_float(batch.targets[:, 2])).requires_grad_()
+        network = Following(image)
+        outcome = predictor_loss(Networks(network), batch, None, replace(
+            config, recursion=recursion, detach_recursion=detached))
+        outcome.loss.backward()
+        found[recursion, detached] = outcome.loss.item(), image.grad, network.share.grad
+    alone, paper, detached = found.values()
+    assert detached[1].equal(alone[1]) and not paper[1].equal(alone[1])
+    assert alone[2] is None and detached[2] == paper[2] != 0
+    assert detached[0] == paper[0] > alone[0]  # the loss is that of Eq. 3 in both
+
+
+@pytest.mark.parametrize('method, posterior', [
+    ('genmin-wo-gan', 'video'), ('min-wo-gan', 'video'), ('min-vae', 'frame')])
+def test_heat_moves_the_match_of_every_level_but_never_to_padding(method, posterior):
+    batch = make_batch(B=64, T=9, padded=3)
+    config = replace(CONFIG, method=method, posterior=posterior)
+    if posterior == 'video':
+        config = replace(config, recursion=2)
+        shown = 0.9 * to_float(batch.targets[:, 4])
+        networks = Networks(Moving(shown, shown, shown, shown))
+    else:
+        networks = Networks(Shade(), Brightness(1))
+    draws = Draws.make(batch, 1, 0, 0, levels=2)
+    cold, hot = (predictor_loss(networks, batch, None, config, draws, temperature=temperature)
+                 for temperature in (0.0, 1e6))
+    assert hot.match.unique().tolist() == list(range(6))
+    assert cold.match.max() <= 5 and not cold.match.equal(hot.match)
+    assert hot.loss > cold.loss
 
 
 def test_the_preference_of_a_level_lies_between_its_own_inputs():

@@ -16,6 +16,7 @@ from tap_ros.cli import main
 from tap_ros.errors import ConfigError, StorageError, WeightsError
 from tap_ros.files import only_writer
 from tap_ros.images import to_float
+from tap_ros.learning import devices
 from tap_ros.learning.parallel import Processes
 from tap_ros.learning.schedule import learning_rate
 from tap_ros.learning.weights import load_tensors, load_weights, save_tensors
@@ -47,6 +48,8 @@ def weights(config):
     {'method': 'genmin-vae-gan'},
     {'method': 'fix0.25', 'mode': 'forward', 'pretrain_steps': 2},
     {'method': 'genmin4', 'mode': 'forward', 'recursion': 2},
+    {'decoder': 'shared', 'skips': True, 'recursion': 2, 'detach_recursion': True,
+     'match_temperature': 1.0, 'match_share': 1.0},
     {'method': 'genmin-vae', 'posterior': 'frame', 'num_targets': 2}])
 def test_two_steps_and_two_more_equal_four(config, tmp_path, values):
     config = replace(config, **values)
@@ -81,6 +84,8 @@ def test_weights_of_another_network_are_no_beginning(config, tmp_path):
     other = replace(config, out=str(tmp_path / 'other'), initial_weights=first, base_width=8)
     with pytest.raises(ConfigError, match='base_width 4 instead of 8'):
         train(other, progress=False)
+    with pytest.raises(ConfigError, match="decoder 'separate' instead of 'shared'"):
+        train(replace(other, base_width=4, decoder='shared'), progress=False)
     assert not (Path(other.out) / 'checkpoint.safetensors').exists()
 
 
@@ -109,9 +114,11 @@ def test_every_method_learns(config, mode, method):
     assert losses[1] < losses[0]
 
 
-def test_a_compiled_discriminator_is_trained(config, monkeypatch):
+@pytest.mark.parametrize('values', [
+    {'method': 'genmin', 'new_pixels': True}, {'method': 'genmin-vae-gan', 'decoder': 'shared'}])
+def test_compiled_networks_are_trained(config, monkeypatch, values):
     monkeypatch.setattr(torch, 'compile', partial(torch.compile, backend='eager'))
-    path = train(replace(config, method='genmin', compile=True, steps=1), progress=False)
+    path = train(replace(config, compile=True, steps=1, **values), progress=False)
     assert load_network(path)[1]['steps'] == 1
 
 
@@ -162,6 +169,20 @@ def test_a_run_leaves_what_is_needed_to_repeat_it(config):
     assert training['scores'] == about['scores']
     assert SubgoalPredictor.load(path).image_size == (32, 32)
     assert list(Path(config.out).glob('events.out.tfevents.*'))
+
+
+@pytest.mark.parametrize('first, second', [(0.1, 9.0), (9.0, 0.1)])
+def test_a_run_goes_on_in_the_precision_that_it_began_with(config, monkeypatch, first, second):
+    monkeypatch.setattr(devices, 'bfloat16_gain', lambda: first)
+    train(config, stop_at=2, progress=False)
+    monkeypatch.setattr(devices, 'bfloat16_gain', lambda: second)
+    path = train(config, progress=False)
+    expected = replace(config, out=f'{config.out}-expected',
+                       precision='float32' if first < 1 else 'bfloat16')
+    train(expected, progress=False)
+    assert all(weights(config)[name].equal(value) for name, value in weights(expected).items())
+    for facts in (load_network(path)[1], json.loads(Path(config.out, 'run.json').read_text())):
+        assert facts['precision'] == expected.precision
 
 
 def test_a_run_of_other_settings_is_not_continued(config):

@@ -117,7 +117,8 @@ def test_the_decoders_alone_are_pretrained(trained):
 
 @pytest.mark.parametrize('values', [
     {'base_width': 8}, {'flow_scale': 4.0}, {'new_pixels': False},
-    {'method': 'genmin-vae', 'latent_size': 5}, {'mode': 'forward'}])
+    {'method': 'genmin-vae', 'latent_size': 5}, {'mode': 'forward'},
+    {'decoder': 'shared'}, {'decoder': 'shared', 'skips': True}])
 def test_the_network_is_the_one_asked_for(trained, values):
     trained(**values)
     shape = load_network(trained.path)[0].config
@@ -126,6 +127,8 @@ def test_the_network_is_the_one_asked_for(trained, values):
         values.get('new_pixels', True))
     assert shape.latent_size == values.get('latent_size', 0)
     assert shape.num_context == (1 if 'mode' in values else 2)
+    assert (shape.decoder, shape.skips) == (
+        values.get('decoder', 'separate'), values.get('skips', False))
 
 
 @pytest.mark.parametrize('posterior, method, images', [
@@ -202,7 +205,8 @@ def test_each_setting_of_the_objective_reaches_the_loss(trained):
     plain = losses(trained, method='genmin-wo-gan')
     assert losses(trained, method='genmin-wo-gan') == plain
     for options in ({'bell_edge': 1.0}, {'outer_power': 1.0}, {'changed_weight': 5.0},
-                    {'recursion': 2}, {'method': 'min-wo-gan'}, {'method': 'fix-wo-gan'}):
+                    {'recursion': 2}, {'match_temperature': 10.0}, {'method': 'min-wo-gan'},
+                    {'method': 'fix-wo-gan'}):
         changed = losses(trained, **{'method': 'genmin-wo-gan', **options})
         assert changed != pytest.approx(plain, rel=1e-6), options
 
