@@ -66,9 +66,9 @@ PRIMITIVES = (
 
 def add_arm(spec: mujoco.MjSpec) -> None:
     """Add the arm's bodies, joints and primitives to a model; nothing of it touches anything."""
-    half = ur10e.BASE_YAW / 2
+    half = ur10e.SIMULATED.yaw / 2
     body = spec.worldbody.add_body(
-        name='ur10e_base', pos=ur10e.BASE_POSITION, quat=[np.cos(half), 0, 0, np.sin(half)])
+        name='ur10e_base', pos=ur10e.SIMULATED.position, quat=[np.cos(half), 0, 0, np.sin(half)])
     bodies = [body]
     place, turn = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
     for name, (a, alpha, d) in zip(ur10e.JOINTS, ur10e.DH):

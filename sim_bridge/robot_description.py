@@ -31,7 +31,7 @@ def robot_description() -> str:
                               shape.colour, shape.capsule)
     ElementTree.SubElement(robot, 'link', name=TIP_FRAME)
     _add_joint(robot, 'world_joint', 'fixed', WORLD_FRAME, 'base',
-               ur10e.BASE_POSITION, (0, 0, ur10e.BASE_YAW))
+               ur10e.SIMULATED.position, (0, 0, ur10e.SIMULATED.yaw))
     place, turn = (0.0, 0.0, 0.0), 0.0
     for i, name in enumerate(ur10e.JOINTS):
         joint = _add_joint(
@@ -44,7 +44,7 @@ def robot_description() -> str:
         a, turn, d = ur10e.DH[i]
         place = (a, 0.0, d)
     _add_joint(robot, 'gripper_joint', 'fixed', links[-1], TIP_FRAME,
-               (place[0], place[1], place[2] + ur10e.TOOL), (turn, 0, 0))
+               (place[0], place[1], place[2] + ur10e.SIMULATED.tool), (turn, 0, 0))
     ElementTree.indent(robot)
     return ElementTree.tostring(robot, 'unicode', xml_declaration=True)
 

@@ -9,6 +9,7 @@ here: the simulated arm is kinematic, it follows the gripper and bears no load.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,13 +24,36 @@ DH = (  # per joint: a (m), alpha (rad), d (m)
 JOINT_LIMITS = np.array([2 * np.pi, 2 * np.pi, np.pi, 2 * np.pi, 2 * np.pi, 2 * np.pi])  # rad, +-
 SPEED_LIMITS = np.radians([120, 120, 180, 180, 180, 180])  # rad/s
 
-# From here, behind the table and a little below it, every command within the contract's limits
-# keeps all joints below their highest speeds.
-BASE_POSITION = np.array([0.0, 0.7, -0.1])  # m in the world
-BASE_YAW = -np.pi / 2  # rad: the arm faces the camera
-TOOL = 0.206  # m from the flange to the fingertips, along the flange's z
-
 _MIN_SINE = 1e-6  # of wrist 2; below, wrist 1 and wrist 3 turn about the same axis
+
+
+@dataclass(frozen=True)
+class Mount:
+    """
+    Where an arm stands, and how long its tool is.
+
+    :param position: x, y, z of its base in the world, m.
+    :param yaw: of the base about the vertical, rad.
+    :param tool: m from the flange to the fingertips, along the flange's z.
+    """
+
+    # From here, behind the simulated table and a little below it, every command within the
+    # contract's limits keeps all joints below their highest speeds.
+    position: tuple[float, float, float] = (0.0, 0.7, -0.1)
+    yaw: float = -np.pi / 2
+    tool: float = 0.206
+
+    @property
+    def pose(self) -> np.ndarray:
+        """Pose (4, 4) of the base in the world."""
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        pose = np.eye(4)
+        pose[:2, :2] = [[c, -s], [s, c]]
+        pose[:3, 3] = self.position
+        return pose
+
+
+SIMULATED = Mount()
 
 
 def link_transform(joint: int, angle: ArrayLike) -> np.ndarray:
@@ -113,40 +137,33 @@ def wrapped(angles: np.ndarray) -> np.ndarray:
     return np.pi - (np.pi - angles) % (2 * np.pi)
 
 
-def base_pose() -> np.ndarray:
-    """Return the pose (4, 4) of the base in the world."""
-    c, s = np.cos(BASE_YAW), np.sin(BASE_YAW)
-    pose = np.eye(4)
-    pose[:2, :2] = [[c, -s], [s, c]]
-    pose[:3, 3] = BASE_POSITION
-    return pose
-
-
-def joints_at(gripper: ArrayLike) -> np.ndarray:
+def joints_at(gripper: ArrayLike, mount: Mount = SIMULATED) -> np.ndarray:
     """
     Return joints that bring the fingertips to a place, the hand pointing straight down.
 
     :param gripper: (3,) x, y, z of the fingertips in the world, m.
+    :param mount: Mount.
     :return: (6,) rad.
     :raises KinematicsError: when the place is out of reach or beyond the joints' limits.
     """
     flange = np.eye(4)
     flange[:3, :3] = np.diag([1, -1, -1])  # the fingers open along the world's x
-    flange[:3, 3] = np.asarray(gripper, np.float64)[:3] + [0, 0, TOOL]
-    joints = inverse(np.linalg.inv(base_pose()) @ flange)
+    flange[:3, 3] = np.asarray(gripper, np.float64)[:3] + [0, 0, mount.tool]
+    joints = inverse(np.linalg.inv(mount.pose) @ flange)
     _check(np.abs(joints) / JOINT_LIMITS, 'its limit', np.degrees(joints), 'degrees')
     return joints
 
 
-def gripper_at(joints: ArrayLike) -> np.ndarray:
+def gripper_at(joints: ArrayLike, mount: Mount = SIMULATED) -> np.ndarray:
     """
     Return where the fingertips are.
 
     :param joints: (..., 6) rad.
+    :param mount: Mount.
     :return: (..., 3) m in the world.
     """
-    flange = base_pose() @ forward(joints)
-    return flange[..., :3, 3] + TOOL * flange[..., :3, 2]
+    flange = mount.pose @ forward(joints)
+    return flange[..., :3, 3] + mount.tool * flange[..., :3, 2]
 
 
 def check_motion(before: ArrayLike, after: ArrayLike, seconds: float) -> None:

@@ -57,8 +57,20 @@ def test_the_hand_points_down_wherever_the_gripper_may_be():
     for place in places(50):
         joints = ur10e.joints_at(place)
         assert np.allclose(ur10e.gripper_at(joints), place, atol=1e-9)
-        flange = ur10e.base_pose() @ ur10e.forward(joints)
+        flange = ur10e.SIMULATED.pose @ ur10e.forward(joints)
         assert np.allclose(flange[:3, :3], np.diag([1, -1, -1]), atol=1e-9)
+
+
+def test_the_mount_moves_the_gripper_with_it():
+    joints = ur10e.joints_at((0.1, -0.2, 0.05))
+    x, y, z = ur10e.SIMULATED.position
+    moved = ur10e.Mount((x + 1, y - 2, z + 0.5), ur10e.SIMULATED.yaw, ur10e.SIMULATED.tool + 0.1)
+    assert np.allclose(ur10e.gripper_at(joints, moved), [1.1, -2.2, 0.45])
+    turned = ur10e.Mount((0, 0, 0), 0.0, ur10e.SIMULATED.tool)
+    place = ur10e.gripper_at(joints, turned)
+    assert np.allclose(ur10e.joints_at(ur10e.gripper_at(joints)), joints)
+    assert place[2] == pytest.approx(0.05 - z)
+    assert np.hypot(*place[:2]) == pytest.approx(np.hypot(0.1 - x, -0.2 - y))
 
 
 @pytest.mark.parametrize('place', [(0, -0.9, 0.1), (0, 0.7, 0.1), (0, 0, 1.5)])
