@@ -1,13 +1,14 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The camera's geometry and the off-screen renderer of the simulator."""
+"""The camera's geometry, and off-screen rendering."""
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
+from sim_bridge.appearance import Appearance
 from sim_bridge.scene import ARM_GEOM_GROUP, CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.errors import SceneError
 
@@ -22,6 +23,8 @@ class Camera:
     height: int
     tilt: float = CAMERA_TILT  # rad from straight down
     fovy: float = CAMERA_FOVY  # degrees
+    position: tuple[float, float, float] = CAMERA_POSITION  # m
+    turn: float = 0.0  # rad about the vertical; at 0 it looks along y
 
     @property
     def K(self) -> np.ndarray:
@@ -35,7 +38,19 @@ class Camera:
         """World to camera, 3x4, metres; the camera looks along +z, x right, y down."""
         c, s = np.cos(self.tilt), np.sin(self.tilt)
         rotation = np.array([[1, 0, 0], [0, -c, -s], [0, s, -c]])
-        return np.column_stack([rotation, -rotation @ np.array(CAMERA_POSITION)])
+        if self.turn:
+            c, s = np.cos(self.turn), np.sin(self.turn)
+            rotation = rotation @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        return np.column_stack([rotation, -rotation @ np.array(self.position)])
+
+    @property
+    def quaternion(self) -> np.ndarray:
+        """Orientation w, x, y, z of MuJoCo's camera, which looks along -z."""
+        tilt = np.array([np.cos(self.tilt / 2), np.sin(self.tilt / 2), 0, 0])
+        turn = np.array([np.cos(self.turn / 2), 0, 0, np.sin(self.turn / 2)])
+        product = np.zeros(4)
+        mujoco.mju_mulQuat(product, turn, tilt)
+        return product
 
     def project(self, points: ArrayLike) -> np.ndarray:
         """
@@ -48,22 +63,58 @@ class Camera:
         rays = (np.asarray(points) @ rotation.T + translation) @ self.K.T
         return rays[..., :2] / rays[..., 2:]
 
+    def on_table(self, pixels: ArrayLike) -> np.ndarray:
+        """
+        Return where the rays of pixels meet the table's plane, z = 0.
 
-class Renderer:
+        :param pixels: (..., 2) (u, v).
+        :return: (..., 2) x, y in m; infinite for rays that do not meet it.
+        """
+        pixels = np.asarray(pixels, np.float64)
+        rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1)
+        rays = rays @ np.linalg.inv(self.K).T @ self.extrinsics[:, :3]
+        with np.errstate(divide='ignore', invalid='ignore'):
+            far = np.where(rays[..., 2] < 0, -self.position[2] / rays[..., 2], np.inf)
+            return np.array(self.position[:2]) + far[..., None] * rays[..., :2]
+
+    def moved(self, appearance: Appearance) -> 'Camera':
+        """Return this camera where an Appearance puts it."""
+        x, y, z = np.add(self.position, appearance.camera_offset).tolist()
+        return replace(self, position=(x, y, z), tilt=self.tilt + appearance.camera_tilt)
+
+    def resized(self, width: int, height: int) -> 'Camera':
+        """Return a camera with the same view and other pixels."""
+        return replace(self, width=width, height=height)
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture, and where the robot is in it if that is known."""
+
+    picture: np.ndarray  # uint8 (H, W, 3) rgb
+    robot_mask: np.ndarray | None = None  # uint8 (H, W), values as in contract.py
+    arm_joints: np.ndarray | None = None  # (6,) rad, of the arm that is shown
+
+
+class OpenGL:
     """
-    Renders models that share the visual settings of scene.py with one OpenGL context.
+    An off-screen OpenGL context; it belongs to the thread that built it.
 
-    Building a context costs far more than a picture, so one is kept for all models. It belongs to
-    the thread that built it.
+    Building a context costs far more than a picture, so one is kept for many models that share
+    their visual settings.
+
+    :param model: mujoco.MjModel with these settings.
+    :param width: of pictures, in pixels.
+    :param height: of pictures, in pixels.
+    :raises SceneError: when nothing can be rendered.
     """
 
-    def __init__(self, model: mujoco.MjModel, image_size: int) -> None:
-        self._size = image_size
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         # Torch's CUDA build brings triton, whose LLVM has to be loaded before that of Mesa.
         with contextlib.suppress(ImportError):
             import triton  # noqa: F401
         try:
-            self._gl = mujoco.GLContext(image_size, image_size)
+            self._gl = mujoco.GLContext(width, height)
             self._gl.make_current()
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -71,7 +122,45 @@ class Renderer:
             raise SceneError(
                 f'cannot render off-screen ({error}); on Debian and Ubuntu: '
                 'apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl') from error
-        self._viewport = mujoco.MjrRect(0, 0, image_size, image_size)
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+
+    def draw(self, scene: mujoco.MjvScene, numbers: bool = False) -> np.ndarray:
+        """
+        Draw a scene.
+
+        :param scene: mujoco.MjvScene.
+        :param numbers: draw the `segid` of each geom instead of its colour.
+        :return: uint8 (H, W, 3) rgb; or int64 (H, W), -1 where no geom is.
+        """
+        self._gl.make_current()
+        for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+            scene.flags[flag] = numbers
+        picture = np.empty((self._viewport.height, self._viewport.width, 3), np.uint8)
+        mujoco.mjr_render(self._viewport, scene, self._context)
+        mujoco.mjr_readPixels(picture, None, self._viewport, self._context)
+        picture = np.ascontiguousarray(picture[::-1])
+        if not numbers:
+            return picture
+        return picture[..., 0] + 2 ** 8 * picture[..., 1].astype(np.int64) - 1
+
+    def close(self) -> None:
+        """Free the context."""
+        self._gl.make_current()  # else another context's objects would be freed
+        self._context.free()
+        self._gl.free()
+
+
+class Renderer:
+    """
+    Renders models that share the visual settings of scene.py with one OpenGL context.
+
+    :param model: mujoco.MjModel, the first of them.
+    :param image_size: of the square picture, in pixels.
+    :raises SceneError: when nothing can be rendered.
+    """
+
+    def __init__(self, model: mujoco.MjModel, image_size: int) -> None:
+        self._gl = OpenGL(model, image_size, image_size)
         self._show, self._hide = mujoco.MjvOption(), mujoco.MjvOption()
         self._hide.geomgroup[ARM_GEOM_GROUP] = 0
         self.use(model)
@@ -84,25 +173,19 @@ class Renderer:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._camera.fixedcamid = 0
 
-    def render(self, data: mujoco.MjData, hide_arm: bool = False) -> np.ndarray:
+    def render(self, data: mujoco.MjData, hide_arm: bool = False) -> View:
         """
         Render one picture.
 
         :param data: mujoco.MjData, after mj_forward.
         :param hide_arm: leave the arm out of the picture.
-        :return: uint8 (H, W, 3) rgb.
+        :return: View with the picture alone.
         """
-        self._gl.make_current()
         mujoco.mjv_updateScene(
             self._model, data, self._hide if hide_arm else self._show, None, self._camera,
             mujoco.mjtCatBit.mjCAT_ALL, self._scene)
-        picture = np.empty((self._size, self._size, 3), np.uint8)
-        mujoco.mjr_render(self._viewport, self._scene, self._context)
-        mujoco.mjr_readPixels(picture, None, self._viewport, self._context)
-        return np.ascontiguousarray(picture[::-1])
+        return View(self._gl.draw(self._scene))
 
     def close(self) -> None:
         """Free the context."""
-        self._gl.make_current()  # else another renderer's objects would be freed
-        self._context.free()
-        self._gl.free()
+        self._gl.close()

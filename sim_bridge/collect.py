@@ -31,6 +31,7 @@ from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
+_LATER_SETTINGS = {'look': 'plain', 'appearance': 'usual'}  # which older files lack
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,9 @@ class CollectSettings:
     :param seed: of the first episode; the others count on from it.
     :param image_size: width and height in pixels.
     :param episodes_per_file: the bag is split into files of so many.
+    :param look: of the world, see looks.LOOKS.
+    :param appearance: of table, light and camera, see appearance.CHOICES; 'random' is drawn anew
+        for every episode.
     """
 
     task: str = 'push2'
@@ -50,6 +54,8 @@ class CollectSettings:
     seed: int = 0
     image_size: int = 64
     episodes_per_file: int = 25
+    look: str = 'plain'
+    appearance: str = 'usual'
 
 
 @dataclass(frozen=True)
@@ -133,6 +139,7 @@ def _check_settings(folder: Path, config: CollectConfig) -> None:
     settings = json.loads(json.dumps(asdict(config)))
     if path.exists():
         before = _read_settings(path)
+        before = _LATER_SETTINGS | before
         changed = [k for k in settings if k != 'episodes' and before.get(k) != settings[k]]
         if changed:
             raise ConfigError(
@@ -179,7 +186,7 @@ def _episodes(config: CollectConfig, shard: int) -> range:
 
 def _collect_shard(folder: str | Path, config: CollectConfig, shard: int) -> dict[str, Any]:
     """Collect one file; runs in a worker process."""
-    simulator = Simulator(config.task, config.image_size)
+    simulator = Simulator(config.task, config.image_size, config.look, config.appearance)
     stats: dict[str, Any] = {
         'shard': shard, 'frames': 0, 'outcomes': [], 'distances': [],
         'seconds': {'search': 0.0, 'step': 0.0, 'write': 0.0}}

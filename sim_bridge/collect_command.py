@@ -5,7 +5,9 @@
 from dataclasses import dataclass
 from typing import Annotated
 
+from sim_bridge.appearance import CHOICES
 from sim_bridge.collect import collect, CollectConfig, CollectSettings
+from sim_bridge.looks import LOOKS
 from sim_bridge.tasks import TASKS
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Folder, one_of
@@ -16,6 +18,8 @@ class Recording(CollectSettings):
     """What to collect."""
 
     task: Annotated[str, one_of(TASKS)] = CollectSettings.task
+    look: Annotated[str, one_of(LOOKS)] = CollectSettings.look
+    appearance: Annotated[str, one_of(CHOICES)] = CollectSettings.appearance
 
 
 @dataclass(frozen=True)

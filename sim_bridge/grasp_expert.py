@@ -136,10 +136,10 @@ class GraspExpert:
         path = [here] + _line(here, above, travel) + _line(above, below, self._drop_steps)
         closed = len(path) - 1
         path += [below, leave]
-        wiggle = self._config.wiggle
+        wiggle, reach = self._config.wiggle, RANGE * simulator.look.spread(True)
         while len(path) <= steps_left:
             path.append(path[-1] + rng.normal(0, [wiggle, wiggle, wiggle / 3]))
-            path[-1] = np.clip(path[-1], [-RANGE, -RANGE, CLEAR], [RANGE, RANGE, 0.14])
+            path[-1] = np.clip(path[-1], [-reach, -reach, CLEAR], [reach, reach, 0.14])
         opening = np.ones(len(path) - 1)
         opening[:closed] = 0
         return np.column_stack([np.diff(path, axis=0), opening])[:steps_left]

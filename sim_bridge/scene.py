@@ -34,6 +34,22 @@ GRIP_FOVY = 27.0  # and higher, so that the lifted arm is in it
 
 
 @dataclass(frozen=True)
+class Hand:
+    """Half sizes (x, y, z) of a finger and of the palm in m, and their colours (r, g, b)."""
+
+    finger: tuple[float, float, float] = (0.01, 0.02, 0.06)
+    palm: tuple[float, float, float] = (0.03, 0.03, 0.02)
+    finger_colour: tuple[float, float, float] = (1, 1, 1)
+    palm_colour: tuple[float, float, float] = (0.55, 0.55, 0.58)
+
+
+NARROW = Hand()
+# Closed, it is as wide along x as along y: objects do not slip off sideways.
+PUSHER = Hand((0.017, 0.035, 0.06), (0.04, 0.04, 0.02), (0.93, 0.93, 0.91), (0.25, 0.26, 0.28))
+GRIPPER = Hand((0.01, 0.02, 0.06), (0.045, 0.035, 0.02), (0.93, 0.93, 0.91), (0.25, 0.26, 0.28))
+
+
+@dataclass(frozen=True)
 class ObjectShape:
     """The boxes or disc that make one object: sizes and places in metres, colours in [0, 1]."""
 
@@ -83,7 +99,7 @@ def object_names(count: int) -> tuple[str, ...]:
 
 
 def build_scene(shapes: Sequence[ObjectShape], image_size: int = 64,
-                gripping: bool = False) -> mujoco.MjModel:
+                gripping: bool = False, hand: Hand = NARROW) -> mujoco.MjModel:
     """
     Compile the MuJoCo model of a table with a gripper and the given objects.
 
@@ -94,6 +110,7 @@ def build_scene(shapes: Sequence[ObjectShape], image_size: int = 64,
     :param image_size: pixels of the square off-screen picture.
     :param gripping: let friction hold what the fingers grip, and look from nearer; pushing does
         without, for speed.
+    :param hand: Hand.
     :return: mujoco.MjModel.
     """
     spec = mujoco.MjSpec()
@@ -119,7 +136,7 @@ def build_scene(shapes: Sequence[ObjectShape], image_size: int = 64,
         name='table', type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1],
         rgba=[0.26, 0.21, 0.18, 1], friction=[1, 0.01, 0.0002])
     _add_camera(world, *(GRIP_TILT, GRIP_FOVY) if gripping else (CAMERA_TILT, CAMERA_FOVY))
-    _add_gripper(spec, world, GRIP if gripping else {'friction': [1, 0.01, 0.0002]})
+    _add_gripper(spec, world, hand, GRIP if gripping else {'friction': [1, 0.01, 0.0002]})
     for name, shape in zip(object_names(len(shapes)), shapes):
         _add_object(world, name, shape)
     return spec.compile()
@@ -133,13 +150,15 @@ def _add_camera(world: mujoco.MjsBody, tilt: float, fovy: float) -> None:
         fovy=fovy)
 
 
-def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, surface: dict[str, Any]) -> None:
+def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, hand: Hand,
+                 surface: dict[str, Any]) -> None:
     """Add the gripper on three slide joints, and two fingers that open along x."""
     gripper = world.add_body(name='gripper', pos=[0, 0, FINGER_CLEARANCE], gravcomp=1)
     arm = {'group': ARM_GEOM_GROUP, 'density': 0, **surface}
     gripper.add_geom(
-        name='palm', type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.03, 0.03, 0.02],
-        pos=[0, 0, 0.14], rgba=[0.55, 0.55, 0.58, 1], contype=0, conaffinity=0, **arm)
+        name='palm', type=mujoco.mjtGeom.mjGEOM_BOX, size=list(hand.palm),
+        pos=[0, 0, 2 * hand.finger[2] + hand.palm[2]], rgba=[*hand.palm_colour, 1],
+        contype=0, conaffinity=0, **arm)
     gripper.mass, gripper.inertia, gripper.explicitinertial = 0.5, [1e-3, 1e-3, 1e-3], True
     # Weak downwards: fingers that come down on an object rest on it and do not shoot it away.
     for name, axis, limit in zip(GRIPPER_JOINTS[:3], np.eye(3), (30, 30, 8)):
@@ -147,12 +166,13 @@ def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, surface: dict[str, 
         _add_servo(spec, name, kp=1500, kv=60, limit=limit)
     for side, sign in (('left', -1), ('right', 1)):
         finger = gripper.add_body(
-            name=f'{side}_finger', pos=[sign * 0.011, 0, 0.06], gravcomp=1)
+            name=f'{side}_finger', pos=[sign * (hand.finger[0] + FINGER_GAP), 0, hand.finger[2]],
+            gravcomp=1)
         finger.mass, finger.inertia, finger.explicitinertial = 0.05, [1e-4, 1e-4, 1e-4], True
         # Fingers touch objects (bit 1), neither each other nor the table.
         finger.add_geom(
-            name=f'{side}_finger', type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.01, 0.02, 0.06],
-            rgba=[1, 1, 1, 1], contype=2, conaffinity=0, **arm)
+            name=f'{side}_finger', type=mujoco.mjtGeom.mjGEOM_BOX, size=list(hand.finger),
+            rgba=[*hand.finger_colour, 1], contype=2, conaffinity=0, **arm)
         finger.add_joint(
             name=f'{side}_finger', type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[sign, 0, 0])
         _add_servo(spec, f'{side}_finger', kp=400, kv=10, limit=20)

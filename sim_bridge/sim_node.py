@@ -14,17 +14,26 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
+from sim_bridge.appearance import CHOICES
+from sim_bridge.looks import LOOKS
+from sim_bridge.robot_description import robot_description
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import TASKS
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
-from tap_ros.contract import ACTION_LIMIT, CAMERA_FRAME, CONTROL_PERIOD, WORLD_FRAME
+from tap_ros.contract import (
+    ACTION_LIMIT,
+    CAMERA_FRAME,
+    CONTROL_PERIOD,
+    OBSERVER_FRAME,
+    WORLD_FRAME,
+)
 from tap_ros.errors import TapError
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.image_messages import encode_image
-from tap_ros.nodes.object_messages import encode_camera_info, encode_gripper, encode_objects
+from tap_ros.nodes.image_messages import encode_image, encode_mask
+from tap_ros.nodes.object_messages import encode_camera_info, encode_joints, encode_objects
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
@@ -54,7 +63,7 @@ class SimNode(Node):
         super().__init__('sim_node')
         self.params = declare_parameters(self)
         task = self.params['task']
-        self._sim = Simulator(task, self.params['image_size'])
+        self._sim = self._simulator(task)
         self._hide_arm = False
         self._opening = 0.0  # the newest gripper command
         self._twist: np.ndarray | None = None  # real time: the command for the next period
@@ -102,6 +111,17 @@ class SimNode(Node):
             topic: self.create_publisher(kind, topic, STREAM) for topic, kind in {
                 'clock': ClockMessage, 'joint_states': JointState, 'objects': ObjectStates,
                 'camera/camera_info': CameraInfo, 'camera/image_raw': Image}.items()}
+        self._goal_mask = None
+        if self._sim.look.studio:
+            self._streams['camera/robot_mask'] = self.create_publisher(
+                Image, 'camera/robot_mask', STREAM)
+            self._goal_mask = self.create_publisher(Image, 'goal/robot_mask', LATCHED)
+        if self._sim.look.arm:
+            self._description = self.create_publisher(String, 'robot_description', LATCHED)
+            self._description.publish(String(data=robot_description()))
+        if self.params['observer']:
+            self._streams['observer/image_raw'] = self.create_publisher(
+                Image, 'observer/image_raw', STREAM)
         self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
         self._episode = self.create_publisher(Episode, 'episode', STREAM)
         self._goal_image = self.create_publisher(Image, 'goal/image', LATCHED)
@@ -160,6 +180,10 @@ class SimNode(Node):
             return 'twist.angular is not zero; this gripper moves but cannot turn'
         if self._paused:
             return 'the simulation is paused; call sim/pause with data false'
+        try:
+            self._sim.check_action(np.append(move, self._opening))
+        except TapError as error:
+            return str(error)
         if stamp_ns == 0:
             return ''
         if stamp_ns > self._stamp_ns:
@@ -218,12 +242,16 @@ class SimNode(Node):
 
     # Simulation
 
+    def _simulator(self, task: str) -> Simulator:
+        return Simulator(task, self.params['image_size'], self.params['look'],
+                         self.params['appearance'])
+
     def _reset(self, task: str, seed: int, hide_arm: bool) -> None:
         """Start a scene; if it cannot be, the present one stays as it is."""
         if task == self._sim.task.name:
             sim = self._sim
         else:
-            sim = Simulator(task, self.params['image_size'])
+            sim = self._simulator(task)
         self._end_episode()
         observation = sim.reset(seed)
         if sim is not self._sim:
@@ -262,11 +290,18 @@ class SimNode(Node):
         camera = self._sim.camera
         self._newest = {
             'clock': ClockMessage(clock=stamp),
-            'joint_states': encode_gripper(observation.gripper, stamp, WORLD_FRAME),
+            'joint_states': encode_joints(
+                observation.gripper, stamp, WORLD_FRAME, observation.arm_joints),
             'objects': encode_observed(observation, stamp),
             'camera/camera_info': encode_camera_info(
                 camera.K, (camera.height, camera.width), stamp, CAMERA_FRAME),
             'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME)}
+        if observation.robot_mask is not None:
+            self._newest['camera/robot_mask'] = encode_mask(
+                observation.robot_mask, stamp, CAMERA_FRAME)
+        if self.params['observer']:
+            self._newest['observer/image_raw'] = encode_image(
+                self._sim.observer_picture(), stamp, OBSERVER_FRAME)
         self._send_newest()
 
     def _send_newest(self) -> None:
@@ -278,6 +313,8 @@ class SimNode(Node):
         stamp = to_stamp(self._stamp_ns)
         self._goal_objects.publish(encode_observed(goal, stamp))
         self._goal_image.publish(encode_image(goal.image, stamp, CAMERA_FRAME))
+        if self._goal_mask is not None and goal.robot_mask is not None:
+            self._goal_mask.publish(encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
 
     def _publish_episode(self, event: int, outcome: str) -> None:
         scene = self._sim.scene
@@ -294,6 +331,14 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('seed', 0, 'Seed of the first scene.', low=0, high=2**62)
     parameters.declare('image_size', 64, 'Width and height of the pictures in pixels.',
                        low=16, high=1024)
+    parameters.declare(
+        'look', 'plain', "The world's look: a UR10e at a wooden table, the hand alone over it, or "
+        'plain colours.', choices=list(LOOKS))
+    parameters.declare(
+        'appearance', 'usual', 'Table, light and camera of looks with a table; random: drawn from '
+        'the seed of each scene.', choices=list(CHOICES))
+    parameters.declare(
+        'observer', False, 'Publish observer/image_raw, a view from the side for people.')
     parameters.declare(
         'lock_step', False,
         'True: each twist command lets one control period pass, so that runs repeat exactly. '

@@ -2,24 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated world: reset, step, observe. Knows nothing of ROS."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.camera import Camera, Renderer
+from sim_bridge.appearance import choose_appearance, USUAL
+from sim_bridge.camera import Renderer
 from sim_bridge.grasping import grasp_place
+from sim_bridge.looks import get_look, OBSERVER
 from sim_bridge.scene import (
     build_scene,
     FINGER_GAP,
     FINGER_TRAVEL,
-    GRIP_FOVY,
-    GRIP_TILT,
     HALF_HEIGHT,
     object_names,
     TIMESTEP,
 )
+from sim_bridge.studio import Studio
 from sim_bridge.tasks import get_task, gripper_away_from, nearest_first, sample_scene
+from tap_ros import ur10e
 from tap_ros.contract import (
     ACTION_LIMIT,
     CONTROL_PERIOD,
@@ -48,6 +50,8 @@ class Observation:
     object_names: tuple[str, ...]
     object_pixels: np.ndarray  # (K, 2) float32 (u, v) of the object origins
     object_poses: np.ndarray  # (K, 7) float64: x, y, z in m, quaternion x, y, z, w
+    robot_mask: np.ndarray | None = None  # (H, W) uint8, values as in contract.py; in a studio
+    arm_joints: np.ndarray | None = None  # (6,) float64 rad, of the UR10e where it is shown
 
 
 def clip_action(action: ArrayLike) -> np.ndarray:
@@ -98,17 +102,26 @@ class Simulator:
 
     :param task: name of a task, see tasks.TASKS.
     :param image_size: pixels of the square picture.
-    :raises SceneError: for an unknown task, a bad size, or when nothing can be rendered.
+    :param look: name of a look, see looks.LOOKS.
+    :param appearance: name of an appearance, see appearance.CHOICES; others than 'usual' need a
+        look with a studio.
+    :raises SceneError: for an unknown task, look or appearance, a bad size, or when nothing can be
+        rendered.
     """
 
-    def __init__(self, task: str = 'push2', image_size: int = 64) -> None:
-        self.task = get_task(task)
+    def __init__(self, task: str = 'push2', image_size: int = 64, look: str = 'plain',
+                 appearance: str = 'usual') -> None:
+        self.task, self.look = get_task(task), get_look(look)
         if not 16 <= image_size <= 1024:
             raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')
-        self.camera = Camera(image_size, image_size)
-        if self.task.gripping:
-            self.camera = Camera(image_size, image_size, GRIP_TILT, GRIP_FOVY)
-        self._renderer: Renderer | None = None
+        if choose_appearance(appearance, 0) != USUAL and not self.look.studio:
+            raise SceneError(f'appearance {appearance!r} needs a look with a studio, not {look!r}')
+        self._appearance = appearance
+        self._usual_camera = self.look.camera(self.task.gripping, image_size, image_size)
+        self.camera = self._usual_camera
+        self._renderer: Renderer | Studio | None = None
+        self._observer: Studio | None = None
+        self._worn = USUAL  # the appearance of the present scene
 
     def reset(self, seed: int) -> Observation:
         """
@@ -118,14 +131,12 @@ class Simulator:
         :return: Observation.
         :raises SceneError: for a bad seed.
         """
-        self.scene = sample_scene(self.task, seed)
+        gripping = self.task.gripping
+        self.scene = sample_scene(self.task, seed, self.look.spread(gripping))
         self.model = build_scene(
-            self.scene.shapes, self.camera.height, self.task.gripping)
+            self.scene.shapes, self.camera.height, gripping, self.look.hand(gripping))
         self.data = mujoco.MjData(self.model)
-        if self._renderer is None:
-            self._renderer = Renderer(self.model, self.camera.height)
-        else:
-            self._renderer.use(self.model)
+        self._prepare_camera()
         self.target = np.append(self.scene.gripper_start, 0.0)
         self._place(_lift(self.scene.start_poses), self.scene.gripper_start)
         poses = _lift(self.scene.goal_poses, self.task.lift)
@@ -177,14 +188,31 @@ class Simulator:
         :param action: (4,) displacement x, y, z in m, limited to ACTION_LIMIT and to the
             workspace, and gripper opening from 0 (closed) to 1.
         :return: Observation.
-        :raises SceneError: for another shape or values that are not finite.
+        :raises SceneError: for another shape, values that are not finite, or what the arm that is
+            shown cannot do; then nothing moves.
         """
-        controls, targets = ramp_controls(self.target, clip_action(action)[None])
-        self.target = targets[0]
+        controls, self.target = self._ramp(action)
         for control in controls:
             self.data.ctrl[:] = control
             mujoco.mj_step(self.model, self.data)
         return self.observe()
+
+    def check_action(self, action: ArrayLike) -> None:
+        """
+        Accept an action or say why it cannot be done; nothing moves.
+
+        :param action: as for step.
+        :raises SceneError: as step does.
+        """
+        self._ramp(action)
+
+    def _ramp(self, action: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the servo targets of an action (SUBSTEPS, 5) and the last one (4,)."""
+        controls, targets = ramp_controls(self.target, clip_action(action)[None])
+        if self.look.arm:
+            ur10e.check_motion(
+                ur10e.joints_at(self.target), ur10e.joints_at(targets[0]), CONTROL_PERIOD)
+        return controls, targets[0]
 
     def observe(self, hide_arm: bool = False) -> Observation:
         """Return the Observation of this moment."""
@@ -192,13 +220,28 @@ class Simulator:
         mujoco.mj_forward(self.model, self.data)
         poses = self.object_poses()
         opening = self.data.qpos[3:5].mean() / FINGER_TRAVEL
+        view = self._renderer.render(self.data, hide_arm)
         return Observation(
-            image=self._renderer.render(self.data, hide_arm),
+            image=view.picture,
             stamp_ns=round(self.data.time * 1e9),
             gripper=np.append(self.data.qpos[:3], opening).astype(np.float32),
             object_names=object_names(self.task.num_objects),
             object_pixels=self.camera.project(poses[:, :3]).astype(np.float32),
-            object_poses=poses)
+            object_poses=poses, robot_mask=view.robot_mask, arm_joints=view.arm_joints)
+
+    def observer_picture(self) -> np.ndarray:
+        """
+        Take a picture from the side, for people: uint8 (360, 480, 3) rgb.
+
+        :raises SceneError: for looks without a studio.
+        """
+        if not self.look.studio:
+            raise SceneError("observer: this look has no view from the side; choose 'ur10e'")
+        if self._observer is None:
+            self._observer = Studio(OBSERVER, self.look.arm)
+        self._observer.dress(replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
+        self._observer.use(self.model)
+        return self._observer.render(self.data).picture
 
     def object_poses(self) -> np.ndarray:
         """Return (K, 7): x, y, z in m, quaternion x, y, z, w."""
@@ -232,10 +275,26 @@ class Simulator:
         return state
 
     def close(self) -> None:
-        """Free the OpenGL context."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        """Free the OpenGL contexts."""
+        for renderer in (self._renderer, self._observer):
+            if renderer is not None:
+                renderer.close()
+        self._renderer = self._observer = None
+
+    def _prepare_camera(self) -> None:
+        """Let the camera see the scene, as it looks with its seed."""
+        if not self.look.studio:
+            if self._renderer is None:
+                self._renderer = Renderer(self.model, self.camera.height)
+            self._renderer.use(self.model)
+            return
+        if self._renderer is None:
+            self._renderer = Studio(self._usual_camera, self.look.arm)
+        assert isinstance(self._renderer, Studio)
+        self._worn = choose_appearance(self._appearance, self.scene.seed)
+        self._renderer.dress(self._worn)
+        self._renderer.use(self.model)
+        self.camera = self._usual_camera.moved(self._worn)
 
     def _fingers(self) -> list[int]:
         """Return the numbers of the fingers' geoms."""

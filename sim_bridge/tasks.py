@@ -93,12 +93,14 @@ def get_task(name: str) -> Task:
     return TASKS[name]
 
 
-def sample_scene(task: Task, seed: int) -> Scene:
+def sample_scene(task: Task, seed: int, spread: float = 1.0) -> Scene:
     """
     Draw shapes, starts, goals and the gripper's start.
 
     :param task: Task.
     :param seed: non-negative integer; the same seed gives the same scene.
+    :param spread: factor of the ranges in which an object to be gripped, its goal and the gripper
+        lie.
     :return: Scene.
     :raises SceneError: for a seed that is negative or not an integer.
     """
@@ -106,7 +108,7 @@ def sample_scene(task: Task, seed: int) -> Scene:
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.stream])
     if task.gripping:
-        return _sample_grasp(task, seed, rng)
+        return _sample_grasp(task, seed, rng, spread)
     shapes = tuple(random_shape(rng) for _ in range(task.num_objects))
     # Separated starts may leave no room for separated goals: then both are drawn anew.
     goals = None
@@ -122,19 +124,21 @@ def sample_scene(task: Task, seed: int) -> Scene:
         gripper_start=gripper_away_from(rng, starts))
 
 
-def _sample_grasp(task: Task, seed: int, rng: np.random.Generator) -> Scene:
+def _sample_grasp(task: Task, seed: int, rng: np.random.Generator, spread: float) -> Scene:
     """Draw a scene with one object that can be held; its goal is lifted, or elsewhere."""
     shape = graspable_shape(rng)
     yaw = graspable_yaw(shape, rng)
-    start = rng.uniform(-GRASP_RANGE, GRASP_RANGE, 2)
+    start = spread * rng.uniform(-GRASP_RANGE, GRASP_RANGE, 2)
     goal = start
     if task.kind == 'pick_place':
-        while not PLACE_DISTANCE[0] <= np.linalg.norm(goal - start) <= PLACE_DISTANCE[1]:
-            goal = rng.uniform(-PLACE_RANGE, PLACE_RANGE, 2)
+        nearest, farthest = PLACE_DISTANCE[0] * spread, PLACE_DISTANCE[1] * spread
+        while not nearest <= np.linalg.norm(goal - start) <= farthest:
+            goal = spread * rng.uniform(-PLACE_RANGE, PLACE_RANGE, 2)
     gripper = np.full(2, np.inf)
-    while (np.abs(gripper) > GRASP_REACH_RANGE).any():
+    while (np.abs(gripper) > spread * GRASP_REACH_RANGE).any():
         angle = rng.uniform(0, 2 * np.pi)
-        gripper = start + rng.uniform(*task.reach) * np.array([np.cos(angle), np.sin(angle)])
+        reach = spread * rng.uniform(*task.reach)
+        gripper = start + reach * np.array([np.cos(angle), np.sin(angle)])
     return Scene(
         task=task, seed=int(seed), shapes=(shape,), start_poses=np.array([[*start, yaw]]),
         goal_poses=np.array([[*goal, grasp_place(shape, yaw)[1]]]),

@@ -30,6 +30,7 @@ GOAL_TOLERANCE = 1.0  # px; the planner takes a goal or subgoal for reached with
 
 WORLD_FRAME = 'world'  # frame of positions and commands
 CAMERA_FRAME = 'camera'  # of pictures
+OBSERVER_FRAME = 'observer'  # of the view from the side
 
 # Names of the gripper's state in joint states: metres, and the opening from 0 to 1.
 GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
@@ -41,6 +42,11 @@ ENCODINGS = {
     'rgba8': (4, (0, 1, 2)), 'bgra8': (4, (2, 1, 0)), 'mono8': (1, (0, 0, 0))}
 PICTURE_ENCODING = 'rgb8'  # in which pictures are sent and recorded
 MAP_ENCODING = '32FC1'  # of object maps
+
+MASK_ENCODING = 'mono8'  # of robot masks
+
+# Values of a robot mask, which says where the robot is in a picture, shadows included.
+ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM = 0, 128, 255
 
 # The module with the main of each node, by the name of the node and of its executable.
 NODE_MODULES = {

@@ -39,6 +39,10 @@ class SceneError(TapError):
     """A task, seed or scene cannot be set up, or an action cannot be applied."""
 
 
+class KinematicsError(SceneError):
+    """An arm cannot be where, or as fast, as it should."""
+
+
 class EngineError(TapError):
     """A task could not be run to its end, since its workers were killed."""
 

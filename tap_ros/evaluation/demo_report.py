@@ -11,10 +11,13 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
+from PIL import Image
 from tap_ros.files import write_atomically
 from tap_ros.pictures import enlarge, film_strip, grid, overlay, png_bytes
 
 SCALE = 4
+FRAME_MS, HOLD_MS = 120, 2000  # of a film: of each frame, and of the last one
+FILM_QUALITY = 70  # 0 to 100
 MODE_NAMES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
 MODE_COLOURS = {'direct': '#648fff', 'subgoal': '#dc267f'}
 
@@ -27,6 +30,7 @@ class Run:
     distances: np.ndarray  # (T + 1, K) metres from each object to its goal
     message: str  # how the planner said that it ended
     planning_ms: float  # median time of one plan
+    side: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 from the side, if there are any
 
 
 @dataclass(frozen=True)
@@ -130,7 +134,10 @@ def _scene_section(scene: SceneRuns) -> str:
         pictures.append((
             f'end, {MODE_NAMES[mode]}: {final:.1f} cm. {run.message}',
             enlarge(run.frames[-1], SCALE)))
-    figures = ''.join(_figure(caption, png_bytes(image)) for caption, image in pictures)
+    figures = ''.join(
+        _figure(f'{MODE_NAMES[mode]}, seen from the side', _film(run.side), 'smooth', 'webp')
+        for mode, run in scene.runs.items() if len(run.side))
+    figures += ''.join(_figure(caption, png_bytes(image)) for caption, image in pictures)
     strips = ''.join(
         _figure(f'{MODE_NAMES[mode]}: frames 0 to {len(run.frames) - 1}, median planning time '
                 f'{run.planning_ms:.0f} ms', png_bytes(grid([film_strip(run.frames)], scale=2)))
@@ -139,10 +146,20 @@ def _scene_section(scene: SceneRuns) -> str:
             f'{_figure("error over time", _error_plot(scene), "smooth")}{strips}')
 
 
-def _figure(caption: str, png: bytes, kind: str = '') -> str:
-    data = base64.b64encode(png).decode()
+def _film(pictures: Sequence[np.ndarray]) -> bytes:
+    """Return an animated WebP that begins anew after it has stood still for a while."""
+    first, *others = (Image.fromarray(picture) for picture in pictures)
+    buffer = io.BytesIO()
+    times = [FRAME_MS] * len(others) + [HOLD_MS]
+    first.save(buffer, 'webp', save_all=True, append_images=others, duration=times, loop=0,
+               quality=FILM_QUALITY)
+    return buffer.getvalue()
+
+
+def _figure(caption: str, picture: bytes, kind: str = '', form: str = 'png') -> str:
+    data = base64.b64encode(picture).decode()
     return (f'<figure><img class="{kind}" alt="{html.escape(caption)}" '
-            f'src="data:image/png;base64,{data}"><figcaption>{html.escape(caption)}'
+            f'src="data:image/{form};base64,{data}"><figcaption>{html.escape(caption)}'
             '</figcaption></figure>')
 
 

@@ -20,6 +20,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
+from sim_bridge.looks import get_look, LOOKS
 from sim_bridge.tasks import get_task
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
@@ -54,14 +55,15 @@ STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
 
 class Watch:
     """
-    Keep every camera picture of a scene, and the objects in it.
+    Keep every camera picture of a scene, the objects in it, and the view from the side if any.
 
     :param node: rclpy Node that another thread spins.
     """
 
     def __init__(self, node: Node) -> None:
         self._kept: dict[str, dict[int, Any]] = {}
-        self._topics = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')}
+        self._topics = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
+                        'side': (Image, 'observer/image_raw')}
         for topic, (message_type, name) in self._topics.items():
             node.create_subscription(message_type, name, partial(self._keep, topic), STREAM)
         self.begin()
@@ -73,9 +75,17 @@ class Watch:
 
     def seen(self) -> tuple[list[Image], list[ObjectStates]]:
         """Return the images and the objects that belong to them, in order of their stamps."""
-        images, objects = (dict(found) for found in self._kept.values())
-        stamps = sorted(stamp for stamp in set(images) & set(objects) if stamp >= self.first_ns)
+        images, objects = dict(self._kept['image']), dict(self._kept['objects'])
+        stamps = self._in_order(set(images) & set(objects))
         return [images[stamp] for stamp in stamps], [objects[stamp] for stamp in stamps]
+
+    def from_the_side(self) -> list[Image]:
+        """Return the pictures of the observer's camera, in order of their stamps."""
+        pictures = dict(self._kept['side'])
+        return [pictures[stamp] for stamp in self._in_order(set(pictures))]
+
+    def _in_order(self, stamps: set[int]) -> list[int]:
+        return sorted(stamp for stamp in stamps if stamp >= self.first_ns)
 
     def _keep(self, topic: str, message: Any) -> None:
         self._kept[topic][to_nanoseconds(message.header.stamp)] = message
@@ -184,7 +194,9 @@ class DemoClient:
         return Run(
             frames=[decode_image(image, 'camera/image_raw') for image in images],
             distances=np.array([np.linalg.norm(positions(o) - goals, axis=1) for o in objects]),
-            message=result.message, planning_ms=float(np.median(planning_ms or [np.nan])))
+            message=result.message, planning_ms=float(np.median(planning_ms or [np.nan])),
+            side=[decode_image(image, 'observer/image_raw')
+                  for image in self._camera.from_the_side()])
 
 
 def positions(message: ObjectStates) -> np.ndarray:
@@ -224,10 +236,11 @@ def run_scene(client: DemoClient, task: str, seed: int, step_budget: int) -> Sce
         runs=runs)
 
 
-def start_nodes(processes: NodeProcesses, folder: Path, task: str) -> None:
+def start_nodes(processes: NodeProcesses, folder: Path, task: str, look: str) -> None:
     """Start the three nodes and the recorder."""
     processes.start('recorder_node', folder=folder / 'recording')
-    processes.start('sim_node', lock_step=True, task=task)
+    processes.start('sim_node', lock_step=True, task=task, look=look,
+                    observer=get_look(look).studio)
     processes.start('predictor_node')
     processes.start('visual_mpc_node')
 
@@ -240,6 +253,7 @@ class Options:
     :param scenes: how many.
     :param seed: of the first scene.
     :param task: what is to be done in them.
+    :param look: of the world, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
     :param attach: use nodes that run already, for example those of demo.launch.py.
     """
@@ -247,6 +261,7 @@ class Options:
     scenes: int = 3
     seed: int = FIRST_SCENE
     task: Annotated[str, one_of(PLANNING_TASKS)] = PLANNING_TASKS[0]
+    look: Annotated[str, one_of(LOOKS)] = 'plain'
     step_budget: Annotated[int, conf.arg(
         help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0
     out: Folder = 'runs/demo'
@@ -275,7 +290,7 @@ def run(args: Options) -> int:
                     print('Waiting for the nodes that run already', flush=True)
                 else:
                     print(f'Starting four nodes; their logs are in {folder / "logs"}', flush=True)
-                    start_nodes(processes, folder, args.task)
+                    start_nodes(processes, folder, args.task, args.look)
                 client.wait_until_ready()
                 scenes = []
                 for i in range(args.scenes):

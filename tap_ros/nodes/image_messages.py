@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from sensor_msgs.msg import Image
-from tap_ros.contract import ENCODINGS, MAP_ENCODING, PICTURE_ENCODING
+from tap_ros.contract import ENCODINGS, MAP_ENCODING, MASK_ENCODING, PICTURE_ENCODING
 from tap_ros.errors import ImageError
 from tap_ros.images import check_image
 from tap_ros.text import escaped
@@ -49,6 +49,18 @@ def encode_map(values: np.ndarray, stamp: 'Time', frame_id: str) -> Image:
     :return: sensor_msgs/Image in MAP_ENCODING.
     """
     return _pack(np.asarray(values, np.float32), MAP_ENCODING, stamp, frame_id)
+
+
+def encode_mask(mask: np.ndarray, stamp: 'Time', frame_id: str) -> Image:
+    """
+    Turn a robot mask into a message.
+
+    :param mask: uint8 (H, W), values as in contract.py.
+    :param stamp: builtin_interfaces/Time, that of the picture.
+    :param frame_id: frame of the camera.
+    :return: sensor_msgs/Image in MASK_ENCODING.
+    """
+    return _pack(mask, MASK_ENCODING, stamp, frame_id)
 
 
 def decode_image(message: Image, name: str, size: Sequence[int] | None = None,

@@ -9,6 +9,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import ObjectState, ObjectStates
+from tap_ros import ur10e
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import PlanningError
 from tap_ros.images import in_picture
@@ -116,16 +117,21 @@ def match_objects(names: Sequence[str], other_names: Sequence[str], other_pixels
     return other_pixels[[other_names.index(object_name) for object_name in names]]
 
 
-def encode_gripper(gripper: np.ndarray, stamp: 'Time', frame_id: str) -> JointState:
+def encode_joints(gripper: Iterable[float], stamp: 'Time', frame_id: str,
+                  arm: Iterable[float] | None = None) -> JointState:
     """
-    Turn the gripper's state into a message.
+    Turn the state of gripper and arm into a message.
 
     :param gripper: (4,) x, y, z in metres and opening from 0 to 1.
     :param stamp: builtin_interfaces/Time.
     :param frame_id: frame of the position.
-    :return: sensor_msgs/JointState with the names GRIPPER_JOINTS.
+    :param arm: (6,) rad of the UR10e, or None without one.
+    :return: sensor_msgs/JointState with the names GRIPPER_JOINTS, then the arm's.
     """
-    message = JointState(name=list(GRIPPER_JOINTS), position=[float(x) for x in gripper])
+    names, positions = [*GRIPPER_JOINTS], [*gripper]
+    if arm is not None:
+        names, positions = [*names, *ur10e.JOINTS], [*positions, *arm]
+    message = JointState(name=names, position=[float(x) for x in positions])
     message.header.stamp = stamp
     message.header.frame_id = frame_id
     return message

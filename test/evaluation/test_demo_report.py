@@ -2,6 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the demo's page, table and film."""
 
+import base64
+from dataclasses import replace
+import io
+import re
+
 import numpy as np
 from PIL import Image, ImageSequence
 import pytest
@@ -38,6 +43,19 @@ def test_the_page_is_one_file_with_everything_inside(scenes, tmp_path):
     assert page.count('<h2>Scene') == 2
     assert page.count('data:image/png;base64,') == page.count('<img ')
     assert 'http' not in page and '<early>' not in page and '&lt;early&gt; &amp;' in page
+
+
+def test_the_page_has_a_film_where_there_are_pictures_from_the_side(scenes, tmp_path):
+    side = [np.full((24, 32, 3), grey, np.uint8) for grey in (0, 80, 160, 240)]
+    scenes[1].runs['direct'] = replace(scenes[1].runs['direct'], side=side)
+    path = tmp_path / 'report.html'
+    write_report(path, scenes)
+    films = re.findall('data:image/webp;base64,([^"]*)"', path.read_text())
+    assert len(films) == 1
+    film = Image.open(io.BytesIO(base64.b64decode(films[0])))
+    greys = [np.asarray(frame.convert('L'), int).mean()
+             for frame in ImageSequence.Iterator(film)]
+    assert np.abs(np.subtract(greys, [0, 80, 160, 240])).max() < 8
 
 
 def test_the_film_shows_each_run_to_its_end_and_stops_there(scenes, tmp_path):

@@ -105,7 +105,7 @@ def test_everything_says_when_and_where_it_was_seen():
                     image_messages.encode_map(np.zeros((5, 7)), STAMP, 'here'),
                     object_messages.encode_objects(
                         ['red'], [[1, 2]], np.zeros((1, 7)), STAMP, 'here', 1),
-                    object_messages.encode_gripper([0, 0, 0, 1], STAMP, 'here'),
+                    object_messages.encode_joints([0, 0, 0, 1], STAMP, 'here'),
                     object_messages.encode_camera_info(np.eye(3), (5, 7), STAMP, 'here')):
         assert message.header.stamp == STAMP and message.header.frame_id == 'here'
 
@@ -232,7 +232,7 @@ def test_pixels_outside_the_picture_are_refused_with_the_bounds(pixel):
 
 
 def test_the_gripper_is_found_among_other_joints():
-    message = object_messages.encode_gripper([0.1, -0.2, 0.05, 1], STAMP, 'world')
+    message = object_messages.encode_joints([0.1, -0.2, 0.05, 1], STAMP, 'world')
     message.name.insert(0, 'elbow')
     message.position.insert(0, 9.0)
     assert np.allclose(object_messages.decode_gripper(message), [0.1, -0.2, 0.05, 1])

@@ -19,6 +19,7 @@ from tap_ros.contract import NODE_MODULES
 ROOT = Path(__file__).parents[2]
 # Imported name: the key by which rosdep knows it.
 ROSDEP_KEYS = {
+    'PIL': 'python3-pil',
     'cv2': 'python3-opencv',
     'matplotlib': 'python3-matplotlib',
     'numpy': 'python3-numpy',

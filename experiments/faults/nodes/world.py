@@ -12,7 +12,7 @@ from sim_bridge.simulator import Simulator
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.nodes.image_messages import encode_image
-from tap_ros.nodes.object_messages import encode_gripper, encode_objects
+from tap_ros.nodes.object_messages import encode_joints, encode_objects
 from tap_ros.nodes.topics import STREAM, to_stamp
 
 TOPICS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
@@ -115,7 +115,7 @@ class World:
     def messages(self, stamp):
         """Return {topic: message} of this moment."""
         gripper = self._seen.gripper if self.gripper is None else self.gripper
-        return {'joints': encode_gripper(gripper, stamp, WORLD_FRAME),
+        return {'joints': encode_joints(gripper, stamp, WORLD_FRAME),
                 'objects': objects_message(self._seen, stamp, self.pixels, self.names),
                 'image': encode_image(self._seen.image, stamp, CAMERA_FRAME)}
 

@@ -1,0 +1,90 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The URDF of the UR10e at its table, written from the numbers that the simulator uses."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+from sim_bridge.arm_shape import PRIMITIVES
+from tap_ros import ur10e
+from tap_ros.contract import WORLD_FRAME
+
+TIP_FRAME = 'gripper_tip'  # between the fingertips
+MAX_EFFORT = (330, 330, 150, 56, 56, 56)  # N m, as published for this arm
+
+
+def robot_description() -> str:
+    """
+    Return the URDF.
+
+    Links and joints have the names that Universal Robots' own description gives them. A capsule
+    is a cylinder with spheres at its ends.
+    """
+    robot = ElementTree.Element('robot', name='ur10e_at_table')
+    ElementTree.SubElement(robot, 'link', name=WORLD_FRAME)
+    links = ['base', *(name.replace('_joint', '_link') for name in ur10e.JOINTS)]
+    for number, name in enumerate(links):
+        link = ElementTree.SubElement(robot, 'link', name=name)
+        for shape in PRIMITIVES:
+            if shape.link == number:
+                _add_cylinder(link, np.array(shape.start), np.array(shape.end), shape.radius,
+                              shape.colour, shape.capsule)
+    ElementTree.SubElement(robot, 'link', name=TIP_FRAME)
+    _add_joint(robot, 'world_joint', 'fixed', WORLD_FRAME, 'base',
+               ur10e.SIMULATED.position, (0, 0, ur10e.SIMULATED.yaw))
+    place, turn = (0.0, 0.0, 0.0), 0.0
+    for i, name in enumerate(ur10e.JOINTS):
+        joint = _add_joint(
+            robot, name, 'revolute', links[i], links[i + 1], place, (turn, 0, 0))
+        ElementTree.SubElement(joint, 'axis', xyz='0 0 1')
+        limit = ur10e.JOINT_LIMITS[i]
+        ElementTree.SubElement(
+            joint, 'limit', lower=_text(-limit), upper=_text(limit),
+            velocity=_text(ur10e.SPEED_LIMITS[i]), effort=_text(MAX_EFFORT[i]))
+        a, turn, d = ur10e.DH[i]
+        place = (a, 0.0, d)
+    _add_joint(robot, 'gripper_joint', 'fixed', links[-1], TIP_FRAME,
+               (place[0], place[1], place[2] + ur10e.SIMULATED.tool), (turn, 0, 0))
+    ElementTree.indent(robot)
+    return ElementTree.tostring(robot, 'unicode', xml_declaration=True)
+
+
+def _add_joint(robot: ElementTree.Element, name: str, kind: str, parent: str, child: str,
+               place: np.ndarray | tuple[float, float, float],
+               turn: tuple[float, float, float]) -> ElementTree.Element:
+    """Add a joint at a place (3,) in m with roll, pitch, yaw in rad."""
+    joint = ElementTree.SubElement(robot, 'joint', name=name, type=kind)
+    ElementTree.SubElement(joint, 'parent', link=parent)
+    ElementTree.SubElement(joint, 'child', link=child)
+    ElementTree.SubElement(joint, 'origin', xyz=_text(*place), rpy=_text(*turn))
+    return joint
+
+
+def _add_cylinder(link: ElementTree.Element, start: np.ndarray, end: np.ndarray, radius: float,
+                  colour: tuple[float, float, float], capsule: bool) -> None:
+    """Add a cylinder between two points, to be seen and to be bumped into."""
+    along = end - start
+    length = float(np.linalg.norm(along))
+    x, y, z = along / length
+    # Roll and pitch that turn z into the cylinder's direction.
+    turn = (0.0, float(np.arctan2(np.hypot(x, y), z)), float(np.arctan2(y, x)))
+    for use in ('visual', 'collision'):
+        parts = [((start + end) / 2, turn, 'cylinder', {'radius': radius, 'length': length})]
+        if capsule:
+            parts += [(place, (0.0, 0.0, 0.0), 'sphere', {'radius': radius})
+                      for place in (start, end)]
+        for place, turned, kind, sizes in parts:
+            element = ElementTree.SubElement(link, use)
+            ElementTree.SubElement(element, 'origin', xyz=_text(*place), rpy=_text(*turned))
+            geometry = ElementTree.SubElement(element, 'geometry')
+            ElementTree.SubElement(
+                geometry, kind, {name: _text(size) for name, size in sizes.items()})
+            if use == 'visual':
+                name = '_'.join(f'{round(255 * part):02x}' for part in colour)
+                material = ElementTree.SubElement(element, 'material', name=name)
+                ElementTree.SubElement(material, 'color', rgba=_text(*colour, 1))
+
+
+def _text(*numbers: float) -> str:
+    """Return numbers as URDF writes them."""
+    return ' '.join(repr(float(number)) for number in numbers)
