@@ -101,7 +101,7 @@ def cover(episode, side=4, seed=0, **changes):
 
     :param episode: Episode.
     :param side: of the robot's square in pixels; it moves to the right, one pixel a frame. Its
-        left half is the hand, its right half the arm.
+        left half is the hand, its right half the arm. So are the last 2x2 pixels, its base.
     :param seed: of the noise.
     :param changes: of fields of the Episode.
     :return: Episode with robot_masks and goal_mask.
@@ -109,6 +109,7 @@ def cover(episode, side=4, seed=0, **changes):
     random = np.random.default_rng([seed, 1])
     T, height, width, _ = episode.frames.shape
     masks = np.zeros((T + 1, height, width), np.uint8)
+    masks[:, -2:, -2:] = ROBOT_MASK_ARM
     for t in range(T + 1):
         left = t % max(width - side, 1)
         masks[t, 1:1 + side, left:left + side // 2] = ROBOT_MASK_HAND

@@ -92,7 +92,7 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     """
     paths = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     bags = [bag for path in paths for bag in find_bags(path)]
-    cache_dir = Path(cache_dir or os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
+    cache_dir = Path(cache_dir) if cache_dir else cache_folder()
     with tqdm(total=sum(file.stat().st_size for bag in bags for file in bag),
               desc='opening recordings', unit='B', unit_scale=True, disable=not progress,
               delay=1) as bar:
@@ -115,6 +115,11 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     if not len(store):
         raise RecordingError(f'{list_paths(paths)}: no camera image lies within an episode')
     return store
+
+
+def cache_folder() -> Path:
+    """Return the folder of the cache: $TAP_ROS_CACHE or ~/.cache/tap_ros."""
+    return Path(os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
 
 
 @dataclass(frozen=True)
