@@ -48,25 +48,42 @@ def trained_robot_mask(training: Mapping[str, Any]) -> tuple[RobotMask, float]:
     return cast(RobotMask, robot_mask), float(share)
 
 
-def fill_in_time(frames: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fill_in_time(frames: np.ndarray, masks: np.ndarray,
+                 robot_mask: RobotMask) -> tuple[np.ndarray, np.ndarray]:
     """
     Fill hidden pixels with what is seen there in the nearest frame where they are free.
 
-    Of two that are equally near the earlier one counts. Pixels that are never free stay.
+    Of two that are equally near the earlier one counts. A hand that stays in the picture fills
+    nothing: it would leave copies of itself on the way of the arm behind it.
 
     :param frames: uint8 (T, H, W, 3), an episode.
-    :param hidden: bool (T, H, W).
-    :return: uint8 (T, H, W, 3); bool (H, W), whether a pixel is ever free.
+    :param masks: uint8 (T, H, W), its robot masks.
+    :param robot_mask: see hidden_pixels.
+    :return: uint8 (T, H, W, 3); bool (H, W), False where a pixel is hidden and never free: such
+        ones stay as they are.
     """
+    hidden, free = hidden_pixels(masks, robot_mask), masks == ROBOT_MASK_FREE
     now = np.arange(len(frames), dtype=np.int32)[:, None, None]
-    past = np.maximum.accumulate(np.where(hidden, -_FAR, now), 0)
-    future = np.minimum.accumulate(np.where(hidden, _FAR, now)[::-1], 0)[::-1]
+    past = np.maximum.accumulate(np.where(free, now, -_FAR), 0)
+    future = np.minimum.accumulate(np.where(free, now, _FAR)[::-1], 0)[::-1]
     source = np.where(now - past <= future - now, past, future)
-    seen = np.asarray(~hidden.all(0))
+    known = np.asarray(free.any(0))
     filled = np.array(frames)
-    t, v, u = np.nonzero(hidden & seen)
+    t, v, u = np.nonzero(hidden & known)
     filled[t, v, u] = frames[source[t, v, u], v, u]
-    return filled, seen
+    return filled, known | ~hidden.any(0)
+
+
+def last_free(frames: np.ndarray, masks: np.ndarray) -> np.ndarray:
+    """
+    Return what was seen free last at each pixel, the last frame where it never was.
+
+    :param frames: uint8 (T, H, W, 3), an episode; masks: uint8 (T, H, W), its robot masks.
+    :return: uint8 (H, W, 3).
+    """
+    back = np.argmax((masks == ROBOT_MASK_FREE)[::-1], 0)  # frames before the last one
+    v, u = np.indices(back.shape)
+    return frames[len(frames) - 1 - back, v, u]
 
 
 class FreeView:
@@ -97,7 +114,7 @@ class FreeView:
         """
         if self._seen is None or self._seen.shape != picture.shape:
             self._seen, self._known = np.zeros_like(picture), np.zeros(mask.shape, bool)
-        free = ~hidden_pixels(mask, self._robot_mask)
+        free = mask == ROBOT_MASK_FREE
         self._seen[free] = picture[free]
         self._known |= free
         return self.fill(picture, mask)

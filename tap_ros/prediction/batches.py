@@ -39,8 +39,8 @@ class Batch:
         distances; None unless asked for.
     :param bare: uint8 (B, C, H, W, 3), the context pictures without the robot, filled as targets
         and video are then; None: the context itself.
-    :param seen: bool (B, H, W), pixels that are ever free of the robot. The others are black in
-        targets, video and bare, and count nowhere; None: all are.
+    :param seen: bool (B, H, W), False where the robot hides a pixel that is never free. There
+        targets, video and bare are black, and nothing counts; None: True everywhere.
     """
 
     context: torch.Tensor

@@ -52,8 +52,7 @@ def test_the_hand_stays_with_arm_and_goes_with_all():
 @pytest.mark.parametrize('robot_mask', ['arm', 'all'])
 def test_a_scene_that_stands_still_comes_back_where_it_is_ever_seen(robot_mask):
     scene, episode = still()
-    hidden = hidden_pixels(episode.robot_masks, robot_mask)
-    filled, seen = fill_in_time(episode.frames, hidden)
+    filled, seen = fill_in_time(episode.frames, episode.robot_masks, robot_mask)
     assert seen.sum() == seen.size - 4  # all but the base
     hand = (episode.robot_masks == ROBOT_MASK_HAND) & (robot_mask == 'arm')
     np.testing.assert_array_equal(filled[:, seen][~hand[:, seen]],
@@ -62,27 +61,31 @@ def test_a_scene_that_stands_still_comes_back_where_it_is_ever_seen(robot_mask):
     np.testing.assert_array_equal(filled[:, ~seen], episode.frames[:, ~seen])  # as recorded
 
 
-def test_the_nearest_frame_fills_and_of_two_the_earlier_one():
+@pytest.mark.parametrize('robot_mask', ['arm', 'all'])
+def test_the_nearest_frame_fills_and_of_two_the_earlier_one(robot_mask):
     T = 7
-    frames = make_episode(1, T=T).frames
-    hidden = random_masks(T) != ROBOT_MASK_FREE
-    filled, seen = fill_in_time(frames, hidden)
+    frames, masks = make_episode(1, T=T).frames, random_masks(T)
+    masks[:, 2] = ROBOT_MASK_HAND
+    hidden = hidden_pixels(masks, robot_mask)
+    filled, seen = fill_in_time(frames, masks, robot_mask)
     for t, v, u in np.ndindex(hidden.shape):
-        free = [s for s in range(T) if not hidden[s, v, u]]
-        source = min(free, key=lambda s: (abs(s - t), s)) if free else t
+        free = [s for s in range(T) if masks[s, v, u] == ROBOT_MASK_FREE]
+        source = min(free, key=lambda s: (abs(s - t), s)) if free and hidden[t, v, u] else t
         assert filled[t, v, u].tolist() == frames[source, v, u].tolist()
-        assert seen[v, u] == bool(free)
+        assert seen[v, u] == (bool(free) or not hidden[:, v, u].any())
 
 
-def test_a_stream_is_filled_with_what_was_seen_last():
+@pytest.mark.parametrize('robot_mask', ['arm', 'all'])
+def test_a_stream_is_filled_with_what_was_seen_last(robot_mask):
     T = 7
     frames, masks = make_episode(2, T=T).frames, random_masks(T, 2)
-    view = FreeView('all')
+    hidden = hidden_pixels(masks, robot_mask)
+    view = FreeView(robot_mask)
     for t in range(T):
         filled = view.update(frames[t], masks[t])
         for v, u in np.ndindex(masks.shape[1:]):
             free = [s for s in range(t + 1) if masks[s, v, u] == ROBOT_MASK_FREE]
-            source = free[-1] if free else t
+            source = free[-1] if free and hidden[t, v, u] else t
             assert filled[v, u].tolist() == frames[source, v, u].tolist()
 
 
@@ -103,22 +106,24 @@ def test_a_view_remembers_only_what_it_is_shown_to_remember():
     assert not np.array_equal(frame[0], first * 0)  # what was given stays as it is
 
 
-def test_filled_recordings_are_read_like_recordings(tmp_path):
+@pytest.mark.parametrize('robot_mask', ['arm', 'all'])
+def test_filled_recordings_are_read_like_recordings(tmp_path, robot_mask):
     plain = make_episode(9, T=4, start=10**12)
     episodes = [cover(make_episode(s, T=5 + s, start=(s + 1) * 10**10), seed=s) for s in range(3)]
     episodes.append(dataclasses.replace(episodes[0], goal_mask=None, stamps=episodes[0].stamps
                                         + 5 * 10**11))
     store = open_recordings([
         write_bag(tmp_path / 'a', episodes), write_bag(tmp_path / 'b', [plain])])
-    found = FilledStore(store, 'all')
+    found = FilledStore(store, robot_mask)
     assert len(found) == 5 and found.num_frames == store.num_frames
     for i, episode in enumerate(episodes):
-        expected, seen = fill_in_time(episode.frames, episode.robot_masks > 0)
+        expected, seen = fill_in_time(episode.frames, episode.robot_masks, robot_mask)
         np.testing.assert_array_equal(found.frames(i), expected)
         np.testing.assert_array_equal(found[i].frames, expected)
         np.testing.assert_array_equal(found.seen[i], seen)
+        behind = fill_in_time(episode.frames, episode.robot_masks, 'all')[0][-1]
         goal = expected[-1] if i == 3 else np.where(
-            episode.goal_mask[..., None] > 0, expected[-1], episode.goal_frame)
+            hidden_pixels(episode.goal_mask, robot_mask)[..., None], behind, episode.goal_frame)
         np.testing.assert_array_equal(found[i].goal_frame, goal)
     np.testing.assert_array_equal(found.frames(4), plain.frames)
     np.testing.assert_array_equal(found[4].goal_frame, plain.goal_frame)

@@ -54,19 +54,20 @@ def batches(bags, robot_mask, **sampling):
     return found[0], replace(found[1], context=found[0].context)
 
 
-def networks(method):
+def networks(method, images=4):
+    """Make the networks of a method; its recognition network sees so many pictures."""
     torch.manual_seed(0)
     config = PredictorConfig(image_size=32, base_width=4, num_context=2,
                              latent_size=3 if method.vae else 0, new_pixels=True)
     return Networks(
-        Predictor(config), Recognition(config, 4) if method.vae else None,
+        Predictor(config), Recognition(config, images) if method.vae else None,
         Discriminator(config, 12) if method.gan else None,
         Discriminator(config, 12) if method.gan and method.vae else None)
 
 
 def learn(batch, config):
     """Return loss, match and the gradients of all networks."""
-    nets = networks(config.chosen)
+    nets = networks(config.chosen, 4 if config.posterior == 'video' else 3)
     augmentation = Augmentation.draw(len(CHOSEN), True, True, 0.2, np.random.default_rng(1))
     assert augmentation.flip.any() and not augmentation.flip.all()
     outcome = predictor_loss(nets, batch, augmentation, config, Draws.make(batch, 3, 0, 0))
