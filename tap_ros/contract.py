@@ -43,10 +43,12 @@ ENCODINGS = {
 PICTURE_ENCODING = 'rgb8'  # in which pictures are sent and recorded
 MAP_ENCODING = '32FC1'  # of object maps
 
-MASK_ENCODING = 'mono8'  # of robot masks
-
-# Values of a robot mask, which says where the robot is in a picture, shadows included.
-ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM = 0, 128, 255
+# Where the robot hides the scene: pictures of the same stamp and size as the camera's.
+MASK_ENCODING = 'mono8'
+ROBOT_MASK_FREE = 0  # neither robot nor shadow
+ROBOT_MASK_HAND = 128  # the hand (gripper) or its shadow
+ROBOT_MASK_ARM = 255  # the arm or its shadow
+ROBOT_MASKS = ('none', 'arm', 'all')  # what is taken for hidden: nothing, arm, arm and hand
 
 # The module with the main of each node, by the name of the node and of its executable.
 NODE_MODULES = {

@@ -1,10 +1,11 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Episodes for tests: random numbers, or two squares that move; and how to compare episodes."""
+"""Episodes for tests: random numbers, squares, a robot over them; and how to compare them."""
 
 import dataclasses
 
 import numpy as np
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 
@@ -92,3 +93,31 @@ def assert_all_equal(found, expected):
     assert len(found) == len(expected)
     for a, b in zip(found, expected, strict=True):
         assert_equal(a, b)
+
+
+def cover(episode, side=4, seed=0, **changes):
+    """
+    Draw a robot over the frames and the goal picture of an episode: noise that nothing repeats.
+
+    :param episode: Episode.
+    :param side: of the robot's square in pixels; it moves to the right, one pixel a frame. Its
+        left half is the hand, its right half the arm. So are the last 2x2 pixels, its base.
+    :param seed: of the noise.
+    :param changes: of fields of the Episode.
+    :return: Episode with robot_masks and goal_mask.
+    """
+    random = np.random.default_rng([seed, 1])
+    T, height, width, _ = episode.frames.shape
+    masks = np.zeros((T + 1, height, width), np.uint8)
+    masks[:, -2:, -2:] = ROBOT_MASK_ARM
+    for t in range(T + 1):
+        left = t % max(width - side, 1)
+        masks[t, 1:1 + side, left:left + side // 2] = ROBOT_MASK_HAND
+        masks[t, 1:1 + side, left + side // 2:left + side] = ROBOT_MASK_ARM
+    noise = random.integers(0, 256, (T + 1, height, width, 3), np.uint8)
+    goal = [] if episode.goal_frame is None else [episode.goal_frame]
+    shown = np.concatenate([episode.frames, *(frame[None] for frame in goal)])
+    shown = np.where(masks[:len(shown), ..., None] > 0, noise[:len(shown)], shown)
+    return dataclasses.replace(episode, **{
+        'frames': shown[:T], 'robot_masks': masks[:T],
+        **({'goal_frame': shown[T], 'goal_mask': masks[T]} if goal else {}), **changes})

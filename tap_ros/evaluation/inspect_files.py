@@ -47,6 +47,8 @@ def run(args: Options) -> None:
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     print(f'length      {lengths.min()} to {lengths.max()} frames, median {np.median(lengths):g}')
     print(f'objects     {", ".join(map(str, objects))}')
+    masked = sum(e.robot_masks is not None for e in episodes)
+    print(f'robot masks {masked} of {len(episodes)} episodes')
     for name, values in (('task', [e.task for e in episodes]),
                          ('outcome', [e.outcome for e in episodes])):
         counts = Counter(values).most_common()

@@ -28,6 +28,8 @@ from tap_ros.evaluation.intervals import bootstrap, gain_interval, Interval, mea
 from tap_ros.evaluation.samples import draw_latents, SAMPLES, SampleScores, score_samples
 from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
+from tap_ros.learning.filled import fill, Filled, with_masks
+from tap_ros.learning.robot_mask import trained_robot_mask
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
 from tap_ros.options import Bags, Flag, Folder
 from tap_ros.pictures import grid, overlay
@@ -110,8 +112,8 @@ class EpisodeScores:
 
 
 def evaluate(network: Predictor, store: EpisodeStore, episodes: Sequence[int] | np.ndarray,
-             margin: int = 0, goal_picture: str = 'last',
-             seed: int = 0) -> dict[str, EpisodeScores]:
+             margin: int = 0, goal_picture: str = 'last', seed: int = 0,
+             filled: Filled | None = None) -> dict[str, EpisodeScores]:
     """
     Measure a predictor, and copying, on episodes it was not trained on.
 
@@ -124,6 +126,7 @@ def evaluate(network: Predictor, store: EpisodeStore, episodes: Sequence[int] | 
     :param margin: frames beside the context pictures that do not count as matches.
     :param goal_picture: see batches.make_batch.
     :param seed: of z.
+    :param filled: the targets without the robot, see batches.make_batch.
     :return: dict from METHODS (without copy-goal where there is no goal) to EpisodeScores.
     """
     device = next(network.parameters()).device
@@ -133,21 +136,23 @@ def evaluate(network: Predictor, store: EpisodeStore, episodes: Sequence[int] | 
     for at in range(0, len(episodes), _BATCH):
         chosen = episodes[at:at + _BATCH]
         batch = make_batch(store, chosen, Sampling(
-            margin, goal_picture=goal_picture, forward=forward)).to(device)
+            margin, goal_picture=goal_picture, forward=forward), filled=filled).to(device)
         context = to_float(batch.context)
         z = None
         if latent_size:
             z = draw_latents(chosen, 1, latent_size, seed)[:, 0].to(device)
         with torch.inference_mode():
             prediction = network(context, z)
-            images = torch.cat([prediction.image[:, None], context], 1)  # B, 1 + C, 3, H, W
+            measured = to_float(batch.measured)
+            images = batch.visible(
+                torch.cat([prediction.image[:, None], measured], 1))         # B, 1 + C, 3, H, W
             errors = l1_errors(images, batch.targets.movedim(-1, 2))     # B, 1 + C, T
             placed, mass = score_bottlenecks([store[i] for i in chosen], prediction, goal_picture)
         for m, method in enumerate(methods):
             match = match_step(errors[:, m], batch.valid)[:, None]
             times = batch.times.gather(1, match)
             row = [errors[:, m].gather(1, match), times, times / batch.end,
-                   _changed_l1(images[:, m], batch, match[:, 0], context)[:, None]]
+                   _changed_l1(images[:, m], batch, match[:, 0], measured)[:, None]]
             parts[method].append([*(part[:, 0].cpu().numpy() for part in row), placed[:, m],
                                   mass[:, m]])
     return {method: EpisodeScores(*(np.concatenate(column) for column in zip(*rows)))
@@ -165,7 +170,7 @@ def _changed_l1(images: torch.Tensor, batch: Batch, match: torch.Tensor,
 
 def write_pictures(path: str | Path, network: Predictor, store: EpisodeStore,
                    episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-                   scale: int = 2) -> None:
+                   scale: int = 2, filled: Filled | None = None) -> None:
     """
     Write a sheet of predictions, a row for each episode.
 
@@ -178,15 +183,17 @@ def write_pictures(path: str | Path, network: Predictor, store: EpisodeStore,
     :param episodes: indices of episodes.
     :param goal_picture: see batches.make_batch.
     :param scale: whole number of times to enlarge each pixel.
+    :param filled: as in evaluate.
     """
     from matplotlib.image import imsave
 
     batch = make_batch(store, episodes, Sampling(
-        goal_picture=goal_picture, forward=network.config.num_context == 1))
+        goal_picture=goal_picture, forward=network.config.num_context == 1), filled=filled)
     context = to_float(batch.context).to(next(network.parameters()).device)
     with torch.inference_mode():
         prediction = network(context)
-        errors = l1_errors(prediction.image[:, None].cpu(), batch.targets.movedim(-1, 2))[:, 0]
+        images = batch.visible(prediction.image[:, None].cpu())
+        errors = l1_errors(images, batch.targets.movedim(-1, 2))[:, 0]
     match, images = match_step(errors, batch.valid), to_uint8(prediction.image)
     rows = []
     for b, i in enumerate(episodes):
@@ -210,6 +217,8 @@ class Options:
         the arm elsewhere.
     :param margin: frames beside the context that do not count as matches.
     :param samples: how many to draw of weights with z.
+    :param robot_mask: what is taken out of the frames that predictions are compared with, see
+        `train --help`; 'weights': what it was when they were trained.
     :param out: write scores.json and pictures.png there.
     """
 
@@ -221,6 +230,7 @@ class Options:
     goal_picture: Literal['last', 'recorded'] = 'recorded'
     margin: int = 0
     samples: int = SAMPLES
+    robot_mask: Literal['weights', 'none', 'arm', 'all'] = 'weights'
     out: Folder = ''
 
 
@@ -236,12 +246,15 @@ def run(args: Options) -> None:
         raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
     fraction = training.get('settings', {}).get('test_fraction', TEST_FRACTION)
-    kept, held_out = split_episodes(store, fraction)
+    robot_mask = (trained_robot_mask(training)[0] if args.robot_mask == 'weights'
+                  else args.robot_mask)
+    kept, held_out = with_masks(store, split_episodes(store, fraction), robot_mask)
     episodes = np.sort(np.concatenate([kept, held_out])) if args.all else held_out
     if not len(episodes):
         raise ConfigError('recordings: no episode of them was held out from training; '
                           'give more of them, or --all')
-    scores = evaluate(network, store, episodes, args.margin, args.goal_picture)
+    filled = fill(store, robot_mask)
+    scores = evaluate(network, store, episodes, args.margin, args.goal_picture, filled=filled)
     print(f'{len(episodes)} episodes, goal picture: {args.goal_picture}; l1 on [0, 1]; object '
           'positions: ground truth; in brackets 95% intervals over the episodes')
     _print_table(scores)
@@ -250,13 +263,17 @@ def run(args: Options) -> None:
         for method, value in scores.items()}
     if network.config.latent_size:
         about['samples'] = _report_samples(score_samples(
-            network, store, episodes, args.margin, args.goal_picture, args.samples), args.samples)
+            network, store, episodes, args.margin, args.goal_picture, args.samples,
+            filled=filled), args.samples)
     if args.out:
         folder = Path(args.out)
         about = {'weights': str(args.weights), 'data_hash': store.data_hash,
                  'goal_picture': args.goal_picture, 'margin': args.margin, 'scores': about}
+        if robot_mask != 'none':
+            about['robot_mask'] = robot_mask
         write_atomically(folder / 'scores.json', json.dumps(about, indent=2) + '\n')
-        write_pictures(folder / 'pictures.png', network, store, episodes[:12], args.goal_picture)
+        write_pictures(folder / 'pictures.png', network, store, episodes[:12], args.goal_picture,
+                       filled=filled)
 
 
 def _std(values: np.ndarray) -> np.ndarray:

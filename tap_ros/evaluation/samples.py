@@ -16,6 +16,7 @@ from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_m
 import torch
 
 if TYPE_CHECKING:
+    from tap_ros.learning.filled import Filled
     from tap_ros.recording.cache import EpisodeStore
 
 SAMPLES = 100  # of the paper's last row of Table 1
@@ -65,7 +66,7 @@ def draw_latents(episodes: Iterable[int], count: int, size: int, seed: int = 0) 
 
 def score_samples(network: Predictor, store: 'EpisodeStore', episodes: Iterable[int],
                   margin: int = 0, goal_picture: str = 'last', count: int = SAMPLES,
-                  seed: int = 0) -> SampleScores:
+                  seed: int = 0, filled: 'Filled | None' = None) -> SampleScores:
     """
     Measure many samples of each episode.
 
@@ -78,6 +79,7 @@ def score_samples(network: Predictor, store: 'EpisodeStore', episodes: Iterable[
     :param goal_picture: see batches.make_batch.
     :param count: samples of each episode.
     :param seed: of the draws.
+    :param filled: as in prediction.evaluate.
     :return: SampleScores.
     """
     device = next(network.parameters()).device
@@ -85,11 +87,12 @@ def score_samples(network: Predictor, store: 'EpisodeStore', episodes: Iterable[
     for i in episodes:
         batch = make_batch(store, [i], Sampling(
             margin, goal_picture=goal_picture,
-            forward=network.config.num_context == 1)).to(device)
+            forward=network.config.num_context == 1), filled=filled).to(device)
         z = draw_latents([i], count, network.config.latent_size, seed)[0].to(device)
         with torch.inference_mode():
             prediction = network(to_float(batch.context).expand(count, -1, -1, -1, -1), z)
-            errors = l1_errors(prediction.image[None], batch.targets.movedim(-1, 2))[0]
+            errors = l1_errors(
+                batch.visible(prediction.image[None]), batch.targets.movedim(-1, 2))[0]
             pixels = context_pixels(store[i], goal_picture)
             spread = (prediction.image.std(0, correction=0) / 2).mean(0).cpu()  # H, W
             placed = _spread_px(prediction, pixels)

@@ -10,6 +10,7 @@ from tap_msgs.msg import ObjectStates
 from tap_ros.errors import PlanningError
 from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.robot_view import GOAL_MASK
 from tap_ros.nodes.topics import LATCHED, to_nanoseconds
 
 if TYPE_CHECKING:
@@ -17,6 +18,12 @@ if TYPE_CHECKING:
     from tap_msgs.action import ReachGoal
 
 TOPICS = {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}
+MASK_TIMEOUT = 0.1  # s that the robot mask of a goal picture may come after it
+
+
+def goal_topics(robot_mask: str) -> dict[str, tuple[type, str]]:
+    """Return TOPICS, and that of the robot mask when one is used."""
+    return TOPICS | (GOAL_MASK if robot_mask != 'none' else {})
 
 
 class GoalSource:
@@ -24,13 +31,15 @@ class GoalSource:
     Goal picture and goal objects, for one request at a time.
 
     :param node: rclpy Node.
+    :param robot_mask: parameter of the node.
     :param on_message: called with the topic name after each message.
     """
 
-    def __init__(self, node: 'Node', on_message: Callable[[str], object]) -> None:
+    def __init__(self, node: 'Node', robot_mask: str, on_message: Callable[[str], object]) -> None:
         self._node = node
-        self._newest = Observations(*TOPICS, latched=True)
-        self._newest.subscribe(node, TOPICS, LATCHED, on_message=on_message)
+        self._types = goal_topics(robot_mask)
+        self._newest = Observations(*self._types, latched=True)
+        self._newest.subscribe(node, self._types, LATCHED, on_message=on_message)
         self.begin(())
 
     def begin(self, needed: Iterable[str]) -> None:
@@ -42,6 +51,8 @@ class GoalSource:
              give_up: Callable[[], bool]) -> dict[str, Any]:
         """
         Return the goal as {'image': message, 'objects': message}.
+
+        With 'mask' where a robot mask is used and one with the stamp of the picture has come.
 
         :param request: ReachGoal goal.
         :param timeout_s: most seconds to wait; give_up: asked whether to stop waiting.
@@ -57,7 +68,11 @@ class GoalSource:
                 f'goal: nothing has come on {self._names(missing)}; publish there (the simulator '
                 'does at sim/reset), or send goal_image and goal_objects along')
         self._stamp = to_nanoseconds(found[self._needed[0]].header.stamp)
-        return goal | {topic: found[topic] for topic in self._needed}
+        masks = [topic for topic in self._types if topic == 'mask' and 'image' in self._needed]
+        if masks and 'mask' not in found and not self._newest.missing(masks):
+            found = self._newest.wait((*self._needed, *masks), MASK_TIMEOUT, self._stamp - 1,
+                                      give_up) or found
+        return goal | {topic: found[topic] for topic in (*self._needed, *masks) if topic in found}
 
     def changed(self, since: float) -> bool:
         """

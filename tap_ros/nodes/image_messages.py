@@ -12,6 +12,7 @@ from sensor_msgs.msg import Image
 from tap_ros.contract import ENCODINGS, MAP_ENCODING, MASK_ENCODING, PICTURE_ENCODING
 from tap_ros.errors import ImageError
 from tap_ros.images import check_image
+from tap_ros.recording.pictures import wrong_mask_value
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:
@@ -105,6 +106,27 @@ def decode_map(message: Image, name: str, size: Sequence[int] | None = None) -> 
     if not np.isfinite(values).all():
         raise ImageError(f'{name}: holds NaN or infinity; expected finite numbers')
     return values
+
+
+def decode_mask(message: Image, name: str, size: Sequence[int]) -> np.ndarray:
+    """
+    Turn a message into a robot mask.
+
+    :param message: sensor_msgs/Image in MASK_ENCODING; rows may be padded.
+    :param name: how an error calls it.
+    :param size: the (height, width) of its picture.
+    :return: uint8 (H, W) of contract.ROBOT_MASK_FREE, _HAND and _ARM.
+    :raises ImageError: for another encoding, size, step, length or value.
+    """
+    _check_encoding(message, name, (MASK_ENCODING,))
+    if (message.height, message.width) != tuple(size):
+        raise ImageError(f'{name}: expected {size[1]}x{size[0]} pixels (width x height) like its '
+                         f'picture, got {message.width}x{message.height}')
+    mask = np.ascontiguousarray(_rows(message, name, 1))
+    wrong = wrong_mask_value(mask)
+    if wrong is not None:
+        raise ImageError(f'{name}: {wrong}')
+    return mask
 
 
 def resize_image(image: np.ndarray, size: Sequence[int]) -> np.ndarray:

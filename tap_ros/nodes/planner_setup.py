@@ -15,6 +15,7 @@ from tap_ros.contract import (
 )
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.mpc_inputs import Scene
@@ -42,6 +43,7 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
                        'with more samples, or what the paper says.', choices=list(PRESETS))
     parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
+    declare_robot_mask(parameters)
     parameters.declare('control_period', CONTROL_PERIOD,
                        'Seconds (of image stamps) that the arm takes for one command.',
                        low=0.01, high=10.0)
@@ -96,7 +98,9 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     :raises ConfigError: when the device is not there.
     """
     check_device(parameters['device'])
-    config = with_preset(parameters['preset'], arm_hidden=parameters['arm_hidden'])
+    config = with_preset(
+        parameters['preset'],
+        arm_hidden=parameters['arm_hidden'] or parameters['robot_mask'] == 'all')
     mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)

@@ -21,13 +21,14 @@ from tap_ros.errors import TapError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.late_answers import create_late_service, take_waiting
-from tap_ros.nodes.predictor_requests import encode_answer, RequestReader, Task, TOPICS
+from tap_ros.nodes.predictor_requests import encode_answer, request_topics, RequestReader, Task
 from tap_ros.nodes.predictor_setup import (
     declare_parameters,
     load_predictors,
     MAX_ROWS,
     MAX_TOGETHER,
     MAX_WAITING,
+    unlike_training,
 )
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import LATCHED
@@ -59,9 +60,10 @@ class PredictorNode(Node):
         self.params = declare_parameters(self)
         self._queue = RequestQueue(
             self._load, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
+        topics = request_topics(self.params['robot_mask'])
         self._diagnostics = Diagnostics(self, {
-            **dict.fromkeys((name for _, name in TOPICS['start'].values()), STALE_S),
-            **dict.fromkeys((name for _, name in TOPICS['goal'].values()), math.inf)},
+            **dict.fromkeys((name for _, name in topics['start'].values()), STALE_S),
+            **dict.fromkeys((name for _, name in topics['goal'].values()), math.inf)},
             queue=lambda: len(self._queue))
         self._reader = RequestReader(
             self, self.params, self._predictors, self._diagnostics.received)
@@ -78,6 +80,9 @@ class PredictorNode(Node):
         sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
                  for mode, predictor in self._predictors.items()]
         files = [path for path in (self.params['weights'], self.params['forward_weights']) if path]
+        unlike = unlike_training(self._predictors, self.params['robot_mask'])
+        if unlike:
+            self.get_logger().warning(unlike)
         self.get_logger().info(
             f'ready: {", ".join(sizes)}, {self.params["device"]}, {", ".join(files)}')
 

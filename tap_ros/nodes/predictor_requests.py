@@ -3,6 +3,7 @@
 """Requests of predict_subgoal and what stands in for their empty fields; their answers."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import CAMERA_FRAME
-from tap_ros.errors import ImageError
+from tap_ros.errors import ImageError, TapError
 from tap_ros.nodes.image_messages import decode_image, is_empty, resize_pixels
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.parameters import Parameters
@@ -24,6 +25,7 @@ from tap_ros.nodes.predictor_setup import (
     MAX_SAMPLES,
 )
 from tap_ros.nodes.pulled import PulledObservations
+from tap_ros.nodes.robot_view import CAMERA_MASK, GOAL_MASK, RobotView
 from tap_ros.nodes.subgoal_messages import encode_subgoal
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 from tap_ros.prediction.predictor import Question, Subgoal, SubgoalPredictor
@@ -35,7 +37,14 @@ if TYPE_CHECKING:
 TOPICS = {  # what stands in for the fields that a request leaves empty
     'start': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
     'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
-OBJECTS_TIMEOUT = 0.1  # s that the objects of the newest picture may come after it
+OBJECTS_TIMEOUT = 0.1  # s that objects and mask of the newest picture may come after it
+
+
+def request_topics(robot_mask: str) -> dict[str, dict[str, tuple[type, str]]]:
+    """Return TOPICS, and those of the robot masks when they are used."""
+    if robot_mask == 'none':
+        return TOPICS
+    return {'start': TOPICS['start'] | CAMERA_MASK, 'goal': TOPICS['goal'] | GOAL_MASK}
 
 
 @dataclass(frozen=True)
@@ -81,14 +90,23 @@ class RequestReader:
                  predictors: Mapping[str, SubgoalPredictor],
                  on_message: Callable[[str], object]) -> None:
         self._node, self._params, self._predictors = node, params, predictors
+        self._robot = RobotView(params['robot_mask'])
+        self._types = request_topics(params['robot_mask'])
         self._newest = {
-            'start': PulledObservations(node, TOPICS['start'], STREAM, on_message=on_message),
-            'goal': PulledObservations(node, TOPICS['goal'], LATCHED, True, on_message)}
+            'start': PulledObservations(
+                node, self._types['start'], STREAM, on_message=on_message),
+            'goal': PulledObservations(node, self._types['goal'], LATCHED, True, on_message)}
 
     def pull(self) -> None:
-        """Take what has come on the topics."""
+        """Take what has come on the topics, and notice of what the camera sees."""
         for observations in self._newest.values():
             observations.pull()
+        if self._robot.used:
+            start = self._newest['start']
+            found = start.newest('image', 'mask')
+            if found is not None:
+                with suppress(TapError):  # who asks for a prediction from it is told
+                    self._robot.see(found['image'], found['mask'], start.jumps)
 
     def read(self, request: PredictSubgoal.Request) -> Task:
         """
@@ -136,7 +154,11 @@ class RequestReader:
                     image.header.frame_id or CAMERA_FRAME)
 
     def _find(self, name: str) -> dict[str, Any]:
-        """Return the newest picture, and its objects if there are any with its stamp."""
+        """
+        Return the newest picture, and its objects if there are any with its stamp.
+
+        The picture is without the robot where a mask is used; a start picture needs its own.
+        """
         newest = self._newest[name]
         found = newest.newest('image')
         if found is None:
@@ -147,10 +169,27 @@ class RequestReader:
                 f'{name}: the request has none and nothing has come on '
                 f'{self._topic(name, "image")}; publish one there (the simulator does at '
                 f'sim/reset), or send it along{advice}')
+        needed, stamp = ('image',), to_nanoseconds(found['image'].header.stamp)
+        if self._robot.used and (name == 'start' or not newest.missing(['mask'])):
+            if 'mask' not in found:
+                found = newest.wait(
+                    ('image', 'mask'), OBJECTS_TIMEOUT, after_ns=stamp - 1) or found
+            if 'mask' in found:
+                needed = 'image', 'mask'
+            elif name == 'start':
+                raise ImageError(
+                    f'start: no robot mask with the stamp of the picture, {stamp / 1e9:.9f} s, '
+                    f'has come on {self._topic(name, "mask")}; publish it, or start the node '
+                    'with robot_mask none')
         if 'objects' not in found and not newest.missing(['objects']):
             stamp = to_nanoseconds(found['image'].header.stamp)
             found = newest.wait(
-                ('image', 'objects'), OBJECTS_TIMEOUT, after_ns=stamp - 1) or found
+                (*needed, 'objects'), OBJECTS_TIMEOUT, after_ns=stamp - 1) or found
+        if 'mask' in needed:
+            image = (self._robot.see(found['image'], found['mask'], newest.jumps)
+                     if name == 'start' else
+                     self._robot.fill_goal(found['image'], found['mask']))
+            found = found | {'image': image}
         return found
 
     def _explain(self, name: str, found: Mapping[str, Any]) -> str:
@@ -167,7 +206,7 @@ class RequestReader:
 
     def _topic(self, name: str, what: str) -> str:
         """Return the full name of a topic, for messages."""
-        return self._node.resolve_topic_name(TOPICS[name][what][1])
+        return self._node.resolve_topic_name(self._types[name][what][1])
 
 
 def encode_answer(task: Task, subgoals: Sequence[Subgoal],

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, weights and requests of predictor_node: what is checked before it predicts."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 from tap_ros.errors import ConfigError
+from tap_ros.learning.robot_mask import trained_robot_mask
 from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.prediction.methods import MODES
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.text import escaped
@@ -46,6 +48,7 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('resize_images', False,
                        'Resize pictures of another size than the weights are made for, instead of '
                        'refusing them; answers have the size of the weights.', read_only=False)
+    declare_robot_mask(parameters)
     return parameters
 
 
@@ -75,6 +78,23 @@ def load_predictors(weights: str, forward_weights: str,
                               'weights')
         predictors['forward'] = forward
     return predictors
+
+
+def unlike_training(predictors: Mapping[str, SubgoalPredictor], robot_mask: str) -> str:
+    """
+    Say for which weights the pictures are unlike those of their training, '' for none.
+
+    :param predictors: {mode: SubgoalPredictor}.
+    :param robot_mask: parameter of the node.
+    """
+    for mode, predictor in predictors.items():
+        trained, share = trained_robot_mask(predictor.training)
+        fitting = [*(['none'] if share < 1 else []), *([trained] if share > 0 else [])]
+        if robot_mask not in fitting:
+            return (f'parameter robot_mask is {robot_mask}, but the {mode} weights were trained '
+                    f'on start and goal pictures as with {" or ".join(fitting)}; predictions may '
+                    'be worse')
+    return ''
 
 
 def choose_mode(request: 'PredictSubgoal.Request', modes: Collection[str]) -> str:

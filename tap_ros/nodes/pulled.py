@@ -81,6 +81,11 @@ class PulledObservations:
                 return found
             time.sleep(PAUSE)
 
+    @property
+    def jumps(self) -> int:
+        """How often the clock of the stamps has jumped."""
+        return self._observations.jumps
+
     def missing(self, topics: Collection[str]) -> list[str]:
         """Return those of `topics` of which nothing has come since the start."""
         self.pull()

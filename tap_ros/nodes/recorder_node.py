@@ -31,7 +31,8 @@ TYPES = {
     'subgoal': 'tap_msgs/msg/Subgoal',
     'subgoal/image': 'sensor_msgs/msg/Image',
     'subgoal/overlay': 'sensor_msgs/msg/Image'}
-LATCHED = ('goal/image', 'goal/objects', 'subgoal', 'subgoal/image', 'subgoal/overlay')
+LATCHED = ('goal/image', 'goal/robot_mask', 'goal/objects', 'subgoal', 'subgoal/image',
+           'subgoal/overlay')
 PERIODIC = ('camera/image_raw', 'camera/camera_info', 'objects', 'joint_states')
 MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls it stale
 LONG = 1000  # characters of an answer

@@ -3,16 +3,18 @@
 """What visual_mpc_node sees: messages put together by their stamp, and decoded once."""
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import replace
 import time
 from typing import Any, TYPE_CHECKING
 
 from sensor_msgs.msg import Image, JointState
 from tap_msgs.msg import Episode, ObjectStates
-from tap_ros.errors import PlanningError
+from tap_ros.errors import PlanningError, TapError
 from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
 from tap_ros.nodes.observations import JUMP_NS, Moment, Observations
+from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
 from tap_ros.nodes.topics import STREAM, to_nanoseconds
 from tap_ros.planning.reach import Seen
 
@@ -24,15 +26,24 @@ TOPICS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objec
           'joints': (JointState, 'joint_states')}
 
 
+def sensor_topics(robot_mask: str) -> dict[str, tuple[type, str]]:
+    """Return TOPICS, and that of the robot mask when one is used."""
+    return TOPICS | (CAMERA_MASK if robot_mask != 'none' else {})
+
+
 class Sight:
     """
     The newest picture with its objects and joints, for one goal at a time.
+
+    With the parameter robot_mask the picture is without the robot, all that is seen; a picture
+    whose mask has not come is not seen.
 
     :param node: rclpy Node.
     :param params: its Parameters.
     :param image_size: (height, width) that pictures must have.
     :param on_message: called with the topic name after each message.
     :ivar sensors: Observations.
+    :ivar robot: RobotView.
     :ivar messages: {topic: message} that the newest Seen was decoded from.
     """
 
@@ -40,10 +51,17 @@ class Sight:
                  on_message: Callable[[str], object]) -> None:
         self._node, self._params, self._size = node, params, image_size
         self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
-        self.sensors = Observations(*TOPICS)
+        self.robot = RobotView(params['robot_mask'])
+        self._types = sensor_topics(params['robot_mask'])
+        self._tell = on_message
+        self.sensors = Observations(*self._types)
         self.begin(0.0)
         node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
-        self.sensors.subscribe(node, TOPICS, STREAM, on_message=on_message)
+        self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message)
+
+    def topics(self, objects: bool = True) -> tuple[str, ...]:
+        """Return the names of what is looked at, with or without the objects."""
+        return tuple(topic for topic in self._types if objects or topic != 'objects')
 
     def begin(self, since: float) -> None:
         """Begin a goal: only what is received from this monotonic time on is seen."""
@@ -56,7 +74,8 @@ class Sight:
         """
         Return what was seen last.
 
-        :param topics: those of TOPICS that are needed; without objects their pixels are None.
+        :param topics: those that are needed, as topics gives them; without objects their pixels
+            are None.
         :return: Seen, or None when nothing was; which sensors are silent, '' if none is.
         :raises TapError: for messages that cannot be used.
         """
@@ -74,6 +93,7 @@ class Sight:
                 moment.stamp_ns, times['jumps']):
             self._seen = replace(self._seen, **times)
         else:
+            moment = self._without_robot(moment)
             self._seen = self._decode(moment, topics, times)
             self.messages = moment.messages
         return self._seen, lacking
@@ -88,6 +108,24 @@ class Sight:
         begun_ns, jumps = self._mark
         known = jumps == self.sensors.jumps and begun_ns <= stamp_ns + JUMP_NS
         return begun_ns if known else 0
+
+    def _without_robot(self, moment: Moment) -> Moment:
+        """Take the robot out of the picture of a Moment, if that is wanted."""
+        if not self.robot.used:
+            return moment
+        messages = moment.messages
+        image = self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
+        return replace(moment, messages=messages | {'image': image})
+
+    def _on_message(self, name: str) -> None:
+        """Take notice of what the camera sees between the goals, too."""
+        self._tell(name)
+        if not self.robot.used or name not in (self._types['image'][1], self._types['mask'][1]):
+            return
+        moment = self.sensors.moment(('image', 'mask'))
+        if moment is not None:
+            with suppress(TapError):  # who looks at it is told
+                self._without_robot(moment)
 
     def _decode(self, moment: Moment, topics: Collection[str], times: dict[str, Any]) -> Seen:
         """Return a Seen; the objects keep the order in which they were seen first."""
@@ -112,7 +150,8 @@ class Sight:
         return f'nothing new has come on {self._names(silent)}' if silent else ''
 
     def _count_publishers(self) -> dict[str, int]:
-        return {topic: self._node.count_publishers(name) for topic, (_, name) in TOPICS.items()}
+        return {topic: self._node.count_publishers(name)
+                for topic, (_, name) in self._types.items()}
 
     def _check_publishers(self) -> None:
         """Refuse to go on by two cameras that take turns; their stamps need not differ."""
@@ -123,9 +162,10 @@ class Sight:
                     'now; leave one, and send the goal again')
 
     def _names(self, topics: Collection[str]) -> str:
-        return ', '.join(self._node.resolve_topic_name(TOPICS[topic][1]) for topic in topics)
+        return ', '.join(self._node.resolve_topic_name(self._types[topic][1]) for topic in topics)
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:
             self._mark = to_nanoseconds(message.header.stamp), self.sensors.jumps
+            self.robot.clear()
             self.sensors.wake()

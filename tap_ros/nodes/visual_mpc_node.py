@@ -21,8 +21,7 @@ from tap_ros.errors import PlanningError, TapError
 from tap_ros.nodes.arm import Arm
 from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.goal_source import GoalSource, needed_topics
-from tap_ros.nodes.goal_source import TOPICS as GOAL
+from tap_ros.nodes.goal_source import goal_topics, GoalSource, needed_topics
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.planner_setup import (
@@ -31,8 +30,7 @@ from tap_ros.nodes.planner_setup import (
     load_planner,
 )
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.sight import Sight
-from tap_ros.nodes.sight import TOPICS as SENSORS
+from tap_ros.nodes.sight import sensor_topics, Sight
 from tap_ros.nodes.subgoal_messages import decode_subgoals
 from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.action_sequences import Limits
@@ -70,11 +68,12 @@ class VisualMpcNode(Node):
         self._cancelled: ServerGoalHandle | None = None  # the goal that was cancelled last
         self._busy = threading.Lock()  # held while a goal is executed
         self._refusals: deque[tuple[int, str]] = deque(maxlen=10)
+        robot_mask = self.params['robot_mask']
         self._diagnostics = Diagnostics(self, {
-            **dict.fromkeys((name for _, name in SENSORS.values()), STALE_S),
-            **dict.fromkeys((name for _, name in GOAL.values()), math.inf)})
+            **dict.fromkeys((name for _, name in sensor_topics(robot_mask).values()), STALE_S),
+            **dict.fromkeys((name for _, name in goal_topics(robot_mask).values()), math.inf)})
         heard = self._diagnostics.received
-        self._goal = GoalSource(self, heard)
+        self._goal = GoalSource(self, robot_mask, heard)
         self._sight = Sight(self, self.params, self._mpc.image_size, heard)
         self._sensors = self._sight.sensors
         self._arm = Arm(self, self.params, self._sensors)
@@ -168,8 +167,7 @@ class VisualMpcNode(Node):
             while self._refusals:
                 reach.refused(*self._refusals.popleft())
             # Objects that are carried need to be seen once only.
-            topics = (('image', 'joints') if config.follower and reach.aimed
-                      else tuple(SENSORS))
+            topics = self._sight.topics(objects=not (config.follower and reach.aimed))
             seen, lacking = self._sight.look(topics)
             if self._goal.changed(accepted):
                 reach = Reach(self._mpc, config, request.seed, accepted)
@@ -244,8 +242,11 @@ class VisualMpcNode(Node):
                           names: Sequence[str]) -> list['Subgoal']:
         """Return the Subgoals of all samples, their objects in the order of `names`."""
         wanted, seen = handle.request, self._sight.messages
+        picture = goal['image']
+        if 'mask' in goal:
+            picture = self._sight.robot.fill_goal(picture, goal['mask'])
         request = PredictSubgoal.Request(
-            start=seen['image'], goal=goal['image'],
+            start=seen['image'], goal=picture,
             start_objects=seen['objects'], goal_objects=goal['objects'],
             num_samples=wanted.num_samples, recursion_depth=wanted.recursion_depth,
             seed=wanted.seed)

@@ -8,7 +8,7 @@ and resumed sees the same ones.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +16,7 @@ from tap_ros.learning.frames import Frames, GOAL, MappedFrames
 import torch
 
 if TYPE_CHECKING:
+    from tap_ros.learning.filled import Filled
     from tap_ros.recording.cache import EpisodeStore
     from tap_ros.recording.episode import Episode
 
@@ -36,6 +37,10 @@ class Batch:
     :param valid: bool (B, T), False where padded.
     :param video: uint8 (B, N, H, W, 3), the episode from start to goal at N moments at equal
         distances; None unless asked for.
+    :param bare: uint8 (B, C, H, W, 3), the context pictures without the robot, filled as targets
+        and video are then; None: the context itself.
+    :param seen: bool (B, H, W), False where the robot hides a pixel that is never free. There
+        targets, video and bare are black, and nothing counts; None: True everywhere.
     """
 
     context: torch.Tensor
@@ -46,6 +51,22 @@ class Batch:
     end: torch.Tensor
     valid: torch.Tensor
     video: torch.Tensor | None = None
+    bare: torch.Tensor | None = None
+    seen: torch.Tensor | None = None
+
+    @property
+    def measured(self) -> torch.Tensor:
+        """The context pictures as errors are measured with them: filled if targets are."""
+        return self.context if self.bare is None else self.bare
+
+    def visible(self, images: torch.Tensor) -> torch.Tensor:
+        """
+        Return pictures (B, N, 3, H, W) in [-1, 1], black where targets are.
+
+        So these pixels add neither to an error nor to a gradient.
+        """
+        return images if self.seen is None else images.masked_fill(
+            ~self.seen[:, None, None], -1)
 
     def to(self, device: torch.device | str) -> 'Batch':
         """Copy everything to a device."""
@@ -68,6 +89,8 @@ class Sampling:
         prediction does; None: all.
     :param num_others: with a fraction, so many random other targets after that one.
     :param video_frames: length of Batch.video; 0: none.
+    :param fill_context: with a robot mask, the share of the episodes whose context pictures are
+        filled, too.
     """
 
     margin: int = 0
@@ -79,6 +102,7 @@ class Sampling:
     fraction: float | None = None
     num_others: int = 0
     video_frames: int = 0
+    fill_context: float = 0.0
 
 
 def episode_order(num_episodes: int, batch_size: int, seed: int, step: int) -> np.ndarray:
@@ -147,7 +171,8 @@ def fixed_time(fraction: float, end: int, first: int, last: int) -> int:
 
 def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
                sampling: Sampling = Sampling(), frames: Frames | None = None,
-               rng: np.random.Generator | None = None, part: slice = slice(None)) -> Batch:
+               rng: np.random.Generator | None = None, part: slice = slice(None),
+               filled: 'Filled | None' = None) -> Batch:
     """
     Gather context pictures and targets.
 
@@ -158,6 +183,7 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     :param rng: numpy Generator; needed only where something is drawn.
     :param part: slice of the episodes whose pictures are gathered; the others only count for what
         is drawn and for T.
+    :param filled: with a robot mask, where targets and video come from; see learning/filled.py.
     :return: Batch.
     """
     rng = rng or np.random.default_rng(0)
@@ -175,10 +201,22 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
                               for name in ('context', 'video', 'bounds'))
     frames = frames or MappedFrames(store)
     first, last, end = torch.from_numpy(bounds).split(1, dim=1)
-    return Batch(
-        frames(episodes, context), frames(episodes, shown), torch.from_numpy(times),
+    free = filled.frames if filled else frames
+    batch = Batch(
+        frames(episodes, context), free(episodes, shown), torch.from_numpy(times),
         first, last, end, torch.from_numpy(valid),
-        frames(episodes, video) if sampling.video_frames else None)
+        free(episodes, video) if sampling.video_frames else None)
+    if filled is None:
+        return batch
+    bare = free(episodes, context)
+    chosen = torch.tensor([row.filled for row in rows], device=bare.device)
+    seen = torch.from_numpy(filled.seen[np.asarray(episodes)]).to(bare.device)
+    batch = replace(batch, seen=seen, bare=bare.clone(), context=torch.where(
+        chosen[:, None, None, None, None], bare, batch.context))
+    for pictures in (batch.targets, batch.video, batch.bare):
+        if pictures is not None:
+            pictures.masked_fill_(~seen[:, None, ..., None], 0)
+    return batch
 
 
 @dataclass(frozen=True)
@@ -190,6 +228,7 @@ class _Row:
     video: np.ndarray  # the same
     times: np.ndarray  # of the targets
     bounds: tuple[int, int, int]  # first and last time that a target could have, time of the goal
+    filled: bool  # whether the context pictures are without the robot
 
 
 def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Generator) -> _Row:
@@ -217,4 +256,5 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
     context = [start] if sampling.forward else [start, goal]
     video = start + np.rint(np.linspace(0, end, sampling.video_frames)).astype(int)
     video[video == start + end] = goal
-    return _Row(start, context, video, times, (first, last, end))
+    filled = sampling.fill_context > 0 and rng.random() < sampling.fill_context
+    return _Row(start, context, video, times, (first, last, end), filled)

@@ -31,7 +31,8 @@ def matched(network: Predictor, batch: Batch, config: TrainingConfig,
     with autocast():
         prediction = network(context)
     targets = Targets(batch, None, config)
-    return prediction, targets.match(prediction.image, context, selection_errors)
+    return prediction, targets.match(
+        prediction.image, targets.measured(context), selection_errors)
 
 
 @torch.no_grad()
@@ -50,7 +51,8 @@ def held_out_scores(network: Predictor, batches: Iterable[Batch], config: Traini
     for batch in batches:
         prediction, match = matched(network, batch, config, autocast)
         rows = torch.arange(len(match), device=match.device)
-        losses.append(l1_error(prediction.image, to_float(batch.targets[rows, match])).cpu())
+        image = batch.visible(prediction.image[:, None])[:, 0]
+        losses.append(l1_error(image, to_float(batch.targets[rows, match])).cpu())
         fractions.append((batch.times.gather(1, match[:, None]) / batch.end)[:, 0].cpu())
     fractions = torch.cat(fractions)
     return {'loss': torch.cat(losses).mean().item(),

@@ -154,8 +154,9 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
         parts['kl'] = config.kl_weight * kl_divergence(mean, log_variance).mean()
     with autocast():
         prediction = networks.predictor(context, z)
-    match = targets.match(prediction.image, context, selection)
-    parts['error'] = targets.loss(prediction.image, match, context)
+    measured = targets.measured(context)
+    match = targets.match(prediction.image, measured, selection)
+    parts['error'] = targets.loss(prediction.image, match, measured)
     judged = None
     if networks.discriminator is not None:
         assert draws is not None, "t' is drawn"
@@ -166,8 +167,8 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
             generator_loss(logits, judged['step']) for logits in verdicts)
     if config.recursion > 1:
         parts['error'] = _recursive_loss(
-            networks, prediction, targets, context, match, parts['error'], config, z, autocast,
-            selection)
+            networks, prediction, targets, context, measured, match, parts['error'], config, z,
+            autocast, selection)
     return Outcome(total(parts.values()), match, prediction,
                    {name: value.detach() for name, value in parts.items()}, judged)
 
@@ -177,12 +178,12 @@ def _judge(networks: Networks, prediction: Prediction, z: torch.Tensor | None, t
            autocast: Autocast) -> dict[str, Any]:
     """Gather what the discriminators see of this batch."""
     batch = targets.batch
-    pairs = [(networks.discriminator, prediction.image)]
+    pairs = [(networks.discriminator, targets.visible(prediction.image))]
     if networks.posterior_discriminator is not None:
         with autocast():
             sampled = networks.predictor(context, draws.prior)
-        pairs = [(networks.discriminator, sampled.image),
-                 (networks.posterior_discriminator, prediction.image)]
+        pairs = [(networks.discriminator, targets.visible(sampled.image)),
+                 (networks.posterior_discriminator, targets.visible(prediction.image))]
     chance = draws.other.masked_fill(~batch.valid, -1)
     chance[targets.rows, match] = -0.5  # t' is another frame, if there is one
     other = chance.argmax(1)
@@ -214,9 +215,9 @@ def discriminators_loss(judged: dict[str, Any],
 
 
 def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets,
-                    context: torch.Tensor, match: torch.Tensor, loss: torch.Tensor,
-                    config: ObjectiveSettings, z: torch.Tensor | None, autocast: Autocast,
-                    selection: Selection) -> torch.Tensor:
+                    context: torch.Tensor, measured: torch.Tensor, match: torch.Tensor,
+                    loss: torch.Tensor, config: ObjectiveSettings, z: torch.Tensor | None,
+                    autocast: Autocast, selection: Selection) -> torch.Tensor:
     """
     Add the levels r > 0 of Eq. 3; gradients flow through the predictions as contexts.
 
@@ -235,7 +236,9 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
         following = prediction.image[:, None]
         if config.detach_recursion:  # unlike Eq. 3
             following = following.detach()
-        context = following if config.forward else torch.cat([context[:, :1], following], 1)
+        context, measured = (
+            following if config.forward else torch.cat([pictures[:, :1], following], 1)
+            for pictures in (context, measured))
         with autocast():
             prediction = networks.predictor(context, z)
         # Preferences lie between the inputs of this level.
@@ -244,8 +247,8 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
             end = torch.where(left[:, None], matched, batch.end)
             between = replace(between, end=end, last=torch.where(
                 left[:, None], matched - 1, batch.last))
-        match = targets.match(prediction.image, context, selection, between, level)
-        errors = outer_error(targets.outer_l1(prediction.image, match, context), config)
+        match = targets.match(prediction.image, measured, selection, between, level)
+        errors = outer_error(targets.outer_l1(prediction.image, match, measured), config)
         losses.append(errors[left].mean())
         counts.append(int(left.sum().item()))
     return recursive_loss(losses, counts)
@@ -266,6 +269,7 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
     B, T = batch.times.shape
     assert networks.recognition is not None
     divergences, errors, predictions = [], [], []
+    measured = targets.measured(context)
     for t in range(T):
         step = torch.full_like(targets.rows, t)
         frame = targets.frame(step)
@@ -274,12 +278,12 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
             prediction = networks.predictor(
                 context, sample_latent(mean, log_variance, draws.posterior[:, t]))
         divergences.append(config.kl_weight * kl_divergence(mean, log_variance))
-        errors.append(targets.outer_l1(prediction.image, step, context))
+        errors.append(targets.outer_l1(prediction.image, step, measured))
         predictions.append(prediction)
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
     whole = (divergences + errors).detach()
     match = targets.choose(selection(
-        whole, lambda: targets.errors(context), batch, config), batch.valid)
+        whole, lambda: targets.errors(measured), batch, config), batch.valid)
     parts = {'kl': fixed_time_loss(divergences, match),
              'error': fixed_time_loss(outer_error(errors, config), match)}
     return Outcome(total(parts.values()), match, _choose(predictions, match),

@@ -64,7 +64,7 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
         progress = picture_progress(copy_error(), batch.valid)
         return preferred_error(error, bell(progress, config.bell_edge))
     if config.chosen.selection == 'cost_of_reaching':
-        cost = path_length(batch.context[:, 0], batch.targets, batch.valid)
+        cost = path_length(batch.measured[:, 0], batch.targets, batch.valid)
         return cost_of_reaching(error, cost, preference)
     return preferred_error(error, preference)
 
@@ -97,6 +97,22 @@ class Targets:
         frame = to_float(self.batch.targets[self.rows, step])[:, None]
         return (self.augmentation.apply(frame) if self.augmentation else frame)[:, 0]
 
+    def measured(self, context: torch.Tensor) -> torch.Tensor:
+        """Return the augmented context that errors are measured with, Batch.measured."""
+        if self.batch.bare is None:
+            return context
+        bare = to_float(self.batch.bare)
+        return self.augmentation.apply(bare) if self.augmentation else bare
+
+    def visible(self, image: torch.Tensor) -> torch.Tensor:
+        """Return augmented pictures (B, 3, H, W), black where targets are, see Batch.visible."""
+        if self.batch.seen is None:
+            return image
+        seen = self.batch.seen
+        if self.augmentation:
+            seen = torch.where(self.augmentation.flip[:, None, None], seen.flip(-1), seen)
+        return image.masked_fill(~seen[:, None], -1)
+
     def match(self, image: torch.Tensor, context: torch.Tensor, selection: Selection,
               batch: Batch | None = None, level: int = 0) -> torch.Tensor:
         """
@@ -106,7 +122,7 @@ class Targets:
         than applying it to all targets.
 
         :param image: (B, 3, H, W), predictions, augmented.
-        :param context: (B, C, 3, H, W), what they come from, augmented.
+        :param context: (B, C, 3, H, W), what they come from, as measured returns it.
         :param selection: function as selection_errors.
         :param batch: with the valid targets and the bounds of the preference, where these are not
             the batch's own.
@@ -131,7 +147,7 @@ class Targets:
         """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
         if self.augmentation:
             images = self.augmentation.undo(images)
-        return l1_errors(images, self.batch.targets.movedim(-1, 2))
+        return l1_errors(self.batch.visible(images), self.batch.targets.movedim(-1, 2))
 
     def outer_l1(self, image: torch.Tensor, step: torch.Tensor,
                  context: torch.Tensor) -> torch.Tensor:
@@ -140,10 +156,11 @@ class Targets:
 
         :param image: (B, 3, H, W), predictions.
         :param step: int64 (B,), the targets, as indices into T.
-        :param context: (B, C, 3, H, W), what the predictions come from.
+        :param context: (B, C, 3, H, W), what the predictions come from, as measured returns it.
         :return: (B,).
         """
-        return weighted_l1_error(image, self.frame(step), context, self.config.changed_weight)
+        return weighted_l1_error(
+            self.visible(image), self.frame(step), context, self.config.changed_weight)
 
     def loss(self, image: torch.Tensor, step: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
         """Return E_t: the l1 error at step, to the configured power, as a mean."""

@@ -17,6 +17,7 @@ import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.learning.devices import Autocast, make_autocast, pick_device, pick_precision
+from tap_ros.learning.filled import fill, Filled, with_masks
 from tap_ros.learning.frames import Frames, MappedFrames, ResidentFrames
 from tap_ros.learning.parallel import joined, Processes, share_batch_norm
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
@@ -84,7 +85,8 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
            stop_at: int | None, deadline: float, progress: bool,
            after_step: Callable[[int], object] | None) -> None:
     """Train as the only run in the folder; see train."""
-    training, held_out = split_episodes(store, config.test_fraction)
+    training, held_out = with_masks(
+        store, split_episodes(store, config.test_fraction), config.robot_mask)
     torch.manual_seed(config.seed)
     network = Predictor(network_config(config, store.image_size))
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
@@ -100,14 +102,17 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
         pick_precision(config.precision, device) == 'bfloat16', device) else 'float32')
     autocast = make_autocast(state.precision, device)
     # Decoding and copying would be most of the time of a step on a GPU.
-    frames = (ResidentFrames(store, device, progress) if device.type == 'cuda'
-              else MappedFrames(store))
+    make_frames = (partial(ResidentFrames, device=device, progress=progress)
+                   if device.type == 'cuda' else MappedFrames)
+    frames = make_frames(store)
+    filled = fill(store, config.robot_mask, make_frames, progress)
     begun = checkpoint.exists()
     processes.wait()  # before the first one writes a checkpoint
     if config.pretrain_steps and not begun:
-        pretrain_decoders(state.network, partial(_single_frames, store, frames, training, config),
-                          config.pretrain_steps, seed=config.seed, autocast=autocast,
-                          progress=progress)
+        draw = partial(
+            _single_frames, store, filled.frames if filled else frames, training, config)
+        pretrain_decoders(state.network, draw, config.pretrain_steps, seed=config.seed,
+                          autocast=autocast, progress=progress)
         state.average.load_state_dict(state.network.state_dict())
         if processes.first:
             save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
@@ -116,15 +121,15 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
     networks = Networks(compiled(state.network), **{
         name: compiled(helper) for name, helper in state.helpers.items()})
     last = min(config.steps, stop_at or config.steps)
-    report = partial(_report, config=config, store=store, frames=frames, training=training,
-                     held_out=held_out, autocast=autocast)
+    report = partial(_report, config=config, store=store, frames=frames, filled=filled,
+                     training=training, held_out=held_out, autocast=autocast)
     bar = tqdm(total=config.steps, initial=state.step, unit='step', disable=not progress,
                desc=f'{config.method}, {state.precision}')
     curves = SummaryWriter(config.out, purge_step=state.step) if processes.first else None
     with curves or nullcontext(), bar:
         began = time.monotonic() - state.seconds
         for step, batch, augmentation in _batches(
-                store, frames, training, config, processes, state.step, last):
+                store, frames, filled, training, config, processes, state.step, last):
             for optimizer, highest in zip(
                     state.optimizers, (config.learning_rate, config.discriminator_rate)):
                 for group in optimizer.param_groups:
@@ -245,22 +250,22 @@ def _single_frames(store: EpisodeStore, frames: Frames, episodes: np.ndarray,
     return frames(chosen, rng.integers(store.lengths[chosen])[:, None])[:, 0]
 
 
-def _batches(store: EpisodeStore, frames: Frames, episodes: np.ndarray, config: TrainingConfig,
-             processes: Processes, first: int,
+def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episodes: np.ndarray,
+             config: TrainingConfig, processes: Processes, first: int,
              last: int) -> Iterator[tuple[int, Batch, Augmentation]]:
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
     whole = config.chosen.vae and config.posterior == 'video'
     sampling = Sampling(
         config.margin, config.num_targets, config.max_frames, config.min_crop,
         config.goal_picture, config.forward, config.chosen.fraction, int(config.chosen.gan),
-        config.video_frames if whole else 0)
+        config.video_frames if whole else 0, config.fill_context)
 
     part = processes.part(config.batch_size)
 
     def make(step: int) -> tuple[int, Batch, Augmentation]:
         rng = np.random.default_rng([config.seed, 2, step])
         chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
-        batch = make_batch(store, chosen, sampling, frames, rng, part)
+        batch = make_batch(store, chosen, sampling, frames, rng, part, filled)
         augmentation = Augmentation.draw(
             len(chosen), config.flip, config.colour, config.brightness, rng)
         return step, batch, augmentation.part(part)
@@ -294,17 +299,18 @@ def _log(curves: SummaryWriter, bar: tqdm, step: int, values: dict[str, float], 
 
 
 def _report(state: TrainingState[Predictor], curves: SummaryWriter, config: TrainingConfig,
-            store: EpisodeStore, frames: Frames, training: np.ndarray, held_out: np.ndarray,
-            autocast: Autocast) -> None:
+            store: EpisodeStore, frames: Frames, filled: Filled | None, training: np.ndarray,
+            held_out: np.ndarray, autocast: Autocast) -> None:
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
     device = next(state.average.parameters()).device
 
     sampling = Sampling(
         config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
-        forward=config.forward, fraction=config.chosen.fraction)
+        forward=config.forward, fraction=config.chosen.fraction,
+        fill_context=config.fill_context)
 
     def batch(episodes: np.ndarray) -> Batch:
-        return make_batch(store, episodes, sampling, frames).to(device)
+        return make_batch(store, episodes, sampling, frames, filled=filled).to(device)
 
     scores = {}
     if len(held_out):

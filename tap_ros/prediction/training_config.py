@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, get_args, Literal
 
 from tap_ros.errors import ConfigError
+from tap_ros.learning.robot_mask import RobotMask
 from tap_ros.learning.split import TEST_FRACTION
 from tap_ros.prediction.methods import Method, Mode, parse_method
 
@@ -150,6 +151,11 @@ class DataSettings:
     :param flip: mirror half of the episodes.
     :param colour: permute the colour channels of each episode.
     :param brightness: change each channel's brightness by up to this share.
+    :param robot_mask: what the recordings' robot masks take out of targets and errors: 'none'; the
+        'arm' with its shadow, so that the hand stays in the picture; or 'all' of the robot. What
+        it hides is filled with what is seen there in the nearest frame of the episode.
+    :param fill_context: share of the episodes whose start and goal pictures are filled, too, as a
+        node with the parameter robot_mask does; 0: the robot stays in all of them.
     """
 
     margin: int = 3
@@ -160,14 +166,19 @@ class DataSettings:
     flip: bool = True
     colour: bool = True
     brightness: float = 0.2
+    robot_mask: RobotMask = 'none'
+    fill_context: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what cannot be taken from episodes."""
-        _check_choice(self, goal_picture=GoalPicture)
+        _check_choice(self, goal_picture=GoalPicture, robot_mask=RobotMask)
         _check_least(self, 0, 'margin', 'num_targets', 'max_frames')
         if 0 < self.max_frames < 3:
             raise ConfigError(f'max_frames: expected 0 or at least 3, got {self.max_frames}')
-        _check_range(self, min_crop=(1e-6, 1), brightness=(0, 0.9))
+        _check_range(self, min_crop=(1e-6, 1), brightness=(0, 0.9), fill_context=(0, 1))
+        if self.fill_context and self.robot_mask == 'none':
+            raise ConfigError('fill_context: nothing is known of the robot; give --robot-mask arm '
+                              'or all')
 
 
 @dataclass(frozen=True)

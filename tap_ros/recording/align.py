@@ -9,6 +9,7 @@ not: a frame belongs to an episode whose marks enclose its stamp, and that is ne
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 import warnings
 
 import numpy as np
@@ -22,7 +23,10 @@ MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a fram
 _LOOKED_AT = 4096  # messages looked at together
 _EMPTY = {
     'frame_log': ((0,), np.int64), 'frame_stamp': ((0,), np.int64),
+    'mask_log': ((0,), np.int64), 'mask_stamp': ((0,), np.int64), 'mask_index': ((0,), np.int64),
     'goal_log': ((0,), np.int64), 'goal_stamp': ((0,), np.int64), 'goal_index': ((0,), np.int64),
+    'goal_mask_log': ((0,), np.int64), 'goal_mask_stamp': ((0,), np.int64),
+    'goal_mask_index': ((0,), np.int64),
     'twist_log': ((0,), np.int64), 'twist_stamp': ((0,), np.int64),
     'twist': ((0, 3), np.float32),
     'command_log': ((0,), np.int64), 'command': ((0,), np.float32),
@@ -45,12 +49,15 @@ class EpisodeTable:
     spans: list[Span]  # E
     file: np.ndarray  # (F,) int64, index into parts
     row: np.ndarray  # (F,) int64, index into the frames of that part
+    mask_file: np.ndarray  # (F,) int64, as file; of the robot mask
+    mask_row: np.ndarray  # (F,) int64, index into the masks of that part; -1: there is none
     stamps: np.ndarray  # (F,) int64
     actions: np.ndarray  # (F, 4) float32
     grippers: np.ndarray  # (F, 4) float32
     objects: np.ndarray  # (F, K, 9) float64: u, v, pose
     names: list[tuple[str, ...]]  # E
     goals: list[tuple[int, int] | None]  # E: index into parts, index into goal_frames
+    goal_masks: list[tuple[int, int] | None]  # E: index into parts, index into goal_masks
     goal_objects: np.ndarray  # (E, K, 9) float64
 
     def __len__(self) -> int:
@@ -59,12 +66,19 @@ class EpisodeTable:
     def frames(self, i: int) -> np.ndarray:
         """Return the frames of episode i, (T, H, W, 3) uint8, a view unless it is in two files."""
         rows = slice(self.starts[i], self.starts[i + 1])
-        file, row = self.file[rows], self.row[rows]
-        runs = np.flatnonzero((np.diff(row) != 1) | (np.diff(file) != 0)) + 1
-        pieces = [
-            self.parts[f[0]].frames[r[0]:r[-1] + 1]
-            for f, r in zip(np.split(file, runs), np.split(row, runs), strict=True)]
-        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+        return _take([part.frames for part in self.parts], self.file[rows], self.row[rows])
+
+    def has_masks(self, i: int) -> bool:
+        """Tell whether every frame of episode i has a robot mask."""
+        return bool((self.mask_row[self.starts[i]:self.starts[i + 1]] >= 0).all())
+
+    def masks(self, i: int) -> np.ndarray | None:
+        """Return the robot masks of episode i, (T, H, W) uint8, or None if a frame has none."""
+        if not self.has_masks(i):
+            return None
+        rows = slice(self.starts[i], self.starts[i + 1])
+        return _take(
+            [part.masks for part in self.parts], self.mask_file[rows], self.mask_row[rows])
 
     def episode(self, i: int) -> Episode:
         """Return episode i."""
@@ -73,6 +87,10 @@ class EpisodeTable:
         goal, goal_frame, span = self.goals[i], None, self.spans[i]
         if goal is not None and (known := self.parts[goal[0]].goal_frames) is not None:
             goal_frame = known[goal[1]]
+        mask, goal_mask = self.goal_masks[i], None
+        if goal_frame is not None and mask is not None and (
+                known := self.parts[mask[0]].goal_masks) is not None:
+            goal_mask = known[mask[1]]
         with np.errstate(over='ignore'):  # absurd pixels become infinite
             pixels, goal_pixels = (
                 a[..., :2].astype(np.float32) for a in (objects, goal_objects))
@@ -81,7 +99,17 @@ class EpisodeTable:
             grippers=self.grippers[rows], object_names=self.names[i],
             object_pixels=pixels, object_poses=objects[..., 2:],
             goal_frame=goal_frame, goal_pixels=goal_pixels, goal_poses=goal_objects[:, 2:],
-            task=span.task, seed=span.seed, outcome=span.outcome or '')
+            task=span.task, seed=span.seed, outcome=span.outcome or '',
+            robot_masks=self.masks(i), goal_mask=goal_mask)
+
+
+def _take(arrays: Sequence[np.ndarray | None], file: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Return rows of several arrays, a view where they follow each other in one."""
+    runs = np.flatnonzero((np.diff(row) != 1) | (np.diff(file) != 0)) + 1
+    pieces = [
+        cast(np.ndarray, arrays[f[0]])[r[0]:r[-1] + 1]
+        for f, r in zip(np.split(file, runs), np.split(row, runs), strict=True)]
+    return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
 
 def follows(before: Columns, after: Columns) -> bool:
@@ -123,9 +151,11 @@ def assemble(parts: Sequence[Columns]) -> EpisodeTable:
     clock = _Clock(spans, starts, stamps)
     picked, goal_picked = _pick_names(data, clock)
     goals = [_newest(data, 'goal', span) for span in spans]
+    mask_file, mask_row = _masks(data, clock, parts)
     return EpisodeTable(
         parts=parts, starts=starts, spans=spans,
-        file=data['frame_file'][order], row=data['frame_row'][order], stamps=stamps,
+        file=data['frame_file'][order], row=data['frame_row'][order],
+        mask_file=mask_file, mask_row=mask_row, stamps=stamps,
         actions=_actions(data, clock, data['frame_log'][order]),
         grippers=clock.nearest(
             data['joint_log'], data['joint_stamp'], data['joint'], np.float32),
@@ -134,6 +164,7 @@ def assemble(parts: Sequence[Columns]) -> EpisodeTable:
         names=[names[i] if i >= 0 else () for i in picked.tolist()],
         goals=[None if g < 0 or data['goal_index'][g] < 0
                else (int(data['goal_file'][g]), int(data['goal_index'][g])) for g in goals],
+        goal_masks=[_goal_mask(data, span, goal) for span, goal in zip(spans, goals)],
         goal_objects=_by_name(goal_picked, goal_picked >= 0, data['goal_object'],
                               data['goal_object_names'], names, picked))
 
@@ -190,7 +221,8 @@ def _join(parts: Sequence[Columns]) -> tuple[
         dict[str, np.ndarray], list[tuple[str, ...]], list[Mark]]:
     """Put the columns of several files one behind the other."""
     data: dict[str, list[np.ndarray]] = {
-        key: [] for key in (*_EMPTY, 'frame_file', 'frame_row', 'goal_file')}
+        key: [] for key in (
+            *_EMPTY, 'frame_file', 'frame_row', 'mask_file', 'goal_file', 'goal_mask_file')}
     numbers: dict[tuple[str, ...], int] = {}
     marks: list[Mark] = []
     newest = -FAR
@@ -206,7 +238,8 @@ def _join(parts: Sequence[Columns]) -> tuple[
         newest = max([newest, *(int(log.max()) for key, log in part.arrays.items()
                                 if key.endswith('_log') and len(log))])
         arrays['frame_row'] = np.arange(len(arrays['frame_log']))
-        arrays['goal_file'] = np.full(len(arrays['goal_log']), index)
+        for key in ('mask', 'goal', 'goal_mask'):
+            arrays[f'{key}_file'] = np.full(len(arrays[f'{key}_log']), index)
         marks += part.marks
         for key, value in arrays.items():
             data[key].append(value)
@@ -306,6 +339,41 @@ def _newest(data: dict[str, np.ndarray], name: str, span: Span) -> int:
             return start + int(known[-1])
         end = start
     return -1
+
+
+def _masks(data: dict[str, np.ndarray], clock: _Clock,
+           parts: Sequence[Columns]) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return (F,) int64 file and row of each frame's robot mask, row -1 where there is none.
+
+    A mask belongs to the picture of its own stamp alone: the one before or after shows the robot
+    elsewhere, which is worse than none.
+    """
+    file = np.full(len(clock.frames), -1)
+    row = file.copy()
+    times, rows = clock.rows(data['mask_log'], data['mask_stamp'])
+    if len(times):
+        first = np.minimum(np.searchsorted(times, clock.frames), len(times) - 1)
+        found = times[first] == clock.frames
+        file[found], row[found] = (
+            data[key][rows[first[found]]] for key in ('mask_file', 'mask_index'))
+    lacking = row < 0
+    if len(data['mask_log']) and lacking.any():
+        warnings.warn(
+            f'{parts[0].source}: {len(np.unique(clock.owner[lacking]))} of {len(clock.spans)} '
+            f'episodes have frames without a robot mask of their stamp ({lacking.sum()} frames, '
+            f'the first at {seconds(int(clock.stamps[lacking][0]))} s); the masks of these '
+            'episodes are not used', RecordingWarning, stacklevel=4)
+    return file, row
+
+
+def _goal_mask(data: dict[str, np.ndarray], span: Span, goal: int) -> tuple[int, int] | None:
+    """Return file and row of the robot mask of a goal picture; None without one of its stamp."""
+    mask = _newest(data, 'goal_mask', span)
+    if min(goal, mask) < 0 or data['goal_mask_index'][mask] < 0 or (
+            data['goal_mask_stamp'][mask] != data['goal_stamp'][goal]):
+        return None
+    return int(data['goal_mask_file'][mask]), int(data['goal_mask_index'][mask])
 
 
 def _pick_names(data: dict[str, np.ndarray], clock: _Clock) -> tuple[np.ndarray, np.ndarray]:

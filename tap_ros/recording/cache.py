@@ -4,7 +4,8 @@
 Recordings as memory maps: decoded once, kept in a cache, then read at the speed of memory.
 
 Each MCAP file has a folder in the cache, named after the SHA-256 of its content, with the frames
-as one uint8 array and all else as columns. Any number of processes may build and read it at once.
+as one uint8 array, the robot masks as another, and all else as columns. Any number of processes
+may build and read it at once.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -36,6 +37,7 @@ ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
 _NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
 _PARSING = threading.Lock()
+_GOALS = ('goal_frames', 'goal_masks')  # of Columns, kept among the arrays
 
 
 class EpisodeStore:
@@ -69,6 +71,11 @@ class EpisodeStore:
         table, local = self._index[i]
         return table.frames(local)
 
+    def has_masks(self, i: int) -> bool:
+        """Tell whether every frame of episode i has a robot mask."""
+        table, local = self._index[i]
+        return table.has_masks(local)
+
 
 def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | Path | None = None,
                     progress: bool = True, image_topic: str | None = None) -> EpisodeStore:
@@ -85,7 +92,7 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     """
     paths = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     bags = [bag for path in paths for bag in find_bags(path)]
-    cache_dir = Path(cache_dir or os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
+    cache_dir = Path(cache_dir) if cache_dir else cache_folder()
     with tqdm(total=sum(file.stat().st_size for bag in bags for file in bag),
               desc='opening recordings', unit='B', unit_scale=True, disable=not progress,
               delay=1) as bar:
@@ -108,6 +115,11 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     if not len(store):
         raise RecordingError(f'{list_paths(paths)}: no camera image lies within an episode')
     return store
+
+
+def cache_folder() -> Path:
+    """Return the folder of the cache: $TAP_ROS_CACHE or ~/.cache/tap_ros."""
+    return Path(os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
 
 
 @dataclass(frozen=True)
@@ -190,15 +202,23 @@ def _build(job: _Job) -> None:
             f'{folder.parent}: the cache cannot be written ({error.strerror}); set {ENVIRONMENT} '
             'to a folder that can') from error
     try:
-        with open(part / 'frames.npy', 'wb') as stream:
-            _empty(stream)
-            columns = decode_file(path, dict(job.found), lambda pixels: stream.write(pixels.data),
-                                  lambda: _empty(stream))
-            _write_header(stream, columns)
+        with open(part / 'frames.npy', 'wb') as frames, open(part / 'masks.npy', 'wb') as masks:
+            def restart() -> None:
+                for stream in (frames, masks):
+                    _empty(stream)
+
+            restart()
+            columns = decode_file(path, dict(job.found), lambda pixels: frames.write(pixels.data),
+                                  lambda mask: masks.write(mask.data), restart)
+            size = columns.image_size or (0, 0)
+            _write_header(frames, (len(columns.arrays.get('frame_log', ())), *size, 3))
+            _write_header(masks, (len(columns.arrays.get('mask_log', ())), *size))
+        if 'mask_log' not in columns.arrays:
+            (part / 'masks.npy').unlink()
         _sort_frames(part / 'frames.npy', columns.arrays)
         arrays = {k: np.ascontiguousarray(a) for k, a in columns.arrays.items()}
-        if columns.goal_frames is not None:
-            arrays['goal_frames'] = columns.goal_frames
+        arrays |= {key: pictures for key in _GOALS
+                   if (pictures := getattr(columns, key)) is not None}
         save_file(arrays, part / 'columns.safetensors', {'columns': columns.describe()})
         _put(part, folder, path)
     except OSError as error:
@@ -230,9 +250,8 @@ def _empty(stream: BinaryIO) -> None:
     stream.write(bytes(_NPY_HEADER))
 
 
-def _write_header(stream: BinaryIO, columns: Columns) -> None:
-    """Put the header of an .npy file in front of the frames."""
-    shape = (len(columns.arrays.get('frame_log', ())), *(columns.image_size or (0, 0)), 3)
+def _write_header(stream: BinaryIO, shape: tuple[int, ...]) -> None:
+    """Put the header of an .npy file in front of what was written."""
     text = repr({'descr': '|u1', 'fortran_order': False, 'shape': shape})
     magic = np.lib.format.magic(1, 0)
     length = _NPY_HEADER - len(magic) - 2
@@ -244,12 +263,12 @@ def _sort_frames(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Bring the frames into the order of their log times, which they nearly always have."""
     order = arrays.pop('frame_order', None)
     if order is not None and (np.diff(order) != 1).any():
-        frames = _map_frames(path)
+        frames = _map(path)
         np.save(path, frames[order], allow_pickle=False)
 
 
-def _map_frames(path: Path) -> np.ndarray:
-    """Map the frames of a cache folder."""
+def _map(path: Path) -> np.ndarray:
+    """Map the frames or masks of a cache folder."""
     # numpy reads the header with ast, which now and then fails when threads do so at once.
     with _PARSING:
         return np.load(path, mmap_mode='r')
@@ -262,13 +281,17 @@ def _load(folder: Path, source: Path) -> Columns | None:
         with open(folder / 'columns.safetensors', 'rb') as stream:
             length = int.from_bytes(stream.read(8), 'little')
             about = json.loads(json.loads(stream.read(length))['__metadata__']['columns'])
-        count = len(arrays.get('frame_log', ()))
-        frames = _map_frames(folder / 'frames.npy') if count else None
+        count, num_masks = (len(arrays.get(f'{name}_log', ())) for name in ('frame', 'mask'))
+        frames = _map(folder / 'frames.npy') if count else None
+        masks = _map(folder / 'masks.npy') if num_masks else None
         if frames is not None and frames.shape != (count, *about['image_size'], 3):
+            return None
+        if masks is not None and masks.shape != (num_masks, *about['image_size']):
             return None
     except (OSError, EOFError, SafetensorError, ValueError, KeyError):
         return None
     return Columns(
         str(source), tuple(about['image_size']) if count else None, frames,
-        arrays.pop('goal_frames', None), arrays, [tuple(n) for n in about['names']],
-        [tuple(m) for m in about['marks']], about['damage'])
+        **{key: arrays.pop(key, None) for key in _GOALS}, masks=masks, arrays=arrays,
+        names=[tuple(n) for n in about['names']], marks=[tuple(m) for m in about['marks']],
+        damage=about['damage'])

@@ -22,7 +22,7 @@ from tap_ros.recording import topics
 from tap_ros.recording.container import McapFile
 from tap_ros.recording.lost import describe, EVERYTHING, FRAMES, gaps, Loss, NOTHING
 from tap_ros.recording.messages import decode
-from tap_ros.recording.pictures import read_pixels
+from tap_ros.recording.pictures import read_mask, read_pixels
 from tap_ros.recording.spans import Mark
 from tap_ros.text import escaped
 
@@ -35,6 +35,7 @@ _MAX_STATE = 2**20  # bytes of one of them
 _PADDED_BYTES, _PADDING = 2**28, 16  # objects may be padded to so much, or so many times theirs
 _CUTS = {topics.IMAGE: FRAMES, topics.TWIST: FRAMES, topics.GRIPPER_COMMAND: FRAMES,
          topics.EPISODE: EVERYTHING}  # what may be missing where one is; else NOTHING
+_GOALS = {topics.GOAL_IMAGE: 'goal', topics.GOAL_ROBOT_MASK: 'goal_mask'}  # names of columns
 
 
 @dataclass
@@ -43,7 +44,9 @@ class Columns:
     What one file holds; times in nanoseconds, N differs from topic to topic.
 
     arrays: <name>_log (N,) int64 and, where messages have a header, <name>_stamp (N,) int64, and
-        goal_index (N,) int64, row of goal_frames, -1 for an empty picture
+        goal_index, goal_mask_index (N,) int64, row of goal_frames and goal_masks, -1 for an empty
+            picture
+        mask_index (N,) int64, row of masks
         twist (N, 3) float32 linear; command (N,) float32 gripper opening
         joint (N, 4) float32 gripper state, NaN where unknown
         object, goal_object (N, K, 9) float64 u, v, pose; object_names, goal_object_names (N,)
@@ -56,6 +59,8 @@ class Columns:
     image_size: tuple[int, int] | None = None  # (H, W); None without any image
     frames: np.ndarray | None = None  # (F, H, W, 3) uint8, rows belong to frame_log
     goal_frames: np.ndarray | None = None  # (G, H, W, 3) uint8
+    masks: np.ndarray | None = None  # (M, H, W) uint8, of the robot; see mask_index
+    goal_masks: np.ndarray | None = None  # (N, H, W) uint8
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     names: list[tuple[str, ...]] = field(default_factory=list)  # of objects
     marks: list[Mark] = field(default_factory=list)  # by row of mark_log
@@ -70,6 +75,7 @@ class Columns:
 
 def decode_file(path: str | Path, found: dict[str, str],
                 write_frame: Callable[[np.ndarray], object],
+                write_mask: Callable[[np.ndarray], object],
                 restart: Callable[[], object]) -> Columns:
     """
     Read a file from front to back.
@@ -81,20 +87,23 @@ def decode_file(path: str | Path, found: dict[str, str],
     :param found: dict from the names in topics to the file's topics, as topics.resolve gives it.
     :param write_frame: called with the pixels of one camera image after the other, (H, W, 3)
         uint8, in the order of the file; they are not to be kept.
+    :param write_mask: called likewise with robot masks, (H, W) uint8.
     :param restart: called without arguments when all that was written is to be forgotten, because
         the first picture was not of the size that most are.
-    :return: Columns without frames; its 'frame_order' (F,) int64 puts what was written in order.
+    :return: Columns without frames and masks; its 'frame_order' (F,) int64 puts the frames that
+        were written in order.
     :raises RecordingError: when no size of pictures is that of more than half of them, or the
         file would take more memory or time than any recording of its size; it names the file.
     """
     size = None
     while True:
-        decoder = _Decoder(McapFile(path), found, write_frame, size)
+        decoder = _Decoder(McapFile(path), found, write_frame, write_mask, size)
         try:
             for topic, log, data in decoder.file.messages(set(found.values())):
                 decoder.take(topic, log, data)
             most = decoder.most_frequent_size()
-            if most == decoder.columns.image_size:
+            if most == decoder.columns.image_size and (
+                    most is None or decoder.mask_size in (None, most)):
                 return decoder.finish()
         except RecordingError as error:
             raise RecordingError(f'{path}: {error}') from error
@@ -107,10 +116,13 @@ class _Decoder:
 
     def __init__(self, file: McapFile, found: dict[str, str],
                  write_frame: Callable[[np.ndarray], object],
+                 write_mask: Callable[[np.ndarray], object],
                  size: tuple[int, int] | None) -> None:
         self.file = file
         self.found = found
-        self.write_frame = write_frame
+        self.write_frame, self.write_mask = write_frame, write_mask
+        self.mask_size = size  # (H, W) of the first robot mask that was written
+        self.num_masks = 0
         self.columns = Columns(str(file.path), size)
         self.sizes: Counter[tuple[int, int]] = Counter()  # (H, W) -> camera images
         self.losses: list[Loss] = []
@@ -119,11 +131,13 @@ class _Decoder:
         self.numbers: defaultdict[str, array[float]] = defaultdict(
             lambda: array('d'))  # column -> as many as its rows have
         self.names: dict[tuple[str, ...], int] = {}  # tuple of object names -> number
-        self.goals: list[np.ndarray] = []
+        self.goals: dict[str, list[np.ndarray]] = {'goal': [], 'goal_mask': []}
         self.state_bytes = 0  # of messages that are no pictures
         self.most_state_bytes = _FREE_STATES + _STATES_PER_BYTE * len(file.data)
         decoders = {
-            topics.IMAGE: self._image, topics.GOAL_IMAGE: self._goal_image,
+            topics.IMAGE: self._image, topics.ROBOT_MASK: self._mask,
+            topics.GOAL_IMAGE: lambda *a: self._goal_picture('goal', read_pixels, *a),
+            topics.GOAL_ROBOT_MASK: lambda *a: self._goal_picture('goal_mask', read_mask, *a),
             topics.TWIST: self._twist, topics.GRIPPER_COMMAND: self._command,
             topics.JOINT_STATES: self._joints, topics.EPISODE: self._mark,
             topics.OBJECTS: lambda *a: self._objects('object', *a),
@@ -135,7 +149,7 @@ class _Decoder:
     def take(self, topic: str, log: int, data: memoryview) -> None:
         """Take a message; note it when it cannot be used."""
         for name, decoder in self.decoders[topic]:
-            state = name not in (topics.IMAGE, topics.GOAL_IMAGE)
+            state = name not in topics.PICTURES
             if state:
                 self._charge(len(data))
             try:
@@ -144,8 +158,8 @@ class _Decoder:
                 decoder(log, decode(topics.TYPES[name], data))
             except RecordingError as error:
                 self._lose(name, log, error)
-                if name == topics.GOAL_IMAGE:  # what was said before holds no more
-                    self._add('goal', log, stamp=0, index=-1)
+                if name in _GOALS:  # what was said before holds no more
+                    self._add(_GOALS[name], log, stamp=0, index=-1)
                 elif name == topics.GOAL_OBJECTS:
                     self._add_objects('goal_object', log, 0, (), ())
 
@@ -163,7 +177,11 @@ class _Decoder:
 
     def finish(self) -> Columns:
         """Make arrays, rows in the order of their log times."""
-        self._drop_goals()
+        for topic, name in _GOALS.items():
+            self._drop_goals(topic, name)
+        if self.columns.image_size is None:  # masks of nothing, whose size nothing tells
+            for key in ('mask_log', 'mask_stamp', 'mask_index'):
+                self.integers.pop(key, None)
         arrays = {key: np.array(column, np.int64) for key, column in self.integers.items()}
         with np.errstate(over='ignore'):  # absurd numbers become infinite
             for key, (width, dtype) in _NUMBERS.items():
@@ -188,26 +206,27 @@ class _Decoder:
             columns.damage, arrays['gap'] = describe(losses), gaps(losses)
         columns.arrays = arrays
         columns.names = list(self.names)
-        if self.goals:
-            columns.goal_frames = np.stack(self.goals)
+        columns.goal_frames, columns.goal_masks = (
+            np.stack(pictures) if pictures else None for pictures in self.goals.values())
         return columns
 
-    def _drop_goals(self) -> None:
+    def _drop_goals(self, topic: str, name: str) -> None:
         """Take back goal pictures that are not of the size of the others, or of the camera's."""
-        size = self.columns.image_size or (self.goals[0].shape[:2] if self.goals else None)
-        kept = [goal for goal in self.goals if goal.shape[:2] == size]
-        if size is None or len(kept) == len(self.goals):
+        goals = self.goals[name]
+        size = self.columns.image_size or (goals[0].shape[:2] if goals else None)
+        kept = [goal for goal in goals if goal.shape[:2] == size]
+        if size is None or len(kept) == len(goals):
             return
-        logs, index, number = self.integers['goal_log'], self.integers['goal_index'], 0
+        logs, index, number = self.integers[f'{name}_log'], self.integers[f'{name}_index'], 0
         for row, old in enumerate(index):
             if old < 0:
                 continue
-            good = self.goals[old].shape[:2] == size
+            good = goals[old].shape[:2] == size
             index[row], number = (number, number + 1) if good else (-1, number)
             if not good:
-                self._lose(topics.GOAL_IMAGE, logs[row], RecordingError(
+                self._lose(topic, logs[row], RecordingError(
                     f'a goal of another size than {size[1]}x{size[0]} pixels'))
-        self.goals = kept
+        self.goals[name] = kept
 
     def _lose(self, name: str, log: int, error: RecordingError) -> None:
         """Note a message that cannot be used."""
@@ -242,13 +261,28 @@ class _Decoder:
         self.write_frame(pixels)
         self._add('frame', log, stamp=_stamp(message))
 
-    def _goal_image(self, log: int, message: Any) -> None:
-        pixels = read_pixels(message)
+    def _mask(self, log: int, message: Any) -> None:
+        mask = read_mask(message)
+        if 0 in mask.shape:
+            raise RecordingError('an empty robot mask')
+        # A mask may come before the first picture; its size is judged at the end.
+        size = self.columns.image_size or self.mask_size or mask.shape
+        if mask.shape != size:
+            raise RecordingError('a robot mask of {1}x{0} pixels among pictures of {3}x{2}'.format(
+                *mask.shape, *size))
+        self.mask_size = self.mask_size or mask.shape
+        self.write_mask(mask)
+        self._add('mask', log, stamp=_stamp(message), index=self.num_masks)
+        self.num_masks += 1
+
+    def _goal_picture(self, name: str, read: Callable[[Any], np.ndarray], log: int,
+                      message: Any) -> None:
+        pixels = read(message)
         if 0 in pixels.shape:
-            self._add('goal', log, stamp=_stamp(message), index=-1)
+            self._add(name, log, stamp=_stamp(message), index=-1)
         else:
-            self._add('goal', log, stamp=_stamp(message), index=len(self.goals))
-            self.goals.append(pixels.copy())
+            self._add(name, log, stamp=_stamp(message), index=len(self.goals[name]))
+            self.goals[name].append(pixels.copy())
 
     def _twist(self, log: int, message: Any) -> None:
         linear = message.twist.linear

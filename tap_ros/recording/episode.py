@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from tap_ros.errors import RecordingError
+from tap_ros.recording.pictures import wrong_mask_value
 
 OUTCOMES = ('success', 'failure', 'interrupted', '')
 
@@ -36,6 +37,9 @@ class Episode:
     task: str = ''  # for example 'push2'; '' when unknown
     seed: int = 0
     outcome: str = ''  # one of OUTCOMES
+    # (T, H, W) uint8, ROBOT_MASK_FREE, _HAND or _ARM; None unless every frame has one
+    robot_masks: np.ndarray | None = None
+    goal_mask: np.ndarray | None = None  # (H, W) uint8: likewise, of the picture of the goal
 
     def __len__(self) -> int:
         """Return the number of frames T."""
@@ -56,15 +60,23 @@ def check_episode(episode: Episode) -> None:
         'actions': ((T, 4), np.float32), 'grippers': ((T, 4), np.float32),
         'object_pixels': ((T, K, 2), np.float32), 'object_poses': ((T, K, 7), np.float64),
         'goal_pixels': ((K, 2), np.float32), 'goal_poses': ((K, 7), np.float64),
-        'goal_frame': ((*size, 3), np.uint8)}
-    if episode.goal_frame is None:
-        del wanted['goal_frame']
+        'goal_frame': ((*size, 3), np.uint8), 'robot_masks': ((T, *size), np.uint8),
+        'goal_mask': (size, np.uint8)}
+    for field in ('goal_frame', 'robot_masks', 'goal_mask'):
+        if getattr(episode, field) is None:
+            del wanted[field]
     for field, (shape, dtype) in wanted.items():
         array = np.asarray(getattr(episode, field))
         if array.shape != shape or array.dtype != dtype:
             raise RecordingError(
                 f'Episode.{field}: expected shape {shape} and type {np.dtype(dtype)}, '
                 f'got {array.shape} and {array.dtype}')
+    for field in ('robot_masks', 'goal_mask'):
+        mask = getattr(episode, field)
+        if mask is not None and (wrong := wrong_mask_value(mask)) is not None:
+            raise RecordingError(f'Episode.{field}: {wrong}')
+    if episode.goal_mask is not None and episode.goal_frame is None:
+        raise RecordingError('Episode.goal_mask: expected None, as there is no goal_frame')
     if T == 0 or 0 in size:
         raise RecordingError('Episode.frames: expected at least one frame of at least one pixel')
     if episode.stamps[0] < 0 or (np.diff(episode.stamps) <= 0).any():

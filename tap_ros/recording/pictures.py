@@ -5,8 +5,18 @@
 from typing import Any
 
 import numpy as np
-from tap_ros.contract import ENCODINGS, PICTURE_ENCODING
+from tap_ros.contract import (
+    ENCODINGS,
+    MASK_ENCODING,
+    PICTURE_ENCODING,
+    ROBOT_MASK_ARM,
+    ROBOT_MASK_FREE,
+    ROBOT_MASK_HAND,
+)
 from tap_ros.errors import RecordingError
+
+_MASK_VALUES = (ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM)
+_IS_MASK_VALUE = np.isin(np.arange(256), _MASK_VALUES)
 
 
 def read_pixels(message: Any) -> np.ndarray:
@@ -16,20 +26,61 @@ def read_pixels(message: Any) -> np.ndarray:
     :param message: sensor_msgs/Image as messages.decode returns it.
     :raises RecordingError: when it cannot be read or contradicts itself.
     """
-    height, width, step, encoding = message.height, message.width, message.step, message.encoding
-    length = len(message.data)
-    channels, order = ENCODINGS.get(encoding, (0, (0, 0, 0)))
-    if length == height * width == 0:
+    if _is_empty(message):
         return np.empty((0, 0, 3), np.uint8)
+    channels, order = ENCODINGS.get(message.encoding, (0, (0, 0, 0)))
     if not channels:
-        raise RecordingError(
-            f'encoding {encoding[:40]!r} cannot be read; choose one of {", ".join(ENCODINGS)}')
-    if height * width == 0 or step < width * channels or length != height * step:
-        raise RecordingError(
-            f'a {encoding} image of {width}x{height} pixels with step {step} and {length} '
-            f'bytes of data; expected a step of at least {width * channels} and '
-            'step * height bytes')
-    pixels = message.data.reshape(height, step)[:, :width * channels].reshape(height, width, -1)
-    if encoding != PICTURE_ENCODING:
+        raise RecordingError(f'encoding {message.encoding[:40]!r} cannot be read; choose one of '
+                             f'{", ".join(ENCODINGS)}')
+    pixels = _rows(message, channels)
+    if message.encoding != PICTURE_ENCODING:
         pixels = pixels[..., list(order)]
     return np.ascontiguousarray(pixels)
+
+
+def read_mask(message: Any) -> np.ndarray:
+    """
+    Return the pixels of a robot mask, (H, W) uint8; H = W = 0 when it holds none.
+
+    :param message: sensor_msgs/Image as messages.decode returns it.
+    :raises RecordingError: when it cannot be read, contradicts itself, or holds other values.
+    """
+    if _is_empty(message):
+        return np.empty((0, 0), np.uint8)
+    if message.encoding != MASK_ENCODING:
+        raise RecordingError(f'encoding {message.encoding[:40]!r} is not that of a robot mask; '
+                             f'expected {MASK_ENCODING}')
+    mask = np.ascontiguousarray(_rows(message, 1)[..., 0])
+    wrong = wrong_mask_value(mask)
+    if wrong is not None:
+        raise RecordingError(wrong)
+    return mask
+
+
+def wrong_mask_value(mask: np.ndarray) -> str | None:
+    """
+    Say what is wrong with the values of a robot mask, None if nothing is.
+
+    :param mask: uint8, any shape.
+    """
+    right = _IS_MASK_VALUE[mask]
+    if right.all():
+        return None
+    return (f'a robot mask with the value {mask[~right][0]}; expected {ROBOT_MASK_FREE} (free), '
+            f'{ROBOT_MASK_HAND} (hand) or {ROBOT_MASK_ARM} (arm)')
+
+
+def _is_empty(message: Any) -> bool:
+    return len(message.data) == message.height * message.width == 0
+
+
+def _rows(message: Any, channels: int) -> np.ndarray:
+    """Return uint8 (H, W, channels), without padding; RecordingError for a wrong layout."""
+    height, width, step = message.height, message.width, message.step
+    length = len(message.data)
+    if height * width == 0 or step < width * channels or length != height * step:
+        raise RecordingError(
+            f'a {message.encoding} image of {width}x{height} pixels with step {step} and {length} '
+            f'bytes of data; expected a step of at least {width * channels} and '
+            'step * height bytes')
+    return message.data.reshape(height, step)[:, :width * channels].reshape(height, width, -1)

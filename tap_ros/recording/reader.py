@@ -49,12 +49,19 @@ def iter_episodes(path: str | Path, image_topic: str | None = None) -> Iterator[
 def _decode(file: Path, found: dict[str, str]) -> Columns:
     """Return the Columns of a file, frames in memory."""
     pieces: list[bytes] = []
-    part = decode_file(
-        file, found, lambda pixels: pieces.append(pixels.tobytes()), pieces.clear)
+    masks: list[bytes] = []
+
+    def restart() -> None:
+        pieces.clear()
+        masks.clear()
+
+    part = decode_file(file, found, lambda pixels: pieces.append(pixels.tobytes()),
+                       lambda mask: masks.append(mask.tobytes()), restart)
     order = part.arrays.pop('frame_order', None)
     if pieces and order is not None and part.image_size is not None:
         frames = np.frombuffer(b''.join(pieces), np.uint8).reshape(-1, *part.image_size, 3)
         part.frames = frames if (np.diff(order) == 1).all() else frames[order]
+        part.masks = np.frombuffer(b''.join(masks), np.uint8).reshape(-1, *part.image_size)
     warn_of_damage(part)
     return part
 
@@ -75,13 +82,13 @@ def _closed(part: Columns) -> bool:
 def _kept(parts: list[Columns]) -> list[Columns]:
     """Return what later files need to know of those before: their marks, goals and gaps."""
     kept = parts[-1:]
-    for key in ('goal_log', 'goal_object_log', 'gap'):
+    for key in ('goal_log', 'goal_mask_log', 'goal_object_log', 'gap'):
         last = next((part for part in reversed(parts) if key in part.arrays), None)
         if last is not None and not any(last is part for part in kept):
             kept.insert(0, last)
     kept = [part for part in parts if any(part is other for other in kept)]
     return [
-        replace(part, frames=None, arrays={
+        replace(part, frames=None, masks=None, arrays={
             key: value for key, value in part.arrays.items()
             if key.startswith(('goal_', 'mark_', 'gap'))})
         for part in kept]

@@ -10,29 +10,35 @@ from tap_ros.errors import RecordingError
 from tap_ros.text import listing
 
 IMAGE = '/camera/image_raw'
+ROBOT_MASK = '/camera/robot_mask'
 CAMERA_INFO = '/camera/camera_info'
 OBJECTS = '/objects'
 JOINT_STATES = '/joint_states'
 TWIST = '/arm/delta_twist_cmds'
 GRIPPER_COMMAND = '/gripper/command'
 GOAL_IMAGE = '/goal/image'
+GOAL_ROBOT_MASK = '/goal/robot_mask'
 GOAL_OBJECTS = '/goal/objects'
 EPISODE = '/episode'
 CLOCK = '/clock'
 
 TYPES = {
     IMAGE: 'sensor_msgs/msg/Image',
+    ROBOT_MASK: 'sensor_msgs/msg/Image',
     CAMERA_INFO: 'sensor_msgs/msg/CameraInfo',
     OBJECTS: 'tap_msgs/msg/ObjectStates',
     JOINT_STATES: 'sensor_msgs/msg/JointState',
     TWIST: 'geometry_msgs/msg/TwistStamped',
     GRIPPER_COMMAND: 'std_msgs/msg/Float64',
     GOAL_IMAGE: 'sensor_msgs/msg/Image',
+    GOAL_ROBOT_MASK: 'sensor_msgs/msg/Image',
     GOAL_OBJECTS: 'tap_msgs/msg/ObjectStates',
     EPISODE: 'tap_msgs/msg/Episode',
     CLOCK: 'rosgraph_msgs/msg/Clock',
 }
-LATCHED = frozenset({GOAL_IMAGE, GOAL_OBJECTS})  # transient_local, depth 1: late joiners get it
+# transient_local, depth 1: late joiners get it
+LATCHED = frozenset({GOAL_IMAGE, GOAL_ROBOT_MASK, GOAL_OBJECTS})
+PICTURES = frozenset({IMAGE, ROBOT_MASK, GOAL_IMAGE, GOAL_ROBOT_MASK})
 
 
 @dataclass(frozen=True)

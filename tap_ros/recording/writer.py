@@ -18,7 +18,13 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import CAMERA_FRAME, GRIPPER_JOINTS, PICTURE_ENCODING, WORLD_FRAME
+from tap_ros.contract import (
+    CAMERA_FRAME,
+    GRIPPER_JOINTS,
+    MASK_ENCODING,
+    PICTURE_ENCODING,
+    WORLD_FRAME,
+)
 from tap_ros.errors import RecordingError, StorageError
 from tap_ros.files import storage_errors
 from tap_ros.recording import metadata, topics
@@ -135,7 +141,7 @@ class EpisodeWriter:
             'distortion_model': 'plumb_bob', 'd': np.zeros(5), 'k': K, 'r': np.eye(3),
             'p': np.hstack([K, np.zeros((3, 1))])}
         self._last_log: int | None = None
-        self._goal_known = self._goal_objects_known = False
+        self._goal_known = self._goal_mask_known = self._goal_objects_known = False
 
     def __enter__(self) -> Self:
         return self
@@ -180,6 +186,8 @@ class EpisodeWriter:
         self._put(topics.CLOCK, stamp, {'clock': _time(stamp)})
         self._put(topics.CAMERA_INFO, stamp, {**camera, **self._camera})
         self._put(topics.IMAGE, stamp, _image(frame, stamp))
+        if episode.robot_masks is not None:
+            self._put(topics.ROBOT_MASK, stamp, _image(episode.robot_masks[t], stamp))
         if episode.object_names:
             self._put(topics.OBJECTS, stamp, _objects(
                 stamp, episode.object_names, episode.object_pixels[t], episode.object_poses[t]))
@@ -201,10 +209,16 @@ class EpisodeWriter:
             frame = episode.goal_frame
             self._put(topics.GOAL_IMAGE, stamp, _image(
                 np.zeros((0, 0, 3), np.uint8) if frame is None else frame, stamp))
+        masked = episode.goal_mask is not None
+        if masked or self._goal_mask_known:
+            mask = episode.goal_mask
+            self._put(topics.GOAL_ROBOT_MASK, stamp, _image(
+                np.zeros((0, 0), np.uint8) if mask is None else mask, stamp))
         if episode.object_names or self._goal_objects_known:
             self._put(topics.GOAL_OBJECTS, stamp, _objects(
                 stamp, episode.object_names, episode.goal_pixels, episode.goal_poses))
-        self._goal_known, self._goal_objects_known = known, bool(episode.object_names)
+        self._goal_known, self._goal_mask_known = known, masked
+        self._goal_objects_known = bool(episode.object_names)
 
     def _mark(self, episode: Episode, stamp: int, event: int) -> None:
         self._put(topics.EPISODE, stamp, {
@@ -273,10 +287,12 @@ def _header(stamp: int, frame_id: str) -> dict[str, Any]:
 
 
 def _image(frame: np.ndarray, stamp: int) -> dict[str, Any]:
-    height, width, _ = frame.shape
+    """Return the message of a picture (H, W, 3) or a mask (H, W)."""
+    height, width, *channels = frame.shape
     return {
         'header': _header(stamp, CAMERA_FRAME), 'height': height, 'width': width,
-        'encoding': PICTURE_ENCODING, 'step': 3 * width, 'data': frame}
+        'encoding': PICTURE_ENCODING if channels else MASK_ENCODING,
+        'step': width * (channels or [1])[0], 'data': frame}
 
 
 def _objects(stamp: int, names: Sequence[str], pixels: np.ndarray,

@@ -7,13 +7,15 @@ from lively import lively_network
 import numpy as np
 from processes import Client, NodeProcess
 import pytest
+from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.learning.weights import save_weights
 from tap_ros.nodes.clients import call, Newest, wait_for_future
 from tap_ros.nodes.image_messages import decode_image, encode_image
 from tap_ros.nodes.object_messages import encode_objects
-from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, to_stamp
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 
 pytestmark = pytest.mark.slow
 NAMES = ('cup', 'box')
@@ -84,7 +86,8 @@ def services(tmp_path_factory):
     with Client() as node:
         try:
             for name, files in (('both', {'weights': between, 'forward_weights': forward}),
-                                ('forward', {'weights': forward}), ('plain', {'weights': plain})):
+                                ('forward', {'weights': forward}), ('plain', {'weights': plain}),
+                                ('masked', {'weights': plain, 'robot_mask': 'all'})):
                 started[name] = Service(node, name, folder, **files)
             for service in started.values():
                 service.process.wait_for('ready', 120)
@@ -200,6 +203,52 @@ def test_why_there_are_no_maps_is_said_of_each_picture(services):
     publishers += [plain.publish('goal/objects', GOAL_OBJECTS)]
     response = reason('maps of cup, box')
     assert response.subgoals == plain.answer(**WITH_GOAL).subgoals
+
+
+def test_the_robot_is_taken_out_of_the_newest_picture(services):
+    masked = services['masked']
+    assert 'robot_mask is all, but the bidirectional weights' in masked.process.text
+    scene, goal = PICTURES
+    mask = np.zeros((32, 32), np.uint8)
+    mask[5:20, 8:24] = ROBOT_MASK_ARM
+    robot = np.where(mask[..., None] > 0, 255 - scene, scene)
+    expected, differing = (
+        pictures(masked.answer(start=encode_image(picture, STAMP, 'eye'), goal=GOAL))
+        for picture in (scene, robot))  # what a request brings along stays as it is
+    assert differ(expected, differing) > 1
+    images = masked.node.create_publisher(Image, '/masked/camera/image_raw', STREAM)
+    masks = masked.node.create_publisher(Image, '/masked/camera/robot_mask', STREAM)
+
+    def publish(picture, hidden, stamp):
+        images.publish(encode_image(picture, to_stamp(stamp), 'eye'))
+        if hidden is not None:
+            message = Image(height=32, width=32, step=32, encoding='mono8', data=hidden.tobytes())
+            message.header.stamp = to_stamp(stamp)
+            masks.publish(message)
+
+    stamp, response = 10**9, None
+    for _ in range(100):  # until it is discovered
+        stamp += 10**8
+        publish(scene, mask * 0, stamp)
+        response = masked.ask(goal=GOAL)
+        if response.success:
+            break
+    assert response.success, response.message
+    assert (pictures(response) == expected).all()
+    publish(robot, mask, stamp + 10**8)
+    publish(robot, mask, stamp + 2 * 10**8)
+    for _ in range(100):
+        response = masked.answer(goal=GOAL)
+        if response.subgoals[0].header.stamp == to_stamp(stamp + 2 * 10**8):
+            break
+    assert (pictures(response) == expected).all()
+    publish(robot, None, stamp + 3 * 10**8)
+    for _ in range(100):
+        response = masked.ask(goal=GOAL)
+        if not response.success:
+            break
+    assert '/masked/camera/robot_mask' in response.message
+    assert f'{(stamp + 3 * 10**8) / 1e9:.9f} s' in response.message
 
 
 def test_many_requests_at_once_all_get_their_own_answer(services):

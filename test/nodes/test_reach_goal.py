@@ -261,3 +261,37 @@ def test_the_planner_keeps_within_the_limits_of_the_parameters(loop):
     assert np.array_equal(moves[0], plan.action[:3])  # nothing is cut off what was planned
     assert np.abs(moves[:, :2]).max() <= 0.02 + 1e-6 and np.abs(moves[:, 2]).max() <= 0.04 + 1e-6
     assert np.abs(moves).max() > 0.01
+
+
+def test_with_a_robot_mask_the_arm_moves_only_where_a_mask_comes(loop):
+    assert loop.processes['visual_mpc_node'].end() == 0
+    loop.start('visual_mpc_node', robot_mask='all', image_timeout=2.0)
+    masks = loop.node.create_publisher(Image, 'camera/robot_mask', STREAM)
+    sending = threading.Event()
+
+    def answer(image):
+        """Publish a mask for a picture: the robot hides nothing."""
+        if sending.is_set():
+            message = Image(header=image.header, height=image.height, width=image.width,
+                            step=image.width, encoding='mono8',
+                            data=bytes(image.height * image.width))
+            masks.publish(message)
+
+    images = loop.node.create_subscription(Image, 'camera/image_raw', answer, STREAM)
+    try:
+        loop.processes['visual_mpc_node'].wait_for('ready', 120)
+        loop.reset()
+        status, result = loop.reach(mode='direct', step_budget=2)
+        assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+        assert '/camera/robot_mask' in result.message
+        assert loop.stopped()
+        sending.set()
+        loop.reset()
+        status, result = loop.reach(mode='direct', step_budget=2)
+        assert status == GoalStatus.STATUS_SUCCEEDED and result.steps == 2, result.message
+    finally:
+        loop.node.destroy_subscription(images)
+        loop.node.destroy_publisher(masks)
+        loop.processes['visual_mpc_node'].end()
+        loop.start('visual_mpc_node')
+        loop.processes['visual_mpc_node'].wait_for('ready', 120)

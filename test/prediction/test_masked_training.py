@@ -1,0 +1,201 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A masked robot leaves no trace in losses, gradients and choices."""
+
+from dataclasses import replace
+
+from made_episodes import cover, move_squares, write_bag
+import numpy as np
+import pytest
+from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.images import to_float
+from tap_ros.learning.filled import fill
+from tap_ros.learning.weights import load_weights
+from tap_ros.prediction.augmentation import Augmentation
+from tap_ros.prediction.batches import make_batch, Sampling
+from tap_ros.prediction.discriminator import Discriminator
+from tap_ros.prediction.held_out import held_out_scores
+from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.objective import discriminators_loss, Draws, Networks, predictor_loss
+from tap_ros.prediction.recognition import Recognition
+from tap_ros.prediction.selection import Targets
+from tap_ros.prediction.training import train
+from tap_ros.prediction.training_config import ObjectiveSettings, TrainingConfig
+from tap_ros.recording.cache import open_recordings
+import torch
+
+CHOSEN = [0, 1, 2, 3]
+
+
+def make_episode(seed):
+    """Draw two squares that move, in 7 to 11 frames; the goal picture is none of them."""
+    rng = np.random.default_rng(seed)
+    start = rng.uniform(6, 22, (2, 2))
+    goal = start + rng.uniform(4, 6, (2, 2)) * rng.choice([-1, 1], (2, 2))
+    episode = move_squares(start, goal, length=7 + seed % 5, seed=seed)
+    return replace(episode, goal_frame=255 - episode.frames[-1])
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    """Write the same episodes twice, with robots that look different."""
+    folder = tmp_path_factory.mktemp('covered')
+    return [write_bag(folder / f'robot{seed}', [
+        cover(make_episode(i), side=6, seed=seed) for i in range(8)]) for seed in range(2)]
+
+
+def batches(bags, robot_mask, **sampling):
+    """Return the batches of two recordings, with the context pictures of the first."""
+    found = []
+    for bag in bags:
+        store = open_recordings([bag], progress=False)
+        found.append(make_batch(store, CHOSEN, Sampling(margin=1, video_frames=4, **sampling),
+                                filled=fill(store, robot_mask)))
+    return found[0], replace(found[1], context=found[0].context)
+
+
+def networks(method, images=4):
+    """Make the networks of a method; its recognition network sees so many pictures."""
+    torch.manual_seed(0)
+    config = PredictorConfig(image_size=32, base_width=4, num_context=2,
+                             latent_size=3 if method.vae else 0, new_pixels=True)
+    return Networks(
+        Predictor(config), Recognition(config, images) if method.vae else None,
+        Discriminator(config, 12) if method.gan else None,
+        Discriminator(config, 12) if method.gan and method.vae else None)
+
+
+def learn(batch, config):
+    """Return loss, match and the gradients of all networks."""
+    nets = networks(config.chosen, 4 if config.posterior == 'video' else 3)
+    augmentation = Augmentation.draw(len(CHOSEN), True, True, 0.2, np.random.default_rng(1))
+    assert augmentation.flip.any() and not augmentation.flip.all()
+    outcome = predictor_loss(nets, batch, augmentation, config, Draws.make(batch, 3, 0, 0))
+    loss = outcome.loss
+    if outcome.judged is not None:
+        loss = loss + discriminators_loss(outcome.judged)
+    loss.backward()
+    return [outcome.loss.detach(), outcome.match, *(
+        parameter.grad for net in vars(nets).values() if net is not None
+        for parameter in net.parameters() if parameter.grad is not None)]
+
+
+@pytest.mark.parametrize('values', [
+    {'method': 'genmin-wo-gan+progress', 'changed_weight': 2.0},
+    {'method': 'genmin-wo-gan+relative', 'recursion': 2},
+    {'method': 'genmin-wo-gan+reach'}, {'method': 'genmin-vae-gan'},
+    {'method': 'genmin-vae', 'posterior': 'frame'}], ids=lambda values: values['method'])
+def test_what_the_robot_looks_like_changes_nothing(bags, values):
+    config = ObjectiveSettings(**values)
+    one, other = (learn(batch, config) for batch in batches(bags, 'all'))
+    assert len(one) == len(other) > 10
+    assert all(a.equal(b) for a, b in zip(one, other))
+    if values['method'] == 'genmin-wo-gan+progress':  # with no or half a mask it does
+        for robot_mask in ('none', 'arm'):
+            one, other = (learn(batch, config) for batch in batches(bags, robot_mask))
+            assert not one[0].equal(other[0])
+
+
+def test_pixels_that_are_never_free_have_no_gradient(bags):
+    batch, _ = batches(bags, 'all')
+    assert (~batch.seen).sum() == 4 * len(CHOSEN)  # the base
+    augmentation = Augmentation.draw(len(CHOSEN), True, True, 0.2, np.random.default_rng(1))
+    targets = Targets(batch, augmentation, ObjectiveSettings())
+    context = augmentation.apply(to_float(batch.context))
+    image = torch.rand(len(CHOSEN), 3, 32, 32, requires_grad=True)
+    targets.loss(image, torch.zeros(len(CHOSEN), dtype=torch.int64), context).backward()
+    touched = (augmentation.undo(image.grad[:, None] - 1)[:, 0] + 1).abs().sum(1) > 1e-9
+    assert not touched[~batch.seen].any()
+    assert touched[batch.seen].float().mean() > 0.99
+
+
+def test_a_perfect_prediction_without_the_robot_has_no_error(bags):
+    batch, _ = batches(bags, 'all')
+    config = ObjectiveSettings(method='min-wo-gan', outer_power=1.0)
+    targets = Targets(batch, None, config)
+    image = to_float(batch.targets[:, 2])
+    image[:, :, -2:, -2:] = torch.rand(len(CHOSEN), 3, 2, 2)  # where the base is
+    match = targets.match(image, to_float(batch.context), lambda error, *_: error)
+    assert match.tolist() == [2] * len(CHOSEN)
+    assert targets.loss(image, match, to_float(batch.measured)).item() < 1e-6
+
+
+def test_progress_does_not_count_the_robot(bags):
+    batch, _ = batches(bags, 'all')
+    targets = Targets(batch, None, ObjectiveSettings())
+    bare = open_recordings([bags[0]], progress=False)
+    scene = [make_episode(i) for i in CHOSEN]
+    errors = targets.errors(targets.measured(to_float(batch.context)))
+    seen = batch.seen.numpy()
+    for b, episode in enumerate(scene):
+        free = np.where(seen[b][..., None], episode.frames, 0)
+        # Objects may be filled with where they were; the robot's noise would be far more.
+        expected = np.abs(free[2].astype(int) - free[0]).mean() / 255
+        assert errors[b, 0, 0].item() == pytest.approx(expected, abs=0.02)
+    plain = make_batch(bare, CHOSEN, Sampling(margin=1))
+    with_robot = Targets(plain, None, ObjectiveSettings()).errors(to_float(plain.context))
+    assert (with_robot[plain.valid[:, None].expand_as(with_robot)].min()
+            > 2 * errors[plain.valid[:, None].expand_as(errors)].min())
+
+
+@pytest.mark.parametrize('share', [0.0, 0.5, 1.0])
+def test_context_pictures_are_filled_when_asked_to(bags, share):
+    store = open_recordings([bags[0]], progress=False)
+    filled = fill(store, 'all')
+    chosen = np.arange(8).repeat(8)
+    batch = make_batch(store, chosen, Sampling(fill_context=share), filled=filled,
+                       rng=np.random.default_rng(0))
+    shown = np.array([(context.numpy() == filled.frames([i], np.array([[0]]))[0, 0].numpy()).all()
+                      for i, context in zip(chosen, batch.context[:, 0])])
+    assert abs(shown.mean() - share) < 0.2
+    for row in np.flatnonzero(~shown):
+        assert (batch.context[row, 0].numpy() == store.frames(chosen[row])[0]).all()
+    assert (batch.bare[:, :, -2:, -2:] == 0).all() and (batch.targets[:, :, -2:, -2:] == 0).all()
+
+
+def test_without_a_mask_a_batch_has_nothing_more(bags):
+    batch, _ = batches(bags, 'none')
+    assert batch.seen is None and batch.bare is None and batch.measured is batch.context
+    image = torch.zeros(4, 1, 3, 32, 32)
+    assert batch.visible(image) is image
+
+
+@pytest.fixture
+def config(bags, tmp_path):
+    return TrainingConfig(
+        recordings=(str(bags[0]),), out=str(tmp_path / 'run'), base_width=4, batch_size=4, steps=2,
+        warmup=1, margin=1, test_fraction=0.3, threads=1, save_every=2, log_every=1,
+        robot_mask='all')
+
+
+def test_weights_say_which_mask_they_were_trained_with(config, bags, tmp_path):
+    config = replace(config, pretrain_steps=1, fill_context=0.5)
+    about = load_weights(train(config, progress=False), 'predictor')[2]
+    assert about['settings']['robot_mask'] == 'all' and about['settings']['fill_context'] == 0.5
+    with pytest.raises(ConfigError, match='robot_mask'):
+        train(replace(config, robot_mask='arm'), progress=False)  # a run is of one setting
+
+
+def test_training_without_masks_or_with_half_of_the_settings_is_refused(config, bag):
+    with pytest.raises(RecordingError, match='robot_mask all .* /camera/robot_mask'):
+        train(replace(config, recordings=(str(bag),)), progress=False)
+    with pytest.raises(ConfigError, match='robot_mask: expected one of none, arm, all'):
+        replace(config, robot_mask='hand')
+    with pytest.raises(ConfigError, match='fill_context: .* --robot-mask arm'):
+        replace(config, robot_mask='none', fill_context=0.5)
+
+
+def test_held_out_scores_do_not_count_what_is_never_free(bags):
+    batch, _ = batches(bags, 'all')
+    config = ObjectiveSettings(method='min-wo-gan', outer_power=1.0)
+    network = networks(config.chosen).predictor.eval()
+    expected = held_out_scores(network, [batch], config)
+    hook = network.register_forward_hook(lambda module, args, output: replace_base(output))
+    assert held_out_scores(network, [batch], config) == expected
+    hook.remove()
+
+
+def replace_base(prediction):
+    """Paint over the base in a prediction."""
+    prediction.image[:, :, -2:, -2:] = 1
+    return prediction
