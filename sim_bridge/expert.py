@@ -7,22 +7,24 @@ A sample is one push: go behind an object, come down, push. Samples are rolled o
 physics, all at once; the best are refitted; the best push of all is executed and the search begins
 anew from where things then lie. Which object comes first (mostly the one nearest to the gripper),
 how fast and how far it is pushed, and whether that succeeds, varies from episode to episode, as
-the paper's non-deterministic planner gives. Proposing whole pushes rather than independent
+the paper's non-deterministic planner gives. Where the order matters, all orders are tried in the
+simulator before each push, see push_order.py. Proposing whole pushes rather than independent
 displacements is our deviation: a few dozen samples then suffice.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 import time
 
 import mujoco
 import mujoco.rollout
 import numpy as np
 from sim_bridge.grasp_expert import EpisodeRun, GraspConfig, run_grasp_episode
-from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, Simulator, SUBSTEPS
-from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
+from sim_bridge.push_order import find_order
+from sim_bridge.pushes import Moment, Push, push_actions, PushRollouts
+from sim_bridge.simulator import Simulator
+from tap_ros.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
 
-MAX_PUSH_STEPS = 24  # longest macro action, in control periods
 STILL = 0.002  # m, an object within this of its last place has come to rest
 TILT_COST = 0.2  # m, added to a sample that topples an object
 
@@ -57,8 +59,7 @@ class Expert:
     def __init__(self, simulator: Simulator, rng: np.random.Generator, config: ExpertConfig,
                  rollout: mujoco.rollout.Rollout) -> None:
         self._simulator, self._rng, self._config = simulator, rng, config
-        self._rollout = rollout
-        self._scratch = mujoco.MjData(simulator.model)  # rollouts overwrite it
+        self._rollouts = PushRollouts(simulator, rollout)
         self._goals = simulator.goal().object_poses[:, :3]
         self._num_samples = rng.integers(*config.num_samples, endpoint=True)
         self._preference = rng.uniform(0, config.preference, simulator.task.num_objects)
@@ -90,19 +91,24 @@ class Expert:
         :param steps_left: control periods until the episode ends.
         :return: (n, 4) actions, or None when every object is in place.
         """
-        poses = self._simulator.object_poses()[:, :3]
-        distances = np.linalg.norm(poses - self._goals, axis=1)
-        todo = np.flatnonzero(distances > self._config.done_distance)
+        now = Moment.of(self._simulator)
+        distances = np.linalg.norm(now.places - self._goals, axis=1)
+        todo: Sequence[int] = np.flatnonzero(distances > self._config.done_distance).tolist()
         if len(todo) == 0:
             return None
-        here = np.linalg.norm(poses[todo, :2] - self._simulator.target[:2], axis=1)
-        first = todo[here.argmin()]
+        if self._simulator.task.ordered and len(todo) > 1:
+            first = find_order(self._rollouts, now, self._goals, todo, self._rng)[0]
+            todo = [first]
+        else:
+            here = np.linalg.norm(now.places[todo, :2] - now.target[:2], axis=1)
+            first = todo[int(here.argmin())]
         best_cost, best = np.inf, None
         mean = spread = None
         for _ in range(self._config.num_iterations):
-            pushes = self._sample(todo, poses, mean, spread)
-            plans = [self._actions(*push, poses)[:steps_left] for push in pushes]
-            costs = self._costs(plans, distances, first)
+            pushes = self._sample(todo, now.places, mean, spread)
+            plans = [push_actions(push, now.target, now.places[k, :2], self._goals[k, :2])[
+                :steps_left] for k, push in pushes]
+            costs = self._costs(now, plans, distances, first)
             if self._rng.random() < self._config.explore:
                 return plans[0]
             order = np.argsort(costs, kind='stable')[:self._config.num_elites]
@@ -110,74 +116,37 @@ class Expert:
                 best_cost, best = costs[order[0]], plans[order[0]]
             # Refit to the elites that push the same object as the best one does.
             same = [i for i in order if pushes[i][0] == pushes[order[0]][0]]
-            parameters = np.array([pushes[i][1] for i in same])
+            parameters = np.array([astuple(pushes[i][1])[:4] for i in same])
             todo = [pushes[order[0]][0]]
             mean, spread = parameters.mean(0), parameters.std(0) + [0.08, 0.006, 0.01, 0.005]
         return best
 
-    def _sample(self, todo: Sequence[int] | np.ndarray, poses: np.ndarray, mean: np.ndarray | None,
-                spread: np.ndarray | None) -> list[tuple[int, np.ndarray, float]]:
-        """Draw pushes: (object, (angle, offset, overshoot, push speed), travel speed)."""
+    def _sample(self, todo: Sequence[int], places: np.ndarray, mean: np.ndarray | None,
+                spread: np.ndarray | None) -> list[tuple[int, Push]]:
+        """Draw objects and pushes of them."""
         rng, config = self._rng, self._config
         pushes = []
         for _ in range(self._num_samples):
             k = int(rng.choice(todo))
             if mean is None or spread is None:
-                gap = self._goals[k, :2] - poses[k, :2]
+                gap = self._goals[k, :2] - places[k, :2]
                 parameters = np.array([
                     np.arctan2(gap[1], gap[0]) + rng.normal(0, 0.35), rng.normal(0, 0.025),
                     rng.normal(0, 0.03), rng.uniform(*config.push_speed)])
             else:
                 parameters = rng.normal(mean, spread)
                 parameters[3] = np.clip(parameters[3], *config.push_speed)
-            pushes.append((k, parameters, rng.uniform(*config.travel_speed)))
+            pushes.append((k, Push(*parameters, rng.uniform(*config.travel_speed))))
         return pushes
 
-    def _actions(self, k: int, parameters: np.ndarray, travel_speed: float,
-                 poses: np.ndarray) -> np.ndarray:
-        """Turn a push into actions: lift, travel, come down, push."""
-        angle, offset, overshoot, push_speed = parameters
-        here = self._simulator.target
-        along = np.array([np.cos(angle), np.sin(angle)])
-        aside = np.array([-along[1], along[0]])
-        start = poses[k, :2] - 0.13 * along + offset * aside
-        length = np.linalg.norm(self._goals[k, :2] - poses[k, :2]) + 0.07 + overshoot
-        lowest, highest = WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2]
-        start = np.clip(start, lowest, highest)
-        end = np.clip(start + max(length, 0.04) * along, lowest, highest)
-        waypoints = []
-        travel = np.linalg.norm(start - here[:2])
-        if travel > 0.02:
-            if here[2] < LIFTED - 0.03:
-                waypoints.append(np.append(here[:2], LIFTED)[None])
-            steps = int(np.ceil(travel / travel_speed))
-            path = here[:2] + np.linspace(0, 1, steps + 1)[1:, None] * (start - here[:2])
-            waypoints.append(np.column_stack([path, np.full(steps, LIFTED)]))
-        waypoints.append(np.append(start, LOW)[None])
-        steps = int(np.ceil(np.linalg.norm(end - start) / push_speed))
-        if steps:
-            path = start + np.linspace(0, 1, steps + 1)[1:, None] * (end - start)
-            waypoints.append(np.column_stack([path, np.full(steps, LOW)]))
-        positions = np.concatenate([here[None, :3], *waypoints])[:MAX_PUSH_STEPS + 1]
-        return np.column_stack([np.diff(positions, axis=0), np.zeros(len(positions) - 1)])
-
-    def _costs(self, plans: Sequence[np.ndarray], distances: np.ndarray, first: int) -> np.ndarray:
+    def _costs(self, now: Moment, plans: Sequence[np.ndarray], distances: np.ndarray,
+               first: int) -> np.ndarray:
         """Roll all plans out in the true simulator; return (N,) metres."""
-        simulator = self._simulator
-        lengths = np.array([len(plan) for plan in plans])
-        actions = np.zeros((len(plans), lengths.max(), 4))
-        for plan, padded in zip(plans, actions):
-            padded[:len(plan)] = plan
-        controls, _ = ramp_controls(simulator.target, actions)
-        states, _ = self._rollout.rollout(
-            simulator.model, self._scratch, np.tile(simulator.state(), (len(plans), 1)), controls)
-        last = states[np.arange(len(plans)), lengths * SUBSTEPS - 1]  # (N, state)
-        objects = last[:, 1 + OBJECT_QPOS_START:1 + simulator.model.nq]
-        objects = objects.reshape(len(plans), -1, 7)
-        ends = np.linalg.norm(objects[..., :3] - self._goals, axis=-1)  # (N, K)
-        upright = 1 - 2 * (objects[..., 4] ** 2 + objects[..., 5] ** 2)
-        costs = ends.sum(1) + TILT_COST * (upright < 0.9).sum(1)
-        costs += self._config.step_cost * lengths
+        moments, upright = self._rollouts(now, plans)
+        ends = np.linalg.norm(
+            np.array([m.places for m in moments]) - self._goals, axis=-1)  # (N, K)
+        costs = ends.sum(1) + TILT_COST * (~upright).sum(1)
+        costs += self._config.step_cost * np.array([len(plan) for plan in plans])
         untouched = np.abs(ends - distances) < 0.005
         return costs + (untouched * self._preference).sum(1) + self._config.nearest * untouched[
             :, first]
@@ -203,7 +172,7 @@ def run_episode(
         return run_grasp_episode(simulator, seed, config, rollout)
     assert config is None or isinstance(config, ExpertConfig)
     observations = [simulator.reset(seed)]
-    rng = np.random.default_rng([seed, simulator.task.num_objects, 1])
+    rng = np.random.default_rng([seed, simulator.task.stream, 1])
     rollout = rollout or mujoco.rollout.Rollout(nthread=0)
     expert = Expert(simulator, rng, config or ExpertConfig(), rollout)
     actions: list[np.ndarray] = []

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.camera import Camera, Renderer
 from sim_bridge.grasping import grasp_place
+from sim_bridge.places import gripper_away_from
 from sim_bridge.scene import (
     build_scene,
     FINGER_GAP,
@@ -19,7 +20,7 @@ from sim_bridge.scene import (
     object_names,
     TIMESTEP,
 )
-from sim_bridge.tasks import get_task, gripper_away_from, nearest_first, sample_scene
+from sim_bridge.tasks import get_task, sample_scene
 from tap_ros.contract import (
     ACTION_LIMIT,
     CONTROL_PERIOD,
@@ -242,9 +243,9 @@ class Simulator:
         return [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
 
     def _after_last_push(self) -> np.ndarray:
-        """Return where the gripper touches one object that it has just pushed to its goal."""
+        """Return where the gripper touches the object that it has pushed to its goal last."""
         starts, goals = self.scene.start_poses[:, :2], self.scene.goal_poses[:, :2]
-        k = nearest_first(self.scene.gripper_start[:2], starts, goals)[-1]
+        k = self.scene.order[-1]
         along = (goals[k] - starts[k]) / np.linalg.norm(goals[k] - starts[k])
         fingers, state = self._fingers(), self.state()
         for behind in np.arange(0.04, 0.16, 0.005):
