@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 import numpy as np
-from sim_bridge.expert import ExpertConfig, run_episode
+from sim_bridge.expert import default_config, ExpertConfig, run_episode
 from sim_bridge.grasp_expert import GraspConfig
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import get_task
@@ -81,8 +81,7 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
     :raises StorageError: when the disk is full, or another process is collecting there. Files
         that are finished stay.
     """
-    default = GraspConfig() if get_task(config.task).gripping else ExpertConfig()
-    config = replace(config, expert=config.expert or default)
+    config = replace(config, expert=config.expert or default_config(get_task(config.task)))
     if min(config.episodes, config.episodes_per_file) < 1:
         raise ConfigError('episodes and episodes_per_file must be at least 1')
     folder = Path(folder)
@@ -219,7 +218,7 @@ def make_episode(simulator: Simulator, observations: Sequence[Observation], acti
     :return: Episode.
     """
     goal = observations[-1]
-    if not simulator.task.gripping:
+    if simulator.task.kind in ('push', 'stack'):
         goal = simulator.photograph(goal.object_poses)
     return Episode(
         frames=np.stack([o.image for o in observations]),

@@ -23,6 +23,8 @@ from sim_bridge.grasp_expert import EpisodeRun, GraspConfig, run_grasp_episode
 from sim_bridge.push_order import find_order
 from sim_bridge.pushes import Moment, Push, push_actions, PushRollouts
 from sim_bridge.simulator import Simulator
+from sim_bridge.stack_expert import run_stack_episode, STACK_CONFIG
+from sim_bridge.tasks import Task
 from tap_ros.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
 
 STILL = 0.002  # m, an object within this of its last place has come to rest
@@ -152,24 +154,34 @@ class Expert:
             :, first]
 
 
+def default_config(task: Task) -> ExpertConfig | GraspConfig:
+    """Return what the expert of a task does unless it is told otherwise."""
+    if task.kind == 'stack':
+        return STACK_CONFIG
+    return GraspConfig() if task.gripping else ExpertConfig()
+
+
 def run_episode(
         simulator: Simulator, seed: int, config: ExpertConfig | GraspConfig | None = None,
-        rollout: mujoco.rollout.Rollout | None = None) -> EpisodeRun:
+        rollout: mujoco.rollout.Rollout | None = None, num_frames: int = 0) -> EpisodeRun:
     """
     Run one episode of the expert, from the first motion of the arm to the last of an object.
 
-    Tasks with a grasp go to grasp_expert.py; their episodes are all equally long.
+    Tasks with a grasp go to grasp_expert.py, where episodes are all equally long, and to
+    stack_expert.py, where they end with the release of the last block.
 
     :param simulator: Simulator.
     :param seed: of the scene and of the expert.
-    :param config: ExpertConfig, or GraspConfig for a task with a grasp; None: the default.
+    :param config: ExpertConfig, or GraspConfig for a task with a grasp; None: default_config.
     :param rollout: mujoco.rollout.Rollout to share between episodes, or None.
+    :param num_frames: of the longest episode; 0: the task's.
     :return: list of T Observations, (T, 4) float32 actions (the last row is zero), outcome, and
         seconds spent in the search and in stepping and rendering.
     """
     if simulator.task.gripping:
         assert config is None or isinstance(config, GraspConfig)
-        return run_grasp_episode(simulator, seed, config, rollout)
+        run = run_stack_episode if simulator.task.kind == 'stack' else run_grasp_episode
+        return run(simulator, seed, config, rollout, num_frames)
     assert config is None or isinstance(config, ExpertConfig)
     observations = [simulator.reset(seed)]
     rng = np.random.default_rng([seed, simulator.task.stream, 1])
@@ -177,7 +189,8 @@ def run_episode(
     expert = Expert(simulator, rng, config or ExpertConfig(), rollout)
     actions: list[np.ndarray] = []
     seconds = {'search': 0.0, 'step': 0.0}
-    while (steps_left := simulator.task.num_frames - len(observations)) > 0:
+    num_frames = num_frames or simulator.task.num_frames
+    while (steps_left := num_frames - len(observations)) > 0:
         begin = time.perf_counter()
         plan = expert.plan(steps_left) if actions else expert.wander()
         planned = time.perf_counter()

@@ -11,7 +11,8 @@ goals of others, see order_tasks.py.
 
 The tasks with a grasp have one object of a shape that the gripper can hold. To grasp is to lift it
 from where it stands; to pick and place is to carry it to a place within 0.2 m of the middle, with
-the arm starting about 0.3 m from the object.
+the arm starting about 0.3 m from the object. To stack is to build a tower of blocks on the first
+one, see stack_tasks.py.
 """
 
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from sim_bridge.places import (
     OBJECT_RANGE,
 )
 from sim_bridge.scene import ObjectShape, random_shape
+from sim_bridge.stack_tasks import BLOCK_SEPARATION, draw_block, draw_blocks
 from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.errors import SceneError
 
@@ -47,7 +49,7 @@ class Task:
     name: str
     num_objects: int
     start_separation: float  # m between object origins at the start
-    kind: str = 'push'  # or 'grasp', 'pick_place'
+    kind: str = 'push'  # or 'grasp', 'pick_place', 'stack'
     reach: tuple[float, float] = (0.0, 0.0)  # m, nearest and farthest start, for grasps
     lift: float = 0.0  # m, height of the goal above the table
     ordered: bool = False  # the wrong order of pushes fails
@@ -77,6 +79,10 @@ TASKS = {
     'pick_place': Task(
         'pick_place', num_objects=1, start_separation=0.0, kind='pick_place',
         reach=(0.27, 0.33), stream=5),
+    'stack2': Task(
+        'stack2', num_objects=2, start_separation=BLOCK_SEPARATION, kind='stack', stream=8),
+    'stack3': Task(
+        'stack3', num_objects=3, start_separation=BLOCK_SEPARATION, kind='stack', stream=9),
 }
 
 
@@ -116,6 +122,8 @@ def sample_scene(task: Task, seed: int) -> Scene:
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.stream])
+    if task.kind == 'stack':
+        return _sample_stack(task, seed, rng)
     if task.gripping:
         return _sample_grasp(task, seed, rng)
     if task.ordered:
@@ -152,6 +160,15 @@ def _with_yaws(rng: np.random.Generator, starts: np.ndarray,
     yaws = rng.uniform(0, 2 * np.pi, len(starts))
     goal_yaws = yaws + rng.uniform(-GOAL_YAW_RANGE, GOAL_YAW_RANGE, len(starts))
     return np.column_stack([starts, yaws]), np.column_stack([goals, goal_yaws])
+
+
+def _sample_stack(task: Task, seed: int, rng: np.random.Generator) -> Scene:
+    """Draw blocks to be stacked; all but the first one are moved."""
+    shapes = tuple(draw_block(rng) for _ in range(task.num_objects))
+    start_poses, goal_poses, hand = draw_blocks(rng, task.num_objects)
+    return Scene(
+        task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
+        gripper_start=hand, order=tuple(range(1, task.num_objects)))
 
 
 def _sample_grasp(task: Task, seed: int, rng: np.random.Generator) -> Scene:

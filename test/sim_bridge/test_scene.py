@@ -22,7 +22,7 @@ from tap_ros.contract import WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 
 PUSHING = [task for task in TASKS.values() if task.kind == 'push' and not task.ordered]
-GRIPPING = [task for task in TASKS.values() if task.gripping]
+GRIPPING = [task for task in TASKS.values() if task.kind in ('grasp', 'pick_place')]
 
 
 def name(task):
