@@ -7,6 +7,7 @@ from typing import Annotated
 
 from sim_bridge.collect import collect, CollectConfig, CollectSettings
 from sim_bridge.tasks import TASKS
+from sim_bridge.timing import TIMINGS
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Folder, one_of
 
@@ -16,6 +17,7 @@ class Recording(CollectSettings):
     """What to collect."""
 
     task: Annotated[str, one_of(TASKS)] = CollectSettings.task
+    timing: Annotated[str, one_of(TIMINGS)] = CollectSettings.timing
 
 
 @dataclass(frozen=True)

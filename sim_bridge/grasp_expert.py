@@ -9,17 +9,15 @@ them may be chosen. Now and then a random place is taken, which may miss: such e
 How fast the arm goes, how low and how high, and where it waits varies from episode to episode.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-import time
 
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.simulator import OBJECT_QPOS_START, Observation, ramp_controls, Simulator
+from sim_bridge.episode_run import carry_out, EpisodeRun
+from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, Simulator
 from tap_ros.contract import CLEAR, MOVE_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW
-
-EpisodeRun = tuple[list[Observation], np.ndarray, str, dict[str, float]]  # see run_grasp_episode
 
 RANGE = 0.3  # m, |x| and |y| of the random walk, all in view
 FAR = 0.22  # m, a start so far from the grasp that the first step cannot hit the object
@@ -235,8 +233,7 @@ def run_grasp_episode(
     :param seed: of the scene and of the expert.
     :param config: GraspConfig.
     :param rollout: mujoco.rollout.Rollout to share between episodes, or None.
-    :return: list of T Observations, (T, 4) float32 actions (the last row is zero), outcome, and
-        seconds spent in the search and in stepping and rendering.
+    :return: EpisodeRun.
     """
     first = simulator.reset(seed)
     rng = np.random.default_rng([seed, simulator.task.stream, 1])
@@ -254,29 +251,3 @@ def _plans(expert: GraspExpert, num_frames: int) -> Iterator[np.ndarray]:
         yield actions
         steps_left -= len(actions)
     yield np.tile([0, 0, 0, simulator.target[3]], (max(steps_left, 0), 1))  # hold still
-
-
-def carry_out(simulator: Simulator, first: Observation, plans: Iterable[np.ndarray],
-              num_frames: int) -> EpisodeRun:
-    """
-    Carry out plans, one after another, until there are so many frames.
-
-    :param first: Observation at the start.
-    :param plans: of (n, 4) actions; each is asked for when those before are carried out.
-    :return: see run_grasp_episode.
-    """
-    observations, actions = [first], []
-    seconds = {'search': 0.0, 'step': 0.0}
-    begin = time.perf_counter()
-    for plan in plans:
-        planned = time.perf_counter()
-        seconds['search'] += planned - begin
-        for action in plan[:num_frames - len(observations)]:
-            observations.append(simulator.step(action))
-            actions.append(action)
-        begin = time.perf_counter()
-        seconds['step'] += begin - planned
-        if len(observations) == num_frames:
-            break
-    done = np.array([*actions, np.zeros(4)], np.float32)
-    return observations, done, simulator.outcome(), seconds

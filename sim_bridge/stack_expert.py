@@ -12,7 +12,8 @@ from collections.abc import Iterator
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.grasp_expert import carry_out, EpisodeRun, GraspConfig, GraspExpert, straight
+from sim_bridge.episode_run import carry_out, EpisodeRun
+from sim_bridge.grasp_expert import GraspConfig, GraspExpert, straight
 from sim_bridge.scene import HALF_HEIGHT
 from sim_bridge.simulator import Simulator
 from tap_ros.contract import CLEAR
@@ -97,7 +98,7 @@ def run_stack_episode(
 
     :param simulator: Simulator of a task of stacking.
     :param num_frames: at most; 0: the task's. The other parameters are expert.run_episode's.
-    :return: as expert.run_episode; the outcome is that after SETTLE_STEPS more.
+    :return: EpisodeRun; the outcome is that after SETTLE_STEPS more.
     """
     first = simulator.reset(seed)
     rng = np.random.default_rng([seed, simulator.task.stream, 1])
