@@ -171,7 +171,9 @@ class Expert:
             else:
                 parameters = rng.normal(mean, spread)
                 parameters[3] = np.clip(parameters[3], *config.push_speed)
-            pushes.append((k, Push(*parameters, rng.uniform(*config.travel_speed))))
+            angle, offset, overshoot, speed = parameters
+            travel_speed = rng.uniform(*config.travel_speed)
+            pushes.append((k, Push(angle, offset, overshoot, speed, travel_speed)))
         return pushes
 
     def _costs(self, now: Moment, plans: Sequence[np.ndarray], goals: np.ndarray,

@@ -53,8 +53,8 @@ def timed_plans(expert: 'Expert', share: float, num_frames: int,
     before = (count * PUSH + AGAIN) * share - (PUSH + GAP / 2)
     waiting = min(before / (1 - share), num_frames - count * PUSH)
     plan = expert.wander(max(int(round(waiting)), int(rng.integers(1, 3))))
-    done, stage, detours = 0, None, []  # control periods, the object being pushed, of that push
-    first = None
+    done, detours = 0, list[int]()  # control periods so far, and of the interruptions to come
+    stage: int | None = None  # the object that is pushed now
     while plan is not None:
         yield plan
         done += len(plan)
@@ -64,9 +64,7 @@ def timed_plans(expert: 'Expert', share: float, num_frames: int,
         todo = expert.undone()
         if stage not in todo:  # the next one
             stage = expert.next_object(OTHER)
-            if first is None:
-                first = stage
-            elif stage is not None and expert.num_objects - len(todo) == 1:
+            if stage is not None and count - len(todo) == 1:
                 detours = _detours(done, share, count, num_frames)
         part = 1 / (1 + len(detours))
         plan = expert.plan(num_frames - 1 - done, stage, part)
