@@ -64,12 +64,14 @@ def test_where_the_order_is_free_the_nearest_comes_first(task):
 
 
 def ends_of_pushes(simulator, rollout, seed, order):
-    """Return in m how far objects end from their goals, each pushed once in that order."""
+    """Return in m how far objects end from their goals, pushed in that order, the worst again."""
     simulator.reset(seed)
     moment, goals = Moment.of(simulator), simulator.goal().object_poses[:, :3]
+    rollouts, rng = PushRollouts(simulator, rollout), np.random.default_rng(seed)
     for k in order:
-        moment, _ = best_push(PushRollouts(simulator, rollout), moment, goals, k,
-                              np.random.default_rng([seed, k]))
+        moment, _ = best_push(rollouts, moment, goals, k, rng)
+    worst = int(np.linalg.norm(moment.places - goals, axis=1).argmax())
+    moment, _ = best_push(rollouts, moment, goals, worst, rng)
     return np.linalg.norm(moment.places - goals, axis=1)
 
 
@@ -80,7 +82,7 @@ def test_the_wrong_order_fails_and_the_right_one_succeeds(simulator, rollout):
         right.append(ends_of_pushes(simulator, rollout, seed, order))
         wrong.append(ends_of_pushes(simulator, rollout, seed, order[::-1]))
     good, bad = (np.max(ends, axis=1) < SUCCESS_DISTANCE for ends in (right, wrong))
-    assert good.mean() >= 0.6 and bad.mean() <= 0.2
+    assert good.mean() >= 0.8 and bad.mean() <= 0.2
 
 
 def test_trying_all_orders_finds_what_comes_first(simulator, rollout):
