@@ -9,17 +9,18 @@ collection goes on with the files that are not there yet.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 import json
 from pathlib import Path
 import time
 from typing import Any
 
 import numpy as np
-from sim_bridge.expert import ExpertConfig, run_episode
+from sim_bridge.expert import default_config, ExpertConfig, run_episode
 from sim_bridge.grasp_expert import GraspConfig
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import get_task
+from sim_bridge.timing import TIMINGS
 from tap_ros.engines.run import run_tasks
 from tap_ros.engines.task import Engine, LOCAL, Task
 from tap_ros.errors import ConfigError, RecordingError
@@ -31,7 +32,9 @@ from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
-_LATER_SETTINGS = {'look': 'plain', 'appearance': 'usual'}  # which older files lack
+# These stand in that file only if they are not the defaults.
+LATER_SETTINGS = ('frames', 'timing', 'look', 'appearance')
+MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,10 @@ class CollectSettings:
     :param seed: of the first episode; the others count on from it.
     :param image_size: width and height in pixels.
     :param episodes_per_file: the bag is split into files of so many.
+    :param frames: of the longest episode; 0: as is usual for the task.
+    :param timing: when in an episode of several pushed objects the first one is home and the
+        others are untouched; natural: as it comes, mostly in the middle; mixed: early, middle or
+        late, drawn for each episode.
     :param look: of the world, see looks.LOOKS.
     :param appearance: of table, light and camera, see appearance.CHOICES; 'random' is drawn anew
         for every episode.
@@ -54,6 +61,8 @@ class CollectSettings:
     seed: int = 0
     image_size: int = 64
     episodes_per_file: int = 25
+    frames: int = 0
+    timing: str = 'natural'
     look: str = 'plain'
     appearance: str = 'usual'
 
@@ -87,10 +96,19 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
     :raises StorageError: when the disk is full, or another process is collecting there. Files
         that are finished stay.
     """
-    default = GraspConfig() if get_task(config.task).gripping else ExpertConfig()
-    config = replace(config, expert=config.expert or default)
+    task = get_task(config.task)
+    config = replace(config, expert=config.expert or default_config(task, config.timing))
     if min(config.episodes, config.episodes_per_file) < 1:
         raise ConfigError('episodes and episodes_per_file must be at least 1')
+    if config.frames and not MIN_FRAMES <= config.frames <= MAX_FRAMES:
+        raise ConfigError(f'frames is {config.frames}; expected {MIN_FRAMES} to {MAX_FRAMES}, or '
+                          f'0 for what is usual for the task')
+    if config.timing not in TIMINGS:
+        raise ConfigError(
+            f'timing {config.timing!r} is unknown; valid timings: {", ".join(TIMINGS)}')
+    if config.timing != 'natural' and task.kind != 'push':
+        raise ConfigError(f'timing {config.timing!r} is for tasks of pushing; with {task.name} '
+                          "it can only be 'natural'")
     folder = Path(folder)
     with only_writer(folder), storage_errors(folder):
         _check_settings(folder, config)
@@ -137,10 +155,13 @@ def _check_settings(folder: Path, config: CollectConfig) -> None:
     """Keep the settings beside the recording and refuse to mix it with other ones."""
     path = folder / SETTINGS_FILE
     settings = json.loads(json.dumps(asdict(config)))
+    for field in fields(CollectSettings):  # as in recordings made before they were settings
+        if field.name in LATER_SETTINGS and settings[field.name] == field.default:
+            del settings[field.name]
     if path.exists():
         before = _read_settings(path)
-        before = _LATER_SETTINGS | before
-        changed = [k for k in settings if k != 'episodes' and before.get(k) != settings[k]]
+        names = dict.fromkeys([*settings, *(k for k in LATER_SETTINGS if k in before)])
+        changed = [k for k in names if k != 'episodes' and before.get(k) != settings.get(k)]
         if changed:
             raise ConfigError(
                 f'{folder} holds a recording made with other settings ({", ".join(changed)}); '
@@ -194,7 +215,8 @@ def _collect_shard(folder: str | Path, config: CollectConfig, shard: int) -> dic
     with EpisodeWriter(path, camera_matrix=simulator.camera.K) as writer:
         for i in _episodes(config, shard):
             seed = config.seed + i
-            observations, actions, outcome, seconds = run_episode(simulator, seed, config.expert)
+            observations, actions, outcome, seconds = run_episode(
+                simulator, seed, config.expert, num_frames=config.frames, timing=config.timing)
             begin = time.perf_counter()
             writer.write(make_episode(
                 simulator, observations, actions, outcome, (i + 1) * EPISODE_SPACING_NS))
@@ -226,7 +248,7 @@ def make_episode(simulator: Simulator, observations: Sequence[Observation], acti
     :return: Episode.
     """
     goal = observations[-1]
-    if not simulator.task.gripping:
+    if simulator.task.kind in ('push', 'stack'):
         goal = simulator.photograph(goal.object_poses)
     return Episode(
         frames=np.stack([o.image for o in observations]),

@@ -9,6 +9,7 @@ from sim_bridge.appearance import CHOICES
 from sim_bridge.collect import collect, CollectConfig, CollectSettings
 from sim_bridge.looks import LOOKS
 from sim_bridge.tasks import TASKS
+from sim_bridge.timing import TIMINGS
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Folder, one_of
 
@@ -18,6 +19,7 @@ class Recording(CollectSettings):
     """What to collect."""
 
     task: Annotated[str, one_of(TASKS)] = CollectSettings.task
+    timing: Annotated[str, one_of(TIMINGS)] = CollectSettings.timing
     look: Annotated[str, one_of(LOOKS)] = CollectSettings.look
     appearance: Annotated[str, one_of(CHOICES)] = CollectSettings.appearance
 

@@ -7,22 +7,27 @@ A sample is one push: go behind an object, come down, push. Samples are rolled o
 physics, all at once; the best are refitted; the best push of all is executed and the search begins
 anew from where things then lie. Which object comes first (mostly the one nearest to the gripper),
 how fast and how far it is pushed, and whether that succeeds, varies from episode to episode, as
-the paper's non-deterministic planner gives. Proposing whole pushes rather than independent
+the paper's non-deterministic planner gives. Where the order matters, all orders are tried in the
+simulator before each push, see push_order.py. Proposing whole pushes rather than independent
 displacements is our deviation: a few dozen samples then suffice.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-import time
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass
 
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.grasp_expert import EpisodeRun, GraspConfig, run_grasp_episode
-from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, Simulator, SUBSTEPS
-from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
+from sim_bridge.episode_run import carry_out, EpisodeRun
+from sim_bridge.grasp_expert import GraspConfig, run_grasp_episode
+from sim_bridge.push_order import find_order
+from sim_bridge.pushes import Moment, Push, push_actions, PushRollouts
+from sim_bridge.simulator import Simulator
+from sim_bridge.stack_expert import run_stack_episode, STACK_CONFIG
+from sim_bridge.tasks import Task
+from sim_bridge.timing import draw_share, MORE_FRAMES, timed_plans
+from tap_ros.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
 
-MAX_PUSH_STEPS = 24  # longest macro action, in control periods
 STILL = 0.002  # m, an object within this of its last place has come to rest
 TILT_COST = 0.2  # m, added to a sample that topples an object
 
@@ -57,22 +62,51 @@ class Expert:
     def __init__(self, simulator: Simulator, rng: np.random.Generator, config: ExpertConfig,
                  rollout: mujoco.rollout.Rollout) -> None:
         self._simulator, self._rng, self._config = simulator, rng, config
-        self._rollout = rollout
-        self._scratch = mujoco.MjData(simulator.model)  # rollouts overwrite it
+        self._rollouts = PushRollouts(simulator, rollout)
         self._goals = simulator.goal().object_poses[:, :3]
         self._num_samples = rng.integers(*config.num_samples, endpoint=True)
         self._preference = rng.uniform(0, config.preference, simulator.task.num_objects)
 
-    def wander(self) -> np.ndarray:
+    @property
+    def num_objects(self) -> int:
+        """Return K."""
+        return len(self._goals)
+
+    def undone(self) -> list[int]:
+        """Return which objects are not at their goals yet."""
+        places = self._simulator.object_poses()[:, :3]
+        distances = np.linalg.norm(places - self._goals, axis=1)
+        return np.flatnonzero(distances > self._config.done_distance).tolist()
+
+    def next_object(self, whim: float = 0.0) -> int | None:
         """
-        Plan to rise and walk about at random before the first push.
+        Choose an object to push: the first in the best order if that matters, else the nearest.
+
+        :param whim: probability of any object instead of the nearest.
+        :return: its number, or None when all are in place.
+        """
+        todo, now = self.undone(), Moment.of(self._simulator)
+        if len(todo) < 2:
+            return todo[0] if todo else None
+        if self._simulator.task.ordered:
+            return find_order(self._rollouts, now, self._goals, todo, self._rng)[0]
+        if whim and self._rng.random() < whim:
+            return int(self._rng.choice(todo))
+        here = np.linalg.norm(now.places[todo, :2] - now.target[:2], axis=1)
+        return todo[int(here.argmin())]
+
+    def wander(self, steps: int | None = None) -> np.ndarray:
+        """
+        Plan to rise and walk about at random, for example before the first push.
 
         Without it, the middle of most episodes is where one object is in place and the other
         untouched, and a prediction for a fixed time finds that bottleneck nearly always.
 
-        :return: (n, 4) actions.
+        :param steps: control periods; None: drawn.
+        :return: (steps, 4) actions.
         """
-        steps = self._rng.integers(*self._config.wander, endpoint=True)
+        if steps is None:
+            steps = int(self._rng.integers(*self._config.wander, endpoint=True))
         # As fast as it travels: pictures of a slow walk would be easy to predict from the start.
         angles = self._rng.uniform(0, 2 * np.pi, steps)
         lengths = self._rng.uniform(*self._config.travel_speed, steps)
@@ -83,26 +117,33 @@ class Expert:
         path = np.concatenate([here[None], np.column_stack([path, np.full(steps, LIFTED)])])
         return np.column_stack([np.diff(path, axis=0), np.zeros(steps)])
 
-    def plan(self, steps_left: int) -> np.ndarray | None:
+    def plan(self, steps_left: int, only: int | None = None,
+             part: float = 1.0) -> np.ndarray | None:
         """
         Search for the next push.
 
         :param steps_left: control periods until the episode ends.
+        :param only: the object to be pushed; None: any, mostly next_object.
+        :param part: of the way that object is pushed.
         :return: (n, 4) actions, or None when every object is in place.
         """
-        poses = self._simulator.object_poses()[:, :3]
-        distances = np.linalg.norm(poses - self._goals, axis=1)
-        todo = np.flatnonzero(distances > self._config.done_distance)
-        if len(todo) == 0:
+        now, todo = Moment.of(self._simulator), self.undone()
+        first = self.next_object() if only is None else only
+        if not todo or first is None:
             return None
-        here = np.linalg.norm(poses[todo, :2] - self._simulator.target[:2], axis=1)
-        first = todo[here.argmin()]
+        goals = self._goals
+        if only is not None or self._simulator.task.ordered:
+            todo = [first]
+            goals = goals.copy()
+            goals[first] = now.places[first] + part * (goals[first] - now.places[first])
+        distances = np.linalg.norm(now.places - goals, axis=1)
         best_cost, best = np.inf, None
         mean = spread = None
         for _ in range(self._config.num_iterations):
-            pushes = self._sample(todo, poses, mean, spread)
-            plans = [self._actions(*push, poses)[:steps_left] for push in pushes]
-            costs = self._costs(plans, distances, first)
+            pushes = self._sample(todo, now.places, goals, mean, spread)
+            plans = [push_actions(push, now.target, now.places[k, :2], goals[k, :2])[:steps_left]
+                     for k, push in pushes]
+            costs = self._costs(now, plans, goals, distances, first)
             if self._rng.random() < self._config.explore:
                 return plans[0]
             order = np.argsort(costs, kind='stable')[:self._config.num_elites]
@@ -110,118 +151,103 @@ class Expert:
                 best_cost, best = costs[order[0]], plans[order[0]]
             # Refit to the elites that push the same object as the best one does.
             same = [i for i in order if pushes[i][0] == pushes[order[0]][0]]
-            parameters = np.array([pushes[i][1] for i in same])
+            parameters = np.array([astuple(pushes[i][1])[:4] for i in same])
             todo = [pushes[order[0]][0]]
             mean, spread = parameters.mean(0), parameters.std(0) + [0.08, 0.006, 0.01, 0.005]
         return best
 
-    def _sample(self, todo: Sequence[int] | np.ndarray, poses: np.ndarray, mean: np.ndarray | None,
-                spread: np.ndarray | None) -> list[tuple[int, np.ndarray, float]]:
-        """Draw pushes: (object, (angle, offset, overshoot, push speed), travel speed)."""
+    def _sample(self, todo: Sequence[int], places: np.ndarray, goals: np.ndarray,
+                mean: np.ndarray | None, spread: np.ndarray | None) -> list[tuple[int, Push]]:
+        """Draw objects and pushes of them."""
         rng, config = self._rng, self._config
         pushes = []
         for _ in range(self._num_samples):
             k = int(rng.choice(todo))
             if mean is None or spread is None:
-                gap = self._goals[k, :2] - poses[k, :2]
+                gap = goals[k, :2] - places[k, :2]
                 parameters = np.array([
                     np.arctan2(gap[1], gap[0]) + rng.normal(0, 0.35), rng.normal(0, 0.025),
                     rng.normal(0, 0.03), rng.uniform(*config.push_speed)])
             else:
                 parameters = rng.normal(mean, spread)
                 parameters[3] = np.clip(parameters[3], *config.push_speed)
-            pushes.append((k, parameters, rng.uniform(*config.travel_speed)))
+            angle, offset, overshoot, speed = parameters
+            travel_speed = rng.uniform(*config.travel_speed)
+            pushes.append((k, Push(angle, offset, overshoot, speed, travel_speed)))
         return pushes
 
-    def _actions(self, k: int, parameters: np.ndarray, travel_speed: float,
-                 poses: np.ndarray) -> np.ndarray:
-        """Turn a push into actions: lift, travel, come down, push."""
-        angle, offset, overshoot, push_speed = parameters
-        here = self._simulator.target
-        along = np.array([np.cos(angle), np.sin(angle)])
-        aside = np.array([-along[1], along[0]])
-        start = poses[k, :2] - 0.13 * along + offset * aside
-        length = np.linalg.norm(self._goals[k, :2] - poses[k, :2]) + 0.07 + overshoot
-        lowest, highest = WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2]
-        start = np.clip(start, lowest, highest)
-        end = np.clip(start + max(length, 0.04) * along, lowest, highest)
-        waypoints = []
-        travel = np.linalg.norm(start - here[:2])
-        if travel > 0.02:
-            if here[2] < LIFTED - 0.03:
-                waypoints.append(np.append(here[:2], LIFTED)[None])
-            steps = int(np.ceil(travel / travel_speed))
-            path = here[:2] + np.linspace(0, 1, steps + 1)[1:, None] * (start - here[:2])
-            waypoints.append(np.column_stack([path, np.full(steps, LIFTED)]))
-        waypoints.append(np.append(start, LOW)[None])
-        steps = int(np.ceil(np.linalg.norm(end - start) / push_speed))
-        if steps:
-            path = start + np.linspace(0, 1, steps + 1)[1:, None] * (end - start)
-            waypoints.append(np.column_stack([path, np.full(steps, LOW)]))
-        positions = np.concatenate([here[None, :3], *waypoints])[:MAX_PUSH_STEPS + 1]
-        return np.column_stack([np.diff(positions, axis=0), np.zeros(len(positions) - 1)])
-
-    def _costs(self, plans: Sequence[np.ndarray], distances: np.ndarray, first: int) -> np.ndarray:
+    def _costs(self, now: Moment, plans: Sequence[np.ndarray], goals: np.ndarray,
+               distances: np.ndarray, first: int) -> np.ndarray:
         """Roll all plans out in the true simulator; return (N,) metres."""
-        simulator = self._simulator
-        lengths = np.array([len(plan) for plan in plans])
-        actions = np.zeros((len(plans), lengths.max(), 4))
-        for plan, padded in zip(plans, actions):
-            padded[:len(plan)] = plan
-        controls, _ = ramp_controls(simulator.target, actions)
-        states, _ = self._rollout.rollout(
-            simulator.model, self._scratch, np.tile(simulator.state(), (len(plans), 1)), controls)
-        last = states[np.arange(len(plans)), lengths * SUBSTEPS - 1]  # (N, state)
-        objects = last[:, 1 + OBJECT_QPOS_START:1 + simulator.model.nq]
-        objects = objects.reshape(len(plans), -1, 7)
-        ends = np.linalg.norm(objects[..., :3] - self._goals, axis=-1)  # (N, K)
-        upright = 1 - 2 * (objects[..., 4] ** 2 + objects[..., 5] ** 2)
-        costs = ends.sum(1) + TILT_COST * (upright < 0.9).sum(1)
-        costs += self._config.step_cost * lengths
+        moments, upright = self._rollouts(now, plans)
+        ends = np.linalg.norm(np.array([m.places for m in moments]) - goals, axis=-1)  # (N, K)
+        costs = ends.sum(1) + TILT_COST * (~upright).sum(1)
+        costs += self._config.step_cost * np.array([len(plan) for plan in plans])
         untouched = np.abs(ends - distances) < 0.005
         return costs + (untouched * self._preference).sum(1) + self._config.nearest * untouched[
             :, first]
 
 
+# Corrections would move the bottleneck; an object that has arrived is left alone.
+TIMED_CONFIG = ExpertConfig(
+    num_samples=(16, 24), explore=0.03, done_distance=0.035, travel_speed=(0.07, 0.08))
+
+
+def default_config(task: Task, timing: str = 'natural') -> ExpertConfig | GraspConfig:
+    """Return what the expert of a task does unless it is told otherwise."""
+    if timing != 'natural':
+        return TIMED_CONFIG
+    if task.kind == 'stack':
+        return STACK_CONFIG
+    return GraspConfig() if task.gripping else ExpertConfig()
+
+
 def run_episode(
         simulator: Simulator, seed: int, config: ExpertConfig | GraspConfig | None = None,
-        rollout: mujoco.rollout.Rollout | None = None) -> EpisodeRun:
+        rollout: mujoco.rollout.Rollout | None = None, num_frames: int = 0,
+        timing: str = 'natural') -> EpisodeRun:
     """
     Run one episode of the expert, from the first motion of the arm to the last of an object.
 
-    Tasks with a grasp go to grasp_expert.py; their episodes are all equally long.
+    Tasks with a grasp go to grasp_expert.py, where episodes are all equally long, and to
+    stack_expert.py, where they end with the release of the last block.
 
     :param simulator: Simulator.
     :param seed: of the scene and of the expert.
-    :param config: ExpertConfig, or GraspConfig for a task with a grasp; None: the default.
+    :param config: ExpertConfig, or GraspConfig for a task with a grasp; None: default_config.
     :param rollout: mujoco.rollout.Rollout to share between episodes, or None.
-    :return: list of T Observations, (T, 4) float32 actions (the last row is zero), outcome, and
-        seconds spent in the search and in stepping and rendering.
+    :param num_frames: of the longest episode; 0: the task's, with a timing MORE_FRAMES more.
+    :param timing: one of timing.TIMINGS, when the first of several pushed objects is home.
+    :return: EpisodeRun.
     """
-    if simulator.task.gripping:
+    task = simulator.task
+    if task.gripping:
         assert config is None or isinstance(config, GraspConfig)
-        return run_grasp_episode(simulator, seed, config, rollout)
+        run = run_stack_episode if task.kind == 'stack' else run_grasp_episode
+        return run(simulator, seed, config, rollout, num_frames)
     assert config is None or isinstance(config, ExpertConfig)
-    observations = [simulator.reset(seed)]
-    rng = np.random.default_rng([seed, simulator.task.num_objects, 1])
-    rollout = rollout or mujoco.rollout.Rollout(nthread=0)
-    expert = Expert(simulator, rng, config or ExpertConfig(), rollout)
-    actions: list[np.ndarray] = []
-    seconds = {'search': 0.0, 'step': 0.0}
-    while (steps_left := simulator.task.num_frames - len(observations)) > 0:
-        begin = time.perf_counter()
-        plan = expert.plan(steps_left) if actions else expert.wander()
-        planned = time.perf_counter()
-        seconds['search'] += planned - begin
-        if plan is None:
-            break
-        for action in plan:
-            observations.append(simulator.step(action))
-            actions.append(action)
-        seconds['step'] += time.perf_counter() - planned
+    natural = timing == 'natural'
+    num_frames = num_frames or task.num_frames + (0 if natural else MORE_FRAMES)
+    first = simulator.reset(seed)
+    rng = np.random.default_rng([seed, task.stream, 1])
+    expert = Expert(simulator, rng, config or (ExpertConfig() if natural else TIMED_CONFIG),
+                    rollout or mujoco.rollout.Rollout(nthread=0))
+    plans = (_plans(expert, num_frames) if natural else
+             timed_plans(expert, draw_share(timing, rng), num_frames, rng))
+    observations, actions, outcome, seconds = carry_out(simulator, first, plans, num_frames)
     length = _last_motion(np.array([o.object_poses[:, :3] for o in observations])) + 1
-    done = np.array(actions[:length - 1] + [np.zeros(4)], np.float32)
-    return observations[:length], done, simulator.outcome(), seconds
+    done = np.concatenate([actions[:length - 1], np.zeros((1, 4), np.float32)])
+    return observations[:length], done, outcome, seconds
+
+
+def _plans(expert: Expert, num_frames: int) -> Iterator[np.ndarray]:
+    """Yield a walk, then pushes until all objects are in place."""
+    plan: np.ndarray | None = expert.wander()
+    steps_left = num_frames - 1
+    while plan is not None:
+        yield plan
+        steps_left -= len(plan)
+        plan = expert.plan(steps_left)
 
 
 def _last_motion(positions: np.ndarray) -> int:

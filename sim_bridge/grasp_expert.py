@@ -9,21 +9,20 @@ them may be chosen. Now and then a random place is taken, which may miss: such e
 How fast the arm goes, how low and how high, and where it waits varies from episode to episode.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
-import time
 
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.simulator import OBJECT_QPOS_START, Observation, ramp_controls, Simulator
+from sim_bridge.episode_run import carry_out, EpisodeRun
+from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, Simulator
 from tap_ros.contract import CLEAR, MOVE_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW
-
-EpisodeRun = tuple[list[Observation], np.ndarray, str, dict[str, float]]  # see run_grasp_episode
 
 RANGE = 0.3  # m, |x| and |y| of the random walk, all in view
 FAR = 0.22  # m, a start so far from the grasp that the first step cannot hit the object
 LOST = 0.12  # m, an object whose origin is farther from the gripper is not held
+OTHERS = 2.0  # cost of moving other objects, m per m
 
 
 @dataclass(frozen=True)
@@ -51,14 +50,16 @@ class GraspExpert:
     :param rng: numpy Generator; every whim of this expert comes from it.
     :param config: GraspConfig.
     :param rollout: mujoco.rollout.Rollout to share between episodes.
+    :param held: index of the object that is to be grasped.
+    :ivar hover: m, height of the gripper before it drops.
     """
 
     def __init__(self, simulator: Simulator, rng: np.random.Generator, config: GraspConfig,
-                 rollout: mujoco.rollout.Rollout) -> None:
-        self._simulator, self._rng, self._config = simulator, rng, config
-        self._rollout = rollout
+                 rollout: mujoco.rollout.Rollout, held: int = 0) -> None:
+        self.simulator, self._rng, self._config = simulator, rng, config
+        self._rollout, self._held = rollout, held
         self._scratch = mujoco.MjData(simulator.model)  # rollouts overwrite it
-        self._hover = rng.uniform(*config.hover)
+        self.hover = rng.uniform(*config.hover)
         self._low = rng.uniform(*config.low)
         self._top = self._low + rng.uniform(*config.lift)
         self._drop_steps = int(rng.integers(1, 3))
@@ -73,7 +74,7 @@ class GraspExpert:
         :param steps_left: control periods until the episode ends.
         :return: (n, 4) actions.
         """
-        here = self._simulator.target
+        here = self.simulator.target
         steps_left -= self._reserve(steps_left)
         place = self._search()
         # From afar the arm rises on the way.
@@ -84,27 +85,46 @@ class GraspExpert:
         travel = min(travel, max(steps_left - fixed, fastest))
         idle = int(self._rng.integers(0, 1 + max(min(steps_left - fixed - travel, 4), 0)))
         lift_steps = self._lift_steps
-        if self._simulator.task.lift:
+        if self.simulator.task.lift:
             # Up to the last frame: idle frames beside the goal picture would make copying perfect.
             lift_steps = max(steps_left - (fixed - lift_steps) - travel - idle, lift_steps)
         path = [here[:3]]
         if rise:
-            path.append(np.append(here[:2], self._hover))
-        above, below = np.append(place, self._hover), np.append(place, self._low)
-        path += _line(path[-1], above, travel)
+            path.append(np.append(here[:2], self.hover))
+        above, below = np.append(place, self.hover), np.append(place, self._low)
+        path += straight(path[-1], above, travel)
         if far:
-            path[-travel:] = [np.append(point[:2], self._hover) for point in path[-travel:]]
+            path[-travel:] = [np.append(point[:2], self.hover) for point in path[-travel:]]
         path += [above] * idle  # it waits above the object
-        path += _line(above, below, self._drop_steps)
+        path += straight(above, below, self._drop_steps)
         opened = len(path) - 1
-        path += [below] + _line(below, np.append(place, self._top), lift_steps)
+        path += [below] + straight(below, np.append(place, self._top), lift_steps)
+        opening = np.zeros(len(path) - 1)
+        opening[:opened] = 1
+        return np.column_stack([np.diff(path, axis=0), opening])
+
+    def pick_and_lift(self) -> np.ndarray:
+        """
+        Plan to go to an object among others, above which the gripper is, and lift it clear of all.
+
+        :return: (n, 4) actions.
+        """
+        here = self.simulator.target
+        place = self._search()
+        travel, _ = self._travel_steps(place - here[:2])
+        above, below = np.append(place, self.hover), np.append(place, self._low)
+        path = [here[:3], *straight(here[:3], above, travel)]
+        path += [above] * int(self._rng.integers(3))  # it waits above the object
+        path += straight(above, below, self._drop_steps)
+        opened = len(path) - 1
+        path += [below, *straight(below, np.append(place, self._top), self._lift_steps)]
         opening = np.zeros(len(path) - 1)
         opening[:opened] = 1
         return np.column_stack([np.diff(path, axis=0), opening])
 
     def _reserve(self, steps_left: int) -> int:
         """Hurry if there is little time; return the control periods that placing will take."""
-        simulator = self._simulator
+        simulator = self.simulator
         if simulator.task.kind != 'pick_place':
             return 0
         start, goal = simulator.object_poses()[0, :2], simulator.goal().object_poses[0, :2]
@@ -125,15 +145,15 @@ class GraspExpert:
         :param steps_left: control periods until the episode ends.
         :return: (n, 4) actions; they may not suffice to reach the goal.
         """
-        simulator, rng = self._simulator, self._rng
+        simulator, rng = self.simulator, self._rng
         here = simulator.target[:3]
         gap = simulator.goal().object_poses[0, :2] - simulator.object_poses()[0, :2]
         end = np.clip(here[:2] + gap, WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])
         travel, fastest = self._travel_steps(end - here[:2])
         travel = min(travel, max(steps_left - self._drop_steps - 2 - self._walk_steps, fastest))
         above = np.append(end, here[2])
-        below, leave = np.append(end, self._low + 0.003), np.append(end, self._hover)
-        path = [here] + _line(here, above, travel) + _line(above, below, self._drop_steps)
+        below, leave = np.append(end, self._low + 0.003), np.append(end, self.hover)
+        path = [here] + straight(here, above, travel) + straight(above, below, self._drop_steps)
         closed = len(path) - 1
         path += [below, leave]
         wiggle, reach = self._config.wiggle, RANGE * simulator.look.spread(True)
@@ -153,7 +173,7 @@ class GraspExpert:
     def _search(self) -> np.ndarray:
         """Return the gripper's x and y, (2,) metres, for a grasp."""
         config, rng = self._config, self._rng
-        origin = self._simulator.object_poses()[0, :2]
+        origin = self.simulator.object_poses()[self._held, :2]
         mean, spread = origin, np.array(config.spread)
         explore = rng.random() < config.explore
         best_cost, best = np.inf, origin
@@ -171,66 +191,63 @@ class GraspExpert:
 
     def _costs(self, places: np.ndarray) -> np.ndarray:
         """Grasp at all places (N, 2) in the true simulator; return (N,) metres not lifted."""
-        simulator = self._simulator
+        simulator = self.simulator
         lift = self._top - self._low
         grasp = self._drop_steps + 1
         actions = np.zeros((grasp + self._lift_steps + 1, 4))  # the last one holds still
-        actions[:self._drop_steps, 2] = (self._low - self._hover) / self._drop_steps
+        actions[:self._drop_steps, 2] = (self._low - self.hover) / self._drop_steps
         actions[:self._drop_steps, 3] = 1
         actions[grasp:-1, 2] = lift / self._lift_steps
-        controls, _ = ramp_controls(np.array([0, 0, self._hover, 1]), actions)
+        controls, _ = ramp_controls(np.array([0, 0, self.hover, 1]), actions)
         controls = np.tile(controls, (len(places), 1, 1))
         controls[..., :2] += places[:, None]
         states = np.tile(simulator.state(), (len(places), 1))
-        states[:, 1:3], states[:, 3] = places, self._hover
+        states[:, 1:3], states[:, 3] = places, self.hover
         states[:, 4:6] = controls[:, :1, 3:].squeeze(1)
         ends, _ = self._rollout.rollout(simulator.model, self._scratch, states, controls)
-        poses = ends[:, -1, 1 + OBJECT_QPOS_START:1 + OBJECT_QPOS_START + 7]
-        lifted = poses[:, 2] - simulator.object_poses()[0, 2]
+        before = simulator.object_poses()[:, :3]
+        after = ends[:, -1, 1 + OBJECT_QPOS_START:1 + simulator.model.nq].reshape(
+            len(places), -1, 7)
+        poses = after[:, self._held]
+        lifted = poses[:, 2] - before[self._held, 2]
+        moved = np.delete(np.linalg.norm(after[..., :3] - before, axis=-1), self._held, axis=1)
         lost = np.linalg.norm(poses[:, :2] - places, axis=1) > LOST
         upright = 1 - 2 * (poses[:, 4] ** 2 + poses[:, 5] ** 2)
         # What is lifted but for a centimetre is as good as can be: such places tie.
         return lift - np.clip(lifted, 0, lift - 0.01) + 0.1 * (
-            (upright < 0.95) | lost)
+            (upright < 0.95) | lost) + OTHERS * moved.sum(1)
 
 
-def _line(start: np.ndarray, end: np.ndarray, steps: int) -> list[np.ndarray]:
+def straight(start: np.ndarray, end: np.ndarray, steps: int) -> list[np.ndarray]:
     """Return the points after start on a straight way of so many steps."""
     return [start + share * (end - start) for share in np.linspace(0, 1, steps + 1)[1:]]
 
 
 def run_grasp_episode(
         simulator: Simulator, seed: int, config: GraspConfig | None = None,
-        rollout: mujoco.rollout.Rollout | None = None) -> EpisodeRun:
+        rollout: mujoco.rollout.Rollout | None = None, num_frames: int = 0) -> EpisodeRun:
     """
-    Run one episode of exactly as many frames as the task has.
+    Run one episode of exactly num_frames frames; 0: as many as the task has.
 
     :param simulator: Simulator of a task with a grasp.
     :param seed: of the scene and of the expert.
     :param config: GraspConfig.
     :param rollout: mujoco.rollout.Rollout to share between episodes, or None.
-    :return: list of T Observations, (T, 4) float32 actions (the last row is zero), outcome, and
-        seconds spent in the search and in stepping and rendering.
+    :return: EpisodeRun.
     """
-    observations = [simulator.reset(seed)]
+    first = simulator.reset(seed)
     rng = np.random.default_rng([seed, simulator.task.stream, 1])
     expert = GraspExpert(
         simulator, rng, config or GraspConfig(), rollout or mujoco.rollout.Rollout(nthread=0))
-    actions: list[np.ndarray] = []
-    seconds = {'search': 0.0, 'step': 0.0}
-    plans: list[Callable[[int], np.ndarray]] = [expert.pick]
-    if simulator.task.kind == 'pick_place':
-        plans.append(expert.place)
-    plans.append(lambda left: np.tile([0, 0, 0, actions[-1][3]], (left, 1)))  # hold still
-    for plan in plans:
-        begin = time.perf_counter()
-        steps_left = simulator.task.num_frames - len(observations)
-        planned = plan(steps_left)[:steps_left]
-        seconds['search'] += time.perf_counter() - begin
-        begin = time.perf_counter()
-        for action in planned:
-            observations.append(simulator.step(action))
-            actions.append(action)
-        seconds['step'] += time.perf_counter() - begin
-    done = np.array(actions + [np.zeros(4)], np.float32)
-    return observations, done, simulator.outcome(), seconds
+    num_frames = num_frames or simulator.task.num_frames
+    return carry_out(simulator, first, _plans(expert, num_frames), num_frames)
+
+
+def _plans(expert: GraspExpert, num_frames: int) -> Iterator[np.ndarray]:
+    """Yield the actions of one episode; each waits until those before are carried out."""
+    simulator, steps_left = expert.simulator, num_frames - 1
+    for plan in (expert.pick, expert.place)[:1 + (simulator.task.kind == 'pick_place')]:
+        actions = plan(steps_left)
+        yield actions
+        steps_left -= len(actions)
+    yield np.tile([0, 0, 0, simulator.target[3]], (max(steps_left, 0), 1))  # hold still

@@ -11,6 +11,7 @@ from sim_bridge.appearance import choose_appearance, USUAL
 from sim_bridge.camera import Renderer
 from sim_bridge.grasping import grasp_place
 from sim_bridge.looks import get_look, OBSERVER
+from sim_bridge.places import gripper_away_from
 from sim_bridge.scene import (
     build_scene,
     FINGER_GAP,
@@ -19,8 +20,9 @@ from sim_bridge.scene import (
     object_names,
     TIMESTEP,
 )
+from sim_bridge.stack_tasks import is_tower, levels
 from sim_bridge.studio import Studio
-from sim_bridge.tasks import get_task, gripper_away_from, nearest_first, sample_scene
+from sim_bridge.tasks import get_task, sample_scene
 from tap_ros import ur10e
 from tap_ros.contract import (
     ACTION_LIMIT,
@@ -139,10 +141,11 @@ class Simulator:
         self._prepare_camera()
         self.target = np.append(self.scene.gripper_start, 0.0)
         self._place(_lift(self.scene.start_poses), self.scene.gripper_start)
-        poses = _lift(self.scene.goal_poses, self.task.lift)
+        poses = _lift(self.scene.goal_poses, levels(self.task.num_objects)
+                      if self.task.kind == 'stack' else self.task.lift)
         gripper = {
             'push': self._after_last_push, 'grasp': self._holding, 'pick_place': self._leaving,
-        }[self.task.kind]()
+            'stack': self._releasing}[self.task.kind]()
         self._goal = [self.photograph(poses, gripper, hide_arm) for hide_arm in (False, True)]
         return self.observe()
 
@@ -175,7 +178,7 @@ class Simulator:
         Return the Observation of the goal.
 
         The arm stands as after pushing one object there, holds the object that is to be grasped,
-        or is above the one that it has put down.
+        is above the one that it has put down, or lets go of the top of a tower.
 
         :param hide_arm: leave the arm out of the picture.
         """
@@ -258,11 +261,13 @@ class Simulator:
         Return 'success' or 'failure'.
 
         An object is in place within SUCCESS_DISTANCE of its goal; to be grasped is to be held by
-        the fingers, that high above the table.
+        the fingers, that high above the table; to be stacked is to stand on the one below, let go.
         """
         if self.task.lift:
             high = self.object_poses()[:, 2] - HALF_HEIGHT > SUCCESS_DISTANCE
-            good = high.all() and np.isin(self.data.contact.geom, self._fingers()).any()
+            good = high.all() and self._touching()
+        elif self.task.kind == 'stack':
+            good = is_tower(self.object_poses()) and not self._touching()
         else:
             good = (self.distances() < SUCCESS_DISTANCE).all()
         return 'success' if good else 'failure'
@@ -300,16 +305,20 @@ class Simulator:
         """Return the numbers of the fingers' geoms."""
         return [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
 
+    def _touching(self) -> bool:
+        """Tell whether a finger touches anything."""
+        return bool(np.isin(self.data.contact.geom, self._fingers()).any())
+
     def _after_last_push(self) -> np.ndarray:
-        """Return where the gripper touches one object that it has just pushed to its goal."""
+        """Return where the gripper touches the object that it has pushed to its goal last."""
         starts, goals = self.scene.start_poses[:, :2], self.scene.goal_poses[:, :2]
-        k = nearest_first(self.scene.gripper_start[:2], starts, goals)[-1]
+        k = self.scene.order[-1]
         along = (goals[k] - starts[k]) / np.linalg.norm(goals[k] - starts[k])
-        fingers, state = self._fingers(), self.state()
+        state = self.state()
         for behind in np.arange(0.04, 0.16, 0.005):
             gripper = np.append(goals[k] - behind * along, 0.01)
             self._place(_lift(self.scene.goal_poses), gripper)
-            if not np.isin(self.data.contact.geom, fingers).any():
+            if not self._touching():
                 break
         mujoco.mj_setState(self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         return gripper
@@ -326,6 +335,11 @@ class Simulator:
         place, _, _ = grasp_place(self.scene.shapes[0], self.scene.start_poses[0, 2])
         return np.array([*self.scene.goal_poses[0, :2] + place, LEAVE_HEIGHT, 1])
 
+    def _releasing(self) -> np.ndarray:
+        """Return where the open gripper has just let go of the top of the tower."""
+        top = levels(self.task.num_objects)[-1]
+        return np.array([*self.scene.goal_poses[-1, :2], top + GRASP_HEIGHT, 1])
+
     def _place(self, object_poses: np.ndarray, gripper: np.ndarray) -> None:
         """Put objects at poses (K, 7) and the gripper at (3,), closed, or (4,), all at rest."""
         mujoco.mj_resetData(self.model, self.data)
@@ -338,8 +352,8 @@ class Simulator:
         mujoco.mj_forward(self.model, self.data)
 
 
-def _lift(planar_poses: np.ndarray, height: float = 0.0) -> np.ndarray:
-    """Turn (K, 3) x, y, yaw into (K, 7) poses at a height above the table in metres."""
+def _lift(planar_poses: np.ndarray, height: float | np.ndarray = 0.0) -> np.ndarray:
+    """Turn (K, 3) x, y, yaw into (K, 7) poses at a height, or (K,), above the table in metres."""
     poses = np.zeros((len(planar_poses), 7))
     poses[:, :2] = planar_poses[:, :2]
     poses[:, 2] = HALF_HEIGHT + height

@@ -6,28 +6,35 @@ The tasks: how many objects, how many frames, and where starts and goals may lie
 The rules are those of the paper's authors (their cartgripper environment): object origins within
 0.35 m of the middle, starts at least 0.35 m apart (0.3 m with three objects), every goal exactly
 0.2 m from its start and at least 0.2 m from the other goals, yaw changed by at most 0.2 rad.
-Doing nothing therefore ends 20 cm from the goals.
+Doing nothing therefore ends 20 cm from the goals. Where the order matters, objects stand on the
+goals of others, see order_tasks.py.
 
 The tasks with a grasp have one object of a shape that the gripper can hold. To grasp is to lift it
 from where it stands; to pick and place is to carry it to a place within 0.2 m of the middle, with
-the arm starting about 0.3 m from the object.
+the arm starting about 0.3 m from the object. To stack is to build a tower of blocks on the first
+one, see stack_tasks.py.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from sim_bridge.grasping import grasp_place, graspable_shape, graspable_yaw
+from sim_bridge.order_tasks import draw_chain, draw_shapes, ORDER_SEPARATION
+from sim_bridge.places import (
+    apart,
+    GOAL_DISTANCE,
+    GOAL_YAW_RANGE,
+    gripper_away_from,
+    GRIPPER_HEIGHT,
+    nearest_first,
+    OBJECT_RANGE,
+)
 from sim_bridge.scene import ObjectShape, random_shape
+from sim_bridge.stack_tasks import BLOCK_SEPARATION, draw_block, draw_blocks
 from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.errors import SceneError
 
-OBJECT_RANGE = 0.35  # m, |x| and |y| of object origins at start and goal
-GOAL_DISTANCE = 0.2  # m from start to goal of every object
-GOAL_YAW_RANGE = 0.2  # rad
 GOAL_SEPARATION = 0.2  # m between goals
-GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
-GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
-GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the start
 GRASP_RANGE = 0.2  # m, |x| and |y| of the start of an object to be grasped
 GRASP_REACH_RANGE = 0.3  # m, |x| and |y| of the gripper's start before a grasp, all in view
 PLACE_RANGE = 0.2  # m, |x| and |y| of the place where a picked object goes
@@ -42,9 +49,10 @@ class Task:
     name: str
     num_objects: int
     start_separation: float  # m between object origins at the start
-    kind: str = 'push'  # or 'grasp', 'pick_place'
+    kind: str = 'push'  # or 'grasp', 'pick_place', 'stack'
     reach: tuple[float, float] = (0.0, 0.0)  # m, nearest and farthest start, for grasps
     lift: float = 0.0  # m, height of the goal above the table
+    ordered: bool = False  # the wrong order of pushes fails
     stream: int = 0  # of random numbers, besides the seed; no two tasks have the same
 
     @property
@@ -61,12 +69,20 @@ class Task:
 TASKS = {
     'push2': Task('push2', num_objects=2, start_separation=0.35, stream=2),
     'push3': Task('push3', num_objects=3, start_separation=0.3, stream=3),
+    'order2': Task(
+        'order2', num_objects=2, start_separation=ORDER_SEPARATION, ordered=True, stream=6),
+    'order3': Task(
+        'order3', num_objects=3, start_separation=ORDER_SEPARATION, ordered=True, stream=7),
     'grasp': Task(
         'grasp', num_objects=1, start_separation=0.0, kind='grasp',
         reach=(0.13, 0.32), lift=LIFT_HEIGHT, stream=4),
     'pick_place': Task(
         'pick_place', num_objects=1, start_separation=0.0, kind='pick_place',
         reach=(0.27, 0.33), stream=5),
+    'stack2': Task(
+        'stack2', num_objects=2, start_separation=BLOCK_SEPARATION, kind='stack', stream=8),
+    'stack3': Task(
+        'stack3', num_objects=3, start_separation=BLOCK_SEPARATION, kind='stack', stream=9),
 }
 
 
@@ -80,6 +96,7 @@ class Scene:
     start_poses: np.ndarray  # (K, 3)
     goal_poses: np.ndarray  # (K, 3)
     gripper_start: np.ndarray  # (3,) m
+    order: tuple[int, ...]  # objects, as they should be moved; the last one is moved last
 
 
 def get_task(name: str) -> Task:
@@ -107,21 +124,53 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0) -> Scene:
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.stream])
+    if task.kind == 'stack':
+        return _sample_stack(task, seed, rng)
     if task.gripping:
         return _sample_grasp(task, seed, rng, spread)
+    if task.ordered:
+        return _sample_ordered(task, seed, rng)
     shapes = tuple(random_shape(rng) for _ in range(task.num_objects))
     # Separated starts may leave no room for separated goals: then both are drawn anew.
     goals = None
     while goals is None:
         starts = _draw_starts(rng, task)
         goals = _draw_goals(rng, starts)
-    yaws = rng.uniform(0, 2 * np.pi, task.num_objects)
-    goal_yaws = yaws + rng.uniform(-GOAL_YAW_RANGE, GOAL_YAW_RANGE, task.num_objects)
+    start_poses, goal_poses = _with_yaws(rng, starts, goals)
+    hand = gripper_away_from(rng, starts)
     return Scene(
-        task=task, seed=int(seed), shapes=shapes,
-        start_poses=np.column_stack([starts, yaws]),
-        goal_poses=np.column_stack([goals, goal_yaws]),
-        gripper_start=gripper_away_from(rng, starts))
+        task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
+        gripper_start=hand, order=tuple(nearest_first(hand[:2], starts, goals)))
+
+
+def _sample_ordered(task: Task, seed: int, rng: np.random.Generator) -> Scene:
+    """Draw a scene in which the wrong order of pushes fails."""
+    shapes = draw_shapes(rng, task.num_objects)
+    starts, goals, hand = draw_chain(rng, task.num_objects)
+    # So that a name, or a place in a list, does not tell the order.
+    names = rng.permutation(task.num_objects)
+    starts[names], goals[names] = starts.copy(), goals.copy()
+    start_poses, goal_poses = _with_yaws(rng, starts, goals)
+    return Scene(
+        task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
+        gripper_start=hand, order=tuple(int(k) for k in names[::-1]))
+
+
+def _with_yaws(rng: np.random.Generator, starts: np.ndarray,
+               goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Draw any yaw at the start, and one near it at the goal; (K, 3) each."""
+    yaws = rng.uniform(0, 2 * np.pi, len(starts))
+    goal_yaws = yaws + rng.uniform(-GOAL_YAW_RANGE, GOAL_YAW_RANGE, len(starts))
+    return np.column_stack([starts, yaws]), np.column_stack([goals, goal_yaws])
+
+
+def _sample_stack(task: Task, seed: int, rng: np.random.Generator) -> Scene:
+    """Draw blocks to be stacked; all but the first one are moved."""
+    shapes = tuple(draw_block(rng) for _ in range(task.num_objects))
+    start_poses, goal_poses, hand = draw_blocks(rng, task.num_objects)
+    return Scene(
+        task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
+        gripper_start=hand, order=tuple(range(1, task.num_objects)))
 
 
 def _sample_grasp(task: Task, seed: int, rng: np.random.Generator, spread: float) -> Scene:
@@ -142,44 +191,14 @@ def _sample_grasp(task: Task, seed: int, rng: np.random.Generator, spread: float
     return Scene(
         task=task, seed=int(seed), shapes=(shape,), start_poses=np.array([[*start, yaw]]),
         goal_poses=np.array([[*goal, grasp_place(shape, yaw)[1]]]),
-        gripper_start=np.append(gripper, rng.uniform(0, GRIPPER_HEIGHT)))
-
-
-def gripper_away_from(rng: np.random.Generator, positions: np.ndarray) -> np.ndarray:
-    """
-    Draw a place of the gripper that touches no object.
-
-    :param rng: numpy Generator.
-    :param positions: (K, 2) object origins in metres.
-    :return: (3,) metres.
-    """
-    while True:
-        xy = rng.uniform(-GRIPPER_RANGE, GRIPPER_RANGE, 2)
-        if np.linalg.norm(positions - xy, axis=1).min() > GRIPPER_MARGIN:
-            return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
-
-
-def nearest_first(hand: np.ndarray, starts: np.ndarray, goals: np.ndarray) -> list[int]:
-    """
-    Order objects as the expert mostly takes them: always the one nearest to the gripper.
-
-    :param hand: (2,) metres, where the gripper is; starts (K, 2), goals (K, 2) of the objects.
-    :return: list of K object indices.
-    """
-    order, left = [], list(range(len(starts)))
-    while left:
-        k = min(left, key=lambda i: np.linalg.norm(starts[i] - hand))
-        left.remove(k)
-        order.append(k)
-        hand = goals[k]
-    return order
+        gripper_start=np.append(gripper, rng.uniform(0, GRIPPER_HEIGHT)), order=(0,))
 
 
 def _draw_starts(rng: np.random.Generator, task: Task) -> np.ndarray:
     """Draw object origins (K, 2) that are far enough apart."""
     while True:
         starts = rng.uniform(-OBJECT_RANGE, OBJECT_RANGE, (task.num_objects, 2))
-        if _apart(starts, task.start_separation):
+        if apart(starts, task.start_separation):
             return starts
 
 
@@ -189,12 +208,6 @@ def _draw_goals(rng: np.random.Generator, starts: np.ndarray,
     for _ in range(attempts):
         angles = rng.uniform(0, 2 * np.pi, len(starts))
         goals = starts + GOAL_DISTANCE * np.column_stack([np.cos(angles), np.sin(angles)])
-        if (np.abs(goals) <= OBJECT_RANGE).all() and _apart(goals, GOAL_SEPARATION):
+        if (np.abs(goals) <= OBJECT_RANGE).all() and apart(goals, GOAL_SEPARATION):
             return goals
     return None
-
-
-def _apart(positions: np.ndarray, separation: float) -> bool:
-    """Tell whether all pairs of positions (K, 2) are at least so far apart."""
-    gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-    return (gaps[np.triu_indices(len(positions), 1)] >= separation).all()

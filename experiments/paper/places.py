@@ -82,7 +82,10 @@ def collect_command(folder):
         return ''
     words = ['python', '-m', 'tap_ros', 'collect', '--task', settings['task'], '--out',
              str(folder), '--episodes', str(settings['episodes'])]
-    return shlex.join(words + (['--seed', str(settings['seed'])] if settings['seed'] else []))
+    for option in ('seed', 'frames', 'timing'):
+        if settings.get(option):
+            words += [f'--{option}', str(settings[option])]
+    return shlex.join(words)
 
 
 def recording_hash(*folders):

@@ -21,7 +21,7 @@ from tap_ros.files import write_atomically, write_rows
 from tap_ros.options import Flag, Folder, one_of, ShippedFile
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
-from tap_ros.planning.scenes import FIRST_SCENE, PLANNING_TASKS
+from tap_ros.planning.scenes import FIRST_SCENE, PAPER_TASKS, PLANNING_TASKS
 from tap_ros.weights import find_predictor, FORWARD_MODEL
 from tyro import conf
 
@@ -63,7 +63,7 @@ class Options:
     :param results_only: run nothing, make planning.json and planning.md again from the scenes.
     """
 
-    tasks: tuple[Annotated[str, one_of(PLANNING_TASKS)], ...] = PLANNING_TASKS
+    tasks: tuple[Annotated[str, one_of(PLANNING_TASKS)], ...] = PAPER_TASKS
     methods: Annotated[tuple[str, ...], conf.arg(metavar='METHOD [METHOD ...]')] = DEFAULT_METHODS
     predictor: Annotated[tuple[str, ...], conf.arg(
         metavar='NAME=FILE [NAME=FILE ...]', help_behavior_hint=f'(default: {TRAINED})')] = ()

@@ -12,7 +12,6 @@ from itertools import product
 
 from experiments.planning.true_model import TrueModel
 import numpy as np
-from sim_bridge.tasks import nearest_first
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
@@ -123,8 +122,7 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed):
         return targets_by(subgoals, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []
-    order = nearest_first(
-        seen.gripper[:2], seen.object_poses[:, :2], goal.object_poses[:, :2])
+    order = simulator.scene.order
     K, n = len(order), method.recursion
     if method.base == 'oracle_order':
         later = [np.isin(np.arange(K), order[i + 1:]) for i in range(K - 1)]

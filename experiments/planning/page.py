@@ -10,7 +10,9 @@ from experiments.planning.methods import BOUNDS
 import pandas as pd
 from tap_ros.planning.forward_scores import MOVED_PIXELS
 
-TITLES = {'push2': 'Two objects', 'push3': 'Three objects'}
+TITLES = {'push2': 'Two objects', 'push3': 'Three objects',
+          'order2': 'Two objects, one on the goal of the other',
+          'order3': 'Three objects, two on goals of others'}
 PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward model',
          'search': 'the search', 'cost': 'its cost', 'tracking': 'object pixels',
          'switch': 'when to go on', 'recursion': 'number of subgoals',

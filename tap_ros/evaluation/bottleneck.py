@@ -112,6 +112,25 @@ def target_bottlenecks(episodes: Sequence[Episode], fraction: float,
     return result
 
 
+def bottleneck_share(episode: Episode, threshold: float = 2.0) -> float:
+    """
+    Find when in an episode the first object is home and the others are untouched.
+
+    :param episode: the Episode; home is where an object lies in the last frame.
+    :param threshold: px, the sum over the objects, up to which a frame is such a bottleneck.
+    :return: where the middle of these frames is, from 0 (the first frame) to 1 (the last); NaN
+        where there are none, or no frame can be one.
+    """
+    pixels = np.stack([episode.object_pixels[0], episode.object_pixels[-1]])
+    if not can_be_bottleneck(pixels):
+        return float('nan')
+    to_start, to_goal = (
+        np.linalg.norm(episode.object_pixels - place, axis=-1) for place in pixels)  # (T, K)
+    scores = (to_start.sum(1, keepdims=True) - to_start + to_goal).min(1)
+    frames = np.flatnonzero(scores <= threshold)
+    return float(frames.mean() / (len(scores) - 1)) if len(frames) else float('nan')
+
+
 def can_be_bottleneck(pixels: np.ndarray) -> bool:
     """Say whether there are two objects or more, known and moved; pixels (2, K, 2)."""
     return bool(pixels.shape[1] >= 2 and np.isfinite(pixels).all() and (

@@ -42,7 +42,7 @@ from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds
 from tap_ros.options import Flag, Folder, one_of
-from tap_ros.planning.scenes import FIRST_SCENE, PLANNING_TASKS
+from tap_ros.planning.scenes import FIRST_SCENE, PAPER_TASKS
 from tqdm import tqdm
 from tyro import conf
 
@@ -260,7 +260,7 @@ class Options:
 
     scenes: int = 3
     seed: int = FIRST_SCENE
-    task: Annotated[str, one_of(PLANNING_TASKS)] = PLANNING_TASKS[0]
+    task: Annotated[str, one_of(PAPER_TASKS)] = PAPER_TASKS[0]
     look: Annotated[str, one_of(LOOKS)] = 'plain'
     step_budget: Annotated[int, conf.arg(
         help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0

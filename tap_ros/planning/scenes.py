@@ -3,4 +3,5 @@
 """Which scenes are planned in."""
 
 FIRST_SCENE = 1_000_000  # seed, far from those of the training recordings
-PLANNING_TASKS = ('push2', 'push3')
+PAPER_TASKS = ('push2', 'push3')
+PLANNING_TASKS = (*PAPER_TASKS, 'order2', 'order3')

@@ -13,6 +13,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.evaluation.bottleneck import (
     bottleneck_frequency,
     bottleneck_scores,
+    bottleneck_share,
     MIN_MOTION,
     target_bottlenecks,
 )
@@ -275,3 +276,18 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     low, high = scores['prediction']['intervals']['min_l1']
     assert low <= scores['prediction']['min_l1'] <= high
     assert (tmp_path / 'out' / 'pictures.png').stat().st_size > 0
+
+
+@pytest.mark.parametrize('home', [3, 5, 8])
+def test_the_bottleneck_is_when_one_object_is_home_and_the_others_untouched(home):
+    T, start, end = 11, np.array([[3.0, 3], [20, 20]]), np.array([[3.0, 12], [28, 20]])
+    pixels = np.tile(start, (T, 1, 1))
+    pixels[home:, 1] = end[1]  # seen from frame `home` on, until object 0 goes in the last one
+    pixels[-1, 0] = end[0]
+    episode = replace(EPISODES[0], object_pixels=pixels.astype(np.float32))
+    assert bottleneck_share(episode) == pytest.approx((home + 9) / 2 / (T - 1))
+    both = pixels.copy()
+    both[home:-1, 0] = (start[0] + end[0]) / 2  # neither untouched nor home
+    assert np.isnan(bottleneck_share(replace(episode, object_pixels=both.astype(np.float32))))
+    alone = replace(episode, object_pixels=pixels[:, :1].astype(np.float32))
+    assert np.isnan(bottleneck_share(alone))

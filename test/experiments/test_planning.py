@@ -15,8 +15,8 @@ from experiments.planning.methods import BASES, parse_method
 from experiments.planning.true_model import TrueModel
 import numpy as np
 import pytest
+from sim_bridge.places import nearest_first
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks import nearest_first
 from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError
 from tap_ros.images import to_float

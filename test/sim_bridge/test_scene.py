@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from sim_bridge.camera import Camera
 from sim_bridge.grasping import GRASP_YAW
+from sim_bridge.places import GOAL_DISTANCE, GOAL_YAW_RANGE, OBJECT_RANGE
 from sim_bridge.scene import build_scene, GRIP_FOVY, GRIP_TILT, random_shape
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import (
-    GOAL_DISTANCE,
     GOAL_SEPARATION,
-    GOAL_YAW_RANGE,
     GRASP_RANGE,
     GRASP_REACH_RANGE,
-    OBJECT_RANGE,
     PLACE_DISTANCE,
     PLACE_RANGE,
     sample_scene,
@@ -23,8 +21,8 @@ from sim_bridge.tasks import (
 from tap_ros.contract import WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 
-PUSHING = [task for task in TASKS.values() if not task.gripping]
-GRIPPING = [task for task in TASKS.values() if task.gripping]
+PUSHING = [task for task in TASKS.values() if task.kind == 'push' and not task.ordered]
+GRIPPING = [task for task in TASKS.values() if task.kind in ('grasp', 'pick_place')]
 
 
 def name(task):

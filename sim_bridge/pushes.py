@@ -1,0 +1,108 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Pushes as actions, and where they lead in the true simulator."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, Simulator, SUBSTEPS
+from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
+
+MAX_PUSH_STEPS = 24  # longest macro action, in control periods
+UPRIGHT = 0.9  # cosine, an object that is tilted more than this is about to topple
+
+
+@dataclass(frozen=True)
+class Push:
+    """Go behind an object, come down, push it past its goal."""
+
+    angle: float  # rad, of the way of the gripper
+    offset: float  # m, of that way from the object's origin
+    overshoot: float  # m
+    speed: float  # m per control period, while low
+    travel_speed: float  # m per control period, while lifted
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The state of a simulator, from which pushes are rolled out."""
+
+    state: np.ndarray  # as Simulator.state
+    target: np.ndarray  # (4,) as Simulator.target
+    places: np.ndarray  # (K, 3) m, of the objects
+
+    @classmethod
+    def of(cls, simulator: Simulator) -> 'Moment':
+        """Return the present moment of a simulator."""
+        return cls(simulator.state(), simulator.target, simulator.object_poses()[:, :3])
+
+
+def push_actions(push: Push, hand: np.ndarray, place: np.ndarray, goal: np.ndarray,
+                 max_steps: int = MAX_PUSH_STEPS) -> np.ndarray:
+    """
+    Turn a push into actions: lift, travel, come down, push.
+
+    :param hand: (4,) target of the gripper before it; place, goal: (2,) m, of the object.
+    :param max_steps: the rest is left out.
+    :return: (n, 4).
+    """
+    along = np.array([np.cos(push.angle), np.sin(push.angle)])
+    aside = np.array([-along[1], along[0]])
+    start = place - 0.13 * along + push.offset * aside
+    length = np.linalg.norm(goal - place) + 0.07 + push.overshoot
+    lowest, highest = WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2]
+    start = np.clip(start, lowest, highest)
+    end = np.clip(start + max(length, 0.04) * along, lowest, highest)
+    waypoints = []
+    travel = np.linalg.norm(start - hand[:2])
+    if travel > 0.02:
+        if hand[2] < LIFTED - 0.03:
+            waypoints.append(np.append(hand[:2], LIFTED)[None])
+        steps = int(np.ceil(travel / push.travel_speed))
+        path = hand[:2] + np.linspace(0, 1, steps + 1)[1:, None] * (start - hand[:2])
+        waypoints.append(np.column_stack([path, np.full(steps, LIFTED)]))
+    waypoints.append(np.append(start, LOW)[None])
+    steps = int(np.ceil(np.linalg.norm(end - start) / push.speed))
+    if steps:
+        path = start + np.linspace(0, 1, steps + 1)[1:, None] * (end - start)
+        waypoints.append(np.column_stack([path, np.full(steps, LOW)]))
+    positions = np.concatenate([hand[None, :3], *waypoints])[:max_steps + 1]
+    return np.column_stack([np.diff(positions, axis=0), np.zeros(len(positions) - 1)])
+
+
+class PushRollouts:
+    """
+    Rolls out pushes from any moment of a scene in its true physics; the simulator stays.
+
+    :param simulator: Simulator, already reset.
+    :param rollout: mujoco.rollout.Rollout.
+    """
+
+    def __init__(self, simulator: Simulator, rollout: mujoco.rollout.Rollout) -> None:
+        self._model, self._rollout = simulator.model, rollout
+        self._scratch = mujoco.MjData(simulator.model)  # rollouts overwrite it
+
+    def __call__(self, moment: Moment,
+                 plans: Sequence[np.ndarray]) -> tuple[list[Moment], np.ndarray]:
+        """
+        Carry out each of N plans from a moment.
+
+        :param plans: N arrays (n, 4) of actions, none empty.
+        :return: the N moments after, and (N, K) bool, which objects are then upright.
+        """
+        lengths = np.array([len(plan) for plan in plans])
+        actions = np.zeros((len(plans), lengths.max(), 4))
+        for plan, padded in zip(plans, actions):
+            padded[:len(plan)] = plan
+        controls, targets = ramp_controls(moment.target, actions)
+        states, _ = self._rollout.rollout(
+            self._model, self._scratch, np.tile(moment.state, (len(plans), 1)), controls)
+        numbers = np.arange(len(plans))
+        last = states[numbers, lengths * SUBSTEPS - 1]  # (N, state)
+        objects = last[:, 1 + OBJECT_QPOS_START:1 + self._model.nq].reshape(len(plans), -1, 7)
+        upright = 1 - 2 * (objects[..., 4] ** 2 + objects[..., 5] ** 2) >= UPRIGHT
+        return [Moment(*moment) for moment in zip(
+            last, targets[numbers, lengths - 1], objects[..., :3])], upright
