@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from sim_bridge.appearance import choose_appearance, USUAL
 from sim_bridge.camera import Camera
+from sim_bridge.collect import collect, CollectConfig
+from sim_bridge.expert import run_episode
 from sim_bridge.looks import LOOKS, OBSERVER
 from sim_bridge.robot_description import robot_description, TIP_FRAME
 from sim_bridge.simulator import Simulator
@@ -16,6 +18,7 @@ from sim_bridge.studio import Studio
 from tap_ros import ur10e
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import KinematicsError, SceneError
+from tap_ros.recording.reader import iter_episodes
 
 TASKS = ('push2', 'pick_place')
 STUDIOS = [name for name, look in LOOKS.items() if look.studio]
@@ -194,3 +197,15 @@ def test_appearances_are_drawn_from_the_seed():
     assert choose_appearance('usual', 7) == USUAL
     assert choose_appearance('random', 7) == choose_appearance('random', 7)
     assert choose_appearance('random', 7) != choose_appearance('random', 8)
+
+
+def test_a_recording_carries_the_masks_of_its_pictures(tmp_path):
+    collect(tmp_path / 'bag', CollectConfig(
+        task='pick_place', episodes=1, look='ur10e', appearance='random'), progress=False)
+    episode, = iter_episodes(tmp_path / 'bag')
+    simulator = Simulator('pick_place', 64, 'ur10e', 'random')
+    observations, *_ = run_episode(simulator, 0)
+    assert np.array_equal(episode.frames, [o.image for o in observations])
+    assert np.array_equal(episode.robot_masks, [o.robot_mask for o in observations])
+    assert np.array_equal(episode.goal_mask, observations[-1].robot_mask)
+    simulator.close()
