@@ -23,21 +23,24 @@ def draw_block(rng: np.random.Generator) -> ObjectShape:
     return ObjectShape('bar', ((width, width, HALF_HEIGHT),), ((0, 0),), (colour,))
 
 
-def draw_blocks(rng: np.random.Generator,
-                count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def draw_blocks(rng: np.random.Generator, count: int,
+                spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Draw where K blocks stand, the tower and the gripper.
 
+    :param rng: numpy Generator.
+    :param count: K.
+    :param spread: factor of the ranges of blocks and gripper.
     :return: start poses (K, 3) and goal poses (K, 3), all on the first block's start and, as the
         closing fingers turn what they hold, in line with x and y; (3,) of the gripper in m.
     """
     places = np.zeros((count, 2))
     while not apart(places, BLOCK_SEPARATION):
-        places = rng.uniform(-BLOCK_RANGE, BLOCK_RANGE, (count, 2))
+        places = spread * rng.uniform(-BLOCK_RANGE, BLOCK_RANGE, (count, 2))
     yaws = rng.uniform(-GRASP_YAW, GRASP_YAW, count)
     hand = places[0]
     while np.linalg.norm(places - hand, axis=1).min() < HAND_MARGIN:
-        hand = rng.uniform(-HAND_RANGE, HAND_RANGE, 2)
+        hand = spread * rng.uniform(-HAND_RANGE, HAND_RANGE, 2)
     goals = np.column_stack([np.tile(places[0], (count, 1)), np.zeros(count)])
     goals[0, 2] = yaws[0]
     return (np.column_stack([places, yaws]), goals,

@@ -125,7 +125,7 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0) -> Scene:
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.stream])
     if task.kind == 'stack':
-        return _sample_stack(task, seed, rng)
+        return _sample_stack(task, seed, rng, spread)
     if task.gripping:
         return _sample_grasp(task, seed, rng, spread)
     if task.ordered:
@@ -164,10 +164,10 @@ def _with_yaws(rng: np.random.Generator, starts: np.ndarray,
     return np.column_stack([starts, yaws]), np.column_stack([goals, goal_yaws])
 
 
-def _sample_stack(task: Task, seed: int, rng: np.random.Generator) -> Scene:
+def _sample_stack(task: Task, seed: int, rng: np.random.Generator, spread: float) -> Scene:
     """Draw blocks to be stacked; all but the first one are moved."""
     shapes = tuple(draw_block(rng) for _ in range(task.num_objects))
-    start_poses, goal_poses, hand = draw_blocks(rng, task.num_objects)
+    start_poses, goal_poses, hand = draw_blocks(rng, task.num_objects, spread)
     return Scene(
         task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
         gripper_start=hand, order=tuple(range(1, task.num_objects)))
