@@ -13,6 +13,7 @@ import os
 import random
 import sys
 
+from experiments.mutants.page import write_page
 from experiments.mutants.tool import generate, load_mutants, OPEN, try_mutants
 from tap_ros.errors import UsageError
 from tap_ros.options import Flag, parse
@@ -55,8 +56,6 @@ def main():
         if left:
             try_mutants(left, args.jobs)
     if not args.only:
-        # Not above: processes that test mutants must not inherit the package without mutants.
-        from experiments.mutants.page import write_page
         found = load_mutants()
         write_page(draw(found, args.sample, args.seed),
                    Counter(mutant.file for mutant in found.values()), args.seed)

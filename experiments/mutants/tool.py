@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import accumulate
 from pathlib import Path
+import subprocess
+import sys
 
 import libcst
 from mutmut import __main__ as mutmut
@@ -74,9 +76,11 @@ def try_mutants(names, jobs):
     """
     Run the tests that reach each of these mutants, the fastest first, until one fails.
 
+    In a process of its own: one that has imported the package without mutants would test that.
+
     :param names: of mutants; jobs: how many at a time.
     """
-    mutmut.cli(['run', '--max-children', str(jobs), *names], standalone_mode=False)
+    subprocess.run([sys.executable, '-m', __spec__.name, str(jobs), *names], check=True)
 
 
 def load_mutants():
@@ -136,3 +140,6 @@ def _run_clean_tests_once():
 _mutate_below_modes()
 _run_fast_tests_first()
 _run_clean_tests_once()
+
+if __name__ == '__main__':
+    mutmut.cli(['run', '--max-children', *sys.argv[1:]], standalone_mode=False)
