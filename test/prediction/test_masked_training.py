@@ -70,7 +70,8 @@ def learn(batch, config):
     nets = networks(config.chosen, 4 if config.posterior == 'video' else 3)
     augmentation = Augmentation.draw(len(CHOSEN), True, True, 0.2, np.random.default_rng(1))
     assert augmentation.flip.any() and not augmentation.flip.all()
-    outcome = predictor_loss(nets, batch, augmentation, config, Draws.make(batch, 3, 0, 0))
+    outcome = predictor_loss(nets, batch, augmentation, config, Draws.make(
+        batch, 3, 0, 0, levels=config.recursion))
     loss = outcome.loss
     if outcome.judged is not None:
         loss = loss + discriminators_loss(outcome.judged)

@@ -228,7 +228,7 @@ def drawn(config, store):
         settings = replace(config, steps=steps, **{
             'batch_size': 8, 'goal_picture': 'last', **options})
         return [(batch, augmentation) for _, batch, augmentation in training._batches(
-            store, MappedFrames(store), np.arange(len(store.lengths)), settings,
+            store, MappedFrames(store), None, np.arange(len(store.lengths)), settings,
             Processes(0, 1), 0, steps)]
     return draw
 
