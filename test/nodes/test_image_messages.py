@@ -235,7 +235,8 @@ def test_the_gripper_is_found_among_other_joints():
     message = object_messages.encode_joints([0.1, -0.2, 0.05, 1], STAMP, 'world')
     message.name.insert(0, 'elbow')
     message.position.insert(0, 9.0)
-    assert np.allclose(object_messages.decode_gripper(message), [0.1, -0.2, 0.05, 1])
+    gripper = object_messages.decode_gripper(message)
+    assert gripper.dtype == np.float32 and np.allclose(gripper, [0.1, -0.2, 0.05, 1])
     message.position[2] = float('nan')
     with pytest.raises(PlanningError, match='finite'):
         object_messages.decode_gripper(message)

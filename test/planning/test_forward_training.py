@@ -8,8 +8,9 @@ import json
 import numpy as np
 import pytest
 from safetensors.torch import load_file
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.learning.split import split_episodes
+from tap_ros.learning.weights import load_tensors
 from tap_ros.planning.forward_data import (
     augment_windows,
     COLOUR_ORDERS,
@@ -39,6 +40,14 @@ def windows(mirrored, order=0, seed=3, steps=4):
     store = [make_episode(seed)]
     raw = read_windows(store, [0], [2], steps)
     return augment_windows(*raw, HOMOGRAPHY, np.array([mirrored]), [order]), store[0]
+
+
+def test_windows_without_the_gripper_are_refused_by_the_number_of_their_episode():
+    store = [make_episode(seed) for seed in (1, 2, 3)]
+    store[2].grippers[3, 0] = np.nan
+    assert len(read_windows(store, [0, 1, 2], [2, 2, 4], 4)[0]) == 3
+    with pytest.raises(RecordingError, match='episode 2 lacks gripper positions'):
+        read_windows(store, [0, 1, 2], [2, 2, 0], 4)
 
 
 def test_mirrored_windows_show_objects_where_the_mirrored_table_says():
@@ -209,6 +218,8 @@ def test_resumed_training_equals_uninterrupted_training(bag, tmp_path):
                            for name in ('run', 'config', 'scores'))
     assert run['steps'] == 4 and run['episodes'] + run['held_out'] == 60
     assert config == json.loads(json.dumps(asdict(config_for(bag, tmp_path / 'a'))))
+    told = load_tensors(resumed)[1]['training']
+    assert (told['settings'], told['scores'], told['steps']) == (config, scores, 4)
     curves = EventAccumulator(str(tmp_path / 'b')).Reload()
     assert {tag: [event.step for event in curves.Scalars(tag)]
             for tag in curves.Tags()['scalars']} == {

@@ -11,7 +11,16 @@ from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig, Seen, Wait
+from tap_ros.planning.reach import (
+    Aim,
+    Command,
+    End,
+    Reach,
+    ReachConfig,
+    scene_change,
+    Seen,
+    Wait,
+)
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from toy_world import SIZE
 
@@ -163,6 +172,11 @@ def test_another_scene_ends_the_goal_even_if_nothing_else_is_new(mpc, changes, w
     end = reach.step(look(0, **changes))
     assert isinstance(end, End) and end.outcome == 'aborted' and words in end.message
     assert isinstance(reach.step(look(1)), Command)
+
+
+def test_objects_that_are_not_looked_at_do_not_vanish():
+    assert scene_change(look(0), look(1, pixels=None, names=())) == ''
+    assert scene_change(look(0), look(1, names=())) == 'a, b vanished'
 
 
 @pytest.mark.parametrize('seed', [0, 3])

@@ -243,6 +243,15 @@ def test_states_hold_for_half_a_frames_time_and_no_longer(tmp_path, off, known):
     np.testing.assert_allclose(episode.grippers[:, 0], expected, rtol=1e-6)
 
 
+def test_of_two_states_equally_near_the_earlier_one_counts(tmp_path):
+    def state(t):
+        return ('/joint_states', 'sensor_msgs/msg/JointState',
+                joints(round(t * SECOND), ['gripper_x'], [t]), round(t * SECOND))
+    record(tmp_path / 'bag', [*map(camera, (3, 4, 5)), state(3.5), state(4.5)])
+    (episode,) = iter_episodes(tmp_path / 'bag')
+    np.testing.assert_allclose(episode.grippers[:, 0], [3.5, 3.5, 4.5])
+
+
 def test_states_of_other_joints_are_no_gripper_states(tmp_path):
     def state(t, name, log):
         return ('/joint_states', 'sensor_msgs/msg/JointState',

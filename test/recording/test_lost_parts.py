@@ -5,6 +5,7 @@
 from functools import partial
 import os
 import random
+import re
 import struct
 import warnings
 
@@ -167,6 +168,10 @@ def test_a_missing_chunk_is_named_with_its_place_and_its_messages(chunked, hole)
     assert any(f'chunk at byte {start}, log time ' in text for text in texts)
     assert any('messages are missing: ' in text and ' of topic /camera/image_raw' in text
                for text in texts)
+    told = ' '.join(texts)
+    gone, all_of_them = re.search(r'(\d+) of (\d+) of topic /camera/image_raw', told).groups()
+    beside = re.search(r'(\d+) frames beside what is lost', told)
+    assert sum(map(len, found)) + int(gone) + int(beside[1] if beside else 0) == int(all_of_them)
     with pytest.warns(RecordingWarning, match=f'chunk at byte {start}'):
         assert_all_equal(open_recordings(path), found)
     with pytest.warns(RecordingWarning, match=f'chunk at byte {start}'):  # from the cache
