@@ -12,12 +12,10 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from std_msgs.msg import Float64, String
+from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
-from tap_ros import ur10e
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.nodes.clients import call, Newest
 from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.object_messages import decode_gripper
@@ -294,36 +292,5 @@ def test_a_bad_parameter_ends_the_start_with_one_clear_line(tmp_path, parameters
         assert '[FATAL]' in line
         for word in words:
             assert word in line
-    finally:
-        process.kill()
-
-
-def test_the_world_of_the_arm_tells_where_the_robot_is(tmp_path):
-    process = NodeProcess(
-        'sim_node', tmp_path / 'log.txt',
-        {'lock_step': 'true', 'seed': 3, 'look': 'ur10e', 'observer': 'true'})
-    try:
-        with Client() as node:
-            rig = Rig(node, process.wait_for('ready'))
-            mask = Newest(node, Image, 'camera/robot_mask', STREAM)
-            side = Newest(node, Image, 'observer/image_raw', STREAM)
-            description = Newest(node, String, 'robot_description', LATCHED).wait(10)
-            goal_mask = Newest(node, Image, 'goal/robot_mask', LATCHED).wait(10)
-            image = rig.act(x=0.05)
-
-            def together(message):
-                return message.header.stamp == image.header.stamp
-
-            values = set(np.unique(mask.wait(10, together).data))
-            assert values == {ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM}
-            shown = mask.wait(1)
-            assert (shown.encoding, shown.height, shown.width) == ('mono8', 64, 64)
-            assert (goal_mask.encoding, goal_mask.height) == ('mono8', 64)
-            assert side.wait(10, together).height == 360
-            joints = rig.joints.wait(10, together)
-            angles = dict(zip(joints.name, joints.position, strict=True))
-            gripper = ur10e.gripper_at([angles[name] for name in ur10e.JOINTS])
-            assert np.allclose(gripper, decode_gripper(joints)[:3], atol=1e-6)
-            assert description.data.startswith('<?xml')
     finally:
         process.kill()
