@@ -51,7 +51,8 @@ COMMANDS = {
     'plan': PLANNING}
 ENGINES = ('collect push2', 'plan')  # those that run a list of tasks
 # Keys of JSON files that say how, where and how fast; what came of it stands beside them.
-LEFT_OUT = ('seconds', '_ms', 'machine', 'commit', 'version', 'command', 'settings')
+LEFT_OUT = ('seconds', '_ms', 'machine', 'commit', 'version', 'command', 'settings', 'precision')
+SETTINGS = 'config.json'  # has those that only one of the commits knows
 PLACES = ('out', 'recordings')
 
 
@@ -84,7 +85,7 @@ def digest(out):
         elif path.suffix == '.safetensors':
             for name, tensor in sorted(load_file(path).items()):
                 parts.update(name.encode() + tensor.tobytes())
-        elif path.suffix == '.json':
+        elif path.suffix == '.json' and path.name != SETTINGS:
             parts.update(json.dumps(kept(json.loads(path.read_text())), sort_keys=True).encode())
         else:
             continue
