@@ -245,6 +245,27 @@ def picture_progress(copy_error: torch.Tensor, valid: torch.Tensor | None = None
     return 2 * (progress - low) / (high - low).clamp(min=_MIN_COPY_DISTANCE) - 1
 
 
+def beside_context(progress: torch.Tensor, margin: float,
+                   valid: torch.Tensor | None = None) -> torch.Tensor:
+    """
+    Say which targets show too little of the way from start to goal, or too much, to be matched.
+
+    A preference divides errors, so it cannot keep a prediction from copying the start picture
+    where a target equals that: 0 over w is 0. The paper leaves frames out by time, next to each
+    context picture; this leaves them out by picture_progress.
+
+    :param progress: (B, T), -1 to 1, see picture_progress.
+    :param margin: what is left out at both ends of the range, 0 to 1; 0: nothing.
+    :param valid: bool (B, T), False where an episode is padded; None: all are valid.
+    :return: bool (B, T); never the valid target whose progress is nearest to 0.
+    """
+    outside = progress.abs() > 1 - margin
+    from_middle = progress.abs()
+    if valid is not None:
+        from_middle = from_middle.masked_fill(~valid, math.inf)
+    return outside.scatter(1, from_middle.argmin(1, keepdim=True), False)
+
+
 def linear_preference(times: torch.Tensor, last: torch.Tensor | float,
                       beta: float) -> torch.Tensor:
     """

@@ -3,6 +3,7 @@
 """Which frame a prediction is trained towards: the selection error E' and its argmin (Eq. 5)."""
 
 from collections.abc import Callable
+import math
 
 from tap_ros.images import to_float
 from tap_ros.prediction.augmentation import Augmentation
@@ -10,6 +11,7 @@ from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import (
     bell,
     bell_preference,
+    beside_context,
     cost_of_reaching,
     fixed_time_loss,
     l1_errors,
@@ -62,6 +64,9 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
         return relative_to_copying(error, copy_error(), preference)
     if config.chosen.selection == 'picture_progress':
         progress = picture_progress(copy_error(), batch.valid)
+        if config.progress_margin:
+            hidden = beside_context(progress, config.progress_margin, batch.valid)
+            error = error.masked_fill(hidden, math.inf)
         return preferred_error(error, bell(progress, config.bell_edge))
     if config.chosen.selection == 'cost_of_reaching':
         cost = path_length(batch.measured[:, 0], batch.targets, batch.valid)

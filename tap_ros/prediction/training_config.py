@@ -73,6 +73,8 @@ class ObjectiveSettings:
         with +relative the error relative to copying selects, with +reach the cost of reaching
         does, with +progress the preference is over what the pictures show of the way (losses.py).
     :param bell_edge: w at both ends of the targets; 2/3 in the paper.
+    :param progress_margin: with +progress, frames whose progress is within this of that of the
+        start or the goal picture are not matched, see losses.beside_context; 0..0.95.
     :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
     :param changed_weight: how much more pixels of the target weigh in the outer error that differ
         from every input; 0 in the paper, see losses.weighted_l1_error.
@@ -91,6 +93,7 @@ class ObjectiveSettings:
     mode: Mode = 'bidirectional'
     method: str = 'genmin-wo-gan+relative'
     bell_edge: float = 2 / 3
+    progress_margin: float = 0.0
     outer_power: float = 0.5
     changed_weight: float = 0.0
     match_temperature: float = 0.0
@@ -106,7 +109,7 @@ class ObjectiveSettings:
         _check_choice(self, mode=Mode, posterior=Posterior)
         _check_least(self, 1, 'recursion')
         _check_least(self, 0, 'changed_weight', 'gan_weight', 'kl_weight')
-        _check_range(self, bell_edge=(1e-6, 1), outer_power=(0.1, 1),
+        _check_range(self, bell_edge=(1e-6, 1), progress_margin=(0, 0.95), outer_power=(0.1, 1),
                      match_temperature=(0, 1e6), match_share=(1e-6, 1))
         method = self.chosen
         if method.beta is not None and not self.forward:
@@ -115,6 +118,9 @@ class ObjectiveSettings:
         if method.selection == 'picture_progress' and self.forward:
             raise ConfigError(f'method: {method.name} needs a goal picture; give --mode '
                               'bidirectional')
+        if self.progress_margin and method.selection != 'picture_progress':
+            raise ConfigError('progress_margin: it goes with a +progress method, got method '
+                              f'{method.name}')
         if self.match_temperature and method.loss == 'fix':
             raise ConfigError('match_temperature: a fixed target is not drawn; expected 0 with '
                               f'method {method.name}')

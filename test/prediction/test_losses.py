@@ -8,6 +8,7 @@ import pytest
 from tap_ros.prediction.losses import (
     bell,
     bell_preference,
+    beside_context,
     changed_pixels,
     cost_of_reaching,
     fixed_time_loss,
@@ -171,6 +172,17 @@ def test_padding_is_not_on_the_way():
     padded = error.clone()
     padded[:, :, 5:] = torch.tensor([[9.0], [0.0]])
     assert picture_progress(padded, valid)[:, :5].equal(picture_progress(error[..., :5]))
+
+
+def test_what_shows_too_little_or_too_much_of_the_way_is_beside_the_context():
+    progress = torch.tensor([[-1, -0.6, -0.4, 0, 0.5, 0.51, 1], [-1, -1, -1, -1, 0.9, 1, 1]])
+    valid = torch.ones(2, 7, dtype=torch.bool)
+    assert beside_context(progress, 0.5, valid).tolist() == [
+        [True, True, False, False, False, True, True],
+        [True, True, True, True, False, True, True]]  # one is left, the nearest to the middle
+    valid[1, 4] = False
+    assert not beside_context(progress, 0.5, valid)[1, :4].all()
+    assert not beside_context(progress, 0).any()
 
 
 def test_a_single_target_and_pictures_that_are_all_alike_are_finite():

@@ -445,6 +445,20 @@ def test_progress_matches_the_frame_half_way_in_the_pictures():
     assert matches == {'genmin-wo-gan': 3, 'genmin-wo-gan+progress': 5}
 
 
+def test_a_prediction_that_copies_the_start_is_not_matched_to_frames_that_equal_it():
+    start, goal = torch.zeros(8, 8, 3), torch.full((8, 8, 3), 200)
+    shares = torch.tensor([0.0, 0.0, 0.4, 0.7, 1.0])  # it waits first
+    targets = (start + shares[:, None, None, None] * (goal - start))[None].byte()
+    T = len(shares)
+    column = torch.ones(1, 1, dtype=torch.int64)
+    batch = Batch(torch.stack([start, goal])[None].byte(), targets, torch.arange(1, T + 1)[None],
+                  column, column * T, column * (T + 1), torch.ones(1, T, dtype=torch.bool))
+    config = replace(CONFIG, method='genmin-wo-gan+progress', bell_edge=1e-6)
+    matches = [predictor_loss(showing(to_float(targets[:, 0])), batch, None, replace(
+        config, progress_margin=margin)).match.item() for margin in (0.0, 0.5)]
+    assert matches == [0, 2]
+
+
 @pytest.mark.parametrize('kind', ['', '+progress', '+reach', '+relative'])
 def test_padding_changes_no_selection_error(kind):
     whole, copy_error = make_batch(T=6), torch.rand(4, 2, 6)

@@ -284,7 +284,7 @@ def test_learning_rate_rises_and_falls():
     {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
     {'bell_edge': 0.0}, {'max_frames': 2}, {'method': 'genmin2'}, {'method': 'fix1.5'},
     {'method': 'min+relative'}, {'method': 'genmin+progress', 'mode': 'forward'},
-    {'recursion': 2, 'method': 'fix'},
+    {'recursion': 2, 'method': 'fix'}, {'progress_margin': 0.5, 'method': 'genmin'},
     {'posterior': 'frame', 'method': 'genmin-vae-gan'},
     {'posterior': 'frame', 'method': 'genmin-wo-gan'}, {'gan_weight': -1.0}])
 def test_settings_that_make_no_sense_are_refused_by_name(values):
