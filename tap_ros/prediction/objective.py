@@ -75,16 +75,15 @@ class Draws:
         :param levels: of recursion.
         :return: Draws.
         """
-        generator = torch.Generator().manual_seed((seed << 32) + step)
+        rng = np.random.default_rng([seed, 4, step])
         B, T = batch.times.shape
         B *= processes.count
-        draws = (torch.randn(B, T, latent_size, generator=generator),
-                 torch.randn(B, latent_size, generator=generator),
-                 torch.rand(B, T, generator=generator),
-                 torch.from_numpy(np.random.default_rng([seed, 4, step]).random(
-                     (B, levels, T), np.float32)))
+        draws = (rng.standard_normal((B, T, latent_size), np.float32),
+                 rng.standard_normal((B, latent_size), np.float32),
+                 rng.random((B, T), np.float32),
+                 rng.random((B, levels, T), np.float32))
         part = processes.part(B)
-        return cls(*(draw[part].to(batch.times.device) for draw in draws))
+        return cls(*(torch.from_numpy(draw[part]).to(batch.times.device) for draw in draws))
 
 
 @dataclass(frozen=True)

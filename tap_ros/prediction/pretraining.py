@@ -78,8 +78,8 @@ def frame_gan(config: PredictorConfig, seed: int) -> tuple[nn.Sequential, nn.Seq
 
 def _latent(batch: int, size: int, seed: int, step: int) -> torch.Tensor:
     """Draw latent vectors (B, size, 1, 1) from N(0, I), the same ones whenever asked."""
-    numbers = torch.Generator().manual_seed((seed << 32) + step)
-    return torch.randn(batch, size, 1, 1, generator=numbers)
+    rng = np.random.default_rng([seed, 5, step])
+    return torch.from_numpy(rng.standard_normal((batch, size, 1, 1), np.float32))
 
 
 def _losses(generator: nn.Sequential, discriminator: nn.Sequential, real: torch.Tensor,
