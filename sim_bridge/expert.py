@@ -117,18 +117,21 @@ class Expert:
         path = np.concatenate([here[None], np.column_stack([path, np.full(steps, LIFTED)])])
         return np.column_stack([np.diff(path, axis=0), np.zeros(steps)])
 
-    def plan(self, steps_left: int, only: int | None = None,
-             part: float = 1.0) -> np.ndarray | None:
+    def plan(self, steps_left: int, only: int | None = None, part: float = 1.0,
+             preferred: int | None = None) -> np.ndarray | None:
         """
         Search for the next push.
 
         :param steps_left: control periods until the episode ends.
-        :param only: the object to be pushed; None: any, mostly next_object.
+        :param only: the object to be pushed; None: any, mostly the preferred one.
         :param part: of the way that object is pushed.
+        :param preferred: object; None: next_object.
         :return: (n, 4) actions, or None when every object is in place.
         """
         now, todo = Moment.of(self._simulator), self.undone()
-        first = self.next_object() if only is None else only
+        first = only if only is not None else preferred
+        if first is None:
+            first = self.next_object()
         if not todo or first is None:
             return None
         goals = self._goals
@@ -241,13 +244,20 @@ def run_episode(
 
 
 def _plans(expert: Expert, num_frames: int) -> Iterator[np.ndarray]:
-    """Yield a walk, then pushes until all objects are in place."""
+    """
+    Yield a walk, then pushes until all objects are in place.
+
+    Which object comes first is mostly chosen before the walk: then the start picture tells it.
+    Where nothing tells the order, the median of both orders, the start picture, is learnt.
+    """
+    first = expert.next_object()
     plan: np.ndarray | None = expert.wander()
     steps_left = num_frames - 1
     while plan is not None:
         yield plan
         steps_left -= len(plan)
-        plan = expert.plan(steps_left)
+        plan = expert.plan(steps_left, preferred=first)
+        first = None
 
 
 def _last_motion(positions: np.ndarray) -> int:
