@@ -26,6 +26,7 @@ from tap_ros.evaluation.bottleneck import (
 )
 from tap_ros.evaluation.intervals import bootstrap, gain_interval, Interval, mean_interval
 from tap_ros.evaluation.samples import draw_latents, SAMPLES, SampleScores, score_samples
+from tap_ros.evaluation.shown import SHOWN, ShownScorer
 from tap_ros.files import write_atomically
 from tap_ros.images import to_float, to_uint8
 from tap_ros.learning.filled import fill, Filled, with_masks
@@ -45,7 +46,8 @@ from tyro import conf
 METHODS = ('prediction', 'copy-start', 'copy-goal')
 _BATCH = 64
 _SHOWN = ('min_l1', 'changed_l1', 'match_fraction', 'match_fraction_std', 'bottleneck_median',
-          'bottleneck_1px', 'bottleneck_2px', 'visible_bottleneck_2px', 'bottleneck_5px')
+          'bottleneck_1px', 'bottleneck_2px', 'visible_bottleneck_2px', 'bottleneck_5px',
+          'shows_hand', 'shows_objects', 'shows_both')
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,8 @@ class EpisodeScores:
         give; NaN where there are none.
     :param bottleneck: (N,), see bottleneck.score_bottlenecks; NaN where it is undefined.
     :param object_mass: (N,), likewise; below bottleneck.VISIBLE an object is left out.
+    :param hand: (N,), how much of the hand is shown, see shown.ShownScorer; NaN where unknown.
+    :param objects: (N,), likewise of the objects.
     """
 
     min_l1: np.ndarray
@@ -70,6 +74,8 @@ class EpisodeScores:
     changed_l1: np.ndarray
     bottleneck: np.ndarray
     object_mass: np.ndarray
+    hand: np.ndarray
+    objects: np.ndarray
 
     def intervals(self) -> dict[str, Interval]:
         """
@@ -77,7 +83,8 @@ class EpisodeScores:
 
         :return: dict from names to Intervals; bottleneck_<n>px is the share of episodes with a
             score of at most n pixels, among those where it is defined; visible_bottleneck_<n>px
-            the share of those in which no object is left out either.
+            the share of those in which no object is left out either; shows_hand, shows_objects
+            and shows_both the shares of those that show them, where the match does.
         """
         result = {
             'min_l1': mean_interval(self.min_l1),
@@ -98,6 +105,10 @@ class EpisodeScores:
                     partial(bottleneck_frequency, threshold=threshold), scores)
                 result[f'visible_bottleneck_{threshold}px'] = bootstrap(
                     partial(bottleneck_frequency, threshold=threshold), visible)
+        both = np.minimum(self.hand, self.objects)
+        for name, shares in (('hand', self.hand), ('objects', self.objects), ('both', both)):
+            if np.isfinite(shares).any():
+                result[f'shows_{name}'] = mean_interval(shares[np.isfinite(shares)] >= SHOWN)
         return result
 
     def summary(self) -> dict[str, float]:
@@ -148,13 +159,17 @@ def evaluate(network: Predictor, store: EpisodeStore, episodes: Sequence[int] | 
                 torch.cat([prediction.image[:, None], measured], 1))         # B, 1 + C, 3, H, W
             errors = l1_errors(images, batch.targets.movedim(-1, 2))     # B, 1 + C, T
             placed, mass = score_bottlenecks([store[i] for i in chosen], prediction, goal_picture)
+        scorers = [ShownScorer(store[i]) for i in chosen]
         for m, method in enumerate(methods):
             match = match_step(errors[:, m], batch.valid)[:, None]
             times = batch.times.gather(1, match)
             row = [errors[:, m].gather(1, match), times, times / batch.end,
                    _changed_l1(images[:, m], batch, match[:, 0], measured)[:, None]]
+            pictures = ((images[:, m] + 1) / 2).movedim(1, -1).cpu().numpy()
+            shown = [scorer.score(picture, int(time)) for scorer, picture, time in zip(
+                scorers, pictures, times[:, 0].tolist())]
             parts[method].append([*(part[:, 0].cpu().numpy() for part in row), placed[:, m],
-                                  mass[:, m]])
+                                  mass[:, m], *np.array(shown).T])
     return {method: EpisodeScores(*(np.concatenate(column) for column in zip(*rows)))
             for method, rows in parts.items()}
 

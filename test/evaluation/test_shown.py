@@ -1,0 +1,56 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the score that says whether hand and objects are shown."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from sim_bridge.collect import make_episode
+from sim_bridge.expert import run_episode
+from sim_bridge.simulator import Simulator
+from tap_ros.evaluation.shown import ShownScorer
+from tap_ros.learning.robot_mask import fill_in_time
+
+CARRYING = 8  # a frame in which the hand is at the object
+
+
+@pytest.fixture(scope='module')
+def episode():
+    simulator = Simulator('pick_place', look='hand')
+    observations, actions, outcome, _ = run_episode(simulator, 3)
+    return make_episode(simulator, observations, actions, outcome)
+
+
+def test_the_matched_frame_shows_all_and_the_one_without_the_hand_no_hand(episode):
+    scorer = ShownScorer(episode)
+    bare = fill_in_time(episode.frames, episode.robot_masks, 'all')[0]
+    for t in range(2, len(episode), 5):
+        assert scorer.score(episode.frames[t] / 255, t) == pytest.approx((1, 1), abs=1e-5)
+        hand, objects = scorer.score(bare[t] / 255, t)
+        assert hand == pytest.approx(0, abs=1e-5) and objects == pytest.approx(1, abs=1e-5)
+
+
+def test_an_object_that_is_painted_over_is_not_shown(episode):
+    t = 2  # before the hand comes near
+    u, v = episode.object_pixels[t, 0]
+    y, x = np.mgrid[:64, :64]
+    disc = (np.hypot(x - u, y - v) < 7).astype(np.uint8)
+    without = cv2.inpaint(episode.frames[t], disc, 3, cv2.INPAINT_NS)
+    hand, objects = ShownScorer(episode).score(without / 255, t)
+    assert hand > 0.9 and objects < 0.3
+
+
+def test_half_faded_is_half_shown(episode):
+    bare = fill_in_time(episode.frames, episode.robot_masks, 'all')[0]
+    faded = (episode.frames[CARRYING] / 255 + bare[CARRYING] / 255) / 2
+    assert ShownScorer(episode).score(faded, CARRYING)[0] == pytest.approx(0.5, abs=0.01)
+
+
+def test_nothing_is_known_without_masks_or_positions(episode):
+    frame = episode.frames[CARRYING] / 255
+    bare = replace(episode, robot_masks=None, goal_mask=None)
+    assert np.isnan(ShownScorer(bare).score(frame, CARRYING)).all()
+    lost = replace(episode, object_pixels=np.full_like(episode.object_pixels, np.nan))
+    assert np.isnan(ShownScorer(lost).score(frame, CARRYING)[1])
