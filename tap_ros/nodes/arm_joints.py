@@ -33,6 +33,10 @@ def declare_mount(parameters: 'Parameters') -> None:
                        low=-2 * math.pi, high=2 * math.pi)
     parameters.declare('tool_length', default.tool,
                        'From the flange to the fingertips along its z, m.', low=0.0, high=2.0)
+
+
+def declare_opening(parameters: 'Parameters') -> None:
+    """Declare how far the gripper is open where nothing tells it."""
     parameters.declare('fixed_opening', 0.0,
                        'Opening of the gripper, 0 to 1, where no joint_states has '
                        'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)

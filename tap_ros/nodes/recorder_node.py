@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError, RecordingError, StorageError
-from tap_ros.nodes.arm_joints import declare_mount, declared_mount
+from tap_ros.nodes.arm_joints import declare_mount, declare_opening, declared_mount
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
@@ -285,6 +285,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('compression', 'zstd', 'Compression of chunks.',
                        choices=['zstd', 'lz4', 'none'])
     declare_mount(parameters)
+    declare_opening(parameters)
     parameters.declare('record_on_start', True,
                        'Record from the start; else from the call of recorder/record on.')
     return parameters
