@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Start the simulation, the predictor, the planner and, if a folder is given, the recorder.
+Start the simulation, the predictor, the planner and, if asked for, recorder and robot masks.
 
 Parameters come from config/tap_ros.yaml of the package or from params_file; for a real camera and
 arm start with sim:=false.
@@ -17,7 +17,7 @@ from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description():
-    """Describe the four nodes and the arguments of this file."""
+    """Describe the nodes and the arguments of this file."""
     record = LaunchConfiguration('record')
     return LaunchDescription([
         DeclareLaunchArgument(
@@ -35,12 +35,16 @@ def generate_launch_description():
             description='Simulated time passes only with commands, so that runs repeat exactly.'),
         DeclareLaunchArgument(
             'record', default_value='', description='Folder to record into; empty: no recorder.'),
+        DeclareLaunchArgument(
+            'mask', default_value='false', choices=['true', 'false'],
+            description='Publish masks of a real robot; the simulation publishes its own.'),
         start('sim_node', {'lock_step': typed('lock_step', bool)},
               condition=IfCondition(LaunchConfiguration('sim'))),
         start('predictor_node'),
         start('visual_mpc_node'),
         start('recorder_node', {'folder': typed('record', str)},
               condition=IfCondition(NotEqualsSubstitution(record, ''))),
+        start('robot_mask_node', condition=IfCondition(LaunchConfiguration('mask'))),
     ])
 
 

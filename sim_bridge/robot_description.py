@@ -5,7 +5,7 @@
 from xml.etree import ElementTree
 
 import numpy as np
-from sim_bridge.arm_shape import PRIMITIVES
+from sim_bridge.arm_shape import DARK, PRIMITIVES
 from tap_ros import ur10e
 from tap_ros.contract import WORLD_FRAME
 
@@ -13,12 +13,17 @@ TIP_FRAME = 'gripper_tip'  # between the fingertips
 MAX_EFFORT = (330, 330, 150, 56, 56, 56)  # N m, as published for this arm
 
 
-def robot_description() -> str:
+def robot_description(mount: ur10e.Mount = ur10e.SIMULATED,
+                      hand_radius: float | None = None) -> str:
     """
     Return the URDF.
 
     Links and joints have the names that Universal Robots' own description gives them. A capsule
     is a cylinder with spheres at its ends.
+
+    :param mount: where the arm stands, and the length of its tool.
+    :param hand_radius: m; with a hand, a cylinder around the tool from flange to fingertips; it is
+        of the link TIP_FRAME.
     """
     robot = ElementTree.Element('robot', name='ur10e_at_table')
     ElementTree.SubElement(robot, 'link', name=WORLD_FRAME)
@@ -29,9 +34,11 @@ def robot_description() -> str:
             if shape.link == number:
                 _add_cylinder(link, np.array(shape.start), np.array(shape.end), shape.radius,
                               shape.colour, shape.capsule)
-    ElementTree.SubElement(robot, 'link', name=TIP_FRAME)
+    tip = ElementTree.SubElement(robot, 'link', name=TIP_FRAME)
+    if hand_radius is not None:
+        _add_cylinder(tip, np.array([0, 0, -mount.tool]), np.zeros(3), hand_radius, DARK, False)
     _add_joint(robot, 'world_joint', 'fixed', WORLD_FRAME, 'base',
-               ur10e.SIMULATED.position, (0, 0, ur10e.SIMULATED.yaw))
+               mount.position, (0, 0, mount.yaw))
     place, turn = (0.0, 0.0, 0.0), 0.0
     for i, name in enumerate(ur10e.JOINTS):
         joint = _add_joint(
@@ -44,7 +51,7 @@ def robot_description() -> str:
         a, turn, d = ur10e.DH[i]
         place = (a, 0.0, d)
     _add_joint(robot, 'gripper_joint', 'fixed', links[-1], TIP_FRAME,
-               (place[0], place[1], place[2] + ur10e.SIMULATED.tool), (turn, 0, 0))
+               (place[0], place[1], place[2] + mount.tool), (turn, 0, 0))
     ElementTree.indent(robot)
     return ElementTree.tostring(robot, 'unicode', xml_declaration=True)
 

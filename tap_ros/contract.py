@@ -59,6 +59,7 @@ NODE_MODULES = {
     'predictor_node': 'tap_ros.nodes.predictor_node',
     'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
     'recorder_node': 'tap_ros.nodes.recorder_node',
+    'robot_mask_node': 'tap_ros.nodes.robot_mask_node',
 }
 
 

@@ -8,7 +8,7 @@ for this arm; the base frame is the controller's own ("base" of its URDF). Only 
 here: the simulated arm is kinematic, it follows the gripper and bears no load.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -164,6 +164,19 @@ def gripper_at(joints: ArrayLike, mount: Mount = SIMULATED) -> np.ndarray:
     """
     flange = mount.pose @ forward(joints)
     return flange[..., :3, 3] + mount.tool * flange[..., :3, 2]
+
+
+def named_joints(positions: Mapping[str, float]) -> list[float] | None:
+    """
+    Return the six joints in the order of JOINTS, whatever their names begin with.
+
+    :param positions: by the name of the joint.
+    :return: None when there is not one arm, or more than one.
+    """
+    first = JOINTS[0]
+    prefixes = [name.removesuffix(first) for name in positions if name.endswith(first)]
+    arms = [prefix for prefix in prefixes if all(prefix + name in positions for name in JOINTS)]
+    return [positions[arms[0] + name] for name in JOINTS] if len(arms) == 1 else None
 
 
 def check_motion(before: ArrayLike, after: ArrayLike, seconds: float) -> None:

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.files import write_atomically
 from tap_ros.options import File
 from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.episode import Episode
 from tap_ros.text import escaped, listing
 from tyro import conf
 
@@ -25,11 +27,13 @@ class Options:
     :param path: an .mcap file, a bag folder, or a .safetensors file.
     :param picture: write film strips of the first episodes to this PNG.
     :param episodes: episodes in the picture.
+    :param robot_mask: tint what the robot masks mark: the arm red, the hand blue.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
     picture: File = ''
     episodes: int = 8
+    robot_mask: bool = False
 
 
 def run(args: Options) -> None:
@@ -56,6 +60,18 @@ def run(args: Options) -> None:
         print(f'{name:<11} {counts}')
     print(f'data hash   {store.data_hash}')
     if args.picture:
-        strips = [film_strip(e.frames) for e in episodes[:args.episodes]]
+        strips = [film_strip(_tinted(e) if args.robot_mask else e.frames)
+                  for e in episodes[:args.episodes]]
         write_atomically(args.picture, png_bytes(grid(strips, scale=2)))
         print(f'picture     {escaped(args.picture)}')
+
+
+def _tinted(episode: Episode) -> np.ndarray:
+    """Return the frames (T, H, W, 3) of an episode with the robot tinted, where it has masks."""
+    frames = episode.frames.copy()
+    if episode.robot_masks is not None:
+        for label, channel in ((ROBOT_MASK_ARM, 0), (ROBOT_MASK_HAND, 2)):
+            marked = episode.robot_masks == label
+            frames[marked] //= 2
+            frames[marked, channel] += 127
+    return frames

@@ -11,7 +11,7 @@ from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import ObjectState, ObjectStates
 from tap_ros import ur10e
 from tap_ros.contract import GRIPPER_JOINTS
-from tap_ros.errors import PlanningError
+from tap_ros.errors import ImageError, PlanningError
 from tap_ros.images import in_picture
 from tap_ros.text import escaped, listing
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is predicted
 MAX_NAME = 100  # characters
+MAX_PIXELS = 2**24  # of a camera
 
 
 def encode_objects(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray, stamp: 'Time',
@@ -177,3 +178,33 @@ def encode_camera_info(K: np.ndarray, size: Sequence[int], stamp: 'Time',
     message.r = [float(x) for x in np.ravel(np.eye(3))]
     message.p = [float(x) for x in np.ravel(np.column_stack([K, np.zeros(3)]))]
     return message
+
+
+def decode_camera_info(message: CameraInfo,
+                       rectified: bool) -> tuple[np.ndarray, tuple[int, int]]:
+    """
+    Return the intrinsics of the pictures that a camera sends, after its region and binning.
+
+    :param rectified: the pictures are rectified: P counts, else K.
+    :return: (3, 3) in pixels, and (height, width).
+    :raises ImageError: for lenses that bend lines, and for numbers that no camera has.
+    """
+    name = 'camera/camera_info'
+    if not rectified and any(message.d):
+        raise ImageError(f'{name}: its lens bends straight lines (d is not zero); rectify the '
+                         'pictures (image_proc), and set the parameter rectified')
+    K = np.array(message.p if rectified else message.k).reshape(3, -1)[:, :3].copy()
+    roi = message.roi
+    region = (roi.height or message.height, roi.width or message.width)
+    bins = np.array([max(message.binning_x, 1), max(message.binning_y, 1)])
+    height, width = region[0] // int(bins[1]), region[1] // int(bins[0])
+    K[:2, 2] -= roi.x_offset, roi.y_offset
+    K[:2] /= bins[:, None]
+    if not (np.isfinite(K).all() and (np.abs(K) < 1e6).all() and K[0, 0] > 0 and K[1, 1] > 0
+            and np.array_equal(K[2], [0, 0, 1])):
+        raise ImageError(f'{name}: {"p" if rectified else "k"} is not that of a camera; expected '
+                         'focal lengths above 0 in pixels, and 0, 0, 1 in its last row')
+    if not 0 < height * width <= MAX_PIXELS:
+        raise ImageError(f'{name}: pictures of {width}x{height} pixels (width x height); expected '
+                         f'1 to {MAX_PIXELS} pixels')
+    return K, (height, width)

@@ -107,6 +107,36 @@ class Observations:
             self.count += 1
             self._changed.notify_all()
 
+    def attach(self, topic: str, stamp: int, message: Any, received: float) -> None:
+        """
+        Add what was derived for a stamp that others have; it says nothing of how old a topic is.
+
+        :param received: monotonic time at which what it was derived from was received.
+        """
+        with self._changed:
+            parts = self._by_stamp.get(stamp)
+            if parts is not None:
+                parts[topic] = message, received
+                self.count += 1
+                self._changed.notify_all()
+
+    def heard(self, topic: str, received: float, renewed: bool) -> None:
+        """
+        Note that something came from which messages of a topic are derived.
+
+        :param renewed: it did not repeat what came before.
+        """
+        with self._changed:
+            self._received[topic] = received
+            if renewed:
+                self._renewed[topic] = received
+
+    def without(self, topic: str, other: str) -> list[int]:
+        """Return the stamps at which `other` has come and `topic` has not, newest last."""
+        with self._changed:
+            return sorted(stamp for stamp, parts in self._by_stamp.items()
+                          if other in parts and topic not in parts)
+
     def _believe(self, topic: str, stamp: int) -> bool:
         """Tell whether a stamp is used; forget all others when the clock has jumped to it."""
         self._drop_stray(topic, stamp)

@@ -14,6 +14,7 @@ from tap_ros.contract import (
     WORLD_FRAME,
 )
 from tap_ros.errors import ConfigError
+from tap_ros.nodes.arm_joints import declare_mount, declare_opening
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.hierarchy import SWITCHES
@@ -82,6 +83,11 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('max_age', 3.0,
                        'Seconds; what was received longer ago is not acted upon, so a plan that '
                        'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
+    declare_mount(parameters)
+    declare_opening(parameters)
+    parameters.declare('joint_prefix', '',
+                       "What the names of the arm's joints begin with, before "
+                       'shoulder_pan_joint and so on.')
     parameters.declare('image_timeout', 5.0,
                        'Seconds without a usable observation after which a goal is aborted.',
                        low=0.1, high=600.0, read_only=False)

@@ -16,12 +16,14 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from std_srvs.srv import SetBool
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.errors import ConfigError, RecordingError, StorageError
+from tap_ros.nodes.arm_joints import declare_mount, declare_opening, declared_mount
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import SERVICE_QOS
 from tap_ros.recording import topics
+from tap_ros.recording.mounts import ArmMount, write_mount
 from tap_ros.recording.writer import BagWriter
 from tap_ros.text import escaped
 
@@ -102,11 +104,21 @@ class RecorderNode(Node):
         now = time.time_ns()
         for topic, (type_name, data, qos) in self._last.items():
             self._write(topic, type_name, data, now, now, qos)
+        self._write_mount()
         if self._writer is not None:
             self._flush()  # a full disk is to be known now, not at the first message
         if self._failure is not None:
             raise RecordingError(self._failure)
         return folder
+
+    def _write_mount(self) -> None:
+        """Say where the arm stands, unless that is where the reader takes it to stand anyway."""
+        arm = ArmMount(declared_mount(self.params), self.params['fixed_opening'])
+        if self._writer is not None and arm != ArmMount():
+            try:
+                write_mount(self._writer.folder, arm)
+            except StorageError as error:
+                self._give_up(error)
 
     def _finish(self) -> str:
         """End the bag; return what became of it, for people."""
@@ -272,6 +284,8 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('topics', list(TYPES), 'Topics to record.')
     parameters.declare('compression', 'zstd', 'Compression of chunks.',
                        choices=['zstd', 'lz4', 'none'])
+    declare_mount(parameters)
+    declare_opening(parameters)
     parameters.declare('record_on_start', True,
                        'Record from the start; else from the call of recorder/record on.')
     return parameters

@@ -10,10 +10,11 @@ from typing import Any, TYPE_CHECKING
 
 from sensor_msgs.msg import Image, JointState
 from tap_msgs.msg import Episode, ObjectStates
-from tap_ros.errors import PlanningError, TapError
+from tap_ros.errors import KinematicsError, PlanningError, TapError
+from tap_ros.nodes.arm_joints import ArmJoints, tells_gripper
 from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
-from tap_ros.nodes.observations import JUMP_NS, Moment, Observations
+from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
 from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
 from tap_ros.nodes.topics import STREAM, to_nanoseconds
 from tap_ros.planning.reach import Seen
@@ -36,7 +37,9 @@ class Sight:
     The newest picture with its objects and joints, for one goal at a time.
 
     With the parameter robot_mask the picture is without the robot, all that is seen; a picture
-    whose mask has not come is not seen.
+    whose mask has not come is not seen. Joint states that do not say where the gripper is, but
+    where the joints of the arm are, have times of their own: the gripper of a picture is found
+    between the states before and after it.
 
     :param node: rclpy Node.
     :param params: its Parameters.
@@ -55,9 +58,17 @@ class Sight:
         self._types = sensor_topics(params['robot_mask'])
         self._tell = on_message
         self.sensors = Observations(*self._types)
+        self._arm = ArmJoints(params)
+        self._useless = ''  # why the joint states cannot be used
         self.begin(0.0)
         node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
-        self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message)
+        joints_type, joints_name = self._types['joints']
+        node.create_subscription(
+            joints_type, joints_name,
+            self._on_joints, STREAM)  # type: ignore[arg-type]  # with the info
+        self.sensors.subscribe(
+            node, {topic: kind for topic, kind in self._types.items() if topic != 'joints'},
+            STREAM, on_message=self._on_message)
 
     def topics(self, objects: bool = True) -> tuple[str, ...]:
         """Return the names of what is looked at, with or without the objects."""
@@ -83,7 +94,7 @@ class Sight:
         moment = self.sensors.moment(topics, since=self._since)
         lacking = self._lacking(topics)
         if moment is None:
-            return None, lacking or (
+            return None, lacking or self._unmatched_joints() or (
                 f'no messages of the same stamp on {self._names(topics)} since the goal was '
                 'accepted')
         times: dict[str, Any] = {
@@ -117,9 +128,48 @@ class Sight:
         image = self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
         return replace(moment, messages=messages | {'image': image})
 
+    def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
+        """Take joint states; they may be the gripper's, the arm's, or another driver's."""
+        received, name = reception_time(info), self._types['joints'][1]
+        self._tell(name)
+        if tells_gripper(message):
+            self.sensors.put('joints', message, received)
+            return
+        try:
+            new = self._arm.take(message, received)
+        except TapError as error:
+            self._useless = f'{self._names(["joints"])}: {error}'
+            return
+        if new:
+            self._useless = ''
+        if self._arm.used:
+            self.sensors.heard('joints', self._arm.received, new)
+            for stamp_ns in self.sensors.without('joints', 'image'):
+                self._match_joints(stamp_ns)
+
+    def _match_joints(self, stamp_ns: int) -> None:
+        """Add the gripper's state at the time of a picture, once the arm's joints are known."""
+        with suppress(KinematicsError):  # who looks at it is told
+            self.sensors.attach('joints', stamp_ns, *self._arm.state(stamp_ns))
+
+    def _unmatched_joints(self) -> str:
+        """Say why the newest picture has no joints, where it should have those of an arm."""
+        newest = self.sensors.moment(('image',))
+        if not self._arm.used or newest is None:
+            return ''
+        try:
+            self._arm.state(newest.stamp_ns)
+        except KinematicsError as error:
+            return f'{self._names(["joints"])}: {error}'
+        return ''
+
     def _on_message(self, name: str) -> None:
         """Take notice of what the camera sees between the goals, too."""
         self._tell(name)
+        if self._arm.used and name == self._types['image'][1]:
+            newest = self.sensors.moment(('image',))
+            if newest is not None:
+                self._match_joints(newest.stamp_ns)  # again, if the picture was sent again
         if not self.robot.used or name not in (self._types['image'][1], self._types['mask'][1]):
             return
         moment = self.sensors.moment(('image', 'mask'))
@@ -143,10 +193,14 @@ class Sight:
 
     def _lacking(self, topics: Collection[str]) -> str:
         missing = self.sensors.missing(topics)
+        if 'joints' in missing and self._useless:
+            return self._useless
         if missing:
             return f'nothing has come on {self._names(missing)}'
         ages = self.sensors.ages(topics, time.monotonic())
         silent = [topic for topic in topics if ages[topic] > self._params['max_silence']]
+        if 'joints' in silent and self._useless:
+            return self._useless
         return f'nothing new has come on {self._names(silent)}' if silent else ''
 
     def _count_publishers(self) -> dict[str, int]:

@@ -14,9 +14,11 @@ import warnings
 
 import numpy as np
 from numpy.typing import DTypeLike
+from tap_ros import ur10e
 from tap_ros.recording.columns import Columns, pad_objects
 from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.lost import EVERYTHING, FAR, seconds
+from tap_ros.recording.mounts import ArmMount
 from tap_ros.recording.spans import assign, in_gaps, Mark, MAX_JITTER_NS, read_spans, Span
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
@@ -32,6 +34,7 @@ _EMPTY = {
     'command_log': ((0,), np.int64), 'command': ((0,), np.float32),
     'joint_log': ((0,), np.int64), 'joint_stamp': ((0,), np.int64),
     'joint': ((0, 4), np.float32),
+    'arm_log': ((0,), np.int64), 'arm_stamp': ((0,), np.int64), 'arm': ((0, 6), np.float64),
     'object_log': ((0,), np.int64), 'object_stamp': ((0,), np.int64),
     'object': ((0, 0, 9), np.float64), 'object_names': ((0,), np.int64),
     'goal_object_log': ((0,), np.int64), 'goal_object_stamp': ((0,), np.int64),
@@ -125,18 +128,19 @@ def follows(before: Columns, after: Columns) -> bool:
     return not ends or not starts or min(starts) >= max(ends) - MAX_JITTER_NS
 
 
-def assemble(parts: Sequence[Columns]) -> EpisodeTable:
+def assemble(parts: Sequence[Columns], arm: ArmMount) -> EpisodeTable:
     """
     Cut files that follow each other into episodes.
 
     :param parts: list of Columns, frames included, in playing order.
+    :param arm: where the arm stood.
     :return: EpisodeTable; episodes without any frame are left out.
     """
     data, names, marks = _join(parts)
     if len(data['frame_stamp']) > 1 and not data['frame_stamp'].any():
         data['frame_stamp'] = data['frame_log']
     _drop_stops(data)
-    for name in ('twist', 'joint', 'object'):
+    for name in ('twist', 'joint', 'arm', 'object'):
         _stamp_unstamped(data, name)
     spans = read_spans(data, marks)
     owner = _owner(spans, data, parts)
@@ -157,8 +161,7 @@ def assemble(parts: Sequence[Columns]) -> EpisodeTable:
         file=data['frame_file'][order], row=data['frame_row'][order],
         mask_file=mask_file, mask_row=mask_row, stamps=stamps,
         actions=_actions(data, clock, data['frame_log'][order]),
-        grippers=clock.nearest(
-            data['joint_log'], data['joint_stamp'], data['joint'], np.float32),
+        grippers=_grippers(data, clock, arm),
         objects=_by_name(*clock.nearest_rows(data['object_log'], data['object_stamp']),
                          data['object'], data['object_names'], names, picked[clock.owner]),
         names=[names[i] if i >= 0 else () for i in picked.tolist()],
@@ -308,6 +311,21 @@ def _actions(data: dict[str, np.ndarray], clock: _Clock, frame_log: np.ndarray) 
         actions[known, 3] = data['command'][newest[known]]
     actions[clock.starts[1:] - 1] = 0
     return actions
+
+
+def _grippers(data: dict[str, np.ndarray], clock: _Clock, arm: ArmMount) -> np.ndarray:
+    """
+    Return (F, 4) float32: the gripper's state at each frame, NaN where unknown.
+
+    Where it is not told, it follows from the arm's joints that are nearest in time.
+    """
+    grippers = clock.nearest(data['joint_log'], data['joint_stamp'], data['joint'], np.float32)
+    rows, found = clock.nearest_rows(data['arm_log'], data['arm_stamp'])
+    found &= np.isnan(grippers[:, :3]).all(1)
+    if found.any():
+        grippers[found, :3] = ur10e.gripper_at(data['arm'][rows[found]], arm.mount)
+        grippers[found & np.isnan(grippers[:, 3]), 3] = arm.opening
+    return grippers
 
 
 def _begins(clock: _Clock, frame_log: np.ndarray) -> np.ndarray:

@@ -30,9 +30,10 @@ from tap_ros.recording.align import assemble, EpisodeTable, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_paths, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.mounts import ArmMount, read_mount
 from tqdm import tqdm
 
-FORMAT = 2  # of a cache folder; another number makes all files be decoded again
+FORMAT = 3  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
 _NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
@@ -45,7 +46,7 @@ class EpisodeStore:
     Episodes of recordings, in their order, as views of memory maps.
 
     :param tables: list of EpisodeTable.
-    :param file_hashes: hex digests of the files, in order.
+    :param file_hashes: hex digests of the files, in order, and what else tells them apart.
     """
 
     def __init__(self, tables: Sequence[EpisodeTable], file_hashes: Iterable[str]) -> None:
@@ -110,8 +111,11 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     check_sizes([part for bag in columns for part in bag])
     for part in (part for bag in columns for part in bag):
         warn_of_damage(part)
-    tables = [assemble(run) for bag in columns for run in _runs(bag)]
-    store = EpisodeStore(tables, [job.digest for bag in jobs for job in bag])
+    arms = [read_mount(bag[0].parent) for bag in bags]
+    tables = [assemble(run, arm) for bag, arm in zip(columns, arms) for run in _runs(bag)]
+    # What is read depends on where the arm stood, too.
+    placed = [repr(arm) for arm in arms if arm != ArmMount()]
+    store = EpisodeStore(tables, [*(job.digest for bag in jobs for job in bag), *placed])
     if not len(store):
         raise RecordingError(f'{list_paths(paths)}: no camera image lies within an episode')
     return store

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tap_ros import ur10e
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import RecordingError
 from tap_ros.recording import topics
@@ -27,7 +28,8 @@ from tap_ros.recording.spans import Mark
 from tap_ros.text import escaped
 
 _ENDINGS = ('_log', '_stamp', '_names', '_event', '_index')  # of column names
-_NUMBERS = {'twist': ((3,), np.float32), 'command': ((), np.float32), 'joint': ((4,), np.float32)}
+_NUMBERS = {'twist': ((3,), np.float32), 'command': ((), np.float32),
+            'joint': ((4,), np.float32), 'arm': ((6,), np.float64)}
 # Messages that are no pictures cost time to decode: so many bytes in any file, and so many for
 # each byte of it.
 _FREE_STATES, _STATES_PER_BYTE = 2**24, 64
@@ -49,6 +51,7 @@ class Columns:
         mask_index (N,) int64, row of masks
         twist (N, 3) float32 linear; command (N,) float32 gripper opening
         joint (N, 4) float32 gripper state, NaN where unknown
+        arm (N, 6) float64 rad, joints of a UR10e where the gripper's place is not told
         object, goal_object (N, K, 9) float64 u, v, pose; object_names, goal_object_names (N,)
             int64, row of names
         mark_event (N,) int64
@@ -296,6 +299,9 @@ class _Decoder:
         if known.keys() & set(GRIPPER_JOINTS):
             self._add('joint', log, [known.get(name, np.nan) for name in GRIPPER_JOINTS],
                       stamp=_stamp(message))
+        arm = None if known.keys() & set(GRIPPER_JOINTS[:3]) else ur10e.named_joints(known)
+        if arm is not None and np.isfinite(arm).all():
+            self._add('arm', log, arm, stamp=_stamp(message))
 
     def _objects(self, column: str, log: int, message: Any) -> None:
         numbers: list[float] = []

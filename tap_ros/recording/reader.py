@@ -12,6 +12,7 @@ from tap_ros.recording.bags import check_sizes, find_bags, find_topics, warn_of_
 from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.lost import EVERYTHING
+from tap_ros.recording.mounts import ArmMount, read_mount
 
 _NO_EVENT = np.empty(0, np.int64)
 _NO_GAP = np.empty((0, 3), np.int64)
@@ -27,7 +28,7 @@ def iter_episodes(path: str | Path, image_topic: str | None = None) -> Iterator[
     :raises RecordingError: when the recording is missing, empty, damaged or lacks the image topic.
     """
     for files in find_bags(path):
-        found = find_topics(files, image_topic)
+        found, arm = find_topics(files, image_topic), read_mount(files[0].parent)
         waiting: list[Columns] = []
         checked: list[Columns] = []
         for file in files:
@@ -36,13 +37,13 @@ def iter_episodes(path: str | Path, image_topic: str | None = None) -> Iterator[
             if part.image_size is not None:
                 check_sizes(checked)
             if waiting and not follows(waiting[-1], part):
-                yield from _episodes(waiting)
+                yield from _episodes(waiting, arm)
                 waiting = []
             waiting.append(part)
             if _closed(part):
-                yield from _episodes(waiting)
+                yield from _episodes(waiting, arm)
                 waiting = _kept(waiting)
-        yield from _episodes(waiting)
+        yield from _episodes(waiting, arm)
         check_sizes(checked)
 
 
@@ -66,8 +67,8 @@ def _decode(file: Path, found: dict[str, str]) -> Columns:
     return part
 
 
-def _episodes(parts: Sequence[Columns]) -> Iterator[Episode]:
-    table = assemble(parts)
+def _episodes(parts: Sequence[Columns], arm: ArmMount) -> Iterator[Episode]:
+    table = assemble(parts, arm)
     for i in range(len(table)):
         yield table.episode(i)
 

@@ -16,9 +16,10 @@ NODES = {key.removeprefix('/**/'): values['ros__parameters']
          for key, values in yaml.safe_load(FILE.read_text()).items()}
 DECLARED_IN = {'sim_node': 'sim_bridge.sim_node', 'recorder_node': 'tap_ros.nodes.recorder_node',
                'predictor_node': 'tap_ros.nodes.predictor_setup',
-               'visual_mpc_node': 'tap_ros.nodes.planner_setup'}
+               'visual_mpc_node': 'tap_ros.nodes.planner_setup',
+               'robot_mask_node': 'tap_ros.nodes.robot_mask_setup'}
 LEFT_OUT = {'sim_node': set(), 'predictor_node': set(), 'visual_mpc_node': {'weights'},
-            'recorder_node': {'topics'}}
+            'recorder_node': {'topics'}, 'robot_mask_node': set()}
 
 
 def declared(name, *arguments):

@@ -16,10 +16,12 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
+from tap_ros import ur10e
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.messages import decode
+from tap_ros.recording.mounts import ArmMount, read_mount
 from tap_ros.recording.reader import iter_episodes
 
 
@@ -121,7 +123,8 @@ def test_a_bag_is_never_overwritten_and_each_one_has_the_goal(client, record, tm
 
 def test_topics_of_any_type_can_be_recorded(client, record, tmp_path):
     joints = client.create_publisher(JointState, 'elsewhere/joints', STREAM)
-    process = record(topics='[elsewhere/joints]', compression='none').wait_for('ready')
+    process = record(topics='[elsewhere/joints]', compression='none', mount_x=0.25,
+                     fixed_opening=0.5).wait_for('ready')
     wait_for_subscriber(joints)
     joints.publish(JointState(name=['a'], position=[1.5]))
     arrived(joints)
@@ -130,6 +133,9 @@ def test_topics_of_any_type_can_be_recorded(client, record, tmp_path):
     (topic, kind, message), = read(tmp_path / 'bag')
     assert (topic, kind) == ('/elsewhere/joints', 'sensor_msgs/msg/JointState')
     assert message.name == ['a'] and message.position.tolist() == [1.5]
+    stood = ur10e.SIMULATED
+    assert read_mount(tmp_path / 'bag') == ArmMount(
+        ur10e.Mount((0.25, *stood.position[1:]), stood.yaw, stood.tool), 0.5)
 
 
 def test_a_full_disk_is_told_and_the_node_stays_up(client, record, tmp_path):

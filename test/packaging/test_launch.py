@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files start the four nodes; only ROS 2 from apt has what it takes to read them."""
+"""The launch files start the nodes; only ROS 2 from apt has what it takes to read them."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path

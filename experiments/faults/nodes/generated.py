@@ -22,6 +22,9 @@ ROUND = 200  # batches between two good calls to everything
 MOST_FAILURES = 5  # of which each is shrunk, with nodes that start anew each time
 SHRINK_S = 240.0
 ANSWER_S = 10.0
+# So that masks and descriptions are used.
+PARAMETERS = {'sim_node': {'look': 'ur10e'}, 'predictor_node': {'robot_mask': 'arm'},
+              'visual_mpc_node': {'robot_mask': 'arm'}}
 TEST = """\
 To see it again, and for the tests:
 
@@ -80,7 +83,7 @@ class Target:
                 attacked.kill()
         if len(rig.processes) < len(NODE_MODULES) or not all(
                 attacked.alive for attacked in rig.processes.values()):
-            rig.need(*NODE_MODULES.keys() - {'sim_node'}, sim='real')
+            rig.need(*NODE_MODULES.keys() - {'sim_node'}, sim='real', parameters=PARAMETERS)
             for name in NODE_MODULES:
                 if not self._parameters[name].wait_for_service(20):
                     raise TapError(f'{name}: its parameters were not found')

@@ -81,12 +81,13 @@ class Rig:
 
     # Nodes
 
-    def need(self, *names, sim=None):
+    def need(self, *names, sim=None, parameters=None):
         """
         Have these nodes running and ready, and no others.
 
         :param names: names of NODE_MODULES without sim_node.
         :param sim: 'lock-step', 'real' or None for no simulator.
+        :param parameters: {node: its parameters}, beside those that it always gets.
         """
         assert self.node
         wanted = {name: {} for name in names}
@@ -94,6 +95,7 @@ class Rig:
             wanted['recorder_node'] = {'folder': self.folder / 'bag'}
         if sim is not None:
             wanted['sim_node'] = SIM_MODES[sim]
+        wanted = {name: own | (parameters or {}).get(name, {}) for name, own in wanted.items()}
         for name, attacked in list(self.processes.items()):
             if name not in wanted or attacked.parameters != wanted[name] or not attacked.alive:
                 self.remove(name)
@@ -131,7 +133,7 @@ class Rig:
                    'visual_mpc_node': self.reach_client.wait_for_server,
                    'recorder_node': self.record_client.wait_for_service}
         for name in names:
-            if not offered[name](timeout_sec=CALL_S):
+            if name in offered and not offered[name](timeout_sec=CALL_S):
                 raise TapError(f'{name}: what it offers was not found in {CALL_S:g} s')
         if 'predictor_node' in names:
             self.expect_prediction(CALL_S)

@@ -7,9 +7,21 @@ from importlib import import_module
 
 from experiments.faults.nodes.world import first_pictures
 from hypothesis import strategies as st
-from tap_ros.contract import ENCODINGS, GRIPPER_JOINTS, MAP_ENCODING, PICTURE_ENCODING
+from sim_bridge.robot_description import robot_description
+from tap_ros.contract import (
+    ENCODINGS,
+    GRIPPER_JOINTS,
+    MAP_ENCODING,
+    MASK_ENCODING,
+    PICTURE_ENCODING,
+    ROBOT_MASK_ARM,
+    ROBOT_MASK_FREE,
+    ROBOT_MASK_HAND,
+)
 from tap_ros.errors import TapError
+from tap_ros.ur10e import JOINTS
 
+MASK = 'sensor_msgs/Image mask'  # what comes after a blank tells strategies apart
 TOPICS = {
     'camera/image_raw': 'sensor_msgs/Image', 'objects': 'tap_msgs/ObjectStates',
     'joint_states': 'sensor_msgs/JointState', 'goal/image': 'sensor_msgs/Image',
@@ -17,8 +29,11 @@ TOPICS = {
     'gripper/command': 'std_msgs/Float64', 'episode': 'tap_msgs/Episode',
     'arm/command_timeout': 'std_msgs/Float64', 'arm/refused': 'tap_msgs/CommandRefused',
     'predictor_node/heartbeat': 'std_msgs/Header', 'clock': 'rosgraph_msgs/Clock',
-    'camera/camera_info': 'sensor_msgs/CameraInfo'}
-LATCHED_TOPICS = ('goal/image', 'goal/objects', 'arm/command_timeout')
+    'camera/camera_info': 'sensor_msgs/CameraInfo', 'camera/robot_mask': MASK,
+    'goal/robot_mask': MASK, 'observer/image_raw': 'sensor_msgs/Image',
+    'robot_description': 'std_msgs/String'}
+LATCHED_TOPICS = ('goal/image', 'goal/objects', 'goal/robot_mask', 'robot_description',
+                  'arm/command_timeout')
 SERVICES = {
     'predict_subgoal': 'tap_msgs/srv/PredictSubgoal', 'sim/reset': 'tap_msgs/srv/ResetScene',
     'sim/step': 'tap_msgs/srv/StepScene', 'sim/pause': 'std_srvs/srv/SetBool',
@@ -72,6 +87,46 @@ def images():
                          'data': st.lists(st.integers(0, UINT8), max_size=12)})
 
 
+def masks():
+    """Return robot masks: whole ones, often with values of one, and other pictures."""
+    def whole(side, header, values, padding):
+        row = (values * side)[:side] + [0] * padding
+        return {'header': header, 'width': side, 'height': side, 'encoding': MASK_ENCODING,
+                'step': len(row), 'data': row * side}
+    values = st.sampled_from((ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM))
+    return st.builds(
+        whole, st.sampled_from((64, 64, 1, 65)), headers(),
+        st.lists(values | st.integers(0, UINT8), min_size=1, max_size=4),
+        st.integers(0, 2)) | images()
+
+
+def joint_states():
+    """Return the joints of the gripper, of the arm whole and in any order, and any others."""
+    names = st.permutations(JOINTS) | st.lists(
+        st.sampled_from(GRIPPER_JOINTS + JOINTS) | texts(), max_size=6)
+    likely = st.floats(-3, 3)
+    return st.fixed_dictionaries({
+        'header': headers(), 'name': names.map(list),
+        'position': st.lists(likely, min_size=6, max_size=6) | st.lists(
+            likely | numbers(), max_size=7),
+        'velocity': st.lists(numbers(), max_size=2)})
+
+
+def descriptions():
+    """Return robot descriptions: the simulator's, whole or with one word replaced or cut."""
+    whole = robot_description()
+    words = ('', 'mesh', 'sphere', 'world', 'base', 'nan', '1e308', '-1', '0 0 0', '<link/>',
+             'shoulder_pan_joint', '&a;', '\x01')
+
+    def spoilt(old, new, times, end):
+        return whole.replace(old, new, times)[:end]
+
+    found = sorted(set(whole.replace('"', ' ').replace('<', ' ').split()))
+    return st.fixed_dictionaries({'data': st.just(whole) | texts() | st.builds(
+        spoilt, st.sampled_from(found), st.sampled_from(words) | texts(), st.integers(1, 3),
+        st.just(len(whole)) | st.integers(0, len(whole)))})
+
+
 def likely_objects():
     """Return lists with the names that the simulator's objects have, at any pixels."""
     names = first_pictures()[0].object_names
@@ -98,17 +153,14 @@ def few(values, empty):
 def fields(type_name):
     """Return the strategy of a type, for its fields as a dict."""
     vector = st.fixed_dictionaries({axis: numbers() for axis in 'xyz'})
-    joints = st.sampled_from(GRIPPER_JOINTS) | texts()
     amounts = st.sampled_from((0, 1, 2, 0, 1, 101, UINT32))
     request = {'num_samples': amounts, 'recursion_depth': amounts,
                'seed': st.sampled_from((0, 1, 2, -1, 2**63 - 1, -2**63)),
                'mode': st.sampled_from(('', 'direct', 'subgoal', 'bidirectional')) | texts()}
     return {
         'sensor_msgs/Image': images(), 'tap_msgs/ObjectStates': objects(),
-        'sensor_msgs/JointState': st.fixed_dictionaries({
-            'header': headers(), 'name': st.lists(joints, max_size=6),
-            'position': st.lists(numbers(), max_size=6),
-            'velocity': st.lists(numbers(), max_size=2)}),
+        MASK: masks(), 'std_msgs/String': descriptions(),
+        'sensor_msgs/JointState': joint_states(),
         'geometry_msgs/TwistStamped': st.fixed_dictionaries({
             'header': headers(), 'twist': st.fixed_dictionaries(
                 {'linear': vector, 'angular': few(vector, {})})}),
@@ -147,6 +199,7 @@ def cases():
 
 def message_type(name):
     """Import a type such as sensor_msgs/Image or tap_msgs/srv/ResetScene."""
+    name = name.split()[0]
     if name == ACTION:
         from tap_msgs.action import ReachGoal
         return ReachGoal

@@ -1,0 +1,101 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""robot_mask_node beside the simulator: masks with the stamps of the pictures, or the reason."""
+
+import numpy as np
+from processes import Client, NodeProcess
+import pytest
+from sensor_msgs.msg import CameraInfo, Image
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.errors import ImageError
+from tap_ros.nodes.clients import Newest
+from tap_ros.nodes.image_messages import decode_mask
+from tap_ros.nodes.object_messages import decode_camera_info, encode_camera_info
+from tap_ros.nodes.topics import STREAM, to_stamp
+
+CAMERA = {  # of the simulator with its arm: 0.84 rad from straight down
+    'camera_y': -1.36, 'camera_z': 1.33,
+    'camera_qx': np.cos(0.42), 'camera_qy': 0.0, 'camera_qz': 0.0, 'camera_qw': -np.sin(0.42)}
+SIM = {'lock_step': 'true', 'seed': 3, 'look': 'ur10e'}
+OWN_TOPIC = ['-r camera/robot_mask:=own_mask']
+
+
+@pytest.mark.parametrize('shape', [
+    {}, {'urdf': 'ur10e', 'hand_radius': 0.04}], ids=['topic', 'own'])
+def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path, shape):
+    sim = NodeProcess('sim_node', tmp_path / 'sim.txt', SIM)
+    node = NodeProcess('robot_mask_node', tmp_path / 'mask.txt',
+                       {**CAMERA, **shape, 'shadow': 'true', 'light_x': 0.45, 'light_y': 0.28},
+                       OWN_TOPIC)
+    try:
+        for process in (sim, node):
+            process.wait_for('ready')
+        with Client() as client:
+            true, own = (Newest(client, Image, topic, STREAM)
+                         for topic in ('camera/robot_mask', 'own_mask'))
+            message = own.wait(30)
+            simulated = true.wait(10, lambda m: m.header.stamp == message.header.stamp)
+        assert message.header == simulated.header
+        mask, wanted = (decode_mask(m, 'mask', (64, 64)) for m in (message, simulated))
+        arm = wanted == ROBOT_MASK_ARM
+        assert (mask[arm] != ROBOT_MASK_FREE).mean() > 0.9  # the simulator's shadows differ
+        assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.75
+        assert (mask == ROBOT_MASK_HAND).any() == bool(shape)
+        assert node.end() == 0
+    finally:
+        for process in (sim, node):
+            process.kill()
+
+
+def test_without_a_robot_there_is_no_mask_and_the_reason(tmp_path):
+    sim = NodeProcess('sim_node', tmp_path / 'sim.txt', {'lock_step': 'true'})
+    node = NodeProcess('robot_mask_node', tmp_path / 'mask.txt', CAMERA, OWN_TOPIC)
+    own = NodeProcess('robot_mask_node', tmp_path / 'own.txt', CAMERA | {'urdf': 'ur10e'},
+                      [*OWN_TOPIC, '-r __node:=other'])
+    try:
+        node.wait_for('no robot mask: nothing that can be used has come on robot_description')
+        own.wait_for('no robot mask: nothing is known of shoulder_pan_joint')
+    finally:
+        for process in (sim, node, own):
+            process.kill()
+
+
+@pytest.mark.parametrize('parameters, words', [
+    ({'urdf': '/nowhere.urdf'}, '/nowhere.urdf is no file'),
+    ({'urdf': 'ur10e', 'base_frame': 'nowhere'}, 'no link nowhere; it has world, base'),
+    ({'shadow': 'true', 'light_z': 1.0}, 'light_z: is 1; expected less than 0'),
+    ({'camera_qx': 0.0}, 'a quaternion of no direction'),
+    ({'camera_pose': 'guess'}, 'valid choices: parameters, tf')])
+def test_a_bad_start_ends_with_one_clear_line(tmp_path, parameters, words):
+    node = NodeProcess('robot_mask_node', tmp_path / 'mask.txt', parameters)
+    try:
+        assert node.process.wait(60) == 1
+        assert words in node.text and 'Traceback' not in node.text
+    finally:
+        node.kill()
+
+
+def test_intrinsics_are_those_of_the_pictures_that_are_sent():
+    K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
+    message = encode_camera_info(K, (480, 640), to_stamp(1), 'eye')
+    found, size = decode_camera_info(message, False)
+    np.testing.assert_array_equal(found, K)
+    assert size == (480, 640)
+    message.roi.x_offset, message.roi.width, message.roi.height = 80, 480, 480
+    message.binning_x = message.binning_y = 4
+    found, size = decode_camera_info(message, True)  # p is the same
+    np.testing.assert_array_equal(found, [[125, 0, 60], [0, 127.5, 60], [0, 0, 1]])
+    assert size == (120, 120)
+
+
+@pytest.mark.parametrize('changes, words', [
+    ({'d': [0.1, 0.0]}, 'bends straight lines'), ({'k': [0.0] * 9}, 'k is not that of a camera'),
+    ({'k': [np.nan] * 9}, 'k is not that of a camera'), ({'height': 0}, '64x0 pixels'),
+    ({'height': 2**31, 'width': 2**31}, 'pixels')])
+def test_cameras_that_cannot_be_used_are_refused(changes, words):
+    message = encode_camera_info(np.eye(3), (64, 64), to_stamp(1), 'eye')
+    for name, value in changes.items():
+        setattr(message, name, value)
+    with pytest.raises(ImageError, match=words):
+        decode_camera_info(message, False)
+    assert isinstance(message, CameraInfo)
