@@ -147,6 +147,7 @@ class Studio:
             place[2] += SHADOW_HEIGHT
             mujoco.mjv_initGeom(shadow, geom.type, geom.size, place,
                                 (self._flatten @ geom.mat).ravel(), geom.rgba)
+            shadow.size[:] = geom.size  # mjv_initGeom makes cylinders and capsules as long as wide
             shadow.segid = scene.ngeom
             labels[i] = label, 0
             labels[scene.ngeom] = label, 1
