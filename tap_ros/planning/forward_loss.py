@@ -73,6 +73,8 @@ def forward_loss(model: ForwardModel, batch: Windows, picture_steps: Collection[
     """
     Roll the model along the windows and compare pictures at some of the steps.
 
+    What the robot hides in a picture is compared with nothing.
+
     :param model: ForwardModel.
     :param batch: Windows.
     :param picture_steps: indices in 1..T of the pictures compared.
@@ -93,6 +95,7 @@ def forward_loss(model: ForwardModel, batch: Windows, picture_steps: Collection[
             arm = draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
             predicted, _ = model.picture(scene, flow, arm, batch.homography)
             target = batch.images[:, t]
+            predicted = torch.where(batch.hidden[:, t], target, predicted)
             weight = motion_weight(target, first, config.motion_factor)
             pictures = pictures + picture_loss(predicted, target, weight)
     parts = {'picture': pictures / len(picture_steps), 'moving': moving / count}

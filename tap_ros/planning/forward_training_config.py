@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The settings of a training run of the forward model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
+from tap_ros.learning.robot_mask import RobotMask
 from tap_ros.learning.split import TEST_FRACTION
 
 
@@ -29,6 +31,9 @@ class ForwardTrainingConfig:
     :param width: channels of the recurrence.
     :param features: channels that the recurrence reads.
     :param augment: mirror and recolour.
+    :param robot_mask: what the recordings' robot masks take out of the pictures: 'none'; the arm
+        with its shadow ('arm'); the hand, too ('all'). What was seen there free last takes its
+        place in the picture that is looked at; no error counts there.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, windows and augmentation.
     :param device: where the model is: 'auto', 'cpu' or 'cuda'.
@@ -53,6 +58,7 @@ class ForwardTrainingConfig:
     width: int = 32
     features: int = 8
     augment: bool = True
+    robot_mask: RobotMask = 'none'
     test_fraction: float = TEST_FRACTION
     seed: int = 0
     device: str = 'auto'
@@ -62,6 +68,9 @@ class ForwardTrainingConfig:
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be trained with."""
+        if self.robot_mask not in ROBOT_MASKS:
+            raise ConfigError(f'robot_mask: expected one of {", ".join(ROBOT_MASKS)}, '
+                              f'got {self.robot_mask!r}')
         for name in ('steps', 'batch_size', 'horizon', 'pictures', 'width', 'features',
                      'log_every', 'save_every'):
             if getattr(self, name) < 1:
@@ -70,3 +79,7 @@ class ForwardTrainingConfig:
                                 ('average_decay', 0, 0.99999), ('learning_rate', 0, 1)):
             if not low <= getattr(self, name) <= high:
                 raise ConfigError(f'{name}: expected {low}..{high}, got {getattr(self, name)}')
+
+
+# What settings were before they existed.
+DEFAULTS = {field.name: field.default for field in fields(ForwardTrainingConfig)}
