@@ -28,6 +28,8 @@ class ForwardTrainingConfig:
     :param average_decay: of the exponential moving average that is shipped.
     :param motion_factor: extra weight of pixels that changed since the window's first picture.
     :param still_weight: weight of the mean share of the crop that is said to move.
+    :param object_weight: weight of the mean share of the picture that is said to be objects: with
+        none, a table with grain counts as one, too.
     :param width: channels of the recurrence.
     :param features: channels that the recurrence reads.
     :param augment: mirror and recolour.
@@ -55,6 +57,7 @@ class ForwardTrainingConfig:
     average_decay: float = 0.995
     motion_factor: float = 8.0
     still_weight: float = 2e-4
+    object_weight: float = 5e-3
     width: int = 32
     features: int = 8
     augment: bool = True
@@ -83,3 +86,4 @@ class ForwardTrainingConfig:
 
 # What settings were before they existed.
 DEFAULTS = {field.name: field.default for field in fields(ForwardTrainingConfig)}
+DEFAULTS['object_weight'] = 0.0
