@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from sim_bridge.expert import default_config, ExpertConfig, run_episode
 from sim_bridge.grasp_expert import GraspConfig
+from sim_bridge.looks import DEFAULT_LOOK
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import get_task
 from sim_bridge.timing import TIMINGS
@@ -63,7 +64,7 @@ class CollectSettings:
     episodes_per_file: int = 25
     frames: int = 0
     timing: str = 'natural'
-    look: str = 'plain'
+    look: str = DEFAULT_LOOK
     appearance: str = 'usual'
 
 

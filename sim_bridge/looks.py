@@ -64,6 +64,7 @@ LOOKS = {
     'hand': Look(True, False, PUSHER, GRIPPER, _TABLE, _NEAR, 0.65),
     'ur10e': Look(True, True, PUSHER, GRIPPER, _TABLE_AND_ARM, _NEAR, 0.65),
 }
+DEFAULT_LOOK = 'plain'
 # From the side, at a person's height: for films.
 OBSERVER = Camera(480, 360, tilt=1.05, fovy=38.0, position=(1.15, -1.35, 1.15), turn=0.7)
 

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from sim_bridge.appearance import CHOICES
-from sim_bridge.looks import LOOKS
+from sim_bridge.looks import DEFAULT_LOOK, LOOKS
 from sim_bridge.robot_description import robot_description
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import TASKS
@@ -332,8 +332,9 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('image_size', 64, 'Width and height of the pictures in pixels.',
                        low=16, high=1024)
     parameters.declare(
-        'look', 'plain', "The world's look: a UR10e at a wooden table, the hand alone over it, or "
-        'plain colours.', choices=list(LOOKS))
+        'look', DEFAULT_LOOK,
+        "The world's look: a UR10e at a wooden table, the hand alone over it, or plain colours.",
+        choices=list(LOOKS))
     parameters.declare(
         'appearance', 'usual', 'Table, light and camera of looks with a table; random: drawn from '
         'the seed of each scene.', choices=list(CHOICES))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from sim_bridge.appearance import choose_appearance, USUAL
 from sim_bridge.camera import Renderer
 from sim_bridge.grasping import grasp_place
-from sim_bridge.looks import get_look, OBSERVER
+from sim_bridge.looks import DEFAULT_LOOK, get_look, OBSERVER
 from sim_bridge.places import gripper_away_from
 from sim_bridge.scene import (
     build_scene,
@@ -111,7 +111,7 @@ class Simulator:
         rendered.
     """
 
-    def __init__(self, task: str = 'push2', image_size: int = 64, look: str = 'plain',
+    def __init__(self, task: str = 'push2', image_size: int = 64, look: str = DEFAULT_LOOK,
                  appearance: str = 'usual') -> None:
         self.task, self.look = get_task(task), get_look(look)
         if not 16 <= image_size <= 1024:

@@ -13,6 +13,7 @@ from experiments.planning.methods import parse_method
 from experiments.planning.page import make_page
 from experiments.planning.results import load_results, make_rows
 from experiments.planning.runs import Job, run_jobs
+from sim_bridge.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.contract import step_budget
 from tap_ros.engines.options import EngineOptions
 from tap_ros.errors import ConfigError
@@ -43,6 +44,8 @@ class Options:
         whatever --preset says), plain_cost, every<n>, for example genmin:half:carried.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
+    :param look: of the world, see sim_bridge.looks; pictures are filled behind the robot as the
+        weights' training was, by the looks' robot masks.
     :param scenes: how many.
     :param seed: of the first scene.
     :param switch: go on from a subgoal when it is reached, or at its share of the budget as in
@@ -67,6 +70,7 @@ class Options:
     methods: Annotated[tuple[str, ...], conf.arg(metavar='METHOD [METHOD ...]')] = DEFAULT_METHODS
     predictor: Annotated[tuple[str, ...], conf.arg(
         metavar='NAME=FILE [NAME=FILE ...]', help_behavior_hint=f'(default: {TRAINED})')] = ()
+    look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     scenes: int = 100
     seed: int = FIRST_SCENE
     engine: EngineOptions = EngineOptions()
@@ -158,7 +162,8 @@ def make_jobs(args):
                         f'name them with --predictor {method.base}=FILE, or leave the method out '
                         'with --methods')
             jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
-                            args.step_budget, args.preset, _command(args, task, method)))
+                            args.step_budget, args.preset, _command(args, task, method),
+                            args.look))
     return jobs
 
 
@@ -186,9 +191,10 @@ def _command(args, task, method):
     """Return the command that makes the numbers of one method again."""
     words = ['python -m tap_ros evaluate planning --tasks', task, '--methods', method.name,
              '--scenes', str(args.scenes)]
-    for option, usual in (('seed', FIRST_SCENE), ('preset', 'default'), ('plan_samples', 0),
-                          ('plan_iterations', 0), ('replan_every', 0), ('step_budget', 0),
-                          ('forward_weights', str(FORWARD_MODEL)), ('device', 'cpu')):
+    for option, usual in (('look', DEFAULT_LOOK), ('seed', FIRST_SCENE), ('preset', 'default'),
+                          ('plan_samples', 0), ('plan_iterations', 0), ('replan_every', 0),
+                          ('step_budget', 0), ('forward_weights', str(FORWARD_MODEL)),
+                          ('device', 'cpu')):
         value = getattr(args, option)
         if value != usual:
             words += ['--' + option.replace('_', '-'), shlex.quote(str(value))]

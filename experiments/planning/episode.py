@@ -7,13 +7,14 @@ The loop is that of visual_mpc_node, planning/reach.py, with the same seeds, so 
 same.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 from experiments.planning.true_model import TrueModel
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
+from tap_ros.learning.robot_mask import FreeView, trained_robot_mask
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
@@ -60,12 +61,13 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     :param reached: px, mean over objects; nearer than this is there. 0: never.
     :param objects: indices of the objects that are planned for; None: all.
     :return: PlannedEpisode.
-    :raises ConfigError: when the predictor is missing.
+    :raises ConfigError: when the predictor is missing, or weights need robot masks that the look
+        has not.
     """
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     start = seen = simulator.reset(seed)
-    goal = simulator.goal()
+    goal, view = simulator.goal(), View(mpc.model.config.robot_mask)
     targets, subgoals = make_targets(simulator, mpc, method, seen, goal, predictor, seed)
     if objects is not None:
         objects = tuple(objects)
@@ -78,10 +80,11 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
     tracked = []
     while method.base != 'nothing':
-        answer = reach.step(as_seen(seen))
+        shown = as_seen(view.see(seen))
+        answer = reach.step(shown)
         if isinstance(answer, Aim):
             reach.head_for(targets)
-            continue
+            answer = reach.step(shown)
         tracked.append(reach.pixels)
         if isinstance(answer, End):
             break
@@ -94,6 +97,33 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     return PlannedEpisode(
         np.array(distances), observations, np.array(actions).reshape(-1, 4), np.array(times),
         goal, targets, reach.switches, np.array(tracked or [start.object_pixels]), subgoals)
+
+
+class View:
+    """
+    Observations of one episode without the robot, as the nodes show them to networks.
+
+    :param robot_mask: see robot_mask.hidden_pixels.
+    """
+
+    def __init__(self, robot_mask):
+        self._robot_mask, self._view = robot_mask, FreeView(robot_mask)
+
+    def see(self, observation):
+        """Fill an Observation of the camera, the newest one, and remember what it shows."""
+        return self._filled(observation, self._view.update)
+
+    def fill(self, observation):
+        """Fill an Observation of the same scene, such as the goal."""
+        return self._filled(observation, self._view.fill)
+
+    def _filled(self, observation, fill):
+        if self._robot_mask == 'none':
+            return observation
+        if observation.robot_mask is None:
+            raise ConfigError(f'weights trained with robot_mask {self._robot_mask} need pictures '
+                              'with robot masks; choose a look that has them, hand or ur10e')
+        return replace(observation, image=fill(observation.image, observation.robot_mask))
 
 
 def as_seen(observation):
@@ -111,11 +141,15 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed):
     start, end = seen.object_pixels, goal.object_pixels
     last = Target(end)
     if method.predicted:
+        robot_mask, share = trained_robot_mask(predictor.training)
+        view = View(robot_mask if share else 'none')
+        before, after = view.see(seen).image, view.fill(goal).image
         found = predictor.predict(
-            seen.image, goal.image, start, end, num_samples=method.samples,
+            before, after, start, end, num_samples=method.samples,
             recursion_depth=method.recursion, seed=seed)
+        shown = View(mpc.model.config.robot_mask).see(seen)
         subgoals = choose_sample(
-            mpc, Scene(seen.image, seen.gripper, start), end, found, seed)
+            mpc, Scene(shown.image, seen.gripper, start), end, found, seed)
         if method.maps == 'true':
             return [*(Target(true_configuration(simulator, s.image, seen, goal))
                       for s in subgoals), last], subgoals
@@ -152,6 +186,7 @@ def true_configuration(simulator, picture, seen, goal):
 def as_recording(run, task, seed, outcome):
     """Return a PlannedEpisode as the Episode of a recording."""
     seen, goal = run.observations, run.goal
+    masked = goal.robot_mask is not None
 
     def stack(name, dtype):
         return np.array([getattr(o, name) for o in seen], dtype)
@@ -164,4 +199,5 @@ def as_recording(run, task, seed, outcome):
         object_poses=stack('object_poses', np.float64), goal_frame=goal.image,
         goal_pixels=np.asarray(goal.object_pixels, np.float32),
         goal_poses=np.asarray(goal.object_poses, np.float64), task=task, seed=seed,
-        outcome=outcome)
+        outcome=outcome, robot_masks=stack('robot_mask', np.uint8) if masked else None,
+        goal_mask=goal.robot_mask)

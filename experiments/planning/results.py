@@ -13,7 +13,7 @@ from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.evaluation.intervals import mean_interval
 
 # Results are compared where these settings agree; what an option changes is not among them.
-SAME = ('step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
+SAME = ('look', 'step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
 
 
 def load_results(folder):
@@ -125,7 +125,7 @@ def _how(name, settings):
     """Say in what way a method was planned, for its rows."""
     method, planner = parse_method(name), settings['planner']
     return {
-        'tracking': settings['object_pixels'], 'switch': method.switch,
+        'look': settings['look'], 'tracking': settings['object_pixels'], 'switch': method.switch,
         'recursion': method.recursion, 'samples': method.samples, 'maps': method.maps,
         'model': method.model, 'cost': method.cost, 'step_budget': settings['step_budget'],
         'planner_samples': planner['search']['num_samples'],

@@ -10,6 +10,7 @@ from pathlib import Path
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import Method
 import numpy as np
+from sim_bridge.looks import DEFAULT_LOOK
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
@@ -25,6 +26,7 @@ from tap_ros.prediction.predictor import SubgoalPredictor
 import torch
 from tqdm import tqdm
 
+FIRST_LOOK = 'plain'  # of results that tell none
 SPEED_ONLY = ('batch_size', 'threads')  # settings of the planner that change no result
 
 
@@ -41,6 +43,7 @@ class Job:
     budget: int = 0  # control periods; 0: the task's
     preset: str = ''  # name of the planner's settings
     command: str = ''  # that makes the numbers again
+    look: str = DEFAULT_LOOK  # of the world
 
     def steps(self):
         """Return the step budget."""
@@ -50,7 +53,8 @@ class Job:
         """Return as a dict all that changes results; weights by what is in them."""
         planner = asdict(self.method.planner(self.planner))
         settings = {
-            'task': self.task, 'method': self.method.name, 'step_budget': self.steps(),
+            'task': self.task, 'look': self.look, 'method': self.method.name,
+            'step_budget': self.steps(),
             'reached_px': GOAL_TOLERANCE, 'object_pixels': self.method.tracking,
             'planner': {k: v for k, v in planner.items() if k not in SPEED_ONLY},
             'preset': self.preset, 'device': self.device,
@@ -104,7 +108,8 @@ def read_results(path):
     Read a result file.
 
     :return: its settings, and its scenes as a dict by seed. Settings of the planner that no longer
-        exist are left out: each had but the one value that now is a constant.
+        exist are left out: each had but the one value that now is a constant. Where no look is
+        told, there was but one.
     :raises ConfigError: if it is damaged.
     """
     try:
@@ -112,7 +117,7 @@ def read_results(path):
         scenes = {scene['seed']: scene for scene in stored['scenes']}
         for scene in scenes.values():
             float(scene['final_cm']), list(scene['objects_cm']), int(scene['steps'])
-        settings = dict(stored['settings'])
+        settings = {'look': FIRST_LOOK} | stored['settings']
         if 'planner' in settings:
             settings['planner'] = known(settings['planner'], asdict(VisualMPCConfig()))
         return settings, scenes
@@ -183,7 +188,7 @@ def plan_scene(job, seed):
     :return: list of PlannedEpisodes, one or, each object alone, K; final distances (K,) metres.
     """
     torch.set_num_threads(1)  # with more, the predictor's last digits differ
-    simulator, predictor = _simulator(job.task), None
+    simulator, predictor = _simulator(job.task, job.look), None
     if job.predictor:
         predictor = _predictor(job.predictor, job.device)
     subsets = [None]
@@ -200,8 +205,8 @@ def plan_scene(job, seed):
 
 
 @lru_cache
-def _simulator(task):
-    return Simulator(task)
+def _simulator(task, look):
+    return Simulator(task, look=look)
 
 
 @lru_cache

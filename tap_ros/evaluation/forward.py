@@ -12,6 +12,8 @@ import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.files import write_rows
+from tap_ros.learning.filled import FilledStore, with_masks
+from tap_ros.learning.robot_mask import fill_from_past
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
 from tap_ros.options import Bags, Folder, ShippedFile
 from tap_ros.planning.forward_model import load_forward_model
@@ -28,6 +30,8 @@ FILE = 'forward_model.json'
 class Options:
     """
     Options of the command.
+
+    Pictures are filled behind the robot as the weights' training was.
 
     :param recordings: bag folders with object pixels; each is scored on its own.
     :param weights: of a forward model.
@@ -56,9 +60,13 @@ def run(args: Options) -> None:
         if store.image_size != (model.config.image_size,) * 2:
             raise ConfigError(f'{args.weights}: made for {model.config.image_size} pixels a side, '
                               f'{recording} has {store.image_size}; use matching ones')
-        fraction = min(args.test_fraction, 1)
-        held_out = range(len(store)) if fraction == 1 else split_episodes(store, fraction)[1]
-        measured = measure_maps(model, store, held_out)
+        fraction, robot_mask = min(args.test_fraction, 1), model.config.robot_mask
+        everything = np.arange(len(store))
+        parts = (everything, everything) if fraction == 1 else split_episodes(store, fraction)
+        held_out = with_masks(store, parts, robot_mask)[1]
+        filled = store if robot_mask == 'none' else FilledStore(
+            store, robot_mask, filling=fill_from_past)
+        measured = measure_maps(model, filled, held_out)
         if not measured:
             raise ConfigError(f'{recording}: no held-out episode of 16 frames or more has object '
                               'pixels that move; give more of them, or --test-fraction 1')

@@ -5,7 +5,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 import tempfile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Union
 import warnings
 
 import numpy as np
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
     from tap_ros.recording.episode import Episode
 
+# From frames (T, H, W, 3), masks (T, H, W) and a RobotMask to filled frames and seen (H, W).
+Filling = Callable[[np.ndarray, np.ndarray, RobotMask], tuple[np.ndarray, np.ndarray]]
+
 
 class FilledStore:
     """
@@ -34,13 +37,14 @@ class FilledStore:
     :param store: the EpisodeStore.
     :param robot_mask: see robot_mask.hidden_pixels.
     :param progress: whether to show a progress bar.
-    :ivar seen: bool (E, H, W), False where a pixel of an episode is hidden and never free; there
-        the pictures are as recorded.
+    :param filling: robot_mask.fill_in_time or fill_from_past.
+    :ivar seen: bool (E, H, W), False where a pixel of an episode is hidden and nothing fills it;
+        there the pictures are as recorded.
     :raises StorageError: when the disk is full.
     """
 
     def __init__(self, store: 'EpisodeStore', robot_mask: RobotMask,
-                 progress: bool = False) -> None:
+                 progress: bool = False, filling: Filling = fill_in_time) -> None:
         self._store = store
         self.lengths, self.num_frames = store.lengths, store.num_frames
         self.image_size = store.image_size
@@ -55,7 +59,7 @@ class FilledStore:
                 episode = store[i]
                 if episode.robot_masks is None:
                     continue
-                frames, self.seen[i] = fill_in_time(
+                frames, self.seen[i] = filling(
                     episode.frames, episode.robot_masks, robot_mask)
                 file.write(frames.data)
                 self._first[i], rows = rows, rows + len(frames)
@@ -96,6 +100,9 @@ def _fill_goal(episode: 'Episode', last: np.ndarray, robot_mask: RobotMask) -> n
     gaps = hidden_pixels(episode.goal_mask, robot_mask)[..., None]
     behind = last_free(episode.frames, episode.robot_masks)
     return np.where(gaps, behind, episode.goal_frame)
+
+
+Episodes = Union['EpisodeStore', FilledStore]
 
 
 @dataclass(frozen=True)

@@ -38,11 +38,12 @@ def trained_robot_mask(training: Mapping[str, Any]) -> tuple[RobotMask, float]:
     Return what weights were trained with.
 
     :param training: the training dict of a weights file, of any version.
-    :return: robot_mask, and the share of the context pictures that were filled, too.
+    :return: robot_mask, and the share of the context pictures that were filled, too; of forward
+        models, which say no share, all are.
     """
     settings = training.get('settings')
     settings = settings if isinstance(settings, dict) else {}
-    robot_mask, share = settings.get('robot_mask'), settings.get('fill_context')
+    robot_mask, share = settings.get('robot_mask'), settings.get('fill_context', 1.0)
     if robot_mask not in ROBOT_MASKS or not isinstance(share, (int, float)):
         return 'none', 0.0
     return cast(RobotMask, robot_mask), float(share)
@@ -72,6 +73,26 @@ def fill_in_time(frames: np.ndarray, masks: np.ndarray,
     t, v, u = np.nonzero(hidden & known)
     filled[t, v, u] = frames[source[t, v, u], v, u]
     return filled, known | ~hidden.any(0)
+
+
+def fill_from_past(frames: np.ndarray, masks: np.ndarray,
+                   robot_mask: RobotMask) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Fill hidden pixels with what was seen there free last, as FreeView does with a stream.
+
+    :param frames: uint8 (T, H, W, 3), an episode.
+    :param masks: uint8 (T, H, W), its robot masks.
+    :param robot_mask: see hidden_pixels.
+    :return: uint8 (T, H, W, 3); bool (H, W), False where a pixel is hidden before it is ever free:
+        until then such ones stay as they are.
+    """
+    hidden, free = hidden_pixels(masks, robot_mask), masks == ROBOT_MASK_FREE
+    now = np.arange(len(frames), dtype=np.int32)[:, None, None]
+    past = np.maximum.accumulate(np.where(free, now, -1), 0)
+    filled = np.array(frames)
+    t, v, u = np.nonzero(hidden & (past >= 0))
+    filled[t, v, u] = frames[past[t, v, u], v, u]
+    return filled, np.logical_not((hidden & (past < 0)).any(0))
 
 
 def last_free(frames: np.ndarray, masks: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.nodes.arm_joints import declare_mount, declare_opening
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
+from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.hierarchy import SWITCHES
 from tap_ros.planning.mpc_config import PRESETS, with_preset
 from tap_ros.planning.mpc_inputs import Scene
@@ -113,6 +114,20 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     mpc.plan(Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels),
              mpc.goal(pixels))
     return mpc
+
+
+def unlike_training(mpc: VisualMPC, robot_mask: str) -> str:
+    """
+    Say whether the pictures are unlike those that the model was trained on, '' if they are not.
+
+    :param mpc: of load_planner; robot_mask: parameter of the node.
+    """
+    assert isinstance(mpc.model, ForwardModel)
+    trained = mpc.model.config.robot_mask
+    if robot_mask == trained:
+        return ''
+    return (f'parameter robot_mask is {robot_mask}, but the forward model was trained on pictures '
+            f'as with {trained}; plans may be worse')
 
 
 def check_request(request: 'ReachGoal.Goal') -> str:

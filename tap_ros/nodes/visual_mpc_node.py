@@ -28,6 +28,7 @@ from tap_ros.nodes.planner_setup import (
     check_request,
     declare_parameters,
     load_planner,
+    unlike_training,
 )
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.sight import sensor_topics, Sight
@@ -85,6 +86,9 @@ class VisualMpcNode(Node):
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
             goal_callback=self._on_goal, cancel_callback=self._on_cancel)
+        unlike = unlike_training(self._mpc, robot_mask)
+        if unlike:
+            self.get_logger().warning(unlike)
         self.get_logger().info(f'ready: {self.params["device"]}, {self.params["weights"]}')
 
     def close(self) -> None:

@@ -24,6 +24,10 @@ class LossSettings(Protocol):
     def still_weight(self) -> float:
         """Weight of the mean share of the crop that is said to move."""
 
+    @property
+    def object_weight(self) -> float:
+        """Weight of the mean share of the picture that is said to be objects."""
+
 
 def draw_arm_like(model: ForwardModel, grippers: torch.Tensor, mirrored: torch.Tensor,
                   colours: torch.Tensor) -> torch.Tensor:
@@ -73,10 +77,13 @@ def forward_loss(model: ForwardModel, batch: Windows, picture_steps: Collection[
     """
     Roll the model along the windows and compare pictures at some of the steps.
 
+    What the robot hides in a picture is compared with nothing. Where the model moves something
+    counts as much as where something moved, else it would rather see pushes where there are none.
+
     :param model: ForwardModel.
     :param batch: Windows.
     :param picture_steps: indices in 1..T of the pictures compared.
-    :param config: with motion_factor and still_weight.
+    :param config: with motion_factor, still_weight and object_weight.
     :return: loss, dict of its parts.
     """
     arms = draw_arm_like(model, batch.grippers[:, 0], batch.mirrored, batch.colours)
@@ -93,8 +100,12 @@ def forward_loss(model: ForwardModel, batch: Windows, picture_steps: Collection[
             arm = draw_arm_like(model, batch.grippers[:, t], batch.mirrored, batch.colours)
             predicted, _ = model.picture(scene, flow, arm, batch.homography)
             target = batch.images[:, t]
-            weight = motion_weight(target, first, config.motion_factor)
+            predicted = torch.where(batch.hidden[:, t], target, predicted)
+            weight = torch.maximum(*(motion_weight(picture, first, config.motion_factor)
+                                     for picture in (target, predicted.detach())))
             pictures = pictures + picture_loss(predicted, target, weight)
-    parts = {'picture': pictures / len(picture_steps), 'moving': moving / count}
-    loss = parts['picture'] + config.still_weight * parts['moving']
+    parts = {'picture': pictures / len(picture_steps), 'moving': moving / count,
+             'objects': scene.objects[:, 3].mean()}
+    loss = (parts['picture'] + config.still_weight * parts['moving']
+            + config.object_weight * parts['objects'])
     return loss, {k: float(v.detach()) for k, v in parts.items()}

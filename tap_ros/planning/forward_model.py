@@ -16,18 +16,20 @@ maps: p_t(x) ~ p_0(x + phi_t(x)). Pictures are only composed in training, as
 arm over warped objects over background, three masks that sum to 1.
 
 Unlike the authors' ConvLSTM, nothing is decoded per step, and the arm, whose motion is commanded,
-is not predicted but drawn where its kinematics put it.
+is not predicted but drawn where its kinematics put it; made for pictures without the robot, it
+draws none.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from tap_ros.contract import ACTION_LIMIT, CLEAR, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.contract import ACTION_LIMIT, CLEAR, ROBOT_MASKS, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import ConfigError
 from tap_ros.learning.devices import has_bfloat16, placed
-from tap_ros.learning.weights import load_weights, make_network
+from tap_ros.learning.robot_mask import RobotMask
+from tap_ros.learning.weights import LATER, load_weights, make_network
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
 from tap_ros.planning.table import (
     channels_first,
@@ -65,6 +67,8 @@ class ForwardModelConfig:
     blocks: int = 3
     encoder_width: int = 16
     sprite_size: int = 24  # pixels, side of the picture of the arm
+    # what the pictures are without, see robot_mask.hidden_pixels
+    robot_mask: RobotMask = field(default='none', metadata=LATER)
 
     def __post_init__(self) -> None:
         if len(self.table) != 9 or len(self.arm) != 12:
@@ -84,6 +88,9 @@ class ForwardModelConfig:
                 isinstance(n, int) and 2 <= n <= 1024 for n in self.crop_cells):
             raise ConfigError('forward model: crop_cells: expected 2 whole numbers of 2..1024, '
                               f'got {self.crop_cells}')
+        if self.robot_mask not in ROBOT_MASKS:
+            raise ConfigError(f'forward model: robot_mask: expected one of '
+                              f'{", ".join(ROBOT_MASKS)}, got {self.robot_mask!r}')
         if not 2 <= self.window_cells <= self.table_cells:
             raise ConfigError(f'forward model: window_cells: expected 2..{self.table_cells} '
                               f'(table_cells), got {self.window_cells}')
@@ -155,8 +162,11 @@ class ForwardModel(nn.Module):
         Draw the arm where its kinematics put it.
 
         :param gripper: (B, 4) metres.
-        :return: (B, 4, H, W): rgb in [-1, 1] and mask in [0, 1].
+        :return: (B, 4, H, W): rgb in [-1, 1] and mask in [0, 1]; zeros for a model that is made
+            for pictures without the robot.
         """
+        if self.config.robot_mask == 'all':
+            return gripper.new_zeros(len(gripper), 4, *self.image_size)
         basis = torch.cat([torch.ones_like(gripper[:, :1]), gripper[:, :3]], 1)  # (B, 4)
         sprites = torch.einsum('bi,icuv->bcuv', basis, self.sprite)
         # a rim of masks near zero, so that nothing is drawn outside the sprite

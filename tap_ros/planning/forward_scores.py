@@ -11,13 +11,13 @@ from tap_ros.planning.forward_model import ForwardModel
 import torch
 
 if TYPE_CHECKING:
-    from tap_ros.recording.cache import EpisodeStore
+    from tap_ros.learning.filled import Episodes
 
 SCORED_STEPS = (1, 5, 10, 15)
 MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than this by then
 
 
-def map_errors(model: ForwardModel, store: 'EpisodeStore', episodes: Iterable[int],
+def map_errors(model: ForwardModel, store: 'Episodes', episodes: Iterable[int],
                stride: int = 8, max_windows: int = 400) -> dict[str, float]:
     """
     Score the maps' expected pixels on recorded episodes, see measure_maps.
@@ -35,7 +35,7 @@ def map_errors(model: ForwardModel, store: 'EpisodeStore', episodes: Iterable[in
 
 
 @torch.no_grad()
-def measure_maps(model: ForwardModel, store: 'EpisodeStore', episodes: Iterable[int],
+def measure_maps(model: ForwardModel, store: 'Episodes', episodes: Iterable[int],
                  stride: int = 8, max_windows: int = 400) -> dict[int, dict[str, np.ndarray]]:
     """
     Measure how far the maps' expected pixels end from where recorded objects went.

@@ -17,7 +17,9 @@ from tap_ros.errors import ConfigError
 from tap_ros.images import to_uint8
 from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.learning.devices import pick_device
+from tap_ros.learning.filled import Episodes, FilledStore, with_masks
 from tap_ros.learning.panels import grey_panels
+from tap_ros.learning.robot_mask import fill_from_past
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
 from tap_ros.learning.schedule import learning_rate
 from tap_ros.learning.split import split_episodes
@@ -27,8 +29,8 @@ from tap_ros.planning.forward_data import draw_windows, Windows
 from tap_ros.planning.forward_loss import draw_arm_like, forward_loss
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
 from tap_ros.planning.forward_scores import map_errors
-from tap_ros.planning.forward_training_config import ForwardTrainingConfig
-from tap_ros.planning.table import fit_arm, fit_table
+from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig
+from tap_ros.planning.table import fit_arm, fit_shift, fit_table
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 import torch
 from torch.utils.tensorboard import SummaryWriter
@@ -65,12 +67,17 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
 def _train(config: ForwardTrainingConfig, device: torch.device, store: EpisodeStore,
            stop_at: int | None, progress: bool) -> None:
     """Train as the only process in the folder; see train."""
-    training, held_out = split_episodes(store, config.test_fraction, config.horizon + 1)
+    training, held_out = with_masks(
+        store, split_episodes(store, config.test_fraction, config.horizon + 1), config.robot_mask)
     torch.manual_seed(config.seed)
     state = start(
         ForwardModel(model_config(config, store, training)), config.learning_rate, device)
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
-    load_checkpoint(checkpoint, state, asdict(config), store.data_hash)
+    load_checkpoint(checkpoint, state, asdict(config), store.data_hash, DEFAULTS)
+    # The picture that is looked at shows what a node would show; see FreeView.
+    episodes = store if config.robot_mask == 'none' else FilledStore(
+        store, config.robot_mask, progress, fill_from_past)
+    tables = episode_tables(store, state.network)
     last = min(config.steps, stop_at or config.steps)
     bar = tqdm(total=config.steps, initial=state.step, desc='forward model', unit='step',
                disable=not progress)
@@ -82,7 +89,7 @@ def _train(config: ForwardTrainingConfig, device: torch.device, store: EpisodeSt
             for group in state.optimizers[0].param_groups:
                 group['lr'] = rate
             # One step of Adam towards the recorded pictures.
-            batch, shown = draw_step(config, store, training, step, state.network.homography)
+            batch, shown = draw_step(config, episodes, training, step, tables)
             loss, parts = forward_loss(state.network, batch.to(device), shown, config)
             state.optimizers[0].zero_grad()
             loss.backward()
@@ -99,7 +106,7 @@ def _train(config: ForwardTrainingConfig, device: torch.device, store: EpisodeSt
             if state.step % config.save_every == 0 or state.step == last:
                 state.seconds = time.monotonic() - began
                 # The report first: a run that is stopped in between reports again.
-                _report(state, curves, config, store, training, held_out)
+                _report(state, curves, config, store, episodes, training, held_out)
                 save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
 
 
@@ -123,34 +130,50 @@ def model_config(config: ForwardTrainingConfig, store: EpisodeStore,
     arm = fit_arm(episodes)
     return ForwardModelConfig(
         table=tuple(fit_table(episodes, arm).ravel().tolist()), arm=tuple(arm.ravel().tolist()),
-        image_size=height, width=config.width, features=config.features)
+        image_size=height, width=config.width, features=config.features,
+        robot_mask=config.robot_mask)
 
 
-def draw_step(config: ForwardTrainingConfig, store: EpisodeStore, training: np.ndarray, step: int,
+def episode_tables(store: EpisodeStore, model: ForwardModel) -> torch.Tensor:
+    """
+    Return where the table is in the pictures of every episode, on the CPU.
+
+    :return: (E, 3, 3); where the robot is masked, shifted as far as the camera was, see fit_shift.
+    """
+    table = model.homography.cpu()
+    if model.config.robot_mask == 'none':
+        return table.expand(len(store), 3, 3)
+    return torch.from_numpy(np.stack([
+        fit_shift(store[i], table.double().numpy()) for i in range(len(store))])).float()
+
+
+def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarray, step: int,
               homography: torch.Tensor) -> tuple[Windows, set[int]]:
     """
     Draw the windows of one step, and which of their pictures are compared.
 
+    :param homography: (3, 3), or (E, 3, 3) of every episode.
     :return: Windows, set of picture indices from 1 to their length.
     """
     rng = np.random.default_rng([config.seed, step])
     growth = min(1.0, (step + 1) / max(1, config.grow * config.steps))
     length = max(1, round(min(2, config.horizon) + growth * (config.horizon - 2)))
     batch = draw_windows(
-        store, training, config.batch_size, length, homography.cpu(), rng, config.augment)
+        store, training, config.batch_size, length, homography.cpu(), rng, config.augment,
+        config.robot_mask)
     return batch, set((rng.permutation(length)[:config.pictures] + 1).tolist())
 
 
 def _report(state: TrainingState[ForwardModel], curves: SummaryWriter,
-            config: ForwardTrainingConfig, store: EpisodeStore, training: np.ndarray,
-            held_out: np.ndarray) -> None:
+            config: ForwardTrainingConfig, store: EpisodeStore, filled: Episodes,
+            training: np.ndarray, held_out: np.ndarray) -> None:
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
-    scores = map_errors(state.average, store, held_out)
+    scores = map_errors(state.average, filled, held_out)
     for name, value in scores.items():
         curves.add_scalar(f'held_out/{name}', value, state.step)
     for name, episodes in (('training', training), ('held_out', held_out)):
         if len(episodes):
-            picture = sample_grid(state.average, store, episodes, config)
+            picture = sample_grid(state.average, filled, episodes, config)
             curves.add_image(name, picture, state.step, dataformats='HWC')
     about = run_facts(state, config.seed, store, training, held_out)
     describe_run(config.out, config=asdict(config), run=about, scores=scores)
@@ -160,7 +183,7 @@ def _report(state: TrainingState[ForwardModel], curves: SummaryWriter,
 
 
 @torch.no_grad()
-def sample_grid(model: ForwardModel, store: EpisodeStore, episodes: np.ndarray,
+def sample_grid(model: ForwardModel, store: Episodes, episodes: np.ndarray,
                 config: ForwardTrainingConfig, rows: int = 6, seed: int = 0) -> np.ndarray:
     """
     Show windows: first picture, its objects' mask and background, then true beside predicted.

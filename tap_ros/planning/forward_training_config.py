@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The settings of a training run of the forward model."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
+from tap_ros.learning.robot_mask import RobotMask
 from tap_ros.learning.split import TEST_FRACTION
 
 
@@ -26,9 +28,14 @@ class ForwardTrainingConfig:
     :param average_decay: of the exponential moving average that is shipped.
     :param motion_factor: extra weight of pixels that changed since the window's first picture.
     :param still_weight: weight of the mean share of the crop that is said to move.
+    :param object_weight: weight of the mean share of the picture that is said to be objects: with
+        none, a table with grain counts as one, too.
     :param width: channels of the recurrence.
     :param features: channels that the recurrence reads.
     :param augment: mirror and recolour.
+    :param robot_mask: what the recordings' robot masks take out of the pictures: 'none'; the arm
+        with its shadow ('arm'); the hand, too ('all'). What was seen there free last takes its
+        place in the picture that is looked at; no error counts there.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, windows and augmentation.
     :param device: where the model is: 'auto', 'cpu' or 'cuda'.
@@ -50,9 +57,11 @@ class ForwardTrainingConfig:
     average_decay: float = 0.995
     motion_factor: float = 8.0
     still_weight: float = 2e-4
+    object_weight: float = 5e-3
     width: int = 32
     features: int = 8
     augment: bool = True
+    robot_mask: RobotMask = 'none'
     test_fraction: float = TEST_FRACTION
     seed: int = 0
     device: str = 'auto'
@@ -62,6 +71,9 @@ class ForwardTrainingConfig:
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be trained with."""
+        if self.robot_mask not in ROBOT_MASKS:
+            raise ConfigError(f'robot_mask: expected one of {", ".join(ROBOT_MASKS)}, '
+                              f'got {self.robot_mask!r}')
         for name in ('steps', 'batch_size', 'horizon', 'pictures', 'width', 'features',
                      'log_every', 'save_every'):
             if getattr(self, name) < 1:
@@ -70,3 +82,8 @@ class ForwardTrainingConfig:
                                 ('average_decay', 0, 0.99999), ('learning_rate', 0, 1)):
             if not low <= getattr(self, name) <= high:
                 raise ConfigError(f'{name}: expected {low}..{high}, got {getattr(self, name)}')
+
+
+# What settings were before they existed.
+DEFAULTS = {field.name: field.default for field in fields(ForwardTrainingConfig)}
+DEFAULTS['object_weight'] = 0.0

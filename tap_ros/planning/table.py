@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.contract import GRIPPER_JOINTS
+from tap_ros.contract import GRIPPER_JOINTS, ROBOT_MASK_HAND
 from tap_ros.errors import RecordingError
 import torch
 from torch.nn import functional as F
@@ -153,11 +153,12 @@ def fit_projection(points: np.ndarray, pixels: np.ndarray, iterations: int = 30)
 
 def fit_arm(episodes: Iterable['Episode']) -> np.ndarray:
     """
-    Fit where the arm appears: a camera from gripper positions to the middle of what changes.
+    Fit where the arm appears: a camera from gripper positions to the middle of the hand.
 
-    From one frame to the next mostly the arm moves, and what it pushes lies around it: the
-    weighted middle of the picture's change, regressed on the middle of the two gripper positions,
-    needs no calibration and no labels. It lands on the arm's visible body, not its fingertips.
+    Robot masks say where the hand is. Without them it is where the picture changes: from one
+    frame to the next mostly the arm moves, and what it pushes lies around it. The weighted middle
+    of the picture's change, regressed on the middle of the two gripper positions, needs no
+    calibration and no labels. It lands on the arm's visible body, not its fingertips.
 
     :param episodes: iterable of recording Episodes.
     :return: (3, 4) float64, metres to pixels.
@@ -165,22 +166,35 @@ def fit_arm(episodes: Iterable['Episode']) -> np.ndarray:
     """
     points, pixels = [], []
     for episode in episodes:
+        if episode.robot_masks is not None:
+            hand = (episode.robot_masks == ROBOT_MASK_HAND).astype(np.float32)
+            middle, good = _middle(hand)
+            good &= np.isfinite(episode.grippers[:, :3]).all(1)
+            points.append(episode.grippers[good, :3])
+            pixels.append(middle[good])
+            continue
         frames = episode.frames.astype(np.float32)
         change = np.abs(np.diff(frames, axis=0)).sum(-1)  # (T-1, H, W)
         change[change < 30] = 0
-        mass = change.sum((1, 2))
-        u = (change.sum(1) @ np.arange(frames.shape[2])) / np.maximum(mass, 1)
-        v = (change.sum(2) @ np.arange(frames.shape[1])) / np.maximum(mass, 1)
+        changed, good = _middle(change)
         middle = (episode.grippers[1:, :3] + episode.grippers[:-1, :3]) / 2
-        good = (mass > 0) & np.isfinite(middle).all(1)
+        good &= np.isfinite(middle).all(1)
         points.append(middle[good])
-        pixels.append(np.column_stack([u, v])[good])
+        pixels.append(changed[good])
     points = np.concatenate(points) if points else np.zeros((0, 3))
     if len(points) < 50 or points[:, :2].std(0).min() < 0.01:
         raise RecordingError(
             '/joint_states: the forward model needs gripper positions of a moving arm '
             f'({", ".join(GRIPPER_JOINTS[:3])}); {len(points)} usable steps found')
     return fit_projection(points.astype(np.float64), np.concatenate(pixels))
+
+
+def _middle(mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the middles (T, 2) of pictures of mass (T, H, W), and whether there is any (T,)."""
+    total = mass.sum((1, 2))
+    u = (mass.sum(1) @ np.arange(mass.shape[2])) / np.maximum(total, 1)
+    v = (mass.sum(2) @ np.arange(mass.shape[1])) / np.maximum(total, 1)
+    return np.column_stack([u, v]), total > 0
 
 
 def fit_table(episodes: Iterable['Episode'], arm: np.ndarray) -> np.ndarray:
@@ -205,3 +219,21 @@ def fit_table(episodes: Iterable['Episode'], arm: np.ndarray) -> np.ndarray:
     if len(points) < 50 or points.std(0).min() < 0.01:
         return arm[:, [0, 1, 3]]
     return fit_projection(points.astype(np.float64), np.concatenate(pixels).astype(np.float64))
+
+
+def fit_shift(episode: 'Episode', table: np.ndarray) -> np.ndarray:
+    """
+    Fit how the camera of one episode differs from the usual one: by a shift of the picture.
+
+    :param episode: Episode; as for fit_table, without object positions nothing is known.
+    :param table: (3, 3), see fit_table.
+    :return: (3, 3) float64, the table of this episode.
+    """
+    xy = episode.object_poses[..., :2].reshape(-1, 2)
+    uv = episode.object_pixels.reshape(-1, 2)
+    good = np.isfinite(xy).all(1) & np.isfinite(uv).all(1)
+    shifted = np.eye(3)
+    if good.any():
+        rays = np.column_stack([xy[good], np.ones(good.sum())]) @ table.T
+        shifted[:2, 2] = np.median(uv[good] - rays[:, :2] / rays[:, 2:], axis=0)
+    return shifted @ table

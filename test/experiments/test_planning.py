@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of planned episodes, in the real simulator with the shipped weights."""
 
+import copy
 from dataclasses import replace
 import inspect
 
@@ -20,6 +21,7 @@ from sim_bridge.simulator import Simulator
 from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError
 from tap_ros.images import to_float
+from tap_ros.learning.robot_mask import FreeView
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.map_model import MapModel
 from tap_ros.planning.mpc_config import LARGE, PAPER, VisualMPCConfig
@@ -110,6 +112,53 @@ def test_a_true_picture_is_recognised(simulator):
         shown = simulator.photograph(poses)
         found = true_configuration(simulator, shown.image, seen, goal)
         np.testing.assert_allclose(found, shown.object_pixels, atol=0.01)
+
+
+@pytest.fixture(scope='module')
+def studio():
+    simulator = Simulator('push2', look='hand')
+    yield simulator
+    simulator.close()
+
+
+class Witness:
+    """A predictor that keeps the pictures it is shown."""
+
+    def __init__(self, predictor, robot_mask, fill_context):
+        self._predictor, self.shown = predictor, []
+        settings = {'robot_mask': robot_mask, 'fill_context': fill_context}
+        self.training = {'settings': settings}
+
+    def predict(self, *pictures, **how):
+        self.shown += pictures[:2]
+        return self._predictor.predict(*pictures, **how)
+
+
+@pytest.mark.parametrize('robot_mask, share', [('none', 1), ('all', 0), ('all', 1)])
+def test_networks_are_shown_what_nodes_would_show(studio, mpc, predictor, robot_mask, share):
+    model = copy.copy(mpc.model)
+    model.config = replace(model.config, robot_mask=robot_mask)
+    seen_by_model, begin = [], model.begin
+    model.begin = lambda image, *rest: (seen_by_model.append(image), begin(image, *rest))[1]
+    witness = Witness(predictor, robot_mask, share)
+    run = run_episode(studio, VisualMPC(model, SMALL), SHIPPED, 3, 5, witness)
+    view = FreeView(robot_mask)
+    expected = [view.update(seen.image, seen.robot_mask) for seen in run.observations]
+    for image, picture in zip(seen_by_model[-3:], expected):
+        np.testing.assert_array_equal(image[0], to_float(picture))
+    first, goal = FreeView(robot_mask if share else 'none'), run.goal
+    start = run.observations[0]
+    np.testing.assert_array_equal(witness.shown[0], first.update(start.image, start.robot_mask))
+    np.testing.assert_array_equal(witness.shown[1], first.fill(goal.image, goal.robot_mask))
+    assert (expected[-1] != run.frames[-1]).any() == (robot_mask == 'all')
+    check_episode(as_recording(run, 'push2', 5, 'failure'))
+
+
+def test_weights_that_need_masks_are_refused_where_a_look_has_none(simulator, mpc):
+    model = copy.copy(mpc.model)
+    model.config = replace(model.config, robot_mask='all')
+    with pytest.raises(ConfigError, match='hand or ur10e'):
+        run_episode(simulator, VisualMPC(model, SMALL), DIRECT, 3, 5)
 
 
 def test_one_object_alone_is_planned_for_alone(simulator, mpc):

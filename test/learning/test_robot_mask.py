@@ -12,6 +12,7 @@ from tap_ros.errors import RecordingError
 from tap_ros.learning.filled import fill, FilledStore, with_masks
 from tap_ros.learning.frames import GOAL, MappedFrames, ResidentFrames
 from tap_ros.learning.robot_mask import (
+    fill_from_past,
     fill_in_time,
     FreeView,
     hidden_pixels,
@@ -153,3 +154,14 @@ def test_only_episodes_with_masks_are_trained_on(tmp_path):
     ({'settings': {'robot_mask': 'hat', 'fill_context': 1}}, ('none', 0.0))])
 def test_weights_of_any_version_tell_what_they_were_trained_with(training, expected):
     assert trained_robot_mask(training) == expected
+
+
+@pytest.mark.parametrize('robot_mask', ROBOT_MASKS)
+def test_an_episode_filled_from_its_past_is_what_a_view_of_the_stream_shows(robot_mask):
+    episode = make_episode(3, T=9)
+    masks = random_masks(9)
+    filled, known = fill_from_past(episode.frames, masks, robot_mask)
+    view = FreeView(robot_mask)
+    shown = [view.update(*both) for both in zip(episode.frames, masks)]
+    np.testing.assert_array_equal(filled, shown)
+    assert known[1].all() and (robot_mask == 'none' or not known[0].any())

@@ -104,12 +104,15 @@ def test_differences_count_as_much_at_every_resolution():
 
 def test_the_loss_is_that_of_the_chosen_pictures_and_what_moves_costs_a_little(model):
     batch, _ = windows(False)
-    config = ForwardTrainingConfig(recordings=('x',), out='x', still_weight=0.5)
+    config = ForwardTrainingConfig(
+        recordings=('x',), out='x', still_weight=0.5, object_weight=0.25)
     losses = {steps: forward_loss(model, batch, set(steps), config)
               for steps in ((1,), (4,), (1, 4))}
     for loss, parts in losses.values():
         assert 0 < parts['moving'] < 1
-        assert float(loss) == pytest.approx(parts['picture'] + 0.5 * parts['moving'])
+        assert 0 < parts['objects'] < 1
+        assert float(loss) == pytest.approx(
+            parts['picture'] + 0.5 * parts['moving'] + 0.25 * parts['objects'])
     first, last, both = (parts for _, parts in losses.values())
     assert first['picture'] != last['picture'] and first['moving'] == last['moving']
     assert both['picture'] == pytest.approx((first['picture'] + last['picture']) / 2)
@@ -128,6 +131,15 @@ class Store(list):
     @property
     def lengths(self):
         return [len(episode.frames) for episode in self]
+
+
+def test_a_push_that_was_not_there_counts_as_much_as_one_that_was_missed(model):
+    batch, _ = windows(False)
+    batch.images[:, 1:] = batch.images[:, :1]  # nothing moves
+    config = ForwardTrainingConfig(recordings=('x',), out='x', still_weight=0, object_weight=0)
+    parts = [forward_loss(model, batch, {4}, replace(config, motion_factor=factor))[1]['picture']
+             for factor in (0.0, 8.0)]
+    assert parts[1] > 1.5 * parts[0]  # the untrained model moves what is there
 
 
 def numbered(number, length):
@@ -223,7 +235,7 @@ def test_resumed_training_equals_uninterrupted_training(bag, tmp_path):
     curves = EventAccumulator(str(tmp_path / 'b')).Reload()
     assert {tag: [event.step for event in curves.Scalars(tag)]
             for tag in curves.Tags()['scalars']} == {
-        'train/picture': [2, 4], 'train/moving': [2, 4],
+        'train/picture': [2, 4], 'train/moving': [2, 4], 'train/objects': [2, 4],
         **{f'held_out/{name}': [2, 4] for name in scores}}
     assert {tag: [event.step for event in curves.Images(tag)]
             for tag in curves.Tags()['images']} == {'training': [2, 4], 'held_out': [2, 4]}
