@@ -20,7 +20,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
-from sim_bridge.looks import get_look
+from sim_bridge.looks import get_look, LOOKS
 from sim_bridge.tasks import get_task
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
@@ -43,15 +43,11 @@ from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds
 from tap_ros.options import Flag, Folder, one_of
 from tap_ros.planning.scenes import FIRST_SCENE, PAPER_TASKS
-from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL, UR10E_FORWARD_MODEL, UR10E_PREDICTOR
 from tqdm import tqdm
 from tyro import conf
 
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 MODES = ('direct', 'subgoal')
-# What knows the pictures of a look: predictor, forward model, and what is taken out of them.
-WEIGHTS = {'plain': (DEFAULT_PREDICTOR, FORWARD_MODEL, 'none'),
-           'ur10e': (UR10E_PREDICTOR, UR10E_FORWARD_MODEL, 'all')}
 START_TIMEOUT_S = 90.0
 CALL_TIMEOUT_S = 20.0
 STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
@@ -242,12 +238,11 @@ def run_scene(client: DemoClient, task: str, seed: int, step_budget: int) -> Sce
 
 def start_nodes(processes: NodeProcesses, folder: Path, task: str, look: str) -> None:
     """Start the three nodes and the recorder."""
-    predictor, forward_model, robot_mask = WEIGHTS[look]
     processes.start('recorder_node', folder=folder / 'recording')
     processes.start('sim_node', lock_step=True, task=task, look=look,
                     observer=get_look(look).studio)
-    processes.start('predictor_node', weights=predictor)
-    processes.start('visual_mpc_node', weights=forward_model, robot_mask=robot_mask)
+    processes.start('predictor_node')
+    processes.start('visual_mpc_node')
 
 
 @dataclass(frozen=True)
@@ -266,7 +261,7 @@ class Options:
     scenes: int = 3
     seed: int = FIRST_SCENE
     task: Annotated[str, one_of(PAPER_TASKS)] = PAPER_TASKS[0]
-    look: Annotated[str, one_of(WEIGHTS)] = 'ur10e'
+    look: Annotated[str, one_of(LOOKS)] = 'plain'
     step_budget: Annotated[int, conf.arg(
         help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0
     out: Folder = 'runs/demo'

@@ -9,9 +9,6 @@ FORWARD_MODEL = _FOLDER / 'forward_model_push.safetensors'
 PREDICTORS = {path.stem.removeprefix('predictor_'): path
               for path in sorted(_FOLDER.glob('predictor_*.safetensors'))}
 DEFAULT_PREDICTOR = 'push2'
-# For the simulator's look ur10e; the others know the look plain.
-UR10E_FORWARD_MODEL = _FOLDER / 'forward_model_push_ur10e.safetensors'
-UR10E_PREDICTOR = 'push2_ur10e'
 
 
 def find_predictor(text: str | Path) -> Path:
