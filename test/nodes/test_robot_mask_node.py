@@ -38,8 +38,8 @@ def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path, shape
         assert message.header == simulated.header
         mask, wanted = (decode_mask(m, 'mask', (64, 64)) for m in (message, simulated))
         arm = wanted == ROBOT_MASK_ARM
-        assert (mask[arm] != ROBOT_MASK_FREE).mean() > 0.9  # the simulator's shadows differ
-        assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.75
+        assert (mask[arm] != ROBOT_MASK_FREE).mean() > 0.97
+        assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.92
         assert (mask == ROBOT_MASK_HAND).any() == bool(shape)
         assert node.end() == 0
     finally:
