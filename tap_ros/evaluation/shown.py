@@ -18,6 +18,7 @@ from tap_ros.recording.episode import Episode
 SHOWN = 0.5  # least share of the contrast of what counts as shown
 OBJECT_RADIUS = 7.0  # px around an object's pixel, in pictures of 64 px
 CONTRAST = 0.06  # on [0, 1]: less is no difference
+HAND_CONTRAST = 0.25  # likewise, of the hand: less is mostly its shadow, which its mask covers, too
 MIN_PIXELS = 5  # fewer cannot be judged
 
 
@@ -47,7 +48,7 @@ class ShownScorer:
         frame, bare = (pictures[t].astype(np.float32) / 255
                        for pictures in (self._episode.frames, self._bare))
         mask = self._episode.robot_masks[t]
-        hand = _share(image, frame, bare, mask == ROBOT_MASK_HAND)
+        hand = _share(image, frame, bare, mask == ROBOT_MASK_HAND, HAND_CONTRAST)
         objects = [share for u, v in self._episode.object_pixels[t] if np.isfinite(share := _share(
             image, frame, *_without_object(frame, u, v, mask == ROBOT_MASK_FREE)))]
         return hand, min(objects, default=np.nan)
@@ -65,9 +66,9 @@ def _without_object(frame: np.ndarray, u: float, v: float,
 
 
 def _share(image: np.ndarray, frame: np.ndarray, without: np.ndarray,
-           where: np.ndarray) -> float:
+           where: np.ndarray, contrast: float = CONTRAST) -> float:
     """Return how much of the contrast between two pictures a third one shows, at most 1."""
-    where = where & (np.abs(frame - without).max(-1) > CONTRAST)
+    where = where & (np.abs(frame - without).max(-1) > contrast)
     if where.sum() < MIN_PIXELS:
         return np.nan
     return 1 - float(np.abs(image - frame)[where].mean() / np.abs(without - frame)[where].mean())
