@@ -5,13 +5,11 @@ The expert that generates the data: a cross-entropy method with the true simulat
 
 A sample is one push: go behind an object, come down, push. Samples are rolled out in the true
 physics, all at once; the best are refitted; the best push of all is executed and the search begins
-anew from where things then lie. How fast and how far an object is pushed, by which way, and
-whether that succeeds, varies from episode to episode, as the paper's non-deterministic planner
-gives. Mostly the object farthest from the robot's base comes first, so that the arm does not reach
-over objects that are in place; where nothing in a picture tells the order, half of the episodes
-contradict the other half, and what is learnt is their median, the start picture. Where the order
-matters, all orders are tried in the simulator before each push, see push_order.py. Proposing whole
-pushes rather than independent displacements is our deviation: a few dozen samples then suffice.
+anew from where things then lie. Which object comes first (mostly the one nearest to the gripper),
+how fast and how far it is pushed, and whether that succeeds, varies from episode to episode, as
+the paper's non-deterministic planner gives. Where the order matters, all orders are tried in the
+simulator before each push, see push_order.py. Proposing whole pushes rather than independent
+displacements is our deviation: a few dozen samples then suffice.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +20,6 @@ import mujoco.rollout
 import numpy as np
 from sim_bridge.episode_run import carry_out, EpisodeRun
 from sim_bridge.grasp_expert import GraspConfig, run_grasp_episode
-from sim_bridge.places import far_first
 from sim_bridge.push_order import find_order
 from sim_bridge.pushes import Moment, Push, push_actions, PushRollouts
 from sim_bridge.simulator import Simulator
@@ -44,7 +41,7 @@ class ExpertConfig:
     num_elites: int = 5
     explore: float = 0.1  # probability that a random sample is executed instead of the best
     preference: float = 0.04  # m, spread of the whim for pushing one object before another
-    far_first: float = 0.1  # m, worth of pushing the object farthest from the base first
+    nearest: float = 0.06  # m, worth of pushing the object nearest to the gripper first
     step_cost: float = 0.001  # m per control period
     done_distance: float = 0.02  # m, an object this near its goal is left alone
     wander: tuple[int, int] = (5, 10)  # control periods of a random walk before the first push
@@ -83,9 +80,9 @@ class Expert:
 
     def next_object(self, whim: float = 0.0) -> int | None:
         """
-        Choose an object to push: the first in the best order if that matters, else the farthest.
+        Choose an object to push: the first in the best order if that matters, else the nearest.
 
-        :param whim: probability of any object instead of the one farthest from the base.
+        :param whim: probability of any object instead of the nearest.
         :return: its number, or None when all are in place.
         """
         todo, now = self.undone(), Moment.of(self._simulator)
@@ -95,7 +92,8 @@ class Expert:
             return find_order(self._rollouts, now, self._goals, todo, self._rng)[0]
         if whim and self._rng.random() < whim:
             return int(self._rng.choice(todo))
-        return todo[far_first(now.places[todo])[0]]
+        here = np.linalg.norm(now.places[todo, :2] - now.target[:2], axis=1)
+        return todo[int(here.argmin())]
 
     def wander(self, steps: int | None = None) -> np.ndarray:
         """
@@ -186,7 +184,7 @@ class Expert:
         costs = ends.sum(1) + TILT_COST * (~upright).sum(1)
         costs += self._config.step_cost * np.array([len(plan) for plan in plans])
         untouched = np.abs(ends - distances) < 0.005
-        return costs + (untouched * self._preference).sum(1) + self._config.far_first * untouched[
+        return costs + (untouched * self._preference).sum(1) + self._config.nearest * untouched[
             :, first]
 
 

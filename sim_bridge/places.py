@@ -32,11 +32,17 @@ def gripper_away_from(rng: np.random.Generator, positions: np.ndarray) -> np.nda
             return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
 
 
-def far_first(starts: np.ndarray) -> list[int]:
+def nearest_first(hand: np.ndarray, starts: np.ndarray, goals: np.ndarray) -> list[int]:
     """
-    Order objects as the expert mostly takes them: the one farthest from the robot's base first.
+    Order objects as the expert mostly takes them: always the one nearest to the gripper.
 
-    :param starts: (K, 2) metres; the base is behind the table, at y > 0.
+    :param hand: (2,) metres, where the gripper is; starts (K, 2), goals (K, 2) of the objects.
     :return: list of K object indices.
     """
-    return [int(k) for k in np.argsort(starts[:, 1], kind='stable')]
+    order, left = [], list(range(len(starts)))
+    while left:
+        k = min(left, key=lambda i: np.linalg.norm(starts[i] - hand))
+        left.remove(k)
+        order.append(k)
+        hand = goals[k]
+    return order

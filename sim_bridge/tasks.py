@@ -22,11 +22,11 @@ from sim_bridge.grasping import grasp_place, graspable_shape, graspable_yaw
 from sim_bridge.order_tasks import draw_chain, draw_shapes, ORDER_SEPARATION
 from sim_bridge.places import (
     apart,
-    far_first,
     GOAL_DISTANCE,
     GOAL_YAW_RANGE,
     gripper_away_from,
     GRIPPER_HEIGHT,
+    nearest_first,
     OBJECT_RANGE,
 )
 from sim_bridge.scene import ObjectShape, random_shape
@@ -140,7 +140,7 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0) -> Scene:
     hand = gripper_away_from(rng, starts)
     return Scene(
         task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
-        gripper_start=hand, order=tuple(far_first(starts[:, :2])))
+        gripper_start=hand, order=tuple(nearest_first(hand[:2], starts, goals)))
 
 
 def _sample_ordered(task: Task, seed: int, rng: np.random.Generator) -> Scene:

@@ -25,7 +25,7 @@ GAP = 9  # of these until the object is touched,
 AGAIN = 3  # on average, pushes that have to be repeated
 RETURN = 6  # to leave an object and come back to it
 DETOUR = 16  # a push is interrupted once for so many
-OTHER = 0.2  # probability that any object comes first
+OTHER = 0.2  # probability that the nearest object does not come first
 
 
 def draw_share(timing: str, rng: np.random.Generator) -> float:

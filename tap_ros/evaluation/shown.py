@@ -18,7 +18,7 @@ from tap_ros.recording.episode import Episode
 SHOWN = 0.5  # least share of the contrast of what counts as shown
 OBJECT_RADIUS = 7.0  # px around an object's pixel, in pictures of 64 px
 CONTRAST = 0.06  # on [0, 1]: less is no difference
-HAND_CONTRAST = 0.25  # likewise, of the hand: less is mostly its shadow, which its mask covers, too
+HAND_CONTRAST = 0.25  # likewise, of the hand: less is mostly its shadow, masked with it
 MIN_PIXELS = 5  # fewer cannot be judged
 
 

@@ -16,7 +16,7 @@ from experiments.planning.methods import BASES, parse_method
 from experiments.planning.true_model import TrueModel
 import numpy as np
 import pytest
-from sim_bridge.places import far_first
+from sim_bridge.places import nearest_first
 from sim_bridge.simulator import Simulator
 from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError
@@ -84,21 +84,23 @@ def test_a_missing_predictor_is_named(simulator, mpc):
         run_episode(simulator, mpc, SHIPPED, 4, seed=5)
 
 
-def test_the_true_subgoal_has_the_first_object_in_order_at_its_goal(simulator, mpc):
+def test_the_true_subgoal_has_the_nearest_object_at_its_goal(simulator, mpc):
     seen = simulator.reset(5)
     goal = simulator.goal()
     targets, _ = make_targets(simulator, mpc, parse_method('true_subgoal'), seen, goal, None, 5)
     moved = np.linalg.norm(targets[0].pixels - seen.object_pixels, axis=1) > 1
-    depths = seen.object_poses[:, 1]  # the robot's base is behind the table, at y > 0
-    assert moved.tolist() == (depths == depths.min()).tolist()
+    gaps = np.linalg.norm(seen.object_poses[:, :2] - seen.gripper[:2], axis=1)
+    assert moved.tolist() == (gaps == gaps.min()).tolist()
     np.testing.assert_array_equal(targets[0].pixels[moved], goal.object_pixels[moved])
     np.testing.assert_array_equal(targets[1].pixels, goal.object_pixels)
     oracle, _ = make_targets(simulator, mpc, parse_method('oracle_order'), seen, goal, None, 5)
     assert oracle[0].free.tolist() == (~moved).tolist() and oracle[1].free is None
 
 
-def test_objects_are_taken_from_the_farthest_from_the_base_on():
-    assert far_first(np.array([[3.0, 0.1], [1, -0.2], [0.5, 3]])) == [1, 0, 2]
+def test_objects_are_taken_from_the_nearest_on():
+    starts = np.array([[3.0, 0], [1, 0], [0.5, 3]])
+    goals = np.array([[3.0, 1], [0.5, 2], [0, 3]])
+    assert nearest_first(np.zeros(2), starts, goals) == [1, 2, 0]
 
 
 def test_a_true_picture_is_recognised(simulator):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sim_bridge.expert import run_episode
 from sim_bridge.order_tasks import EDGE_RANGE, NEAR, ORDER_SEPARATION
-from sim_bridge.places import GOAL_DISTANCE, GRIPPER_MARGIN, GRIPPER_RANGE
+from sim_bridge.places import GOAL_DISTANCE, GRIPPER_MARGIN, GRIPPER_RANGE, nearest_first
 from sim_bridge.push_order import best_push, find_order
 from sim_bridge.pushes import Moment, PushRollouts
 from sim_bridge.simulator import Simulator
@@ -49,19 +49,18 @@ def test_each_object_stands_on_the_goal_of_the_one_after_it(task):
         hand = scene.gripper_start[:2]
         assert np.linalg.norm(starts - hand, axis=1).min() >= GRIPPER_MARGIN
         assert (np.abs(hand) <= GRIPPER_RANGE).all()
-        nearest = np.linalg.norm(starts - hand, axis=1).argmin()
-        assert nearest == scene.order[-1], 'the near one is last'
+        assert nearest_first(hand, starts, goals)[0] == scene.order[-1], 'the near one is last'
         orders.add(scene.order)
     assert len(orders) >= 2, 'the number of an object does not tell its turn'
 
 
 @pytest.mark.parametrize('task', [t for t in TASKS.values() if t.kind == 'push' and not t.ordered],
                          ids=lambda task: task.name)
-def test_where_the_order_is_free_the_farthest_from_the_base_comes_first(task):
+def test_where_the_order_is_free_the_nearest_comes_first(task):
     for seed in range(5):
         scene = sample_scene(task, seed)
-        in_order = scene.start_poses[list(scene.order), 1]  # the base is at y > 0
-        assert (np.diff(in_order) > 0).all()
+        starts, goals = scene.start_poses[:, :2], scene.goal_poses[:, :2]
+        assert list(scene.order) == nearest_first(scene.gripper_start[:2], starts, goals)
 
 
 def ends_of_pushes(simulator, rollout, seed, order):
