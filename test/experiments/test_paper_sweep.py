@@ -93,7 +93,7 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places, small):
     for method in ('prediction', 'copy-start', 'copy-goal'):
         assert {name: len(values) for name, values in scores[method].items()} == dict.fromkeys(
             ('min_l1', 'match_step', 'match_fraction', 'changed_l1', 'bottleneck',
-             'object_mass'), held_out)
+             'object_mass', 'hand', 'objects'), held_out)
     assert result['training']['steps'] == 2 and result['config']['method'] == RUN.method
     assert result['name'] == RUN.name and RUN.name in result['command']
 

@@ -27,6 +27,7 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
+ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules with another name
 
 
 def required(tree):
@@ -120,7 +121,8 @@ def undeclared(folders, *files):
     declared = {depend.name for depend in parse_package(str(ROOT)).exec_depends}
     required = {distribution for file in files for distribution in requirements(file)}
     return [name for name in sorted(imported_packages(*folders)) if name not in declared
-            and ROSDEP_KEYS.get(name) not in declared and not distributions_of(name) & required]
+            and (ROSDEP_KEYS | ROS_PACKAGES).get(name) not in declared
+            and not distributions_of(name) & required]
 
 
 def test_everything_imported_is_declared_with_ros_or_with_pip():
