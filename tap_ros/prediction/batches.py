@@ -83,6 +83,7 @@ class Sampling:
     :param num_targets: at most so many targets, drawn at random without repetition; 0: all.
     :param max_frames: longer episodes are cut to a random piece of this many; 0: never.
     :param min_crop: cut episodes to a random piece of at least this share; 1: never.
+    :param start_crop: leave out a random beginning of at most this share; 0: never.
     :param goal_picture: 'last', 'recorded' or 'mixed', see uses_recorded_goal.
     :param forward: whether the start picture is all of the context.
     :param fraction: take only the frame at this share of the episode, 0 to 1, as fixed-time
@@ -97,6 +98,7 @@ class Sampling:
     num_targets: int = 0
     max_frames: int = 0
     min_crop: float = 1.0
+    start_crop: float = 0.0
     goal_picture: str = 'last'
     forward: bool = False
     fraction: float | None = None
@@ -239,6 +241,9 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
     if sampling.max_frames:
         length = min(length, sampling.max_frames)
     start = int(rng.integers(available - length + 1)) if length < available else 0
+    if sampling.start_crop:
+        late = min(int(rng.uniform(0, sampling.start_crop) * length), length - 3)
+        start, length = start + late, length - late
     end = length - 1
     first, last = target_times(end, sampling.margin, sampling.forward)
     times = np.arange(first, last + 1)

@@ -152,6 +152,8 @@ class DataSettings:
     :param num_targets: at most so many random targets an episode and step; 0: all of them.
     :param max_frames: longer episodes are cut to a random piece of this length; 0: never.
     :param min_crop: cut episodes to a random piece of at least this share; 1: never.
+    :param start_crop: leave out a random beginning of at most this share, so that the start
+        picture often shows the arm at work already; 0: never.
     :param goal_picture: the goal picture is the episode's 'last' frame; the 'recorded' goal
         where the episode reached it; or 'mixed', one or the other at random.
     :param flip: mirror half of the episodes.
@@ -168,6 +170,7 @@ class DataSettings:
     num_targets: int = 0
     max_frames: int = 0
     min_crop: float = 1.0
+    start_crop: float = 0.0
     goal_picture: GoalPicture = 'mixed'
     flip: bool = True
     colour: bool = True
@@ -181,7 +184,8 @@ class DataSettings:
         _check_least(self, 0, 'margin', 'num_targets', 'max_frames')
         if 0 < self.max_frames < 3:
             raise ConfigError(f'max_frames: expected 0 or at least 3, got {self.max_frames}')
-        _check_range(self, min_crop=(1e-6, 1), brightness=(0, 0.9), fill_context=(0, 1))
+        _check_range(self, min_crop=(1e-6, 1), brightness=(0, 0.9), start_crop=(0, 0.9),
+                     fill_context=(0, 1))
         if self.fill_context and self.robot_mask == 'none':
             raise ConfigError('fill_context: nothing is known of the robot; give --robot-mask arm '
                               'or all')

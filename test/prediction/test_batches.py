@@ -106,6 +106,20 @@ def test_pieces_of_episodes_are_pieces(store):
                    for t in starts if t + batch.end[b] < len(frames))
 
 
+def test_a_beginning_of_at_most_the_share_given_is_left_out(store):
+    rng = np.random.default_rng(0)
+    sampling = Sampling(start_crop=0.5, goal_picture='recorded')
+    batch = make_batch(store, [4] * 60, sampling, rng=rng)
+    frames = store.frames(4)
+    assert len(frames) == 11 and set(batch.end[:, 0].tolist()) == {5, 6, 7, 8, 9, 10}
+    for b in range(60):
+        start = 10 - batch.end[b, 0]  # the end, and so a recorded goal, stays
+        assert np.array_equal(frames[start], batch.context[b, 0])
+        assert np.array_equal(store[4].goal_frame, batch.context[b, 1])
+    short = make_batch(store, [0] * 60, Sampling(start_crop=0.9), rng=rng)
+    assert short.end.min() == 2  # one target is left
+
+
 def test_recorded_goals_stand_in_for_last_frames_where_they_were_reached(store):
     reached, unknown = store[0], np.full((2, 2), np.nan, np.float32)
     episodes = [
