@@ -20,7 +20,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
-from sim_bridge.looks import get_look, LOOKS
+from sim_bridge.looks import DEFAULT_LOOK, get_look, LOOKS
 from sim_bridge.tasks import get_task
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
@@ -261,7 +261,7 @@ class Options:
     scenes: int = 3
     seed: int = FIRST_SCENE
     task: Annotated[str, one_of(PAPER_TASKS)] = PAPER_TASKS[0]
-    look: Annotated[str, one_of(LOOKS)] = 'plain'
+    look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     step_budget: Annotated[int, conf.arg(
         help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0
     out: Folder = 'runs/demo'
