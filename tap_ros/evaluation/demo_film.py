@@ -1,71 +1,88 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The scenes of the demo as one animated GIF: direct beside via the subgoal."""
+"""The scenes of the demo as one film: direct beside via the subgoal, seen from the side."""
 
 from collections.abc import Sequence
+import io
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 import numpy as np
+from PIL import Image
 from tap_ros.evaluation.demo_report import MODE_NAMES, SceneRuns
 from tap_ros.files import write_atomically
-from tap_ros.pictures import enlarge, overlay
+from tap_ros.pictures import OBJECT_COLOURS
 
-SCALE = 3
-GAP, HEAD = 8, 26  # pixels between panels, and above them for the names
+SMALL = 128  # pixels, side of goal and subgoal, one above the other on the left
+GAP, HEAD = 8, 24  # pixels between panels, and above them for the names
+HEIGHT = 2 * SMALL + HEAD  # of a run's picture beside both
 DPI = 100
-FRAMES_PER_S = 10
-HOLD = 15  # frames for which the end of a scene stands still
+FRAME_MS, HOLD_MS = 100, 1800  # of each frame, and of the end of a scene
+QUALITY = 60  # 0 to 100
 
 
 def write_film(path: str | Path, scenes: Sequence[SceneRuns]) -> None:
     """
     Write a film of scenes, one after the other; crosses mark where the objects should end.
 
-    :param path: of the GIF file.
+    :param path: of the WebP file.
     :param scenes: list of SceneRuns with the same modes.
     """
     modes = list(scenes[0].runs)
-    figure, panels = _panels(2 + len(modes), scenes[0].start)
-    with TemporaryDirectory() as folder:
-        part = Path(folder, 'film.gif')
-        writer = PillowWriter(fps=FRAMES_PER_S)
-        with writer.saving(figure, part, DPI):
-            for scene in scenes:
-                _show(panels[0], 'goal', scene.goal)
-                _show(panels[1], 'predicted subgoal', scene.subgoal)
-                for t in range(max(len(run.frames) for run in scene.runs.values()) + HOLD):
-                    for panel, mode in zip(panels[2:], modes):
-                        run = scene.runs[mode]
-                        now = min(t, len(run.frames) - 1)
-                        _show(panel, f'{MODE_NAMES[mode]}: '
-                              f'{100 * run.distances[now].mean():.1f} cm', run.frames[now],
-                              scene.goal_pixels)
-                    writer.grab_frame()
-        write_atomically(path, part.read_bytes())
+    canvas, goal, subgoal, panels = _panels(
+        [run.pictures[0].shape for run in scenes[0].runs.values()])
+    pictures: list[Image.Image] = []
+    times: list[int] = []
+    for scene in scenes:
+        _show(goal, 'goal', scene.goal, scene.goal_pixels)
+        _show(subgoal, 'predicted subgoal', scene.subgoal)
+        length = max(len(run.pictures) for run in scene.runs.values())
+        for t in range(length):
+            for panel, mode in zip(panels, modes):
+                run = scene.runs[mode]
+                distances, picture = (values[min(t, len(values) - 1)]
+                                      for values in (run.distances, run.pictures))
+                _show(panel, f'{MODE_NAMES[mode]}: {100 * distances.mean():.1f} cm', picture,
+                      scene.side_goal_pixels if len(run.side) else scene.goal_pixels)
+            canvas.draw()
+            pictures.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+        times += [FRAME_MS] * (length - 1) + [HOLD_MS]
+    buffer = io.BytesIO()
+    pictures[0].save(buffer, 'webp', save_all=True, append_images=pictures[1:], duration=times,
+                     loop=0, quality=QUALITY)
+    write_atomically(path, buffer.getvalue())
 
 
-def _panels(count: int, picture: np.ndarray) -> tuple[Figure, list[tuple[Axes, AxesImage]]]:
-    """Return a figure and its panels, each the axes and what is drawn on them."""
-    H, W = (SCALE * side for side in picture.shape[:2])
-    width, height = count * (W + GAP) + GAP, HEAD + H + GAP
+def _panels(shapes: Sequence[Sequence[int]]) -> tuple[FigureCanvasAgg, Axes, Axes, list[Axes]]:
+    """Return a canvas, the panels of goal and subgoal, and those of runs, (H, W, 3) each."""
+    widths = [round(HEIGHT * shape[1] / shape[0]) for shape in shapes]
+    width = SMALL + sum(widths) + GAP * (2 + len(widths))
+    height = HEAD + HEIGHT + GAP
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
-    panels = []
-    for i in range(count):
-        axes = figure.add_axes((
-            (GAP + i * (W + GAP)) / width, GAP / height, W / width, H / height))
+
+    def panel(left: int, bottom: int, wide: int, high: int) -> Axes:
+        axes = figure.add_axes((left / width, bottom / height, wide / width, high / height))
         axes.set_axis_off()
-        panels.append((axes, axes.imshow(enlarge(picture, SCALE), interpolation='nearest')))
-    return figure, panels
+        return axes
+
+    goal = panel(GAP, GAP + SMALL + HEAD, SMALL, SMALL)
+    subgoal = panel(GAP, GAP, SMALL, SMALL)
+    lefts = np.cumsum([2 * GAP + SMALL, *(wide + GAP for wide in widths[:-1])]).tolist()
+    runs = [panel(left, GAP, wide, HEIGHT) for left, wide in zip(lefts, widths)]
+    return FigureCanvasAgg(figure), goal, subgoal, runs
 
 
-def _show(panel: tuple[Axes, AxesImage], name: str, picture: np.ndarray,
+def _show(axes: Axes, name: str, picture: np.ndarray,
           goal_pixels: np.ndarray | None = None) -> None:
-    """Put a picture and its name on a panel."""
-    axes, drawn = panel
+    """Put a picture, its name and crosses on a panel."""
+    for artist in (*axes.images, *axes.lines):
+        artist.remove()
     axes.set_title(name, fontsize=10, pad=5)
-    drawn.set_data(overlay(picture, (), SCALE, goal_pixels=goal_pixels))
+    axes.imshow(picture, interpolation='nearest', aspect='auto')
+    H, W = picture.shape[:2]
+    for k, (u, v) in enumerate(() if goal_pixels is None else goal_pixels):
+        colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)]) / 255
+        axes.plot(u, v, 'x', color=colour, markersize=8, markeredgewidth=2)
+    axes.set(xlim=(-0.5, W - 0.5), ylim=(H - 0.5, -0.5))

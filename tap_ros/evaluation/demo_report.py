@@ -32,6 +32,11 @@ class Run:
     planning_ms: float  # median time of one plan
     side: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 from the side, if there are any
 
+    @property
+    def pictures(self) -> Sequence[np.ndarray]:
+        """Those from the side, or where there are none the camera's."""
+        return self.side if len(self.side) else self.frames
+
 
 @dataclass(frozen=True)
 class SceneRuns:
@@ -45,6 +50,7 @@ class SceneRuns:
     subgoal: np.ndarray  # (H, W, 3) uint8
     object_maps: np.ndarray  # (K, H, W)
     runs: dict[str, Run]  # by mode
+    side_goal_pixels: np.ndarray | None = None  # (K, 2) in pictures from the side
 
 
 def results_table(scenes: Sequence[SceneRuns]) -> str:

@@ -20,7 +20,7 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
-from sim_bridge.looks import get_look, LOOKS
+from sim_bridge.looks import get_look, LOOKS, OBSERVER
 from sim_bridge.tasks import get_task
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
@@ -233,7 +233,7 @@ def run_scene(client: DemoClient, task: str, seed: int, step_budget: int) -> Sce
         goal=decode_image(goal['image'], 'goal/image'), start_pixels=pixels(objects),
         goal_pixels=pixels(goal['objects']), subgoal=decode_image(subgoal.image, 'subgoal'),
         object_maps=np.stack([decode_map(m, 'object_maps') for m in subgoal.object_maps]),
-        runs=runs)
+        runs=runs, side_goal_pixels=OBSERVER.project(positions(goal['objects'])))
 
 
 def start_nodes(processes: NodeProcesses, folder: Path, task: str, look: str) -> None:
@@ -304,7 +304,7 @@ def run(args: Options) -> int:
     seconds = time.monotonic() - begin
     print(f'\n{results_table(scenes)}\n')
     write_overview(folder / 'subgoals.png', scenes)
-    write_film(folder / 'demo.gif', scenes)
+    write_film(folder / 'demo.webp', scenes)
     write_report(
         folder / 'report.html', scenes,
         f'Task {args.task}, seeds {args.seed} to {args.seed + args.scenes - 1}, at most '
@@ -312,7 +312,7 @@ def run(args: Options) -> int:
         'distances, are ground truth of the simulator.')
     if not args.attach:
         print(f'recording  {folder / "recording"}')
-    print(f'film       {folder / "demo.gif"}')
+    print(f'film       {folder / "demo.webp"}')
     print(f'page       {folder / "report.html"}')
     return 0
 

@@ -257,8 +257,8 @@ def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episode
     whole = config.chosen.vae and config.posterior == 'video'
     sampling = Sampling(
         config.margin, config.num_targets, config.max_frames, config.min_crop,
-        config.start_crop, config.goal_picture, config.forward, config.chosen.fraction, int(config.chosen.gan),
-        config.video_frames if whole else 0, config.fill_context)
+        config.start_crop, config.goal_picture, config.forward, config.chosen.fraction,
+        int(config.chosen.gan), config.video_frames if whole else 0, config.fill_context)
 
     part = processes.part(config.batch_size)
 

@@ -10,7 +10,7 @@ import re
 import numpy as np
 from PIL import Image, ImageSequence
 import pytest
-from tap_ros.evaluation.demo_film import FRAMES_PER_S, GAP, HOLD, SCALE, write_film
+from tap_ros.evaluation.demo_film import FRAME_MS, GAP, HEAD, HEIGHT, HOLD_MS, SMALL, write_film
 from tap_ros.evaluation.demo_report import results_table, Run, SceneRuns, write_report
 
 
@@ -58,20 +58,38 @@ def test_the_page_has_a_film_where_there_are_pictures_from_the_side(scenes, tmp_
     assert np.abs(np.subtract(greys, [0, 80, 160, 240])).max() < 8
 
 
-def test_the_film_shows_each_run_to_its_end_and_stops_there(scenes, tmp_path):
-    path, size = tmp_path / 'demo.gif', 16
+@pytest.mark.parametrize('seen', ['frames', 'side'])
+def test_the_film_shows_each_run_to_its_end_and_stops_there(scenes, tmp_path, seen):
+    path = tmp_path / 'demo.webp'
     greys = {'direct': (0, 60, 120, 180), 'subgoal': (240, 90)}  # one run is shorter
     for scene in scenes:
         for mode, run in scene.runs.items():
-            run.frames[:] = [np.full((size, size, 3), grey, np.uint8) for grey in greys[mode]]
+            pictures = [np.full((16, 32, 3), grey, np.uint8) for grey in greys[mode]]
+            scene.runs[mode] = replace(run, **{seen: pictures})
     write_film(path, scenes)
-    film, shown, seconds = Image.open(path), [], 0
+    film, shown, milliseconds = Image.open(path), [], 0
+    centres = [2 * GAP + SMALL + i * (2 * HEIGHT + GAP) + HEIGHT for i in (0, 1)]
     for frame in ImageSequence.Iterator(film):
-        pixels = np.array(frame.convert('L'), int)[-GAP - 2]  # a row that no mark reaches
-        centres = [i * (size * SCALE + GAP) + GAP + size * SCALE // 2 for i in (2, 3)]
+        pixels = np.array(frame.convert('L'), int)[-GAP - 4]  # a row that no mark reaches
         shown.append(tuple(pixels[centres]))
-        seconds += frame.info['duration'] / 1000
+        milliseconds += frame.info['duration']
     expected = [(0, 240), (60, 90), (120, 90), (180, 90)] * len(scenes)
-    assert np.abs(np.subtract(shown, expected)).max() <= 2
-    assert seconds == pytest.approx(len(scenes) * (4 + HOLD) / FRAMES_PER_S)
+    assert np.abs(np.subtract(shown, expected)).max() <= 6
+    assert milliseconds == len(scenes) * (3 * FRAME_MS + HOLD_MS)
     assert film.info['loop'] == 0  # for ever
+
+
+def test_the_film_marks_the_goals_in_the_view_that_it_shows(scenes, tmp_path):
+    path, black = tmp_path / 'demo.webp', np.zeros((30, 40, 3), np.uint8)
+    scene = replace(scenes[0], side_goal_pixels=np.array([[10.0, 7.0], [30.0, 22.0]]))
+    for mode, run in scene.runs.items():
+        scene.runs[mode] = replace(run, side=[black])
+    write_film(path, [scene])
+    film = np.array(Image.open(path).convert('RGB'), int)
+    left, top = 2 * GAP + SMALL, HEAD
+    panel = film[top:top + HEIGHT, left:left + HEIGHT * 4 // 3]
+    v, u = (panel.max(-1) > 128).nonzero()
+    marks = np.stack([u, v], -1) * 30 / HEIGHT - 0.5
+    for place in scene.side_goal_pixels:
+        assert np.abs(marks - place).max(1).min() < 0.5
+    assert np.abs(marks[:, None] - scene.side_goal_pixels).max(-1).min(1).max() < 1.5
