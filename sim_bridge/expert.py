@@ -30,6 +30,7 @@ from tap_ros.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
 
 STILL = 0.002  # m, an object within this of its last place has come to rest
 TILT_COST = 0.2  # m, added to a sample that topples an object
+MISS = 0.1  # m, at most, from the object's origin to the way of a push at random
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,13 @@ class Expert:
     :param rng: numpy Generator; every whim of this expert comes from it.
     :param config: ExpertConfig.
     :param rollout: mujoco.rollout.Rollout to share between episodes.
+    :param misses: share of the pushes that are at random instead of searched.
     """
 
     def __init__(self, simulator: Simulator, rng: np.random.Generator, config: ExpertConfig,
-                 rollout: mujoco.rollout.Rollout) -> None:
+                 rollout: mujoco.rollout.Rollout, misses: float = 0.0) -> None:
         self._simulator, self._rng, self._config = simulator, rng, config
+        self._misses = misses
         self._rollouts = PushRollouts(simulator, rollout)
         self._goals = simulator.goal().object_poses[:, :3]
         self._num_samples = rng.integers(*config.num_samples, endpoint=True)
@@ -131,6 +134,8 @@ class Expert:
         first = self.next_object() if only is None else only
         if not todo or first is None:
             return None
+        if self._misses and self._rng.random() < self._misses:
+            return self._random_push(now, steps_left)
         goals = self._goals
         if only is not None or self._simulator.task.ordered:
             todo = [first]
@@ -155,6 +160,15 @@ class Expert:
             todo = [pushes[order[0]][0]]
             mean, spread = parameters.mean(0), parameters.std(0) + [0.08, 0.006, 0.01, 0.005]
         return best
+
+    def _random_push(self, now: Moment, steps_left: int) -> np.ndarray:
+        """Aim at any object, from anywhere, so that it is hit, grazed or missed."""
+        rng, config = self._rng, self._config
+        k = rng.integers(self.num_objects)
+        push = Push(
+            rng.uniform(0, 2 * np.pi), rng.uniform(-MISS, MISS), rng.uniform(-0.1, 0.05),
+            rng.uniform(*config.push_speed), rng.uniform(*config.travel_speed))
+        return push_actions(push, now.target, now.places[k, :2], self._goals[k, :2])[:steps_left]
 
     def _sample(self, todo: Sequence[int], places: np.ndarray, goals: np.ndarray,
                 mean: np.ndarray | None, spread: np.ndarray | None) -> list[tuple[int, Push]]:
@@ -205,7 +219,7 @@ def default_config(task: Task, timing: str = 'natural') -> ExpertConfig | GraspC
 def run_episode(
         simulator: Simulator, seed: int, config: ExpertConfig | GraspConfig | None = None,
         rollout: mujoco.rollout.Rollout | None = None, num_frames: int = 0,
-        timing: str = 'natural') -> EpisodeRun:
+        timing: str = 'natural', misses: float = 0.0) -> EpisodeRun:
     """
     Run one episode of the expert, from the first motion of the arm to the last of an object.
 
@@ -218,6 +232,7 @@ def run_episode(
     :param rollout: mujoco.rollout.Rollout to share between episodes, or None.
     :param num_frames: of the longest episode; 0: the task's, with a timing MORE_FRAMES more.
     :param timing: one of timing.TIMINGS, when the first of several pushed objects is home.
+    :param misses: share of the pushes that are at random, so that objects are missed, too.
     :return: EpisodeRun.
     """
     task = simulator.task
@@ -231,7 +246,7 @@ def run_episode(
     first = simulator.reset(seed)
     rng = np.random.default_rng([seed, task.stream, 1])
     expert = Expert(simulator, rng, config or (ExpertConfig() if natural else TIMED_CONFIG),
-                    rollout or mujoco.rollout.Rollout(nthread=0))
+                    rollout or mujoco.rollout.Rollout(nthread=0), misses)
     plans = (_plans(expert, num_frames) if natural else
              timed_plans(expert, draw_share(timing, rng), num_frames, rng))
     observations, actions, outcome, seconds = carry_out(simulator, first, plans, num_frames)
