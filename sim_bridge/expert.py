@@ -162,13 +162,26 @@ class Expert:
         return best
 
     def _random_push(self, now: Moment, steps_left: int) -> np.ndarray:
-        """Aim at any object, from anywhere, so that it is hit, grazed or missed."""
+        """
+        Aim at any object from anywhere, then go on low, in other directions or back.
+
+        So that objects are hit, grazed and missed, and the gripper leaves them without lifting.
+        """
         rng, config = self._rng, self._config
         k = rng.integers(self.num_objects)
         push = Push(
             rng.uniform(0, 2 * np.pi), rng.uniform(-MISS, MISS), rng.uniform(-0.1, 0.05),
             rng.uniform(*config.push_speed), rng.uniform(*config.travel_speed))
-        return push_actions(push, now.target, now.places[k, :2], self._goals[k, :2])[:steps_left]
+        actions = push_actions(push, now.target, now.places[k, :2], self._goals[k, :2])
+        here = now.target[:3] + actions[:, :3].sum(0)
+        path = [here]
+        for _ in range(rng.integers(1, 4)):
+            angle, speed = rng.uniform(0, 2 * np.pi), rng.uniform(*config.push_speed)
+            step = speed * np.array([np.cos(angle), np.sin(angle), 0])
+            path += [path[-1] + i * step for i in range(1, rng.integers(2, 6))]
+        path = np.clip(path, WORKSPACE_LOW, WORKSPACE_HIGH)
+        further = np.column_stack([np.diff(path, axis=0), np.zeros(len(path) - 1)])
+        return np.concatenate([actions, further])[:steps_left]
 
     def _sample(self, todo: Sequence[int], places: np.ndarray, goals: np.ndarray,
                 mean: np.ndarray | None, spread: np.ndarray | None) -> list[tuple[int, Push]]:
