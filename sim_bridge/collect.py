@@ -34,7 +34,7 @@ from tqdm import tqdm
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
 # These stand in that file only if they are not the defaults.
-LATER_SETTINGS = ('frames', 'timing', 'look', 'appearance')
+LATER_SETTINGS = ('misses', 'frames', 'timing', 'look', 'appearance')
 MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 
 
@@ -52,6 +52,8 @@ class CollectSettings:
     :param timing: when in an episode of several pushed objects the first one is home and the
         others are untouched; natural: as it comes, mostly in the middle; mixed: early, middle or
         late, drawn for each episode.
+    :param misses: share of the pushes that are at random, so that objects are hit, grazed and
+        missed: what a forward model has to tell apart.
     :param look: of the world, see looks.LOOKS.
     :param appearance: of table, light and camera, see appearance.CHOICES; 'random' is drawn anew
         for every episode.
@@ -64,6 +66,7 @@ class CollectSettings:
     episodes_per_file: int = 25
     frames: int = 0
     timing: str = 'natural'
+    misses: float = 0.0
     look: str = DEFAULT_LOOK
     appearance: str = 'usual'
 
@@ -98,6 +101,10 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
         that are finished stay.
     """
     task = get_task(config.task)
+    if not 0 <= config.misses <= 1:
+        raise ConfigError(f'misses is {config.misses:g}; expected a share from 0 to 1')
+    if config.misses and task.kind != 'push':
+        raise ConfigError(f'misses are of tasks of pushing, not of {task.name}')
     config = replace(config, expert=config.expert or default_config(task, config.timing))
     if min(config.episodes, config.episodes_per_file) < 1:
         raise ConfigError('episodes and episodes_per_file must be at least 1')
@@ -217,7 +224,8 @@ def _collect_shard(folder: str | Path, config: CollectConfig, shard: int) -> dic
         for i in _episodes(config, shard):
             seed = config.seed + i
             observations, actions, outcome, seconds = run_episode(
-                simulator, seed, config.expert, num_frames=config.frames, timing=config.timing)
+                simulator, seed, config.expert, num_frames=config.frames, timing=config.timing,
+                misses=config.misses)
             begin = time.perf_counter()
             writer.write(make_episode(
                 simulator, observations, actions, outcome, (i + 1) * EPISODE_SPACING_NS))

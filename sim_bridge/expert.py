@@ -5,9 +5,9 @@ The expert that generates the data: a cross-entropy method with the true simulat
 
 A sample is one push: go behind an object, come down, push. Samples are rolled out in the true
 physics, all at once; the best are refitted; the best push of all is executed and the search begins
-anew from where things then lie. Which object comes first (mostly the one nearest to the gripper),
-how fast and how far it is pushed, and whether that succeeds, varies from episode to episode, as
-the paper's non-deterministic planner gives. Where the order matters, all orders are tried in the
+anew from where things then lie. The object nearest to the gripper mostly comes first. How fast and
+how far it is pushed, and whether that succeeds, varies from episode to episode, as the paper's
+non-deterministic planner gives. Where the order matters, all orders are tried in the
 simulator before each push, see push_order.py. Proposing whole pushes rather than independent
 displacements is our deviation: a few dozen samples then suffice.
 """
@@ -30,6 +30,7 @@ from tap_ros.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
 
 STILL = 0.002  # m, an object within this of its last place has come to rest
 TILT_COST = 0.2  # m, added to a sample that topples an object
+MISS = 0.1  # m, at most, from the object's origin to the way of a push at random
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class ExpertConfig:
     num_elites: int = 5
     explore: float = 0.1  # probability that a random sample is executed instead of the best
     preference: float = 0.04  # m, spread of the whim for pushing one object before another
-    nearest: float = 0.06  # m, worth of pushing the object nearest to the gripper first
+    nearest: float = 0.12  # m, worth of pushing first what is nearest to the gripper at the start
     step_cost: float = 0.001  # m per control period
     done_distance: float = 0.02  # m, an object this near its goal is left alone
     wander: tuple[int, int] = (5, 10)  # control periods of a random walk before the first push
@@ -57,15 +58,18 @@ class Expert:
     :param rng: numpy Generator; every whim of this expert comes from it.
     :param config: ExpertConfig.
     :param rollout: mujoco.rollout.Rollout to share between episodes.
+    :param misses: share of the pushes that are at random instead of searched.
     """
 
     def __init__(self, simulator: Simulator, rng: np.random.Generator, config: ExpertConfig,
-                 rollout: mujoco.rollout.Rollout) -> None:
+                 rollout: mujoco.rollout.Rollout, misses: float = 0.0) -> None:
         self._simulator, self._rng, self._config = simulator, rng, config
+        self._misses = misses
         self._rollouts = PushRollouts(simulator, rollout)
         self._goals = simulator.goal().object_poses[:, :3]
         self._num_samples = rng.integers(*config.num_samples, endpoint=True)
         self._preference = rng.uniform(0, config.preference, simulator.task.num_objects)
+        self._first = self._nearest(range(simulator.task.num_objects), Moment.of(simulator))
 
     @property
     def num_objects(self) -> int:
@@ -78,11 +82,12 @@ class Expert:
         distances = np.linalg.norm(places - self._goals, axis=1)
         return np.flatnonzero(distances > self._config.done_distance).tolist()
 
-    def next_object(self, whim: float = 0.0) -> int | None:
+    def next_object(self) -> int | None:
         """
         Choose an object to push: the first in the best order if that matters, else the nearest.
 
-        :param whim: probability of any object instead of the nearest.
+        That is at first the one nearest to where the gripper started, wherever it walked since.
+
         :return: its number, or None when all are in place.
         """
         todo, now = self.undone(), Moment.of(self._simulator)
@@ -90,10 +95,12 @@ class Expert:
             return todo[0] if todo else None
         if self._simulator.task.ordered:
             return find_order(self._rollouts, now, self._goals, todo, self._rng)[0]
-        if whim and self._rng.random() < whim:
-            return int(self._rng.choice(todo))
-        here = np.linalg.norm(now.places[todo, :2] - now.target[:2], axis=1)
-        return todo[int(here.argmin())]
+        return self._first if self._first in todo else self._nearest(todo, now)
+
+    def _nearest(self, objects: Sequence[int], now: Moment) -> int:
+        """Return the object nearest to the gripper."""
+        here = np.linalg.norm(now.places[list(objects), :2] - now.target[:2], axis=1)
+        return objects[int(here.argmin())]
 
     def wander(self, steps: int | None = None) -> np.ndarray:
         """
@@ -131,6 +138,8 @@ class Expert:
         first = self.next_object() if only is None else only
         if not todo or first is None:
             return None
+        if self._misses and self._rng.random() < self._misses:
+            return self._random_push(now, steps_left)
         goals = self._goals
         if only is not None or self._simulator.task.ordered:
             todo = [first]
@@ -155,6 +164,28 @@ class Expert:
             todo = [pushes[order[0]][0]]
             mean, spread = parameters.mean(0), parameters.std(0) + [0.08, 0.006, 0.01, 0.005]
         return best
+
+    def _random_push(self, now: Moment, steps_left: int) -> np.ndarray:
+        """
+        Aim at any object from anywhere, then go on low, in other directions or back.
+
+        So that objects are hit, grazed and missed, and the gripper leaves them without lifting.
+        """
+        rng, config = self._rng, self._config
+        k = rng.integers(self.num_objects)
+        push = Push(
+            rng.uniform(0, 2 * np.pi), rng.uniform(-MISS, MISS), rng.uniform(-0.1, 0.05),
+            rng.uniform(*config.push_speed), rng.uniform(*config.travel_speed))
+        actions = push_actions(push, now.target, now.places[k, :2], self._goals[k, :2])
+        here = now.target[:3] + actions[:, :3].sum(0)
+        path = [here]
+        for _ in range(rng.integers(1, 4)):
+            angle, speed = rng.uniform(0, 2 * np.pi), rng.uniform(*config.push_speed)
+            step = speed * np.array([np.cos(angle), np.sin(angle), 0])
+            path += [path[-1] + i * step for i in range(1, rng.integers(2, 6))]
+        path = np.clip(path, WORKSPACE_LOW, WORKSPACE_HIGH)
+        further = np.column_stack([np.diff(path, axis=0), np.zeros(len(path) - 1)])
+        return np.concatenate([actions, further])[:steps_left]
 
     def _sample(self, todo: Sequence[int], places: np.ndarray, goals: np.ndarray,
                 mean: np.ndarray | None, spread: np.ndarray | None) -> list[tuple[int, Push]]:
@@ -205,7 +236,7 @@ def default_config(task: Task, timing: str = 'natural') -> ExpertConfig | GraspC
 def run_episode(
         simulator: Simulator, seed: int, config: ExpertConfig | GraspConfig | None = None,
         rollout: mujoco.rollout.Rollout | None = None, num_frames: int = 0,
-        timing: str = 'natural') -> EpisodeRun:
+        timing: str = 'natural', misses: float = 0.0) -> EpisodeRun:
     """
     Run one episode of the expert, from the first motion of the arm to the last of an object.
 
@@ -218,6 +249,7 @@ def run_episode(
     :param rollout: mujoco.rollout.Rollout to share between episodes, or None.
     :param num_frames: of the longest episode; 0: the task's, with a timing MORE_FRAMES more.
     :param timing: one of timing.TIMINGS, when the first of several pushed objects is home.
+    :param misses: share of the pushes that are at random, so that objects are missed, too.
     :return: EpisodeRun.
     """
     task = simulator.task
@@ -231,7 +263,7 @@ def run_episode(
     first = simulator.reset(seed)
     rng = np.random.default_rng([seed, task.stream, 1])
     expert = Expert(simulator, rng, config or (ExpertConfig() if natural else TIMED_CONFIG),
-                    rollout or mujoco.rollout.Rollout(nthread=0))
+                    rollout or mujoco.rollout.Rollout(nthread=0), misses)
     plans = (_plans(expert, num_frames) if natural else
              timed_plans(expert, draw_share(timing, rng), num_frames, rng))
     observations, actions, outcome, seconds = carry_out(simulator, first, plans, num_frames)

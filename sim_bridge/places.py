@@ -10,6 +10,7 @@ GOAL_YAW_RANGE = 0.2  # rad
 GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
 GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
 GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the start
+GRIPPER_NEAR = 0.2  # m, at most, to the object that is pushed first
 
 
 def apart(positions: np.ndarray, separation: float) -> bool:
@@ -29,6 +30,26 @@ def gripper_away_from(rng: np.random.Generator, positions: np.ndarray) -> np.nda
     while True:
         xy = rng.uniform(-GRIPPER_RANGE, GRIPPER_RANGE, 2)
         if np.linalg.norm(positions - xy, axis=1).min() > GRIPPER_MARGIN:
+            return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
+
+
+def gripper_beside_one(rng: np.random.Generator, positions: np.ndarray) -> np.ndarray:
+    """
+    Draw a place of the gripper that touches no object and is near one of them.
+
+    So the start picture tells which object is pushed first, also where a goal picture with the
+    arm elsewhere does not tell which was last.
+
+    :param rng: numpy Generator.
+    :param positions: (K, 2) object origins in metres, at least GRIPPER_MARGIN apart.
+    :return: (3,) metres.
+    """
+    while True:
+        angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(GRIPPER_MARGIN, GRIPPER_NEAR)
+        xy = positions[rng.integers(len(positions))] + distance * np.array(
+            [np.cos(angle), np.sin(angle)])
+        away = np.linalg.norm(positions - xy, axis=1)
+        if (away >= GRIPPER_MARGIN).all() and (np.abs(xy) <= GRIPPER_RANGE).all():
             return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
 
 

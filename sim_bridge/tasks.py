@@ -24,7 +24,7 @@ from sim_bridge.places import (
     apart,
     GOAL_DISTANCE,
     GOAL_YAW_RANGE,
-    gripper_away_from,
+    gripper_beside_one,
     GRIPPER_HEIGHT,
     nearest_first,
     OBJECT_RANGE,
@@ -137,7 +137,7 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0) -> Scene:
         starts = _draw_starts(rng, task)
         goals = _draw_goals(rng, starts)
     start_poses, goal_poses = _with_yaws(rng, starts, goals)
-    hand = gripper_away_from(rng, starts)
+    hand = gripper_beside_one(rng, starts)
     return Scene(
         task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
         gripper_start=hand, order=tuple(nearest_first(hand[:2], starts, goals)))

@@ -25,7 +25,6 @@ GAP = 9  # of these until the object is touched,
 AGAIN = 3  # on average, pushes that have to be repeated
 RETURN = 6  # to leave an object and come back to it
 DETOUR = 16  # a push is interrupted once for so many
-OTHER = 0.2  # probability that the nearest object does not come first
 
 
 def draw_share(timing: str, rng: np.random.Generator) -> float:
@@ -63,7 +62,7 @@ def timed_plans(expert: 'Expert', share: float, num_frames: int,
             done += len(plan)
         todo = expert.undone()
         if stage not in todo:  # the next one
-            stage = expert.next_object(OTHER)
+            stage = expert.next_object()
             if stage is not None and count - len(todo) == 1:
                 detours = _detours(done, share, count, num_frames)
         part = 1 / (1 + len(detours))
