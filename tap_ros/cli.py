@@ -39,6 +39,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'faults': ('inject faults into real nodes and files', 'experiments.faults.nodes.command'),
     }),
     'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
+    'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo'),
     'bench': ('measure speed; without a name, all of it', {
         'collect': ('speed of collecting', 'experiments.bench.collect'),

@@ -126,7 +126,7 @@ def test_help_says_of_every_option_what_it_is(command, capsys, monkeypatch):
     ('collect --out a --episodes many', '--episodes: expected INT'),
     ('collect --out a --nothing 3', '--nothing'), ('collect --out a b', 'b'),
     ('import-bair --out a', 'PATH'), ('paper --only', '--only'), ('paper --seeds 1 x', '--seeds'),
-    ('train --recordings --out a', '--recordings'), ('paper --ship run', '--ship'),
+    ('train --recordings --out a', '--recordings'),
     ('--tyro-print-completion', 'bash'), ('--tyro-print-completion sh', 'bash'),
     ('collect --out a --seed "\x1b[31m\n"', r'\x1b'), ('collect --out a --task "\x1b\n"', r'\x1b'),
     ('collect --out a "\x1b\n"', r'\x1b')])

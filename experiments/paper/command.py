@@ -36,8 +36,6 @@ class Options:
     :param list: show the runs, how far they are and their scores; do nothing.
     :param collect: make the recordings only.
     :param results_only: only write the page and its data from the runs that are done.
-    :param ship: write the weights of a run that is done at half their size, with a model card
-        beside them.
     :param limit: stop after so many; the next call goes on.
     :param seeds: of the trainings.
     :param episodes: collect so many of each task; 0: as the scale says.
@@ -51,8 +49,6 @@ class Options:
     list: Flag = False
     collect: Flag = False
     results_only: Flag = False
-    ship: Annotated[tuple[str, str] | None, conf.arg(
-        metavar='RUN FILE', help_behavior_hint=default_text)] = None
     limit: Annotated[float | None, conf.arg(
         aliases=('--slice-minutes',), metavar='MINUTES', help_behavior_hint=default_text)] = None
     seeds: tuple[int, ...] = (0,)
@@ -77,8 +73,6 @@ def run(args):
     if args.results_only:
         _write_results(places, pictures=True)
         return 0
-    if args.ship:
-        return _ship(*args.ship, args, places)
     runs = choose_runs(args)
     if args.list:
         show(runs, places)
@@ -104,17 +98,6 @@ def run(args):
     if failed and any(state.kind == 'other' for state in states):
         print('--fresh begins runs anew that were begun with other settings or recordings')
     return 1 if failed else 0
-
-
-def _ship(name, file, args, places):
-    """Write weights and card of the run of this name."""
-    from experiments.paper.shipping import ship
-    runs = {run.name: run for run in paper_runs(
-        args.scale, args.seeds, args.episodes, args.steps)}
-    if name not in runs:
-        raise ConfigError(f'--ship {name}: there is no such run; --list shows all')
-    print(ship(runs[name], file, places))
-    return 0
 
 
 def choose_runs(args):

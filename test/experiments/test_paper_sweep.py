@@ -22,7 +22,6 @@ from experiments.paper.places import (
     recording_hash,
 )
 from experiments.paper.runs import paper_runs, PaperRun, SCALES
-from experiments.paper.shipping import ship
 from experiments.paper.sweep import find_state, sweep
 from made_episodes import move_squares, write_bag
 import numpy as np
@@ -32,7 +31,6 @@ from tap_ros.errors import ConfigError
 from tap_ros.files import locked
 from tap_ros.learning.split import split_episodes
 from tap_ros.options import parse
-from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
 
 ROOT = Path(__file__).parents[2]
@@ -297,19 +295,3 @@ def test_the_command_lists_and_does_what_fits_the_pattern(places, capsys, monkey
 def test_bad_options_are_refused(places, options, named):
     with pytest.raises(ConfigError, match=named):
         command.run(arguments(places, *options))
-
-
-def test_shipped_weights_predict_the_same_and_their_card_says_so(places, tmp_path, small):
-    assert perform(RUN, places) == DONE
-    file = tmp_path / 'shipped' / 'predictor_push2.safetensors'
-    card = ship(RUN, file, places).read_text()
-    source = RUN.folder(places.runs) / 'predictor.safetensors'
-    assert file.stat().st_size < 0.6 * source.stat().st_size
-    picture = np.random.default_rng(0).integers(0, 256, (16, 16, 3), np.uint8)
-    shipped, trained = (SubgoalPredictor.load(path).predict(picture, picture[::-1].copy())[0]
-                        for path in (file, source))
-    assert np.abs(shipped.image.astype(int) - trained.image).max() <= 1
-    for text in (RUN.command, 'predictor_push2.safetensors', 'copy-start', 'last frame'):
-        assert text in card
-    with pytest.raises(ConfigError, match='is not done'):
-        ship(replace(RUN, seed=7), file, places)

@@ -1,0 +1,104 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Weights to ship: those of a run at half the size, a model card and pictures beside them."""
+
+import json
+from pathlib import Path
+import shlex
+
+from experiments.pages import interval, render
+import numpy as np
+import pandas as pd
+from tap_ros.evaluation.prediction import evaluate, write_pictures
+from tap_ros.evaluation.shown import SHOWN
+from tap_ros.files import write_atomically
+from tap_ros.learning.weights import load_weights, save_weights
+from tap_ros.prediction.predictor import load_network
+from tap_ros.recording.cache import open_recordings
+import torch
+
+THRESHOLD = 2  # px, of the bottleneck frequency on the card
+PICTURED = 4  # successes and failures each
+_BOTTLENECKS = f'bottleneck_{THRESHOLD}px'
+_COLUMNS = {  # of the table: what EpisodeScores.intervals calls it, and digits
+    'min l1': ('min_l1', 4), 'match-step, share of the episode': ('match_fraction', 2),
+    f'bottlenecks at {THRESHOLD} px': (_BOTTLENECKS, 2),
+    'shows the hand': ('shows_hand', 2), 'shows the objects': ('shows_objects', 2),
+    'shows both': ('shows_both', 2)}
+
+
+def ship(recipe, bags, runs, out):
+    """
+    Write a run's weights as float16, with a card and a picture.
+
+    :param recipe: Recipe whose run is done and whose recordings are there.
+    :param bags: folder of recordings; runs: of trainings.
+    :param out: folder to write into.
+    :return: Path of the card.
+    """
+    run = Path(runs, recipe.name)
+    config, state, about = load_weights(run / 'predictor.safetensors', 'predictor')
+    state = {name: value.to(torch.float16) if value.is_floating_point() else value
+             for name, value in state.items()}
+    file = Path(out, f'predictor_{recipe.name}.safetensors')
+    save_weights(file, state, 'predictor', config, about)
+    network, _ = load_network(file)
+    store = open_recordings([str(recipe.fresh(bags))], progress=False)
+    episodes = np.arange(len(store))
+    goals = ['last frame']
+    if not np.array_equal(store[0].goal_frame, store[0].frames[-1]):
+        goals.append('arm elsewhere')
+    scores = {goal: evaluate(network, store, episodes, goal_picture=_option(goal))
+              for goal in goals}
+    good = found(scores['last frame']['prediction'])
+    shown = [*np.flatnonzero(good)[:PICTURED], *np.flatnonzero(~good)[:PICTURED]]
+    write_pictures(file.with_suffix('.png'), network, store, shown, 'last')
+    card = file.with_suffix('.md')
+    commands = {step: shlex.join(['python', '-m', 'tap_ros', *words])
+                for step, words in recipe.commands('bags', 'runs/weights').items()}
+    write_atomically(card, render(
+        'weights/templates/card.md.j2', file=file.name, task=recipe.task, commands=commands,
+        run=json.loads((run / 'run.json').read_text()), method=about['settings']['method'],
+        fresh=len(store), pushing=np.isfinite(scores['last frame']['prediction'].bottleneck).any(),
+        scores=tabulate(scores), succeed=int(good[shown].sum()),
+        fail=int((~good[shown]).sum())))
+    return card
+
+
+def found(scores):
+    """
+    Say of each episode whether its prediction is what it should be.
+
+    :param scores: EpisodeScores of predictions.
+    :return: bool (N,): a bottleneck within THRESHOLD where objects are pushed; else whether both
+        hand and objects are shown.
+    """
+    if np.isfinite(scores.bottleneck).any():
+        return scores.bottleneck <= THRESHOLD
+    return np.minimum(scores.hand, scores.objects) >= SHOWN
+
+
+def tabulate(scores):
+    """
+    Make the card's table.
+
+    :param scores: dict from a description of the goal picture to {method: EpisodeScores}.
+    :return: DataFrame, a line for each goal picture and method; what is not known has no column.
+    """
+    lines = {(goal, method): score.intervals()
+             for goal, methods in scores.items() for method, score in methods.items()}
+    table = pd.DataFrame(list(lines), columns=['goal picture', 'method'])
+    pushing = any(_BOTTLENECKS in line for line in lines.values())
+    for title, (name, digits) in _COLUMNS.items():
+        if pushing and name.startswith('shows'):
+            continue  # of a bottleneck the hand is no part
+        known = [line.get(name, [np.nan] * 3) for line in lines.values()]
+        if np.isfinite(np.array(known, float)).any():
+            table[title] = interval(
+                pd.DataFrame(known, columns=['value', 'ci_low', 'ci_high']), digits)
+    return table
+
+
+def _option(goal):
+    """Return what `evaluate prediction --goal-picture` calls it."""
+    return 'last' if goal == 'last frame' else 'recorded'

@@ -1,0 +1,59 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What each of the shipped predictors is made with: options of `collect` and of `train`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+import shlex
+
+FRESH_SEED, FRESH_EPISODES = 900_000, 100  # of the scenes that weights are scored in
+
+# Pictures that must be made up, of a gripper where it was not yet, do not come by warping.
+_GRIPPING = ('--method genmin-wo-gan+progress --outer-power 1 --batch-size 24 --decoder shared '
+             '--skips --new-pixels --goal-picture last --no-colour --brightness 0')
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """
+    How one predictor is made.
+
+    :param name: of the weights, as `SubgoalPredictor.load` takes it.
+    :param task: of its scenes.
+    :param episodes: to collect from seed 0 on.
+    :param train: options of `train` beside recordings and folder.
+    """
+
+    name: str
+    task: str
+    episodes: int
+    train: str
+
+    def recording(self, folder: str | Path) -> Path:
+        """Return the folder of the recording that it is trained on."""
+        return Path(folder, self.task)
+
+    def fresh(self, folder: str | Path) -> Path:
+        """Return the folder of the recording of scenes that it never saw."""
+        return Path(folder, f'fresh_{self.task}')
+
+    def commands(self, bags: str | Path, runs: str | Path) -> dict[str, list[str]]:
+        """
+        Return the words behind `python -m tap_ros` of each step, in order.
+
+        :param bags: folder of recordings; runs: of trainings.
+        :return: dict with 'collect', 'fresh' and 'train'.
+        """
+        collect = ['collect', '--task', self.task, '--episodes']
+        recording, fresh = str(self.recording(bags)), str(self.fresh(bags))
+        return {
+            'collect': [*collect, str(self.episodes), '--out', recording],
+            'fresh': [*collect, str(FRESH_EPISODES), '--seed', str(FRESH_SEED), '--out', fresh],
+            'train': ['train', '--recordings', recording, '--out', str(Path(runs, self.name)),
+                      *shlex.split(self.train)]}
+
+
+RECIPES = {recipe.name: recipe for recipe in (
+    Recipe('grasp', 'grasp', 3000, f'{_GRIPPING} --steps 4000'),
+    Recipe('pick_place', 'pick_place', 3000, f'{_GRIPPING} --steps 5000'),
+)}
