@@ -37,6 +37,7 @@ SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
 if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
     raise SceneError(f'the control period {CONTROL_PERIOD} s is no multiple of {TIMESTEP} s')
 RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time to catch up
+BENT = 0.1  # share of the fingers' travel that they may be beyond their ends
 GRASP_HEIGHT = 0.012  # m of the gripper when it holds an object on the table, in the goal picture
 LEAVE_HEIGHT = 0.12  # m of the gripper when it has put the object down, in the goal picture
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers
@@ -222,7 +223,8 @@ class Simulator:
         assert self._renderer is not None, 'reset comes first'
         mujoco.mj_forward(self.model, self.data)
         poses = self.object_poses()
-        opening = self.data.qpos[3:5].mean() / FINGER_TRAVEL
+        # Contact can press the fingers beyond closed or open, as it bends those of a real hand.
+        opening = np.clip(self.data.qpos[3:5].mean() / FINGER_TRAVEL, -BENT, 1 + BENT)
         view = self._renderer.render(self.data, hide_arm)
         return Observation(
             image=view.picture,

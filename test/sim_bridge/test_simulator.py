@@ -4,10 +4,12 @@
 
 import numpy as np
 import pytest
+from sim_bridge.scene import FINGER_TRAVEL
 from sim_bridge.simulator import ramp_controls, Simulator, SUBSTEPS
 from sim_bridge.tasks import sample_scene
 from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORKSPACE_HIGH
 from tap_ros.errors import SceneError
+from tap_ros.planning.mpc_inputs import GRIPPER_HIGH, GRIPPER_LOW
 
 
 @pytest.fixture(scope='module')
@@ -140,3 +142,12 @@ def test_closing_one_simulator_leaves_the_pictures_of_another_alone(simulator):
     before = simulator.reset(1).image
     other.close()
     np.testing.assert_array_equal(simulator.observe().image, before)
+
+
+@pytest.mark.parametrize('pressed', [-0.3, 1.3])
+def test_fingers_pressed_beyond_their_ends_are_told_as_a_planner_accepts_them(simulator, pressed):
+    simulator.reset(2)
+    simulator.data.qpos[3:5] = pressed * FINGER_TRAVEL
+    gripper = simulator.observe().gripper
+    assert (gripper >= GRIPPER_LOW).all() and (gripper <= GRIPPER_HIGH).all()
+    assert abs(gripper[3] - np.clip(pressed, 0, 1)) == pytest.approx(0.1)
