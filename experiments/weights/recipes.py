@@ -60,8 +60,6 @@ _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0
 
 RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push2', 'push2', 600, f'{_PUSHING} --steps 8000'),
-    Recipe('order2', 'order2', 500, f'{_PUSHING} --steps 6000'),
-    Recipe('push3', 'push3', 400, f'{_PUSHING} --steps 6000'),
     Recipe('stack2', 'stack2', 1000, f'{_GRIPPING} --steps 4000'),
     Recipe('grasp', 'grasp', 3000, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', 3000, f'{_GRIPPING} --steps 5000'),
