@@ -265,8 +265,9 @@ def test_the_planner_keeps_within_the_limits_of_the_parameters(loop):
 
 def test_with_a_robot_mask_the_arm_moves_only_where_a_mask_comes(loop):
     assert loop.processes['visual_mpc_node'].end() == 0
-    loop.start('visual_mpc_node', robot_mask='all', image_timeout=2.0)
-    masks = loop.node.create_publisher(Image, 'camera/robot_mask', STREAM)
+    loop.start('visual_mpc_node', ['-r camera/robot_mask:=own_mask'], robot_mask='all',
+               image_timeout=2.0)
+    masks = loop.node.create_publisher(Image, 'own_mask', STREAM)
     sending = threading.Event()
 
     def answer(image):
@@ -283,7 +284,7 @@ def test_with_a_robot_mask_the_arm_moves_only_where_a_mask_comes(loop):
         loop.reset()
         status, result = loop.reach(mode='direct', step_budget=2)
         assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
-        assert '/camera/robot_mask' in result.message
+        assert '/own_mask' in result.message
         assert loop.stopped()
         sending.set()
         loop.reset()
