@@ -25,8 +25,8 @@ paper: export OMP_NUM_THREADS ?= 1
 .PHONY: help demo test mutants paper faults build lint bench clean
 
 help:
-	@echo 'make demo    push two objects to where a goal picture shows them, three scenes'
-	@echo '             SCENES=20: that many scenes; ARGS=...: more options of the demo'
+	@echo 'make demo    push objects to where a goal picture shows them, predict a stack'
+	@echo '             SCENES=20: that many of each task; ARGS=...: more options of the demo'
 	@echo 'make test    all tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'
 	@echo 'make mutants change the code a little, thousands of times, and see whether a test fails, in'
 	@echo '             docs/results: hours; goes on; ARGS="--sample 300": so many, drawn at random'

@@ -93,7 +93,7 @@ class View:
 
     picture: np.ndarray  # uint8 (H, W, 3) rgb
     robot_mask: np.ndarray | None = None  # uint8 (H, W), values as in contract.py
-    arm_joints: np.ndarray | None = None  # (6,) rad, of the arm that is shown
+    arm_joints: np.ndarray | None = None  # (6,) rad, of the UR10e; in a studio
 
 
 class OpenGL:

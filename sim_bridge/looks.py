@@ -24,8 +24,8 @@ class Look:
     """
     One look.
 
-    :param studio: table, light and shadows of studio.py; else flat colours.
-    :param arm: the whole UR10e; else the hand alone.
+    :param studio: table, light and shadows of studio.py, and a UR10e; else flat colours.
+    :param arm: the camera's pictures show the whole UR10e; else the hand alone.
     :param push_hand: Hand of tasks that push.
     :param grip_hand: Hand of tasks with a grasp.
     :param push_camera: what Camera is given for tasks that push.
@@ -64,7 +64,7 @@ LOOKS = {
     'hand': Look(True, False, PUSHER, GRIPPER, _TABLE, _NEAR, 0.65),
     'ur10e': Look(True, True, PUSHER, GRIPPER, _TABLE_AND_ARM, _NEAR, 0.65),
 }
-DEFAULT_LOOK = 'plain'
+DEFAULT_LOOK = 'hand'
 # From the side, at a person's height: for films.
 OBSERVER = Camera(480, 360, tilt=1.05, fovy=38.0, position=(1.15, -1.35, 1.15), turn=0.7)
 

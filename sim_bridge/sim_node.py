@@ -116,7 +116,6 @@ class SimNode(Node):
             self._streams['camera/robot_mask'] = self.create_publisher(
                 Image, 'camera/robot_mask', STREAM)
             self._goal_mask = self.create_publisher(Image, 'goal/robot_mask', LATCHED)
-        if self._sim.look.arm:
             self._description = self.create_publisher(String, 'robot_description', LATCHED)
             self._description.publish(String(data=robot_description()))
         if self.params['observer']:
@@ -333,7 +332,8 @@ def declare_parameters(node: Node) -> Parameters:
                        low=16, high=1024)
     parameters.declare(
         'look', DEFAULT_LOOK,
-        "The world's look: a UR10e at a wooden table, the hand alone over it, or plain colours.",
+        "What the camera's pictures show: the whole UR10e at a wooden table, its hand alone, or "
+        'plain colours.',
         choices=list(LOOKS))
     parameters.declare(
         'appearance', 'usual', 'Table, light and camera of looks with a table; random: drawn from '

@@ -54,7 +54,7 @@ class Observation:
     object_pixels: np.ndarray  # (K, 2) float32 (u, v) of the object origins
     object_poses: np.ndarray  # (K, 7) float64: x, y, z in m, quaternion x, y, z, w
     robot_mask: np.ndarray | None = None  # (H, W) uint8, values as in contract.py; in a studio
-    arm_joints: np.ndarray | None = None  # (6,) float64 rad, of the UR10e where it is shown
+    arm_joints: np.ndarray | None = None  # (6,) float64 rad, of the UR10e; in a studio
 
 
 def clip_action(action: ArrayLike) -> np.ndarray:
@@ -192,8 +192,8 @@ class Simulator:
         :param action: (4,) displacement x, y, z in m, limited to ACTION_LIMIT and to the
             workspace, and gripper opening from 0 (closed) to 1.
         :return: Observation.
-        :raises SceneError: for another shape, values that are not finite, or what the arm that is
-            shown cannot do; then nothing moves.
+        :raises SceneError: for another shape, values that are not finite, or what the UR10e
+            cannot do; then nothing moves.
         """
         controls, self.target = self._ramp(action)
         for control in controls:
@@ -213,7 +213,7 @@ class Simulator:
     def _ramp(self, action: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the servo targets of an action (SUBSTEPS, 5) and the last one (4,)."""
         controls, targets = ramp_controls(self.target, clip_action(action)[None])
-        if self.look.arm:
+        if self.look.studio:
             ur10e.check_motion(
                 ur10e.joints_at(self.target), ur10e.joints_at(targets[0]), CONTROL_PERIOD)
         return controls, targets[0]
@@ -243,7 +243,7 @@ class Simulator:
         if not self.look.studio:
             raise SceneError("observer: this look has no view from the side; choose 'ur10e'")
         if self._observer is None:
-            self._observer = Studio(OBSERVER, self.look.arm)
+            self._observer = Studio(OBSERVER, arm=True)
         self._observer.dress(replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
         self._observer.use(self.model)
         return self._observer.render(self.data).picture

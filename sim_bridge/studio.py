@@ -39,12 +39,13 @@ class Studio:
     Takes pictures of physics models with one OpenGL context, in the thread that built it.
 
     :param camera: Camera.
-    :param arm: draw the whole UR10e; else the hand alone.
+    :param arm: draw the whole UR10e; else the hand alone, as if the links were rendered away.
     :raises SceneError: when nothing can be rendered.
     """
 
     def __init__(self, camera: Camera, arm: bool) -> None:
         self._camera, self._arm = camera, arm
+        self._joints = np.zeros(len(ur10e.JOINTS))
         self._model = _studio_model(arm)
         self._model.vis.global_.offwidth = SAMPLES * camera.width
         self._model.vis.global_.offheight = SAMPLES * camera.height
@@ -92,10 +93,7 @@ class Studio:
         :param hide_arm: leave arm and hand out of the picture.
         :return: View.
         """
-        joints = None
-        if self._arm:
-            self._pose_arm(data.qpos[:3])
-            joints = self._data.qpos.copy()
+        self._pose_arm(data.qpos[:3])
         scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL
         option = self._hide if hide_arm else self._show
         mujoco.mjv_updateScene(
@@ -112,7 +110,7 @@ class Studio:
         shaded = colours * shade[..., None]
         picture = sum(_samples(shaded)) / SAMPLES ** 2
         mask = np.maximum.reduce(_samples(label))  # the robot's if one of its samples is
-        return View(np.rint(picture).astype(np.uint8), mask, joints)
+        return View(np.rint(picture).astype(np.uint8), mask, self._joints.copy())
 
     def close(self) -> None:
         """Free the OpenGL context."""
@@ -123,8 +121,10 @@ class Studio:
         # Contact can press the gripper a little beyond where commands may bring it, and the arm's
         # reach: then the arm stays as it was.
         with contextlib.suppress(SceneError):
-            self._data.qpos[:] = ur10e.joints_at(gripper)
-        mujoco.mj_kinematics(self._model, self._data)
+            self._joints = ur10e.joints_at(gripper)
+        if self._arm:
+            self._data.qpos[:] = self._joints
+            mujoco.mj_kinematics(self._model, self._data)
 
     def _add_shadows(self, own: int) -> np.ndarray:
         """

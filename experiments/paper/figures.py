@@ -8,13 +8,13 @@ from experiments.paper.names import COPIES, method_order, variant_of
 from experiments.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
+    FRAMES,
     GAINS,
     TITLES,
 )
 from experiments.paper.rows import find, lower_hull, select
 from matplotlib.figure import Figure
 import numpy as np
-from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.evaluation.bottleneck import THRESHOLDS
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
@@ -110,7 +110,7 @@ def forward_scatter(rows, task='grasp'):
             name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
     figure, axes = _new_figure(3.9, len(panels))
     for axis, (title, points) in zip(axes[0], panels):
-        _scatter(axis, points, EPISODE_FRAMES[task])
+        _scatter(axis, points, FRAMES[task])
         axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
         axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
     axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)

@@ -9,7 +9,7 @@ Sentences that judge depend on the numbers; what a person has to say stands in f
 from experiments.pages import render
 from experiments.paper.figures import file_name
 from experiments.paper.names import BEST, method_order
-from experiments.paper.published import BOTTLENECK_2PX, TITLES
+from experiments.paper.published import BOTTLENECK_2PX, FRAMES, TITLES
 from experiments.paper.rows import find
 from experiments.paper.runs import paper_runs
 from experiments.paper.tables import (
@@ -22,7 +22,6 @@ from experiments.paper.tables import (
     scores_table,
 )
 import pandas as pd
-from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.evaluation.bottleneck import MIN_MOTION
 from tap_ros.evaluation.samples import NEAR
 from tap_ros.prediction.losses import CHANGED
@@ -115,7 +114,7 @@ def _settings(runs):
             data, config = own[0]['data'], own[0]['config']
             steps = sorted({run['training']['steps'] for run in own})
             lines.append({
-                'task': title, 'frames': EPISODE_FRAMES[task], 'trained on': data['episodes'],
+                'task': title, 'frames': FRAMES[task], 'trained on': data['episodes'],
                 'held out': data['held_out'], 'data': f'`{data["hash"][:8]}`',
                 'steps': ' to '.join(map(str, dict.fromkeys((steps[0], steps[-1])))),
                 'batch': config.get('batch_size'), 'base width': config.get('base_width'),

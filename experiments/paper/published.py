@@ -7,6 +7,8 @@ The range of the paper's l1 errors is not known, and its world, cameras and trai
 others than ours: only how its methods stand to each other carries over.
 """
 
+from tap_ros.contract import EPISODE_FRAMES
+
 TITLES = {'grasp': 'Grasping', 'pick_place': 'Pick-and-place', 'push2': 'Pushing two objects',
           'push3': 'Pushing three objects'}
 
@@ -47,3 +49,5 @@ FORWARD_GRASP = {
 
 # Appendix E: share of predictions within 2 px of a bottleneck, pushing two objects.
 BOTTLENECK_2PX = {'genmin': 0.58, 'fix': 0.0}
+# Frames of an episode, at most, in the recordings that the results here are of.
+FRAMES = EPISODE_FRAMES | {'push2': 40, 'push3': 75}

@@ -1,12 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One self-contained HTML page about a few scenes, each pushed directly and via a subgoal."""
+"""One self-contained HTML page about a few scenes and the subgoals predicted for them."""
 
 import base64
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import html
 import io
+from itertools import groupby
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -40,8 +41,9 @@ class Run:
 
 @dataclass(frozen=True)
 class SceneRuns:
-    """A scene, the subgoal predicted for it, and the attempts."""
+    """A scene, the subgoal predicted for it, and the attempts, if any."""
 
+    task: str
     seed: int
     start: np.ndarray  # (H, W, 3) uint8
     goal: np.ndarray
@@ -51,26 +53,33 @@ class SceneRuns:
     object_maps: np.ndarray  # (K, H, W)
     runs: dict[str, Run]  # by mode
     side_goal_pixels: np.ndarray | None = None  # (K, 2) in pictures from the side
+    expert: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 from the side of its own attempt
+
+    @property
+    def name(self) -> str:
+        """Task and seed."""
+        return f'{self.task} {self.seed}'
 
 
 def results_table(scenes: Sequence[SceneRuns]) -> str:
     """
     Say in plain text how far from their goals the objects ended.
 
-    :param scenes: list of SceneRuns with the same modes.
+    :param scenes: list of SceneRuns with the same modes, those of a task together.
     :return: lines of text; distances in cm, mean over the objects.
     """
-    modes = list(scenes[0].runs)
-    rows = [_row(f'scene {scene.seed}', [
-        scene.runs[modes[0]].distances[0].mean(),
-        *(scene.runs[m].distances[-1].mean() for m in modes)]) for scene in scenes]
-    means = np.mean([[
-        s.runs[modes[0]].distances[0].mean(),
-        *(s.runs[m].distances[-1].mean() for m in modes)] for s in scenes], axis=0)
+    modes, rows = list(scenes[0].runs), list[str]()
+    for task, group in groupby(scenes, lambda scene: scene.task):
+        distances = []
+        for scene in group:
+            distances.append([scene.runs[modes[0]].distances[0].mean(),
+                              *(scene.runs[m].distances[-1].mean() for m in modes)])
+            rows.append(_row(scene.name, distances[-1]))
+        rows.append(_row(f'{task}, mean of {len(distances)}', np.mean(distances, 0)))
     head = f'{"final mean distance, cm":<26}{"do nothing":>12}' + ''.join(
         f'{m:>12}' for m in modes)
     rule = '-' * len(head)
-    return '\n'.join([head, rule, *rows, rule, _row(f'mean of {len(scenes)}', means)])
+    return '\n'.join([head, rule, *rows])
 
 
 def _row(label: str, distances: Iterable[float]) -> str:
@@ -86,9 +95,11 @@ def write_report(path: str | Path, scenes: Sequence[SceneRuns], note: str = '') 
     :param note: a sentence on how the numbers were made.
     """
     body = ''.join(_scene_section(scene) for scene in scenes)
+    pushed = [scene for scene in scenes if scene.runs]
+    table = f'<pre>{html.escape(results_table(pushed))}</pre>' if pushed else ''
     page = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>tap_ros: pushed via a predicted subgoal</title>
+<title>tap_ros: demo</title>
 <style>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 1120px; margin: 2rem auto;
   padding: 0 1rem; color: #222; background: #fff; }}
@@ -99,11 +110,12 @@ img {{ image-rendering: pixelated; display: block; max-width: 100%; }}
 img.smooth {{ image-rendering: auto; }}
 pre {{ background: #f4f4f6; padding: 1rem; overflow-x: auto; }}
 </style>
-<h1>Objects pushed to where a goal picture shows them, via a predicted subgoal</h1>
-<p>Each scene was pushed twice: directly, and via the subgoal that <code>/predict_subgoal</code>
-returned, a picture of a moment on the way with a probability map of where every object should then
-be. Doing nothing ends 20 cm from the goals.</p>
-<pre>{html.escape(results_table(scenes))}</pre>
+<h1>Predicted subgoals, and objects pushed to a goal picture via them</h1>
+<p>The subgoal is what <code>/predict_subgoal</code> returned: a picture of a moment on the way,
+with a probability map of where every object should then be. Where objects are pushed, each scene
+was pushed twice: directly, and via the subgoal. Where a gripper is needed nothing was planned; the
+film shows the expert whose recordings the predictor learned from.</p>
+{table}
 <p>{html.escape(note)}</p>
 {body}</html>
 """
@@ -143,13 +155,15 @@ def _scene_section(scene: SceneRuns) -> str:
     figures = ''.join(
         _figure(f'{MODE_NAMES[mode]}, seen from the side', _film(run.side), 'smooth', 'webp')
         for mode, run in scene.runs.items() if len(run.side))
+    if len(scene.expert):
+        figures += _figure('the expert, seen from the side', _film(scene.expert), 'smooth', 'webp')
     figures += ''.join(_figure(caption, png_bytes(image)) for caption, image in pictures)
     strips = ''.join(
         _figure(f'{MODE_NAMES[mode]}: frames 0 to {len(run.frames) - 1}, median planning time '
                 f'{run.planning_ms:.0f} ms', png_bytes(grid([film_strip(run.frames)], scale=2)))
         for mode, run in scene.runs.items())
-    return (f'<h2>Scene {scene.seed}</h2>{figures}'
-            f'{_figure("error over time", _error_plot(scene), "smooth")}{strips}')
+    plot = _figure('error over time', _error_plot(scene), 'smooth') if scene.runs else ''
+    return f'<h2>{html.escape(scene.name)}</h2>{figures}{plot}{strips}'
 
 
 def _film(pictures: Sequence[np.ndarray]) -> bytes:

@@ -4,7 +4,8 @@
 The demo: real nodes in processes of their own push objects to where a goal picture shows them.
 
 Each scene is pushed twice: directly, and via the subgoal that predict_subgoal answers. Everything
-goes through the topics, services and actions that any client would use.
+goes through the topics, services and actions that any client would use. Where a gripper is needed
+the subgoal is predicted only; nothing here plans grasps.
 """
 
 from dataclasses import dataclass
@@ -20,8 +21,10 @@ from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
-from sim_bridge.looks import get_look, LOOKS, OBSERVER
-from sim_bridge.tasks import get_task
+from sim_bridge.expert import run_episode
+from sim_bridge.looks import DEFAULT_LOOK, get_look, LOOKS, OBSERVER
+from sim_bridge.simulator import Simulator
+from sim_bridge.tasks import get_task, TASKS
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
@@ -42,10 +45,12 @@ from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds
 from tap_ros.options import Flag, Folder, one_of
-from tap_ros.planning.scenes import FIRST_SCENE, PAPER_TASKS
+from tap_ros.planning.scenes import FIRST_SCENE
+from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tqdm import tqdm
 from tyro import conf
 
+USUAL_TASKS = ('push2', 'stack2')
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 MODES = ('direct', 'subgoal')
 START_TIMEOUT_S = 90.0
@@ -96,15 +101,17 @@ class DemoClient:
     The demo's own node: it resets the scene, asks for a subgoal and for pushes, and watches.
 
     :param processes: NodeProcesses to keep an eye on.
+    :param plans: whether there is a planner to be waited for.
     """
 
-    def __init__(self, processes: NodeProcesses) -> None:
+    def __init__(self, processes: NodeProcesses, plans: bool = True) -> None:
         self.node = rclpy.create_node('demo')
         self._processes = processes
         self._reset = self.node.create_client(ResetScene, 'sim/reset')
         self._predict = self.node.create_client(
             PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS)
         self._reach = ActionClient(self.node, ReachGoal, 'reach_goal')
+        self._plans = plans
         self._alive = {name: Liveness(self.node, name) for name in (
             'sim_node', 'predictor_node', 'visual_mpc_node')}
         self._camera = Watch(self.node)
@@ -117,8 +124,9 @@ class DemoClient:
         deadline = time.monotonic() + START_TIMEOUT_S
         waiting = {
             'sim_node': self._reset.service_is_ready,
-            'predictor_node': self._predict.service_is_ready,
-            'visual_mpc_node': self._reach.server_is_ready}
+            'predictor_node': self._predict.service_is_ready}
+        if self._plans:
+            waiting['visual_mpc_node'] = self._reach.server_is_ready
         while waiting:
             self._processes.check()
             for name in [name for name, ready in waiting.items() if ready()]:
@@ -210,39 +218,59 @@ def pixels(message: ObjectStates) -> np.ndarray:
     return np.array([(state.u, state.v) for state in message.objects])
 
 
-def run_scene(client: DemoClient, task: str, seed: int, step_budget: int) -> SceneRuns:
+def run_scene(client: DemoClient, task: str, seed: int, step_budget: int,
+              look: str) -> SceneRuns:
     """
-    Push one scene in every mode.
+    Predict a subgoal of one scene; push it in every mode, or show how the expert does it.
 
+    :param step_budget: the most steps of a run.
+    :param look: of the world.
     :return: SceneRuns.
     """
     runs: dict[str, Run] = {}
-    for mode in MODES:
-        goal = client.reset(task, seed)
-        if not runs:
-            subgoal = client.predict()
+    goal = client.reset(task, seed)
+    subgoal, (image, objects) = client.predict(), client.start()
+    for mode in () if get_task(task).gripping else MODES:
+        if runs:
+            goal = client.reset(task, seed)
         begin = time.monotonic()
         runs[mode] = client.push(mode, seed, step_budget, goal)
         run = runs[mode]
         print(f'    {mode:<8} {100 * run.distances[0].mean():5.1f} -> '
               f'{100 * run.distances[-1].mean():5.1f} cm in {len(run.frames) - 1} steps, '
               f'{time.monotonic() - begin:.0f} s ({run.planning_ms:.0f} ms a plan)', flush=True)
-    image, objects = client.start()
     return SceneRuns(
-        seed=seed, start=decode_image(image, 'camera/image_raw'),
+        task=task, seed=seed, start=decode_image(image, 'camera/image_raw'),
         goal=decode_image(goal['image'], 'goal/image'), start_pixels=pixels(objects),
         goal_pixels=pixels(goal['objects']), subgoal=decode_image(subgoal.image, 'subgoal'),
         object_maps=np.stack([decode_map(m, 'object_maps') for m in subgoal.object_maps]),
-        runs=runs, side_goal_pixels=OBSERVER.project(positions(goal['objects'])))
+        runs=runs, side_goal_pixels=OBSERVER.project(positions(goal['objects'])),
+        expert=() if runs else film_expert(task, seed, look))
+
+
+def film_expert(task: str, seed: int, look: str) -> list[np.ndarray]:
+    """Return pictures from the side of the expert doing a task, without ROS."""
+    simulator = Simulator(task, look=look)
+    try:
+        _, actions, _, _ = run_episode(simulator, seed)
+        simulator.reset(seed)
+        pictures = [simulator.observer_picture()]
+        for action in actions:
+            simulator.step(action)
+            pictures.append(simulator.observer_picture())
+        return pictures
+    finally:
+        simulator.close()
 
 
 def start_nodes(processes: NodeProcesses, folder: Path, task: str, look: str) -> None:
-    """Start the three nodes and the recorder."""
-    processes.start('recorder_node', folder=folder / 'recording')
+    """Start simulator, predictor, recorder and, for tasks that push, the planner."""
+    processes.start('recorder_node', folder=folder / 'recording' / task)
     processes.start('sim_node', lock_step=True, task=task, look=look,
                     observer=get_look(look).studio)
-    processes.start('predictor_node')
-    processes.start('visual_mpc_node')
+    processes.start('predictor_node', weights=task if task in PREDICTORS else DEFAULT_PREDICTOR)
+    if not get_task(task).gripping:
+        processes.start('visual_mpc_node')
 
 
 @dataclass(frozen=True)
@@ -250,18 +278,19 @@ class Options:
     """
     Options of the demo.
 
-    :param scenes: how many.
-    :param seed: of the first scene.
-    :param task: what is to be done in them.
+    :param scenes: how many of each task.
+    :param seed: of the first scene of each task.
+    :param tasks: what is to be done in them; none named: push2 and stack2, or with attach
+        push2.
     :param look: of the world, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
     :param attach: use nodes that run already, for example those of demo.launch.py.
     """
 
-    scenes: int = 3
+    scenes: int = 2
     seed: int = FIRST_SCENE
-    task: Annotated[str, one_of(PAPER_TASKS)] = PAPER_TASKS[0]
-    look: Annotated[str, one_of(LOOKS)] = 'plain'
+    tasks: tuple[Annotated[str, one_of(TASKS)], ...] = ()
+    look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     step_budget: Annotated[int, conf.arg(
         help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0
     out: Folder = 'runs/demo'
@@ -277,44 +306,62 @@ def run(args: Options) -> int:
     """
     if args.scenes < 1 or args.step_budget < 0:
         raise ConfigError('scenes must be at least 1, and step-budget 0 or more')
-    budget = args.step_budget or step_budget(get_task(args.task).num_objects)
+    tasks = args.tasks or (USUAL_TASKS[:1] if args.attach else USUAL_TASKS)
+    if len(set(tasks)) < len(tasks):
+        raise ConfigError(f'tasks: {" ".join(tasks)}: name each once')
     folder = new_folder(args.out)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    client = None
     begin = time.monotonic()
     try:
-        with NodeProcesses(folder / 'logs') as processes:
-            client = DemoClient(processes)
+        scenes = [scene for task in tasks for scene in run_task(args, task, folder)]
+    finally:
+        rclpy.try_shutdown()
+    seconds = time.monotonic() - begin
+    pushed = [scene for scene in scenes if scene.runs]
+    write_overview(folder / 'subgoals.png', scenes)
+    write_report(
+        folder / 'report.html', scenes,
+        f'Tasks {", ".join(tasks)}, seeds {args.seed} to {args.seed + args.scenes - 1} of each, '
+        f'at most {_budget(args, tasks[0])} steps of a push, {seconds:.0f} s in all. Object '
+        'pixels at every step, and the distances, are ground truth of the simulator.')
+    if pushed:
+        write_film(folder / 'demo.webp', pushed)
+        print(f'\n{results_table(pushed)}\n')
+        print(f'film       {folder / "demo.webp"}')
+    if not args.attach:
+        print(f'recording  {folder / "recording"}')
+    print(f'page       {folder / "report.html"}')
+    return 0
+
+
+def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
+    """Run the scenes of one task with nodes of its own, or with those that run already."""
+    client = None
+    try:
+        with NodeProcesses(folder / 'logs' / task) as processes:
+            client = DemoClient(processes, not get_task(task).gripping)
             with Spinner(client.node):
                 if args.attach:
-                    print('Waiting for the nodes that run already', flush=True)
+                    print(f'{task}: waiting for the nodes that run already', flush=True)
                 else:
-                    print(f'Starting four nodes; their logs are in {folder / "logs"}', flush=True)
-                    start_nodes(processes, folder, args.task, args.look)
+                    print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
+                          flush=True)
+                    start_nodes(processes, folder, task, args.look)
                 client.wait_until_ready()
                 scenes = []
                 for i in range(args.scenes):
-                    print(f'  scene {args.seed + i} ({i + 1} of {args.scenes}): {args.task}',
-                          flush=True)
-                    scenes.append(run_scene(client, args.task, args.seed + i, budget))
+                    print(f'  scene {args.seed + i} ({i + 1} of {args.scenes})', flush=True)
+                    scenes.append(run_scene(
+                        client, task, args.seed + i, _budget(args, task), args.look))
+                return scenes
     finally:
         if client is not None:
             client.node.destroy_node()
-        rclpy.try_shutdown()
-    seconds = time.monotonic() - begin
-    print(f'\n{results_table(scenes)}\n')
-    write_overview(folder / 'subgoals.png', scenes)
-    write_film(folder / 'demo.webp', scenes)
-    write_report(
-        folder / 'report.html', scenes,
-        f'Task {args.task}, seeds {args.seed} to {args.seed + args.scenes - 1}, at most '
-        f'{budget} steps, {seconds:.0f} s in all. Object pixels at every step, and the '
-        'distances, are ground truth of the simulator.')
-    if not args.attach:
-        print(f'recording  {folder / "recording"}')
-    print(f'film       {folder / "demo.webp"}')
-    print(f'page       {folder / "report.html"}')
-    return 0
+
+
+def _budget(args: Options, task: str) -> int:
+    """Return the most steps of one run."""
+    return args.step_budget or step_budget(get_task(task).num_objects)
 
 
 def new_folder(wanted: str | Path) -> Path:

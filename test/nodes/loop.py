@@ -54,8 +54,9 @@ class Loop:
         node.create_subscription(
             TwistStamped, 'arm/delta_twist_cmds', self.twists.append, STREAM)
 
-    def start(self, name, **parameters):
-        self.processes[name] = NodeProcess(name, self.folder / f'{name}.log', parameters)
+    def start(self, name, remaps=(), **parameters):
+        self.processes[name] = NodeProcess(
+            name, self.folder / f'{name}.log', parameters, remaps)
 
     def reset(self, seed=SEED, patience=30.0):
         """Start a scene, and wait so many seconds for what is published at its start."""

