@@ -9,7 +9,7 @@ collection goes on with the files that are not there yet.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 import json
 from pathlib import Path
 import time
@@ -33,8 +33,8 @@ from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
-# These stand in that file only if they are not the defaults.
-LATER_SETTINGS = ('misses', 'frames', 'timing', 'look', 'appearance')
+# What they were before they were settings.
+EARLIER = {'misses': 0.0, 'frames': 0, 'timing': 'natural', 'look': 'plain', 'appearance': 'usual'}
 MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 
 
@@ -163,13 +163,9 @@ def _check_settings(folder: Path, config: CollectConfig) -> None:
     """Keep the settings beside the recording and refuse to mix it with other ones."""
     path = folder / SETTINGS_FILE
     settings = json.loads(json.dumps(asdict(config)))
-    for field in fields(CollectSettings):  # as in recordings made before they were settings
-        if field.name in LATER_SETTINGS and settings[field.name] == field.default:
-            del settings[field.name]
     if path.exists():
-        before = _read_settings(path)
-        names = dict.fromkeys([*settings, *(k for k in LATER_SETTINGS if k in before)])
-        changed = [k for k in names if k != 'episodes' and before.get(k) != settings.get(k)]
+        before = EARLIER | _read_settings(path)
+        changed = [k for k in settings if k != 'episodes' and before.get(k) != settings[k]]
         if changed:
             raise ConfigError(
                 f'{folder} holds a recording made with other settings ({", ".join(changed)}); '

@@ -49,7 +49,7 @@ def test_the_nodes_go_through_a_chain_as_one_process_does(loop):
     run, stages = acts_like(loop, 'shipped:recursion2', DEFAULT_PREDICTOR, recursion_depth=2,
                             num_samples=3, step_budget=3)  # these weights have but one sample
     chain = ['subgoal 1 of 2', 'subgoal 2 of 2', 'goal']  # one that is reached already is left out
-    assert stages == sorted(set(stages), key=chain.index) and len(stages) > 1
+    assert stages == sorted(stages, key=chain.index) and len(set(stages)) > 1
     assert stages[-1] == 'goal' and run.switches[-1] > 0
 
 

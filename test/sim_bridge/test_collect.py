@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the expert and of collecting: progress, variety, reproducibility, resuming."""
 
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -177,3 +178,37 @@ def test_a_damaged_file_is_made_anew(tmp_path):
     assert collect(folder, config, progress=False)['episodes'] == 1
     assert contents(folder) == before
     assert json.loads(before['collection.json'])['episodes'] == 2
+
+
+def test_a_recording_from_before_there_were_looks_is_not_gone_on_with_in_another(tmp_path):
+    folder = tmp_path / 'bag'
+    config = CollectConfig(task='grasp', episodes=1)
+    collect(folder, config, progress=False)
+    path = folder / 'collection.json'
+    settings = json.loads(path.read_text())
+    for name in ('look', 'appearance', 'frames', 'timing', 'misses'):
+        del settings[name]
+    path.write_text(json.dumps(settings))
+    with pytest.raises(ConfigError, match=r'other settings \(look\)'):
+        collect(folder, config, progress=False)
+    collect(folder, replace(config, look='plain'), progress=False)
+
+
+def test_pushes_at_random_miss_and_are_repeated_exactly(tmp_path):
+    episodes = {}
+    for name, misses in (('a', 1.0), ('b', 1.0), ('expert', 0.0)):
+        config = CollectConfig(episodes=2, seed=4, misses=misses)
+        collect(tmp_path / name, config, progress=False)
+        episodes[name] = list(iter_episodes(tmp_path / name))
+    for a, b in zip(episodes['a'], episodes['b']):
+        assert np.array_equal(a.actions, b.actions)
+    low = [e.grippers[:, 2] < 0.03 for e in episodes['a']]
+    still = [np.linalg.norm(np.diff(e.object_pixels, axis=0), axis=-1).max(1) < 0.05
+             for e in episodes['a']]
+    missed = sum((a[:-1] & a[1:] & b).sum() for a, b in zip(low, still))
+    assert missed > 5, 'low, and nothing moves'
+    assert all(e.outcome == 'failure' for e in episodes['a'])
+    for bad, words in (({'misses': 1.5}, 'misses is 1.5'),
+                       ({'misses': 0.5, 'task': 'grasp'}, 'grasp')):
+        with pytest.raises(ConfigError, match=words):
+            collect(tmp_path / 'bad', CollectConfig(episodes=1, **bad), progress=False)

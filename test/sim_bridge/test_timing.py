@@ -61,10 +61,11 @@ def test_shares_are_drawn_within_their_ranges():
     assert all(((low <= mixed) & (mixed <= high)).mean() > 0.2 for low, high in SHARES.values())
 
 
-def test_frames_and_timing_are_kept_beside_the_recording_unless_they_are_the_usual(tmp_path):
+def test_frames_and_timing_are_kept_beside_the_recording(tmp_path):
     usual, late = tmp_path / 'usual', tmp_path / 'late'
     collect(usual, CollectConfig(episodes=1, seed=4), progress=False)
-    assert not {'frames', 'timing'} & set(json.loads((usual / 'collection.json').read_text()))
+    kept = json.loads((usual / 'collection.json').read_text())
+    assert (kept['frames'], kept['timing']) == (0, 'natural')
     with pytest.raises(ConfigError, match='frames'):
         collect(usual, CollectConfig(episodes=1, seed=4, frames=20), progress=False)
     config = CollectConfig(episodes=1, seed=4, frames=20, timing='late')
