@@ -101,17 +101,17 @@ class DemoClient:
     The demo's own node: it resets the scene, asks for a subgoal and for pushes, and watches.
 
     :param processes: NodeProcesses to keep an eye on.
-    :param plans: whether there is a planner to be waited for.
+    :param task: what is done; where it is pushing, there is a planner to be waited for.
     """
 
-    def __init__(self, processes: NodeProcesses, plans: bool = True) -> None:
-        self.node = rclpy.create_node('demo')
+    def __init__(self, processes: NodeProcesses, task: str) -> None:
+        self.node = rclpy.create_node(f'demo_{task}')
         self._processes = processes
         self._reset = self.node.create_client(ResetScene, 'sim/reset')
         self._predict = self.node.create_client(
             PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS)
         self._reach = ActionClient(self.node, ReachGoal, 'reach_goal')
-        self._plans = plans
+        self._plans = not get_task(task).gripping
         self._alive = {name: Liveness(self.node, name) for name in (
             'sim_node', 'predictor_node', 'visual_mpc_node')}
         self._camera = Watch(self.node)
@@ -339,7 +339,7 @@ def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
     client = None
     try:
         with NodeProcesses(folder / 'logs' / task) as processes:
-            client = DemoClient(processes, not get_task(task).gripping)
+            client = DemoClient(processes, task)
             with Spinner(client.node):
                 if args.attach:
                     print(f'{task}: waiting for the nodes that run already', flush=True)
