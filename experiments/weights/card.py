@@ -57,7 +57,8 @@ def ship(recipe, bags, runs, out):
     commands = {step: shlex.join(['python', '-m', 'tap_ros', *words])
                 for step, words in recipe.commands('bags', 'runs/weights').items()}
     write_atomically(card, render(
-        'weights/templates/card.md.j2', file=file.name, task=recipe.task, commands=commands,
+        'weights/templates/card.md.j2', file=file.name, name=recipe.name, task=recipe.task,
+        commands=commands,
         run=json.loads((run / 'run.json').read_text()), method=about['settings']['method'],
         fresh=len(store), pushing=np.isfinite(scores['last frame']['prediction'].bottleneck).any(),
         scores=tabulate(scores), succeed=int(good[shown].sum()),

@@ -58,7 +58,7 @@ _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0
             '--start-crop 0.3 --batch-size 24 --decoder shared --goal-picture mixed')
 
 RECIPES = {recipe.name: recipe for recipe in (
-    Recipe('push2', 'push2', 750, f'{_PUSHING} --steps 3500'),
+    Recipe('push2', 'push2', 600, f'{_PUSHING} --steps 3500'),
     Recipe('stack2', 'stack2', 1000, f'{_GRIPPING} --steps 4000'),
     Recipe('grasp', 'grasp', 3000, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', 3000, f'{_GRIPPING} --steps 5000'),
