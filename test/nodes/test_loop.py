@@ -20,7 +20,7 @@ from tap_ros.nodes.clients import call, send_goal
 from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.predictor_node import OVERLAY_SCALE
-from tap_ros.nodes.topics import STREAM, to_stamp
+from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
@@ -151,9 +151,10 @@ def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
     moves = loop.moves()
     loop.reset()
-    moving = threading.Event()
-    send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30, lambda _: moving.set())
-    assert moving.wait(120)
+    begin = to_nanoseconds(loop.image.wait(30).header.stamp)
+    send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30)
+    # A step was made: the stop that the planner sends when it ends may overtake a command.
+    loop.image.wait(120, lambda m: to_nanoseconds(m.header.stamp) > begin)
     for name in ('visual_mpc_node', 'predictor_node', 'sim_node', 'recorder_node'):
         process = loop.processes[name]
         assert process.end() == 0, process.text
