@@ -2,28 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line of Table 2: python -m tap_ros evaluate planning."""
 
-from dataclasses import dataclass, replace
-import json
-from pathlib import Path
-import shlex
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from experiments.planning.films import write_films
-from experiments.planning.methods import parse_method
-from experiments.planning.page import make_page
-from experiments.planning.results import load_results, make_rows
-from experiments.planning.runs import Job, run_jobs
 from sim_bridge.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.contract import step_budget
 from tap_ros.engines.options import EngineOptions
-from tap_ros.errors import ConfigError
-from tap_ros.evaluation import forward
-from tap_ros.files import write_atomically, write_rows
 from tap_ros.options import Flag, Folder, one_of, ShippedFile
-from tap_ros.planning.hierarchy import SWITCHES
-from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.mpc_config import PRESETS, SWITCHES
 from tap_ros.planning.scenes import FIRST_SCENE, PAPER_TASKS, PLANNING_TASKS
-from tap_ros.weights import find_predictor, FORWARD_MODEL
+from tap_ros.weights import FORWARD_MODEL
 from tyro import conf
 
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
@@ -94,110 +82,5 @@ class Options:
 
 def run(args):
     """Run what is missing; write the numbers, the page and the films."""
-    if args.scenes < 1:
-        raise ConfigError('scenes must be at least 1')
-    out, films = Path(args.out), {}
-    if not args.results_only:
-        jobs = make_jobs(args)
-        seeds = range(args.seed, args.seed + args.scenes)
-        files = run_jobs(jobs, seeds, out / 'planning', args.engine)
-        _write_results(out, films)  # first: whatever happens to the films, these stay
-        for job, file in zip(jobs, files):
-            name = f'{job.task}-{job.method.file_name}'
-            if not args.no_films and job.method.base != 'nothing':
-                caption = write_films(job, file.scenes, out / 'planning' / f'{name}.png',
-                                      Path(args.recordings) / f'{name}.mcap')
-                films[job.task, job.method.name] = f'planning/{name}.png', caption
-    rows = _write_results(out, films)
-    for row in rows:
-        if row['metric'] == 'final_distance_cm':
-            print(f'  {row["task"]} {row["method"]:24} {row["value"]:5.1f} cm '
-                  f'[{row["ci_low"]:.1f}, {row["ci_high"]:.1f}], {row["n"]} scenes')
-    print(f'written: {out / "planning.json"}, {out / "planning.md"}')
-
-
-def _write_results(out, films):
-    """Write planning.json and planning.md from the scenes that were run; return the rows."""
-    rows = make_rows(load_results(out / 'planning'))
-    if not rows:
-        raise ConfigError(f'{out / "planning"}: holds no results; run without --results-only')
-    write_rows(out / 'planning.json', rows)
-    maps, findings = out / forward.FILE, out / 'planning_findings.md'
-    write_atomically(out / 'planning.md', make_page(
-        rows, find_films(out, rows) | films,
-        json.loads(maps.read_text()) if maps.exists() else (),
-        findings.read_text() if findings.exists() else ''))
-    return rows
-
-
-def make_jobs(args):
-    """
-    Return a Job for each task and method.
-
-    :raises ConfigError: for a method or predictor that cannot be used.
-    """
-    planner = with_preset(args.preset)
-    if args.plan_samples or args.plan_iterations or args.replan_every:
-        planner = changed(planner, args.plan_samples, args.plan_iterations, args.replan_every)
-    weights = {'shipped': '{task}'}
-    for text in args.predictor:
-        name, found, file = text.partition('=')
-        if not found:
-            raise ConfigError(f'--predictor {text}: expected NAME=FILE')
-        weights[name] = file
-    defaults = {'switch': args.switch, 'recursion': args.recursion, 'samples': args.samples,
-                'tracking': args.tracking}
-    methods = list(dict.fromkeys(parse_method(text, **defaults) for text in args.methods))
-    jobs = []
-    for task in args.tasks:
-        for method in methods:
-            file = ''
-            if method.predicted:
-                file = weights.get(method.base, TRAINED.replace('{name}', method.base))
-                file = str(find_predictor(file.replace('{task}', task)))
-                if not Path(file).is_file():
-                    raise ConfigError(
-                        f'method {method.name!r}: no weights {file}; train them with `python -m '
-                        f'tap_ros paper --only "{task}-bidirectional-{method.base}-warp-s0"`, '
-                        f'name them with --predictor {method.base}=FILE, or leave the method out '
-                        'with --methods')
-            jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
-                            args.step_budget, args.preset, _command(args, task, method),
-                            args.look))
-    return jobs
-
-
-def changed(planner, samples, iterations, replan_every):
-    """Return a VisualMPCConfig with what is not 0 changed, its other numbers in proportion."""
-    search = planner.search
-    share = (samples or search.num_samples) / search.num_samples
-    search = replace(
-        search, num_samples=samples or search.num_samples,
-        num_iterations=iterations or search.num_iterations,
-        num_elites=max(2, round(share * search.num_elites)) if samples else search.num_elites)
-    return replace(planner, search=search, proposals=int(share * planner.proposals),
-                   replan_every=replan_every or planner.replan_every)
-
-
-def find_films(out, rows):
-    """Return the film strips that are there: {(task, method): (file name in out, caption)}."""
-    keys = dict.fromkeys((row['task'], row['method']) for row in rows)
-    names = {key: f'planning/{key[0]}-{parse_method(key[1]).file_name}.png' for key in keys}
-    return {key: (name, 'the best, the median and the worst scene')
-            for key, name in names.items() if (out / name).exists()}
-
-
-def _command(args, task, method):
-    """Return the command that makes the numbers of one method again."""
-    words = ['python -m tap_ros evaluate planning --tasks', task, '--methods', method.name,
-             '--scenes', str(args.scenes)]
-    for option, usual in (('look', DEFAULT_LOOK), ('seed', FIRST_SCENE), ('preset', 'default'),
-                          ('plan_samples', 0), ('plan_iterations', 0), ('replan_every', 0),
-                          ('step_budget', 0), ('forward_weights', str(FORWARD_MODEL)),
-                          ('device', 'cpu')):
-        value = getattr(args, option)
-        if value != usual:
-            words += ['--' + option.replace('_', '-'), shlex.quote(str(value))]
-    words += [word for text in args.predictor if text.split('=')[0] == method.base
-              for word in ('--predictor', shlex.quote(text))]
-    return ' '.join(words)
+    from experiments.planning.evaluate import evaluate  # torch takes seconds, --help does without
+    evaluate(args)

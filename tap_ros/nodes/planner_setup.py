@@ -18,8 +18,7 @@ from tap_ros.nodes.arm_joints import declare_mount, declare_opening
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.forward_model import ForwardModel
-from tap_ros.planning.hierarchy import SWITCHES
-from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.mpc_config import PRESETS, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.text import escaped

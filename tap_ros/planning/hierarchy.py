@@ -19,13 +19,12 @@ from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.expected_distance import distances_to_all_pixels
+from tap_ros.planning.mpc_config import SWITCHES
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 
 if TYPE_CHECKING:
     from tap_ros.prediction.predictor import Subgoal
-
-SWITCHES = ('reached', 'half')
 
 
 @dataclass(frozen=True)

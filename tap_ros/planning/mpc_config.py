@@ -10,6 +10,8 @@ from tap_ros.errors import ConfigError
 from tap_ros.planning.action_sequences import HORIZON, Limits, SequenceShape
 from tap_ros.planning.cem import CEMConfig
 
+SWITCHES = ('reached', 'half')  # when to go on from a subgoal, see hierarchy.py
+
 
 @dataclass(frozen=True)
 class VisualMPCConfig:

@@ -10,7 +10,7 @@ from experiments.paper.page import make_page as make_prediction_page
 from experiments.paper.results import load_runs, on_same_recordings, told_apart
 from experiments.paper.rows import as_frame, group_runs, make_rows
 from experiments.planning import results as planning
-from experiments.planning.command import find_films
+from experiments.planning.evaluate import find_films
 from experiments.planning.page import make_page as make_planning_page
 from tap_ros.evaluation import forward
 
