@@ -54,11 +54,11 @@ def ship(recipe, bags, runs, out):
     shown = [*np.flatnonzero(good)[:PICTURED], *np.flatnonzero(~good)[:PICTURED]]
     write_pictures(file.with_suffix('.png'), network, store, shown, 'last')
     card = file.with_suffix('.md')
-    commands = {step: shlex.join(['python', '-m', 'tap_ros', *words])
-                for step, words in recipe.commands('bags', 'runs/weights').items()}
+    *collect, again, train = (shlex.join(['python', '-m', 'tap_ros', *words])
+                              for words in recipe.commands('bags', 'runs/weights'))
     write_atomically(card, render(
         'weights/templates/card.md.j2', file=file.name, name=recipe.name, task=recipe.task,
-        commands=commands,
+        collect=collect, again=again, train=train,
         run=json.loads((run / 'run.json').read_text()), method=about['settings']['method'],
         fresh=len(store), pushing=np.isfinite(scores['last frame']['prediction'].bottleneck).any(),
         scores=tabulate(scores), succeed=int(good[shown].sum()),

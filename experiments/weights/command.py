@@ -44,7 +44,7 @@ def run(args):
     """
     for name in args.only or RECIPES:
         recipe = RECIPES[name]
-        for words in recipe.commands(args.bags, args.runs).values():
+        for words in recipe.commands(args.bags, args.runs):
             if words[0] == 'train':
                 words = [*words, '--threads', str(args.threads)]
             print(shlex.join(['python', '-m', 'tap_ros', *words]), flush=True)

@@ -20,37 +20,35 @@ class Recipe:
 
     :param name: of the weights, as `SubgoalPredictor.load` takes it.
     :param task: of its scenes.
-    :param episodes: to collect from seed 0 on.
+    :param collections: options of `collect` beside the task, by names of folders.
     :param train: options of `train` beside recordings and folder.
     """
 
     name: str
     task: str
-    episodes: int
+    collections: dict[str, str]
     train: str
-
-    def recording(self, folder: str | Path) -> Path:
-        """Return the folder of the recording that it is trained on."""
-        return Path(folder, self.task)
 
     def fresh(self, folder: str | Path) -> Path:
         """Return the folder of the recording of scenes that it never saw."""
         return Path(folder, f'fresh_{self.task}')
 
-    def commands(self, bags: str | Path, runs: str | Path) -> dict[str, list[str]]:
+    def commands(self, bags: str | Path, runs: str | Path) -> list[list[str]]:
         """
         Return the words behind `python -m tap_ros` of each step, in order.
 
         :param bags: folder of recordings; runs: of trainings.
-        :return: dict with 'collect', 'fresh' and 'train'.
+        :return: list: one or several that collect, one of fresh scenes, and that of the training.
         """
-        collect = ['collect', '--task', self.task, '--episodes']
-        recording, fresh = str(self.recording(bags)), str(self.fresh(bags))
-        return {
-            'collect': [*collect, str(self.episodes), '--out', recording],
-            'fresh': [*collect, str(FRESH_EPISODES), '--seed', str(FRESH_SEED), '--out', fresh],
-            'train': ['train', '--recordings', recording, '--out', str(Path(runs, self.name)),
-                      *shlex.split(self.train)]}
+        collect = ['collect', '--task', self.task]
+        folders = [str(Path(bags, name)) for name in self.collections]
+        return [
+            *([*collect, *shlex.split(options), '--out', folder]
+              for folder, options in zip(folders, self.collections.values())),
+            [*collect, '--episodes', str(FRESH_EPISODES), '--seed', str(FRESH_SEED),
+             '--out', str(self.fresh(bags))],
+            ['train', '--recordings', *folders, '--out', str(Path(runs, self.name)),
+             *shlex.split(self.train)]]
 
 
 # With the arm elsewhere in half of the goal pictures, one decoder learns faster than three.
@@ -58,8 +56,9 @@ _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0
             '--start-crop 0.3 --batch-size 24 --decoder shared --goal-picture mixed')
 
 RECIPES = {recipe.name: recipe for recipe in (
-    Recipe('push2', 'push2', 600, f'{_PUSHING} --steps 3500'),
-    Recipe('stack2', 'stack2', 1000, f'{_GRIPPING} --steps 4000'),
-    Recipe('grasp', 'grasp', 3000, f'{_GRIPPING} --steps 4000'),
-    Recipe('pick_place', 'pick_place', 3000, f'{_GRIPPING} --steps 5000'),
+    Recipe('push2', 'push2', {'push2': '--episodes 600'}, f'{_PUSHING} --steps 3500'),
+    Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),
+    Recipe('grasp', 'grasp', {'grasp': '--episodes 3000'}, f'{_GRIPPING} --steps 4000'),
+    Recipe('pick_place', 'pick_place', {'pick_place': '--episodes 3000'},
+           f'{_GRIPPING} --steps 5000'),
 )}

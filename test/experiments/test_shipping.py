@@ -15,8 +15,10 @@ from tap_ros.evaluation.prediction import EpisodeScores
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import PREDICTORS
 
-TINY = Recipe('tiny', 'grasp', 30, '--method genmin-wo-gan --steps 2 --batch-size 2 '
-              '--base-width 4 --goal-picture last')
+TINY = Recipe('tiny', 'grasp', {'grasp': '--episodes 30',
+                                'light': '--episodes 2 --appearance lighter_table'},
+              '--method genmin-wo-gan --steps 2 --batch-size 2 --base-width 4 '
+              '--goal-picture last')
 
 
 @pytest.fixture
@@ -40,8 +42,9 @@ def test_weights_are_made_from_nothing_and_their_card_says_how(places, capfd):
     card = file.with_suffix('.md').read_text()
     for text in ('python -m tap_ros collect --task grasp --episodes 30 --out bags/grasp',
                  'python -m tap_ros collect --task grasp --episodes 3 --seed 900000',
-                 'python -m tap_ros train --recordings bags/grasp', '--steps 2', 'copy-start',
-                 'last frame', f'({file.stem}.png)', '3 scenes'):
+                 '--episodes 2 --appearance lighter_table --out bags/light',
+                 'python -m tap_ros train --recordings bags/grasp bags/light', '--steps 2',
+                 'copy-start', 'last frame', f'({file.stem}.png)', '3 scenes'):
         assert text in card
     assert file.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
 
@@ -53,7 +56,8 @@ def test_weights_are_made_from_nothing_and_their_card_says_how(places, capfd):
 def test_the_list_is_of_commands_that_exist(places, capsys):
     assert command.run(command.Options(list=True, **places)) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 3 * len(RECIPES) and not Path(places['runs']).exists()
+    assert len(lines) == sum(2 + len(recipe.collections) for recipe in RECIPES.values())
+    assert not Path(places['runs']).exists()
     for line in lines:
         words = line.split()[3:]
         with pytest.raises(SystemExit) as ended:
