@@ -53,10 +53,12 @@ class Recipe:
 
 # With the arm elsewhere in half of the goal pictures, one decoder learns faster than three.
 _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0.5 '
-            '--start-crop 0.3 --batch-size 24 --decoder shared --goal-picture mixed')
+            '--start-crop 0.3 --batch-size 24 --decoder shared --skips --goal-picture mixed')
 
 RECIPES = {recipe.name: recipe for recipe in (
-    Recipe('push2', 'push2', {'push2': '--episodes 600'}, f'{_PUSHING} --steps 3500'),
+    Recipe('push2', 'push2', {
+        'push2': '--episodes 1800', 'push2_random': '--episodes 1200 --appearance random'},
+        f'{_PUSHING} --steps 10000'),
     Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('grasp', 'grasp', {'grasp': '--episodes 3000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', {'pick_place': '--episodes 3000'},

@@ -3,10 +3,12 @@
 """Which episodes a network is trained on, and which it is measured on."""
 
 from typing import TYPE_CHECKING
+import warnings
 import zlib
 
 import numpy as np
 from tap_ros.errors import RecordingError
+from tap_ros.recording.episode import RecordingWarning
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
@@ -20,7 +22,8 @@ def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
     Split episodes into training and held-out ones, by task and seed.
 
     Episodes of the same scene land on the same side, whichever recording they are in.
-    Recordings without seeds are split by position.
+    Recordings without seeds are split by position. Of two scenes or more one is always held out,
+    unless the share is 0.
 
     :param store: the EpisodeStore.
     :param test_fraction: the held-out share, 0..1.
@@ -36,8 +39,19 @@ def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
     if len(set(keys)) == 1:
         keys = usable
     # A hash rather than a random draw: adding episodes moves none to the other side.
-    held = np.array([zlib.crc32(repr(key).encode()) < test_fraction * 2 ** 32 for key in keys])
-    usable = np.array(usable)
+    hashes = np.array([zlib.crc32(repr(key).encode()) for key in keys])
+    held = hashes < test_fraction * 2 ** 32
+    if test_fraction and not held.any():
+        held = hashes == hashes.min()
     if held.all():
         held[0] = False
-    return usable[~held], usable[held]
+    chosen = np.array(usable)
+    return chosen[~held], chosen[held]
+
+
+def warn_if_none(held_out: np.ndarray) -> None:
+    """Say before a training that nothing will be measured, as no episode is held out."""
+    if not len(held_out):
+        warnings.warn('recordings: no episode is held out, so nothing is measured; record at '
+                      'least two, and give a --test-fraction above 0', RecordingWarning,
+                      stacklevel=3)

@@ -22,7 +22,7 @@ from tap_ros.learning.panels import grey_panels
 from tap_ros.learning.robot_mask import fill_from_past
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
 from tap_ros.learning.schedule import learning_rate
-from tap_ros.learning.split import split_episodes
+from tap_ros.learning.split import split_episodes, warn_if_none
 from tap_ros.learning.weights import save_weights
 from tap_ros.pictures import grid
 from tap_ros.planning.forward_data import draw_windows, Windows
@@ -69,6 +69,7 @@ def _train(config: ForwardTrainingConfig, device: torch.device, store: EpisodeSt
     """Train as the only process in the folder; see train."""
     training, held_out = with_masks(
         store, split_episodes(store, config.test_fraction, config.horizon + 1), config.robot_mask)
+    warn_if_none(held_out)
     torch.manual_seed(config.seed)
     state = start(
         ForwardModel(model_config(config, store, training)), config.learning_rate, device)

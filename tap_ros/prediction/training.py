@@ -22,7 +22,7 @@ from tap_ros.learning.frames import Frames, MappedFrames, ResidentFrames
 from tap_ros.learning.parallel import joined, Processes, share_batch_norm
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
 from tap_ros.learning.schedule import learning_rate, match_temperature
-from tap_ros.learning.split import split_episodes
+from tap_ros.learning.split import split_episodes, warn_if_none
 from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch, episode_order, make_batch, Sampling
@@ -87,6 +87,7 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
     """Train as the only run in the folder; see train."""
     training, held_out = with_masks(
         store, split_episodes(store, config.test_fraction), config.robot_mask)
+    warn_if_none(held_out)
     torch.manual_seed(config.seed)
     network = Predictor(network_config(config, store.image_size))
     checkpoint = Path(config.out) / 'checkpoint.safetensors'

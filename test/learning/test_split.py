@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tap_ros.errors import RecordingError
-from tap_ros.learning.split import split_episodes
+from tap_ros.learning.split import split_episodes, warn_if_none
+from tap_ros.recording.episode import RecordingWarning
 
 
 class Store:
@@ -43,6 +44,22 @@ def test_recordings_without_seeds_are_split_by_position():
 def test_something_is_left_to_train_on():
     training, held_out = split_episodes(Store(range(3)), 1.0)
     assert training.tolist() == [0] and held_out.tolist() == [1, 2]
+
+
+def test_one_of_several_scenes_is_always_held_out():
+    for seeds in (range(2), range(20), [None] * 3):
+        training, held_out = split_episodes(Store(seeds), 0.001)
+        assert len(held_out) == 1 and len(training) == len(seeds) - 1
+    training, held_out = split_episodes(Store([5, 8, 5, 8]), 0.001)
+    assert len(held_out) == 2 and {i % 2 for i in training}.isdisjoint(i % 2 for i in held_out)
+    assert not len(split_episodes(Store(range(20)), 0.0)[1])
+
+
+def test_a_lone_episode_is_trained_on_and_a_warning_says_so():
+    training, held_out = split_episodes(Store([7]), 0.05)
+    assert training.tolist() == [0] and not len(held_out)
+    with pytest.warns(RecordingWarning, match='no episode is held out'):
+        warn_if_none(held_out)
 
 
 def test_nothing_to_train_on_is_said():

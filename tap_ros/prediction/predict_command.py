@@ -1,0 +1,196 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m tap_ros predict`: subgoals from picture files, as a labelled picture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import io
+from pathlib import Path
+from typing import Annotated, TYPE_CHECKING
+
+import cv2
+import numpy as np
+from tap_ros.errors import ConfigError, ImageError
+from tap_ros.files import write_atomically
+from tap_ros.images import in_picture
+from tap_ros.options import File
+from tap_ros.text import escaped
+from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
+from tyro import conf
+
+if TYPE_CHECKING:
+    from tap_ros.prediction.predictor import Subgoal
+
+PANEL = 2.6  # inches, side of a picture
+DPI = 100
+FAINT = 0.85  # mass of a map, below which an object is hardly in the prediction
+
+_Pixels = conf.arg(metavar='U,V [U,V ...]', help_behavior_hint='(default: none)')
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param start: picture file, square.
+    :param goal: likewise; left out for weights that predict from the start alone.
+    :param objects: where the objects are in the start picture: column and row of each, in the
+        pixels of the file.
+    :param goal_objects: where the same objects are in the goal picture, in the same order.
+    :param samples: how many to draw of weights with z.
+    :param recursion: subgoals in a row.
+    :param seed: of z; the same one draws the same samples.
+    :param out: PNG file to write: start, goal and subgoals, with maps of where objects are then.
+    """
+
+    start: Annotated[conf.Positional[str], conf.arg(metavar='START')]
+    goal: Annotated[conf.Positional[str], conf.arg(
+        metavar='GOAL', help_behavior_hint='(default: none)')] = ''
+    weights: Annotated[str, conf.arg(
+        metavar='FILE', help=f'a file, or shipped ones: {", ".join(PREDICTORS)}.'
+    )] = DEFAULT_PREDICTOR
+    objects: Annotated[tuple[str, ...], _Pixels] = ()
+    goal_objects: Annotated[tuple[str, ...], _Pixels] = ()
+    samples: int = 1
+    recursion: int = 1
+    seed: int = 0
+    out: File = 'subgoal.png'
+
+
+def run(args: Options) -> None:
+    """
+    Predict, print where the objects should then be, and write the picture.
+
+    :raises TapError: for a file, pixels or weights that cannot be used, saying why.
+    """
+    from tap_ros.prediction.predictor import SubgoalPredictor  # torch takes seconds
+    predictor = SubgoalPredictor.load(args.weights)
+    size = predictor.image_size
+    pictures = {'start': read_picture(args.start)}
+    if args.goal:
+        pictures['goal'] = read_picture(args.goal)
+    pixels = {'start': read_pixels(args.objects, '--objects'),
+              'goal': read_pixels(args.goal_objects, '--goal-objects')}
+    if args.goal and len(pixels['start']) != len(pixels['goal']):
+        raise ConfigError(
+            f'--goal-objects: expected {len(pixels["start"])} positions, one for each of '
+            f'--objects, got {len(pixels["goal"])}; say where they are in the goal picture')
+    scaled, places = {}, {}
+    for name, picture in pictures.items():
+        scaled[name], places[name] = fit(picture, pixels[name], size, name)
+    subgoals = predictor.predict(
+        scaled['start'], scaled.get('goal'), places['start'], places.get('goal'),
+        num_samples=args.samples, recursion_depth=args.recursion, seed=args.seed)
+    factor = np.array(pictures['start'].shape[1::-1]) / size[::-1]
+    for subgoal in subgoals:
+        print(f'{_title(subgoal, len(subgoals))}{":" if len(places["start"]) else ""}')
+        for k, (where, mass) in enumerate(zip(subgoal.expected_pixels, subgoal.mass), start=1):
+            u, v = (where + 0.5) * factor - 0.5
+            faint = ', hardly in the picture' if mass < FAINT else ''
+            print(f'  object {k} at {u:.1f},{v:.1f} (mass {mass:.2f}{faint})')
+    write_atomically(args.out, labelled(scaled, places, subgoals))
+    print(f'written: {escaped(args.out)}')
+
+
+def read_picture(path: str | Path) -> np.ndarray:
+    """
+    Read a picture file.
+
+    :param path: of a PNG, JPEG or anything else that OpenCV reads.
+    :return: uint8 (H, W, 3) rgb.
+    :raises ImageError: when it is not there or is no picture.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if Path(path).is_file() else None
+    if image is None:
+        raise ImageError(f'{escaped(path)}: '
+                         + ('is no picture that can be read; give a PNG or JPEG file'
+                            if Path(path).exists() else 'is not there; give a picture file'))
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
+    """
+    Read positions.
+
+    :param words: list of 'u,v'.
+    :param option: that they were given with.
+    :return: float32 (K, 2), (u, v).
+    :raises ConfigError: for a word that is none.
+    """
+    pixels = []
+    for word in words:
+        try:
+            u, v = (float(number) for number in word.split(','))
+        except ValueError:
+            raise ConfigError(f'{option} {escaped(word)}: expected column,row of an object, such '
+                              'as 20,30') from None
+        pixels.append((u, v))
+    return np.array(pixels, np.float32).reshape(-1, 2)
+
+
+def fit(picture: np.ndarray, pixels: np.ndarray, size: Sequence[int],
+        name: str) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Scale a picture, and positions in it, to what the weights take; pixels are averaged.
+
+    :param picture: uint8 (H, W, 3), as wide as high if `size` is.
+    :param pixels: (K, 2), (u, v) in it.
+    :param size: (height, width).
+    :param name: how errors call it.
+    :return: uint8 (height, width, 3) and float32 (K, 2).
+    :raises ImageError: for another shape, or a position outside.
+    """
+    H, W = picture.shape[:2]
+    if W * size[0] != H * size[1]:
+        raise ImageError(f'{name}: {W}x{H} pixels (width x height); the weights take pictures of '
+                         f'the shape {size[1]}x{size[0]}, cut it to that first')
+    if not in_picture(pixels, (H, W)).all():
+        raise ImageError(f'{name}: an object is outside its {W}x{H} pixels; expected column,row '
+                         'in the picture as it is in the file')
+    factor = np.array([size[1] / W, size[0] / H], np.float32)
+    scaled = cv2.resize(picture, (size[1], size[0]), interpolation=cv2.INTER_AREA)
+    return scaled, ((pixels + 0.5) * factor - 0.5).astype(np.float32)
+
+
+def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
+             subgoals: Sequence['Subgoal']) -> bytes:
+    """
+    Draw a picture for people.
+
+    :param pictures: 'start' and perhaps 'goal', uint8 (H, W, 3).
+    :param pixels: of the objects in these, (K, 2) each.
+    :param subgoals: list of Subgoal; a row for each, its maps beside it where there are objects.
+    :return: bytes of a PNG file.
+    """
+    from matplotlib.figure import Figure
+    from tap_ros.pictures import OBJECT_COLOURS, overlay
+    count = len(pixels['start'])
+    columns = len(pictures) + 1 + bool(count)
+    figure = Figure(figsize=(PANEL * columns, (PANEL + 0.3) * len(subgoals)), dpi=DPI,
+                    layout='constrained')
+    axes = figure.subplots(len(subgoals), columns, squeeze=False)
+    for row, subgoal in zip(axes, subgoals):
+        panels = [(name, picture, pixels[name]) for name, picture in pictures.items()]
+        panels.append((_title(subgoal, len(subgoals)), subgoal.image, pixels['start'][:0]))
+        if count:
+            panels.append(('where the objects are then', overlay(
+                subgoal.image, subgoal.object_maps), subgoal.expected_pixels))
+        for panel, (title, picture, marks) in zip(row, panels):
+            panel.imshow(picture, interpolation='nearest')
+            panel.set_title(title, fontsize=10)
+            panel.set_axis_off()
+            for k, (u, v) in enumerate(marks):
+                colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)]) / 255
+                panel.annotate(
+                    str(k + 1), (u, v), xytext=(8, 8), textcoords='offset points', color='white',
+                    fontsize=9, arrowprops={'arrowstyle': '-', 'color': colour},
+                    bbox={'boxstyle': 'circle,pad=0.15', 'facecolor': colour, 'linewidth': 0})
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='png')
+    return buffer.getvalue()
+
+
+def _title(subgoal: 'Subgoal', count: int) -> str:
+    """Say which subgoal it is."""
+    return 'subgoal' if count == 1 else f'sample {subgoal.sample + 1}, level {subgoal.level}'

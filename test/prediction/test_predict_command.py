@@ -1,0 +1,98 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""`python -m tap_ros predict` on picture files."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+from tap_ros.cli import main
+from tap_ros.prediction.predict_command import fit
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.recording.reader import iter_episodes
+
+
+@pytest.fixture(scope='module')
+def episode():
+    return next(iter_episodes('bags/sample_push2'))
+
+
+@pytest.fixture
+def files(episode, tmp_path):
+    paths = [tmp_path / 'start.png', tmp_path / 'goal.png']
+    for path, frame, scale in zip(paths, (episode.frames[0], episode.frames[-1]), (3, 1)):
+        cv2.imwrite(str(path), frame[..., ::-1].repeat(scale, 0).repeat(scale, 1))
+    return [str(path) for path in paths]
+
+
+def words(pixels):
+    return [f'{u},{v}' for u, v in pixels]
+
+
+def test_it_predicts_what_the_predictor_does_in_the_pixels_of_the_start_picture(
+        episode, files, tmp_path, capsys):
+    start, goal = episode.object_pixels[[0, -1]]
+    out = tmp_path / 'a' / 'subgoal.png'
+    assert main(['predict', *files, '--objects', *words((start + 0.5) * 3 - 0.5),
+                 '--goal-objects', *words(goal), '--out', str(out)]) == 0
+    subgoal, = SubgoalPredictor.load('push2').predict(
+        episode.frames[0], episode.frames[-1], start, goal)
+    told = capsys.readouterr().out
+    found = np.array(re.findall(r'object \d at ([\d.]+),([\d.]+)', told), float)
+    assert found == pytest.approx((subgoal.expected_pixels + 0.5) * 3 - 0.5, abs=0.2)
+    assert str(out) in told
+    picture = cv2.imread(str(out))
+    assert picture.shape[1] > 3 * picture.shape[0] and picture.std() > 20
+
+
+def test_without_objects_pictures_alone_are_predicted_and_samples_are_rows(
+        files, tmp_path, capsys):
+    sizes = []
+    for samples in '13':
+        out = tmp_path / f'{samples}.png'
+        assert main(['predict', *files, '--weights', 'push2_vae', '--samples', samples,
+                     '--out', str(out)]) == 0
+        sizes.append(cv2.imread(str(out)).shape)
+    assert 'object 1' not in capsys.readouterr().out
+    assert sizes[1][0] == 3 * sizes[0][0] and sizes[1][1] == sizes[0][1]
+
+
+def test_weights_that_predict_forward_need_no_goal(files, tmp_path):
+    out = tmp_path / 'later.png'
+    assert main(['predict', files[0], '--weights', 'grasp_forward', '--objects', '30,40',
+                 '--out', str(out)]) == 0
+    assert out.exists()
+
+
+@pytest.mark.parametrize('change, named', [
+    (['--objects', '1,2', '3,4'], '--goal-objects'), (['--objects', '20'], '--objects 20'),
+    (['--objects', '500,2', '--goal-objects', '1,2'], 'outside its 192x192'),
+    (['--objects', 'nan,2', '--goal-objects', '1,2'], 'outside'),
+    (['--weights', 'none.safetensors'], 'none.safetensors'),
+    (['--weights', 'grasp_forward'], 'goal'), (['--samples', '0'], 'num_samples')])
+def test_what_cannot_be_used_is_named_and_nothing_is_written(
+        files, tmp_path, capsys, change, named):
+    out = tmp_path / 'subgoal.png'
+    assert main(['predict', *files, '--out', str(out), *change]) == 1
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1 and named in error
+    assert not out.exists()
+
+
+@pytest.mark.parametrize('name, named', [
+    ('absent.png', 'is not there'), ('text.png', 'is no picture'), ('wide.png', '96x64')])
+def test_a_file_that_is_no_square_picture_is_named(files, tmp_path, capsys, name, named):
+    (tmp_path / 'text.png').write_text('not a picture')
+    cv2.imwrite(str(tmp_path / 'wide.png'), np.zeros((64, 96, 3), np.uint8))
+    assert main(['predict', str(tmp_path / name), files[1]]) == 1
+    assert named in capsys.readouterr().err
+
+
+def test_pictures_are_averaged_and_positions_scaled_with_them():
+    rng = np.random.default_rng(0)
+    small = rng.integers(0, 256, (8, 8, 3), np.uint8)
+    large = small.repeat(4, 0).repeat(4, 1)
+    picture, pixels = fit(large, np.array([[1.5, 1.5], [31.5, -0.5]]), (8, 8), 'start')
+    assert (picture == small).all()
+    assert pixels == pytest.approx(np.array([[0, 0], [7.5, -0.5]]))
