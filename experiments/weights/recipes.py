@@ -57,10 +57,10 @@ _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0
 
 RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push2', 'push2', {
-        'push2': '--episodes 1800', 'push2_random': '--episodes 1200 --appearance random'},
-        f'{_PUSHING} --steps 10000'),
+        'push2': '--episodes 1800', 'push2_random': '--episodes 3000 --appearance random'},
+        f'{_PUSHING} --steps 8000'),
     Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('grasp', 'grasp', {'grasp': '--episodes 3000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', {'pick_place': '--episodes 3000'},
-           f'{_GRIPPING} --steps 5000'),
+           f'{_GRIPPING} --steps 10000'),
 )}
