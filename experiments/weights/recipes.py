@@ -59,6 +59,8 @@ RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push2', 'push2', {
         'push2': '--episodes 1800', 'push2_random': '--episodes 3000 --appearance random'},
         f'{_PUSHING} --steps 8000'),
+    Recipe('order2', 'order2', {'order2': '--episodes 600'},
+           f'{_PUSHING} --initial-weights push2 --steps 2500'),
     Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('grasp', 'grasp', {'grasp': '--episodes 3000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', {'pick_place': '--episodes 3000'},

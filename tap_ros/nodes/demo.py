@@ -50,7 +50,7 @@ from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tqdm import tqdm
 from tyro import conf
 
-USUAL_TASKS = ('push2', 'stack2')
+USUAL_TASKS = ('push2', 'order2', 'stack2')
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 MODES = ('direct', 'subgoal')
 START_TIMEOUT_S = 90.0
@@ -280,7 +280,7 @@ class Options:
 
     :param scenes: how many of each task.
     :param seed: of the first scene of each task.
-    :param tasks: what is to be done in them; none named: push2 and stack2, or with attach
+    :param tasks: what is to be done in them; none named: push2, order2 and stack2, or with attach
         push2.
     :param look: of the world, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
