@@ -52,7 +52,7 @@ class Task:
     kind: str = 'push'  # or 'grasp', 'pick_place', 'stack'
     reach: tuple[float, float] = (0.0, 0.0)  # m, nearest and farthest start, for grasps
     lift: float = 0.0  # m, height of the goal above the table
-    ordered: bool = False  # the wrong order of pushes fails
+    ordered: bool = False  # the wrong order of pushes makes it hard
     stream: int = 0  # of random numbers, besides the seed; no two tasks have the same
 
     @property
@@ -144,7 +144,7 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0) -> Scene:
 
 
 def _sample_ordered(task: Task, seed: int, rng: np.random.Generator) -> Scene:
-    """Draw a scene in which the wrong order of pushes fails."""
+    """Draw a scene in which the order of pushes matters."""
     shapes = draw_shapes(rng, task.num_objects)
     starts, goals, hand = draw_chain(rng, task.num_objects)
     # So that a name, or a place in a list, does not tell the order.

@@ -59,6 +59,7 @@ RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push2', 'push2', {
         'push2': '--episodes 1800', 'push2_random': '--episodes 3000 --appearance random'},
         f'{_PUSHING} --steps 8000'),
+    # Begins with the push2 that is installed, not with the one made just before.
     Recipe('order2', 'order2', {'order2': '--episodes 600'},
            f'{_PUSHING} --initial-weights push2 --steps 2500'),
     Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),

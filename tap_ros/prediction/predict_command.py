@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 PANEL = 2.6  # inches, side of a picture
 DPI = 100
-FAINT = 0.85  # mass of a map, below which an object is hardly in the prediction
+FAINT = 0.5  # mass of a map, below which an object is hardly in the prediction
 
 _Pixels = conf.arg(metavar='U,V [U,V ...]', help_behavior_hint='(default: none)')
 
@@ -65,6 +65,10 @@ def run(args: Options) -> None:
     :raises TapError: for a file, pixels or weights that cannot be used, saying why.
     """
     from tap_ros.prediction.predictor import SubgoalPredictor  # torch takes seconds
+    if Path(args.out).suffix.lower() != '.png':
+        raise ConfigError(f'--out {escaped(args.out)}: expected a .png file')
+    if Path(args.out).resolve() in (Path(args.start).resolve(), Path(args.goal).resolve()):
+        raise ConfigError(f'--out {escaped(args.out)}: is a picture to predict from; give another')
     predictor = SubgoalPredictor.load(args.weights)
     size = predictor.image_size
     pictures = {'start': read_picture(args.start)}
@@ -72,10 +76,12 @@ def run(args: Options) -> None:
         pictures['goal'] = read_picture(args.goal)
     pixels = {'start': read_pixels(args.objects, '--objects'),
               'goal': read_pixels(args.goal_objects, '--goal-objects')}
+    if not args.goal and len(pixels['goal']):
+        raise ConfigError('--goal-objects: there is no goal picture; name it behind the start')
     if args.goal and len(pixels['start']) != len(pixels['goal']):
         raise ConfigError(
-            f'--goal-objects: expected {len(pixels["start"])} positions, one for each of '
-            f'--objects, got {len(pixels["goal"])}; say where they are in the goal picture')
+            f'--objects and --goal-objects: {len(pixels["start"])} and {len(pixels["goal"])} '
+            'positions; give those of the same objects in both pictures')
     scaled, places = {}, {}
     for name, picture in pictures.items():
         scaled[name], places[name] = fit(picture, pixels[name], size, name)
@@ -132,7 +138,7 @@ def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
 def fit(picture: np.ndarray, pixels: np.ndarray, size: Sequence[int],
         name: str) -> tuple[np.ndarray, np.ndarray]:
     """
-    Scale a picture, and positions in it, to what the weights take; pixels are averaged.
+    Scale a picture, and positions in it, to what the weights take; several pixels are averaged.
 
     :param picture: uint8 (H, W, 3), as wide as high if `size` is.
     :param pixels: (K, 2), (u, v) in it.

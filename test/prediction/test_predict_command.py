@@ -80,6 +80,17 @@ def test_what_cannot_be_used_is_named_and_nothing_is_written(
     assert not out.exists()
 
 
+def test_the_picture_is_a_png_beside_the_others(files, tmp_path, capsys):
+    before = [open(file, 'rb').read() for file in files]
+    for out in (*files, str(tmp_path / 'subgoal.jpg')):
+        assert main(['predict', *files, '--out', out]) == 1
+        assert f'--out {out}' in capsys.readouterr().err
+    assert [open(file, 'rb').read() for file in files] == before
+    assert main(['predict', files[0], '--weights', 'grasp_forward', '--goal-objects', '1,2',
+                 '--out', str(tmp_path / 'a.png')]) == 1
+    assert 'no goal picture' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('name, named', [
     ('absent.png', 'is not there'), ('text.png', 'is no picture'), ('wide.png', '96x64')])
 def test_a_file_that_is_no_square_picture_is_named(files, tmp_path, capsys, name, named):
