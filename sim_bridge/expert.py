@@ -42,9 +42,9 @@ class ExpertConfig:
     num_elites: int = 5
     explore: float = 0.1  # probability that a random sample is executed instead of the best
     preference: float = 0.04  # m, spread of the whim for pushing one object before another
-    nearest: float = 0.12  # m, worth of pushing first what is nearest to the gripper at the start
+    nearest: float = 0.3  # m, worth of pushing the first object home before the next one
     step_cost: float = 0.001  # m per control period
-    done_distance: float = 0.02  # m, an object this near its goal is left alone
+    done_distance: float = 0.025  # m, an object this near its goal is left alone
     wander: tuple[int, int] = (5, 10)  # control periods of a random walk before the first push
     travel_speed: tuple[float, float] = (0.06, 0.08)  # m per control period
     push_speed: tuple[float, float] = (0.03, 0.055)
