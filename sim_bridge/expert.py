@@ -5,11 +5,12 @@ The expert that generates the data: a cross-entropy method with the true simulat
 
 A sample is one push: go behind an object, come down, push. Samples are rolled out in the true
 physics, all at once; the best are refitted; the best push of all is executed and the search begins
-anew from where things then lie. The object nearest to the gripper mostly comes first. How fast and
-how far it is pushed, and whether that succeeds, varies from episode to episode, as the paper's
-non-deterministic planner gives. Where the order matters, all orders are tried in the
-simulator before each push, see push_order.py. Proposing whole pushes rather than independent
-displacements is our deviation: a few dozen samples then suffice.
+anew from where things then lie. The object nearest to the gripper mostly comes first, and is
+mostly brought home before the next one is touched. How fast and how far it is pushed, and whether
+that succeeds, varies from episode to episode, as the paper's non-deterministic planner gives.
+Where the order matters, all orders are tried in the simulator before each push, see push_order.py.
+Proposing whole pushes rather than independent displacements is our deviation: a few dozen samples
+then suffice.
 """
 
 from collections.abc import Iterator, Sequence

@@ -9,7 +9,9 @@ from sim_bridge.arm_shape import DARK, PRIMITIVES
 from tap_ros import ur10e
 from tap_ros.contract import WORLD_FRAME
 
+BASE_FRAME = 'base'  # of the arm, as its controller has it
 TIP_FRAME = 'gripper_tip'  # between the fingertips
+LINKS = (BASE_FRAME, *(name.replace('_joint', '_link') for name in ur10e.JOINTS))
 MAX_EFFORT = (330, 330, 150, 56, 56, 56)  # N m, as published for this arm
 
 
@@ -27,8 +29,7 @@ def robot_description(mount: ur10e.Mount = ur10e.SIMULATED,
     """
     robot = ElementTree.Element('robot', name='ur10e_at_table')
     ElementTree.SubElement(robot, 'link', name=WORLD_FRAME)
-    links = ['base', *(name.replace('_joint', '_link') for name in ur10e.JOINTS)]
-    for number, name in enumerate(links):
+    for number, name in enumerate(LINKS):
         link = ElementTree.SubElement(robot, 'link', name=name)
         for shape in PRIMITIVES:
             if shape.link == number:
@@ -37,23 +38,36 @@ def robot_description(mount: ur10e.Mount = ur10e.SIMULATED,
     tip = ElementTree.SubElement(robot, 'link', name=TIP_FRAME)
     if hand_radius is not None:
         _add_cylinder(tip, np.array([0, 0, -mount.tool]), np.zeros(3), hand_radius, DARK, False)
-    _add_joint(robot, 'world_joint', 'fixed', WORLD_FRAME, 'base',
+    _add_joint(robot, 'world_joint', 'fixed', WORLD_FRAME, BASE_FRAME,
                mount.position, (0, 0, mount.yaw))
-    place, turn = (0.0, 0.0, 0.0), 0.0
-    for i, name in enumerate(ur10e.JOINTS):
+    *origins, tip_origin = joint_origins(mount)
+    for i, (name, (place, roll)) in enumerate(zip(ur10e.JOINTS, origins)):
         joint = _add_joint(
-            robot, name, 'revolute', links[i], links[i + 1], place, (turn, 0, 0))
+            robot, name, 'revolute', LINKS[i], LINKS[i + 1], place, (roll, 0, 0))
         ElementTree.SubElement(joint, 'axis', xyz='0 0 1')
         limit = ur10e.JOINT_LIMITS[i]
         ElementTree.SubElement(
             joint, 'limit', lower=_text(-limit), upper=_text(limit),
             velocity=_text(ur10e.SPEED_LIMITS[i]), effort=_text(MAX_EFFORT[i]))
-        a, turn, d = ur10e.DH[i]
-        place = (a, 0.0, d)
-    _add_joint(robot, 'gripper_joint', 'fixed', links[-1], TIP_FRAME,
-               (place[0], place[1], place[2] + mount.tool), (turn, 0, 0))
+    place, roll = tip_origin
+    _add_joint(robot, 'gripper_joint', 'fixed', LINKS[-1], TIP_FRAME, place, (roll, 0, 0))
     ElementTree.indent(robot)
     return ElementTree.tostring(robot, 'unicode', xml_declaration=True)
+
+
+def joint_origins(
+        mount: ur10e.Mount = ur10e.SIMULATED) -> list[tuple[tuple[float, float, float], float]]:
+    """
+    Return where the frame of each link is in the one before while its joint is at 0.
+
+    A URDF's joint turns about the z of its own link; Denavit-Hartenberg's about that before.
+
+    :param mount: where the arm stands, and the length of its tool.
+    :return: x, y, z (m) and roll (rad) of the links behind LINKS[0], then of TIP_FRAME.
+    """
+    origins = [((0.0, 0.0, 0.0), 0.0), *(((a, 0.0, d), alpha) for a, alpha, d in ur10e.DH)]
+    (x, y, z), roll = origins[-1]
+    return [*origins[:-1], ((x, y, z + mount.tool), roll)]
 
 
 def _add_joint(robot: ElementTree.Element, name: str, kind: str, parent: str, child: str,

@@ -15,10 +15,11 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from sim_bridge.appearance import CHOICES
-from sim_bridge.looks import DEFAULT_LOOK, LOOKS
+from sim_bridge.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from sim_bridge.robot_description import robot_description
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import TASKS
+from sim_bridge.transforms import arm_transforms, camera_transform, fixed_arm_transforms
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
@@ -37,6 +38,7 @@ from tap_ros.nodes.object_messages import encode_camera_info, encode_joints, enc
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
+from tap_ros.nodes.tf_publisher import TransformPublisher
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)
@@ -122,6 +124,7 @@ class SimNode(Node):
             self._streams['observer/image_raw'] = self.create_publisher(
                 Image, 'observer/image_raw', STREAM)
         self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
+        self._transforms = TransformPublisher(self)
         self._episode = self.create_publisher(Episode, 'episode', STREAM)
         self._goal_image = self.create_publisher(Image, 'goal/image', LATCHED)
         self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
@@ -262,6 +265,7 @@ class SimNode(Node):
         self._num_steps = 0
         self._in_episode = True
         self._publish_episode(Episode.START, '')
+        self._publish_fixed_transforms()
         self._publish_goal(sim.goal(hide_arm or self.params['hide_arm_in_goal']))
         self._publish(observation)
 
@@ -301,7 +305,16 @@ class SimNode(Node):
         if self.params['observer']:
             self._newest['observer/image_raw'] = encode_image(
                 self._sim.observer_picture(), stamp, OBSERVER_FRAME)
+        if observation.arm_joints is not None:
+            self._transforms.moving(arm_transforms(observation.arm_joints), stamp)
         self._send_newest()
+
+    def _publish_fixed_transforms(self) -> None:
+        """Tell where the cameras and the foot of the arm are in this scene."""
+        fixed = [camera_transform(self._sim.camera, CAMERA_FRAME)]
+        if self._sim.look.studio:
+            fixed += [camera_transform(OBSERVER, OBSERVER_FRAME), *fixed_arm_transforms()]
+        self._transforms.fixed(fixed, to_stamp(self._stamp_ns))
 
     def _send_newest(self) -> None:
         """Send what the camera sees now, again if need be."""

@@ -5,6 +5,8 @@
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from processes import Client, NodeProcess
+import pytest
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String
 from tap_ros import ur10e
@@ -50,5 +52,29 @@ def test_the_world_of_the_arm_tells_where_the_robot_is(tmp_path):
             gripper = ur10e.gripper_at([angles[name] for name in ur10e.JOINTS])
             assert np.allclose(gripper, decode_gripper(told)[:3], atol=1e-6)
             assert gripper[0] - before[0] > 0.03
+    finally:
+        process.kill()
+
+
+def test_tf_has_the_camera_and_the_arm(tmp_path):
+    TFMessage = pytest.importorskip('tf2_msgs.msg').TFMessage
+    process = NodeProcess('sim_node', tmp_path / 'log.txt', {'lock_step': 'true'})
+    try:
+        process.wait_for('ready')
+        with Client() as node:
+            image = Newest(node, Image, 'camera/image_raw', STREAM)
+            moving = Newest(node, TFMessage, '/tf', QoSProfile(depth=100))
+            twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
+            fixed = Newest(node, TFMessage, '/tf_static', LATCHED).wait(10).transforms
+            assert {(one.header.frame_id, one.child_frame_id) for one in fixed} == {
+                ('world', 'camera_optical_frame'), ('world', 'observer_optical_frame'),
+                ('world', 'base'), ('wrist_3_link', 'gripper_tip')}
+            first = image.wait(10)
+            assert first.header.frame_id == 'camera_optical_frame'
+            twist.publish(TwistStamped(header=first.header))
+            arm = moving.wait(10).transforms
+            assert len(arm) == 6
+            assert {to_nanoseconds(one.header.stamp) for one in arm} == {
+                to_nanoseconds(first.header.stamp) + round(CONTROL_PERIOD * 1e9)}
     finally:
         process.kill()
