@@ -95,3 +95,33 @@ def in_picture(pixels: np.ndarray, size: Sequence[int]) -> np.ndarray | np.bool_
     :return: bool (...); False where a position is not a number.
     """
     return ((pixels >= -0.5) & (pixels <= np.array(size[::-1]) - 0.5)).all(-1)
+
+
+def resize_image(image: np.ndarray, size: Sequence[int]) -> np.ndarray:
+    """
+    Resize a picture with antialiasing.
+
+    :param image: uint8 (H, W, 3).
+    :param size: (height, width) of the answer.
+    :return: uint8 (height, width, 3).
+    """
+    import torch  # as above
+    planes = torch.from_numpy(np.ascontiguousarray(image)).movedim(-1, 0)[None].float()
+    planes = torch.nn.functional.interpolate(
+        planes, tuple(size), mode='bilinear', antialias=True, align_corners=False)
+    return planes[0].round().clamp(0, 255).byte().movedim(0, -1).contiguous().numpy()
+
+
+def resize_pixels(pixels: np.ndarray, old_size: Sequence[int],
+                  new_size: Sequence[int]) -> np.ndarray:
+    """
+    Move pixel positions along with a resized picture.
+
+    :param pixels: (..., 2) as (u, v); (0, 0) is the centre of the top-left pixel.
+    :param old_size: (height, width) of the picture they belong to.
+    :param new_size: (height, width) after resizing.
+    :return: float32 (..., 2).
+    """
+    scale = np.array([new_size[1] / old_size[1], new_size[0] / old_size[0]])
+    # in float64, so that pixels of the same size stay the same to the last bit
+    return ((np.asarray(pixels, np.float64) + 0.5) * scale - 0.5).astype(np.float32)

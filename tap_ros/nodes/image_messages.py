@@ -11,7 +11,7 @@ import numpy as np
 from sensor_msgs.msg import Image
 from tap_ros.contract import ENCODINGS, MAP_ENCODING, MASK_ENCODING, PICTURE_ENCODING
 from tap_ros.errors import ImageError
-from tap_ros.images import check_image
+from tap_ros.images import check_image, resize_image
 from tap_ros.recording.pictures import wrong_mask_value
 from tap_ros.text import escaped
 
@@ -127,36 +127,6 @@ def decode_mask(message: Image, name: str, size: Sequence[int]) -> np.ndarray:
     if wrong is not None:
         raise ImageError(f'{name}: {wrong}')
     return mask
-
-
-def resize_image(image: np.ndarray, size: Sequence[int]) -> np.ndarray:
-    """
-    Resize a picture with antialiasing.
-
-    :param image: uint8 (H, W, 3).
-    :param size: (height, width) of the answer.
-    :return: uint8 (height, width, 3).
-    """
-    import torch  # here, since it takes seconds, and not every node resizes
-    planes = torch.from_numpy(np.ascontiguousarray(image)).movedim(-1, 0)[None].float()
-    planes = torch.nn.functional.interpolate(
-        planes, tuple(size), mode='bilinear', antialias=True, align_corners=False)
-    return planes[0].round().clamp(0, 255).byte().movedim(0, -1).contiguous().numpy()
-
-
-def resize_pixels(pixels: np.ndarray, old_size: Sequence[int],
-                  new_size: Sequence[int]) -> np.ndarray:
-    """
-    Move pixel positions along with a resized picture.
-
-    :param pixels: (..., 2) as (u, v); (0, 0) is the centre of the top-left pixel.
-    :param old_size: (height, width) of the picture they belong to.
-    :param new_size: (height, width) after resizing.
-    :return: float32 (..., 2).
-    """
-    scale = np.array([new_size[1] / old_size[1], new_size[0] / old_size[0]])
-    # in float64, so that pixels of the same size stay the same to the last bit
-    return ((np.asarray(pixels, np.float64) + 0.5) * scale - 0.5).astype(np.float32)
 
 
 def _check_encoding(message: Image, name: str, valid: Collection[str]) -> None:

@@ -14,7 +14,8 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import CAMERA_FRAME
 from tap_ros.errors import ImageError, TapError
-from tap_ros.nodes.image_messages import decode_image, is_empty, resize_pixels
+from tap_ros.images import resize_pixels
+from tap_ros.nodes.image_messages import decode_image, is_empty
 from tap_ros.nodes.object_messages import decode_objects, match_objects
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.predictor_setup import (

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from tap_ros.errors import ConfigError, ImageError
 from tap_ros.files import write_atomically
-from tap_ros.images import in_picture
+from tap_ros.images import in_picture, resize_image, resize_pixels
 from tap_ros.options import File
 from tap_ros.text import escaped
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
@@ -138,7 +138,7 @@ def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
 def fit(picture: np.ndarray, pixels: np.ndarray, size: Sequence[int],
         name: str) -> tuple[np.ndarray, np.ndarray]:
     """
-    Scale a picture, and positions in it, to what the weights take; several pixels are averaged.
+    Scale a picture, and positions in it, to what the weights take.
 
     :param picture: uint8 (H, W, 3), as wide as high if `size` is.
     :param pixels: (K, 2), (u, v) in it.
@@ -154,9 +154,7 @@ def fit(picture: np.ndarray, pixels: np.ndarray, size: Sequence[int],
     if not in_picture(pixels, (H, W)).all():
         raise ImageError(f'{name}: an object is outside its {W}x{H} pixels; expected column,row '
                          'in the picture as it is in the file')
-    factor = np.array([size[1] / W, size[0] / H], np.float32)
-    scaled = cv2.resize(picture, (size[1], size[0]), interpolation=cv2.INTER_AREA)
-    return scaled, ((pixels + 0.5) * factor - 0.5).astype(np.float32)
+    return resize_image(picture, size), resize_pixels(pixels, (H, W), size)
 
 
 def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
