@@ -32,6 +32,7 @@ Flag = Annotated[bool, conf.FlagCreatePairsOff]  # without --no-...
 Folder = Annotated[str, conf.arg(metavar='FOLDER', help_behavior_hint=default_text)]
 ShippedFile = Annotated[str, conf.arg(  # its own place is long, and other on each machine
     metavar='FILE', help_behavior_hint='(default: the shipped ones)')]
+Topic = Annotated[str, conf.arg(metavar='TOPIC', help_behavior_hint=default_text)]
 
 _STYLE = (conf.OmitArgPrefixes, conf.OmitSubcommandPrefixes, conf.HelptextFromCommentsOff)
 _RULES = ConstructorRegistry()

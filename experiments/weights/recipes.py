@@ -57,11 +57,13 @@ _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0
 
 RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push2', 'push2', {
-        'push2': '--episodes 1800', 'push2_random': '--episodes 3000 --appearance random'},
-        f'{_PUSHING} --steps 8000'),
-    # Begins with the push2 that is installed, not with the one made just before.
+        'push2': '--episodes 2000', 'push2_random': '--episodes 3500 --appearance random'},
+        f'{_PUSHING} --steps 10000'),
+    # These begin with the push2 that is installed, not with the one made just before.
     Recipe('order2', 'order2', {'order2': '--episodes 600'},
            f'{_PUSHING} --initial-weights push2 --steps 2500'),
+    Recipe('push3', 'push3', {'push3': '--episodes 1300'},
+           f'{_PUSHING} --initial-weights push2 --steps 4000'),
     Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('grasp', 'grasp', {'grasp': '--episodes 3000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', {'pick_place': '--episodes 3000'},

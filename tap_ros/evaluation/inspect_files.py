@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.files import write_atomically
-from tap_ros.options import File
+from tap_ros.options import File, Topic
 from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
@@ -25,12 +25,14 @@ class Options:
     Options of the command.
 
     :param path: an .mcap file, a bag folder, or a .safetensors file.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in it.
     :param picture: write film strips of the first episodes to this PNG.
     :param episodes: episodes in the picture.
     :param robot_mask: tint what the robot masks mark: the arm red, the hand blue.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
+    image_topic: Topic = ''
     picture: File = ''
     episodes: int = 8
     robot_mask: bool = False
@@ -43,7 +45,7 @@ def run(args: Options) -> None:
         _, about = load_tensors(args.path)
         print(json.dumps(about, indent=2))
         return
-    store = open_recordings([args.path])
+    store = open_recordings([args.path], image_topic=args.image_topic or None)
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})

@@ -32,7 +32,7 @@ from tap_ros.images import to_float, to_uint8
 from tap_ros.learning.filled import fill, Filled, with_masks
 from tap_ros.learning.robot_mask import trained_robot_mask
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
-from tap_ros.options import Bags, Flag, Folder
+from tap_ros.options import Bags, Flag, Folder, Topic
 from tap_ros.pictures import grid, overlay
 from tap_ros.prediction.batches import Batch, make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
@@ -227,6 +227,7 @@ class Options:
     Options of `python -m tap_ros evaluate prediction`.
 
     :param recordings: bag folders, folders of bag folders, or .mcap files.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param all: take every episode, not only those that training held out.
     :param goal_picture: the episode's last frame, or the goal's own picture where reached, with
         the arm elsewhere.
@@ -241,6 +242,7 @@ class Options:
         metavar='FILE',
         help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}.')]
     recordings: Bags
+    image_topic: Topic = ''
     all: Flag = False
     goal_picture: Literal['last', 'recorded'] = 'recorded'
     margin: int = 0
@@ -256,7 +258,7 @@ def run(args: Options) -> None:
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
     network, training = load_network(args.weights)
-    store = open_recordings(args.recordings)
+    store = open_recordings(args.recordings, image_topic=args.image_topic or None)
     if store.image_size != (network.config.image_size,) * 2:
         raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')

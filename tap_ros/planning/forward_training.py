@@ -58,7 +58,8 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
     """
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
-    store = open_recordings(list(config.recordings), progress=progress)
+    store = open_recordings(list(config.recordings), progress=progress,
+                            image_topic=config.image_topic or None)
     with run_folder(config.out):
         _train(config, device, store, stop_at, progress)
     return str(Path(config.out) / 'forward_model.safetensors')

@@ -17,6 +17,7 @@ class ForwardTrainingConfig:
 
     :param recordings: bag folders, folders of bag folders, or .mcap files.
     :param out: folder of the run; an interrupted run goes on there.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param steps: optimiser steps in all.
     :param batch_size: windows per step.
     :param horizon: control periods of the longest windows.
@@ -46,6 +47,7 @@ class ForwardTrainingConfig:
 
     recordings: tuple[str, ...]
     out: str
+    image_topic: str = ''
     steps: int = 6000
     batch_size: int = 16
     horizon: int = 8

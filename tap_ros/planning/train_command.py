@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from tap_ros.learning.model_option import ModelOption
-from tap_ros.options import Bags, default_text, Folder
+from tap_ros.options import Bags, default_text, Folder, Topic
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tyro import conf
 
@@ -19,6 +19,7 @@ class Training(ForwardTrainingConfig):
 
     recordings: Bags
     out: Folder = 'runs/forward_model'
+    image_topic: Topic = ''
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@
 from dataclasses import asdict, dataclass
 
 from tap_ros.learning.model_option import ModelOption
-from tap_ros.options import Bags, Folder
+from tap_ros.options import Bags, Folder, Topic
 from tap_ros.prediction.training_config import (
     DataSettings,
     NetworkSettings,
@@ -22,6 +22,7 @@ class RunOptions(RunSettings):
 
     recordings: Bags
     out: Folder
+    image_topic: Topic = ''
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,6 +29,7 @@ class RunSettings:
 
     :param recordings: .mcap files, bag folders, or folders of these.
     :param out: the run's folder; if it holds a checkpoint, training goes on from there.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, batches and augmentation.
     :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
@@ -42,6 +43,7 @@ class RunSettings:
 
     recordings: tuple[str, ...]
     out: str
+    image_topic: str = ''
     test_fraction: float = TEST_FRACTION
     seed: int = 0
     device: str = 'auto'

@@ -86,7 +86,7 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     :param paths: one or a list of .mcap files, bag folders, or folders of bag folders.
     :param cache_dir: by default $TAP_ROS_CACHE or ~/.cache/tap_ros.
     :param progress: show a progress bar when decoding takes long.
-    :param image_topic: the camera's topic when its name does not end in /camera/image_raw.
+    :param image_topic: the camera's topic, see topics.resolve.
     :return: EpisodeStore.
     :raises RecordingError: when a recording is missing, empty, damaged or lacks the image topic,
         or when the images differ in size; the message names the file.

@@ -23,7 +23,7 @@ def iter_episodes(path: str | Path, image_topic: str | None = None) -> Iterator[
     Yield the episodes of a recording; at most about one file is in memory at a time.
 
     :param path: .mcap file, bag folder, or folder of bag folders.
-    :param image_topic: the camera's topic when its name does not end in /camera/image_raw.
+    :param image_topic: the camera's topic, see topics.resolve.
     :return: iterator over Episode.
     :raises RecordingError: when the recording is missing, empty, damaged or lacks the image topic.
     """

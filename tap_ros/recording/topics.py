@@ -73,7 +73,8 @@ def resolve(available: Mapping[str, str], source: str,
 
     :param available: dict topic -> type of what the recording holds.
     :param source: what messages call the recording.
-    :param image_topic: the camera's topic when its name does not end in /camera/image_raw.
+    :param image_topic: the camera's topic; by default the one that ends in /camera/image_raw, else
+        the only one of images.
     :return: dict from the names above to topics of the recording; what it lacks is left out.
     :raises RecordingError: without an image topic, or when several would do.
     """
@@ -96,11 +97,15 @@ def resolve(available: Mapping[str, str], source: str,
         if len(candidates) > 1:
             raise RecordingError(
                 f'{source}: several topics could be {name}: {listing(sorted(candidates))}; '
-                'name the camera topic (image_topic) whose namespace is wanted')
+                'name the camera topic (--image-topic) whose namespace is wanted')
         if candidates:
             found[name] = candidates[0]
     if IMAGE not in found:
-        raise RecordingError(
-            f'{source}: no topic ends in {IMAGE} with type {TYPES[IMAGE]}; name the camera topic '
-            f'(image_topic) if it is called otherwise; topics found: {known}')
+        images = [topic for topic, kind in available.items()
+                  if kind == TYPES[IMAGE] and topic not in found.values()]
+        if len(images) != 1:
+            raise RecordingError(
+                f'{source}: no topic ends in {IMAGE} with type {TYPES[IMAGE]}; name the camera '
+                f'topic (--image-topic) if it is called otherwise; topics found: {known}')
+        found[IMAGE] = images[0]
     return found

@@ -150,12 +150,25 @@ def test_unusable_images_are_named(tmp_path, changes, words):
         open_recordings(tmp_path / 'bag')
 
 
-def test_another_image_topic(tmp_path):
-    record(tmp_path / 'bag', [camera(t, topic='/front/rgb') for t in range(1, 4)])
-    with pytest.raises(RecordingError, match='image_topic.*/front/rgb'):
-        open_recordings(tmp_path / 'bag')
-    (episode,) = open_recordings(tmp_path / 'bag', image_topic='/front/rgb')
+@pytest.mark.parametrize('topic', ['/front/rgb', '/camera/color/image_raw', '/image_raw'])
+def test_another_image_topic_is_found_where_it_is_the_only_one(tmp_path, topic):
+    record(tmp_path / 'bag', [camera(t, topic=topic) for t in range(1, 4)])
+    (episode,) = open_recordings(tmp_path / 'bag')
     assert episode.frames[:, 0, 0, 0].tolist() == [1, 2, 3]
+
+
+def test_of_two_other_image_topics_one_has_to_be_named(tmp_path):
+    record(tmp_path / 'bag', [camera(t, topic='/front/rgb') for t in range(1, 4)]
+           + [camera(t, topic='/side/rgb') for t in range(4, 7)])
+    with pytest.raises(RecordingError, match='--image-topic.*/front/rgb.*/side/rgb'):
+        open_recordings(tmp_path / 'bag')
+    (episode,) = open_recordings(tmp_path / 'bag', image_topic='/side/rgb')
+    assert episode.frames[:, 0, 0, 0].tolist() == [4, 5, 6]
+
+
+def test_a_goal_is_not_taken_for_the_camera():
+    with pytest.raises(RecordingError, match='no topic ends in /camera/image_raw'):
+        resolve({'/goal/image': IMAGE, '/camera/robot_mask': IMAGE}, 'bag')
 
 
 def test_topics_in_a_namespace(tmp_path, episodes):
