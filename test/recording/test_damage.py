@@ -221,7 +221,7 @@ def test_damage_that_no_checksum_shows_costs_its_chunk(tmp_path, long_file, kind
         path, other, chunk_size=2**18, compression=CompressionType.NONE, enable_crcs=False)
     data = bytearray(other.read_bytes())
     where = data.index(episodes[10].frames[4].tobytes())
-    start = data.rindex(b'camera_optical_frame\0', 0, where) - 47  # of the record: 31 + 16 bytes before
+    start = data.rindex(b'camera_optical_frame\0', 0, where) - 47  # 31 + 16 bytes
     assert data[start] == 5
     data[start] = kind
     if length is not None:
