@@ -58,7 +58,7 @@ def ship(recipe, bags, runs, out):
                               for words in recipe.commands('bags', 'runs/weights'))
     write_atomically(card, render(
         'weights/templates/card.md.j2', file=file.name, name=recipe.name, task=recipe.task,
-        collect=collect, again=again, train=train,
+        collect=collect, again=again, train=train, earlier=recipe.earlier,
         run=json.loads((run / 'run.json').read_text()), method=about['settings']['method'],
         fresh=len(store), pushing=np.isfinite(scores['last frame']['prediction'].bottleneck).any(),
         scores=tabulate(scores), succeed=int(good[shown].sum()),

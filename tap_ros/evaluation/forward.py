@@ -15,7 +15,7 @@ from tap_ros.files import write_rows
 from tap_ros.learning.filled import FilledStore, with_masks
 from tap_ros.learning.robot_mask import fill_from_past
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
-from tap_ros.options import Bags, Folder, ShippedFile
+from tap_ros.options import Bags, Folder, ShippedFile, Topic
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
 from tap_ros.recording.cache import open_recordings
@@ -34,6 +34,7 @@ class Options:
     Pictures are filled behind the robot as the weights' training was.
 
     :param recordings: bag folders with object pixels; each is scored on its own.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param weights: of a forward model.
     :param test_fraction: share of the episodes that training held out, by seed; 1: all.
     :param device: cpu or cuda.
@@ -41,6 +42,7 @@ class Options:
     """
 
     recordings: Bags
+    image_topic: Topic = ''
     weights: ShippedFile = str(FORWARD_MODEL)
     test_fraction: float = TEST_FRACTION
     device: str = 'cpu'
@@ -56,7 +58,7 @@ def run(args: Options) -> None:
     model = load_forward_model(args.weights, args.device)
     rows = []
     for recording in args.recordings:
-        store = open_recordings([recording])
+        store = open_recordings([recording], image_topic=args.image_topic or None)
         if store.image_size != (model.config.image_size,) * 2:
             raise ConfigError(f'{args.weights}: made for {model.config.image_size} pixels a side, '
                               f'{recording} has {store.image_size}; use matching ones')

@@ -25,17 +25,17 @@ class Options:
     Options of the command.
 
     :param path: an .mcap file, a bag folder, or a .safetensors file.
-    :param image_topic: the camera's topic; needed where several topics of pictures are in it.
     :param picture: write film strips of the first episodes to this PNG.
     :param episodes: episodes in the picture.
     :param robot_mask: tint what the robot masks mark: the arm red, the hand blue.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in it.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
-    image_topic: Topic = ''
     picture: File = ''
     episodes: int = 8
     robot_mask: bool = False
+    image_topic: Topic = ''
 
 
 def run(args: Options) -> None:

@@ -22,7 +22,7 @@ import torch
 Trained = TypeVar('Trained', bound=torch.nn.Module)
 
 # Settings that change where a run happens and what it shows, not what it learns.
-FREE = ('recordings', 'out', 'image_topic', 'device', 'threads', 'log_every', 'save_every')
+FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
 _REMEDY = 'remove it to begin anew, or choose another --out folder'
 
 

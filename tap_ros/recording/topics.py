@@ -97,7 +97,7 @@ def resolve(available: Mapping[str, str], source: str,
         if len(candidates) > 1:
             raise RecordingError(
                 f'{source}: several topics could be {name}: {listing(sorted(candidates))}; '
-                'name the camera topic (--image-topic) whose namespace is wanted')
+                'name the camera topic (image_topic, --image-topic) whose namespace is wanted')
         if candidates:
             found[name] = candidates[0]
     if IMAGE not in found:
@@ -106,6 +106,7 @@ def resolve(available: Mapping[str, str], source: str,
         if len(images) != 1:
             raise RecordingError(
                 f'{source}: no topic ends in {IMAGE} with type {TYPES[IMAGE]}; name the camera '
-                f'topic (--image-topic) if it is called otherwise; topics found: {known}')
+                'topic (image_topic, --image-topic) if it is called otherwise; topics found: '
+                f'{known}')
         found[IMAGE] = images[0]
     return found

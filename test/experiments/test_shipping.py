@@ -74,7 +74,8 @@ def test_a_training_may_begin_with_weights_of_an_earlier_commit(places, monkeypa
                       train=RECIPES['grasp'].train + ' --steps 1 --batch-size 2')
     monkeypatch.setitem(RECIPES, TINY.name, earlier)
     assert command.run(command.Options(only=(TINY.name,), **places)) == 0
-    assert '--initial-weights' in Path(places['out'], 'predictor_tiny.md').read_text()
+    card = Path(places['out'], 'predictor_tiny.md').read_text()
+    assert '--initial-weights' in card and f'(`git show {earlier.earlier}`)' in card
     gone = replace(earlier, earlier='HEAD:never.safetensors')
     monkeypatch.setitem(RECIPES, TINY.name, gone)
     with pytest.raises(ConfigError, match='HEAD:never.safetensors: git does not have it here'):

@@ -400,7 +400,7 @@ def test_one_message_with_many_objects_does_not_widen_all_others(tmp_path):
 def test_inspect_shows_names_in_one_line(tmp_path, capsys):
     with EpisodeWriter(tmp_path / 'a.mcap') as writer:
         writer.write(make_episode(task='push2\n\x1b[2Jall is well'))
-    args = type('Args', (), {'path': str(tmp_path / 'a.mcap'), 'picture': None, 'episodes': 1})
+    args = inspect_files.Options(str(tmp_path / 'a.mcap'), episodes=1)
     inspect_files.run(args)
     lines = capsys.readouterr().out.splitlines()
     assert all(line.isprintable() for line in lines)
