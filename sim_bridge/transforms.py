@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the frames of the cameras and of the arm are, as tf tells it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -49,16 +50,16 @@ def fixed_arm_transforms(mount: ur10e.Mount = ur10e.SIMULATED) -> list[Transform
             Transform(LINKS[-1], TIP_FRAME, _pose(tip, roll, 0.0))]
 
 
-def arm_transforms(joints: ArrayLike) -> list[Transform]:
+def arm_transforms(joints: ArrayLike) -> Iterator[Transform]:
     """
-    Return where each link is in the one before.
+    Yield where each link is in the one before.
 
     :param joints: (6,) rad, of ur10e.JOINTS.
     :return: six, from the base on.
     """
-    return [Transform(parent, child, _pose(place, roll, angle))
-            for parent, child, (place, roll), angle in zip(
-                LINKS, LINKS[1:], joint_origins(), np.asarray(joints, np.float64))]
+    for parent, child, (place, roll), angle in zip(
+            LINKS, LINKS[1:], joint_origins(), np.asarray(joints, np.float64)):
+        yield Transform(parent, child, _pose(place, roll, angle))
 
 
 def _pose(place: tuple[float, float, float], roll: float, yaw: float) -> np.ndarray:

@@ -58,7 +58,7 @@ def run(args: Options) -> None:
     model = load_forward_model(args.weights, args.device)
     rows = []
     for recording in args.recordings:
-        store = open_recordings([recording], image_topic=args.image_topic or None)
+        store = open_recordings([recording], image_topic=args.image_topic)
         if store.image_size != (model.config.image_size,) * 2:
             raise ConfigError(f'{args.weights}: made for {model.config.image_size} pixels a side, '
                               f'{recording} has {store.image_size}; use matching ones')

@@ -45,7 +45,7 @@ def run(args: Options) -> None:
         _, about = load_tensors(args.path)
         print(json.dumps(about, indent=2))
         return
-    store = open_recordings([args.path], image_topic=args.image_topic or None)
+    store = open_recordings([args.path], image_topic=args.image_topic)
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})

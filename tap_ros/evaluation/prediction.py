@@ -258,7 +258,7 @@ def run(args: Options) -> None:
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
     network, training = load_network(args.weights)
-    store = open_recordings(args.recordings, image_topic=args.image_topic or None)
+    store = open_recordings(args.recordings, image_topic=args.image_topic)
     if store.image_size != (network.config.image_size,) * 2:
         raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')

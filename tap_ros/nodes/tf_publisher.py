@@ -31,7 +31,7 @@ class TransformPublisher:
             self._fixed = node.create_publisher(TFMessage, '/tf_static', LATCHED)
 
     def moving(self, transforms: Iterable[Transform], stamp: Time) -> None:
-        """Publish transforms of this time; twice at one time, listeners would complain."""
+        """Publish transforms of this time, once: of a second time listeners would complain."""
         if self._moving is not None:
             self._moving.publish(_encode(transforms, stamp))
 

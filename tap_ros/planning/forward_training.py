@@ -59,7 +59,7 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
     store = open_recordings(list(config.recordings), progress=progress,
-                            image_topic=config.image_topic or None)
+                            image_topic=config.image_topic)
     with run_folder(config.out):
         _train(config, device, store, stop_at, progress)
     return str(Path(config.out) / 'forward_model.safetensors')

@@ -76,7 +76,7 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
     with joined(device) as processes:
         progress = progress and processes.first
         store = open_recordings(list(config.recordings), progress=progress,
-                                image_topic=config.image_topic or None)
+                                image_topic=config.image_topic)
         with run_folder(config.out) if processes.first else nullcontext():
             _train(config, device, processes, store, stop_at, deadline, progress, after_step)
     return str(Path(config.out) / 'predictor.safetensors')

@@ -43,7 +43,7 @@ def find_bags(path: str | Path) -> list[list[Path]]:
     return bags
 
 
-def find_topics(files: Sequence[Path], image_topic: str | None = None) -> dict[str, str]:
+def find_topics(files: Sequence[Path], image_topic: str = '') -> dict[str, str]:
     """
     Find the topics of a bag.
 

@@ -79,7 +79,7 @@ class EpisodeStore:
 
 
 def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | Path | None = None,
-                    progress: bool = True, image_topic: str | None = None) -> EpisodeStore:
+                    progress: bool = True, image_topic: str = '') -> EpisodeStore:
     """
     Open recordings, decoding what is not in the cache yet.
 

@@ -18,7 +18,7 @@ _NO_EVENT = np.empty(0, np.int64)
 _NO_GAP = np.empty((0, 3), np.int64)
 
 
-def iter_episodes(path: str | Path, image_topic: str | None = None) -> Iterator[Episode]:
+def iter_episodes(path: str | Path, image_topic: str = '') -> Iterator[Episode]:
     """
     Yield the episodes of a recording; at most about one file is in memory at a time.
 

@@ -67,7 +67,7 @@ def default_qos(topic: str) -> Qos:
 
 
 def resolve(available: Mapping[str, str], source: str,
-            image_topic: str | None = None) -> dict[str, str]:
+            image_topic: str = '') -> dict[str, str]:
     """
     Find the topics of a recording, in whatever namespace they are.
 
@@ -79,7 +79,7 @@ def resolve(available: Mapping[str, str], source: str,
     :raises RecordingError: without an image topic, or when several would do.
     """
     known = listing((f'{t} ({k})' for t, k in sorted(available.items())), 20) or 'none'
-    if image_topic is not None and available.get(image_topic) != TYPES[IMAGE]:
+    if image_topic and available.get(image_topic) != TYPES[IMAGE]:
         raise RecordingError(
             f'{source}: no topic {image_topic} of type {TYPES[IMAGE]}; topics found: {known}')
     found = {IMAGE: image_topic} if image_topic else {}

@@ -60,7 +60,7 @@ def test_the_order_of_objects_varies(episodes):
 
 
 def test_the_first_object_is_home_before_the_next_is_touched():
-    """Else no frame shows the bottleneck; in this scene the first push ends 3 cm short."""
+    """Else no frame shows the bottleneck; in this scene the first push ends short."""
     simulator = Simulator('push2')
     observations = run_episode(simulator, 12)[0]
     places = np.array([observation.object_poses[:, :3] for observation in observations])
