@@ -3,6 +3,7 @@
 """Publishes transforms as tf does, where its message is installed."""
 
 from collections.abc import Iterable
+import contextlib
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
@@ -10,11 +11,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sim_bridge.transforms import Transform
 from tap_ros.nodes.topics import LATCHED
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # no wheel has it
-    TFMessage = None
 
 
 class TransformPublisher:
@@ -26,29 +22,32 @@ class TransformPublisher:
 
     def __init__(self, node: Node) -> None:
         self._moving = self._fixed = None
-        if TFMessage is not None:  # qualities as of tf2_ros' broadcasters
+        with contextlib.suppress(ImportError):  # no wheel has it
+            from tf2_msgs.msg import TFMessage
+            self._message = TFMessage
+            # Qualities as of tf2_ros' broadcasters.
             self._moving = node.create_publisher(TFMessage, '/tf', QoSProfile(depth=100))
             self._fixed = node.create_publisher(TFMessage, '/tf_static', LATCHED)
 
     def moving(self, transforms: Iterable[Transform], stamp: Time) -> None:
         """Publish transforms of this time, once: of a second time listeners would complain."""
         if self._moving is not None:
-            self._moving.publish(_encode(transforms, stamp))
+            self._moving.publish(self._message(transforms=_encode(transforms, stamp)))
 
     def fixed(self, transforms: Iterable[Transform], stamp: Time) -> None:
         """Publish all transforms that hold from now on, also for who comes later."""
         if self._fixed is not None:
-            self._fixed.publish(_encode(transforms, stamp))
+            self._fixed.publish(self._message(transforms=_encode(transforms, stamp)))
 
 
-def _encode(transforms: Iterable[Transform], stamp: Time) -> 'TFMessage':
-    message = TFMessage()
+def _encode(transforms: Iterable[Transform], stamp: Time) -> list[TransformStamped]:
+    messages = []
     for transform in transforms:
-        encoded = TransformStamped(child_frame_id=transform.child)
-        encoded.header.stamp, encoded.header.frame_id = stamp, transform.parent
+        message = TransformStamped(child_frame_id=transform.child)
+        message.header.stamp, message.header.frame_id = stamp, transform.parent
         x, y, z = transform.pose[:3, 3].tolist()
-        encoded.transform.translation = Vector3(x=x, y=y, z=z)
+        message.transform.translation = Vector3(x=x, y=y, z=z)
         x, y, z, w = transform.quaternion.tolist()
-        encoded.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
-        message.transforms.append(encoded)
-    return message
+        message.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
+        messages.append(message)
+    return messages
