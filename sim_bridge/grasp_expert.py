@@ -23,6 +23,7 @@ RANGE = 0.3  # m, |x| and |y| of the random walk, all in view
 FAR = 0.22  # m, a start so far from the grasp that the first step cannot hit the object
 LOST = 0.12  # m, an object whose origin is farther from the gripper is not held
 OTHERS = 2.0  # cost of moving other objects, m per m
+OFF_CENTRE = 0.2  # cost of a grasp beside the object's centre, m per m
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,7 @@ class GraspConfig:
     hover: tuple[float, float] = (0.1, 0.13)  # m, heights of the gripper before it drops,
     low: tuple[float, float] = (0.004, 0.018)  # when it grasps
     lift: tuple[float, float] = (0.12, 0.14)  # and how far it lifts
+    hold: int = 2  # control periods that it stays closed at the place, if there is time
     travel_speed: tuple[float, float] = (0.035, 0.08)  # m per control period
     walk: tuple[int, int] = (1, 6)  # control periods of the random walk at the end
     wiggle: float = 0.035  # m per control period, of the random walk
@@ -136,7 +138,7 @@ class GraspExpert:
             while getattr(self, name) > 1 and fixed + (
                     2 * self._drop_steps + self._lift_steps + self._walk_steps) > steps_left:
                 setattr(self, name, getattr(self, name) - 1)
-        return carry + self._drop_steps + 2 + self._walk_steps
+        return carry + self._drop_steps + self._config.hold + 2 + self._walk_steps
 
     def place(self, steps_left: int) -> np.ndarray:
         """
@@ -150,10 +152,13 @@ class GraspExpert:
         gap = simulator.goal().object_poses[0, :2] - simulator.object_poses()[0, :2]
         end = np.clip(here[:2] + gap, WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])
         travel, fastest = self._travel_steps(end - here[:2])
-        travel = min(travel, max(steps_left - self._drop_steps - 2 - self._walk_steps, fastest))
+        free = steps_left - self._drop_steps - 2 - self._walk_steps
+        hold = int(np.clip(free - fastest, 0, self._config.hold))
+        travel = min(travel, max(free - hold, fastest))
         above = np.append(end, here[2])
         below, leave = np.append(end, self._low + 0.003), np.append(end, self.hover)
         path = [here] + straight(here, above, travel) + straight(above, below, self._drop_steps)
+        path += [below] * hold
         closed = len(path) - 1
         path += [below, leave]
         wiggle, reach = self._config.wiggle, RANGE * simulator.look.spread(True)
@@ -215,7 +220,8 @@ class GraspExpert:
         upright = 1 - 2 * (poses[:, 4] ** 2 + poses[:, 5] ** 2)
         # What is lifted but for a centimetre is as good as can be: such places tie.
         return lift - np.clip(lifted, 0, lift - 0.01) + 0.1 * (
-            (upright < 0.95) | lost) + OTHERS * moved.sum(1)
+            (upright < 0.95) | lost) + OTHERS * moved.sum(1) + OFF_CENTRE * np.linalg.norm(
+                places - before[self._held, :2], axis=1)
 
 
 def straight(start: np.ndarray, end: np.ndarray, steps: int) -> list[np.ndarray]:

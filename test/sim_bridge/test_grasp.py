@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from sim_bridge import grasp_expert
 from sim_bridge.collect import collect, CollectConfig, make_episode
 from sim_bridge.expert import run_episode
 from sim_bridge.grasp_expert import GraspConfig
@@ -166,3 +167,34 @@ def test_the_same_seed_gives_the_same_bytes_and_another_expert_is_refused(simula
                           expert=GraspConfig(explore=0.5))
     with pytest.raises(ConfigError, match='expert'):
         collect(tmp_path / 'a' / 'bag', other, progress=False)
+
+
+def test_the_object_is_held_near_its_centre_where_that_is_possible(monkeypatch):
+    simulator = Simulator('grasp')
+
+    def mean_distance():
+        distances = []
+        for seed in SEEDS:
+            observations, actions, outcome = run_episode(simulator, seed)[:3]
+            objects, grippers, _ = tracks(observations)
+            if outcome == 'success':
+                distances.append(np.linalg.norm((grippers - objects)[closing(actions), :2]))
+        return np.mean(distances)
+
+    near = mean_distance()
+    monkeypatch.setattr(grasp_expert, 'OFF_CENTRE', 0.0)
+    assert near < 0.75 * mean_distance()
+    simulator.close()
+
+
+def test_before_it_lets_go_the_hand_rests_at_the_place():
+    simulator, rests = Simulator('pick_place'), []
+    for seed in SEEDS:
+        observations, actions, outcome = run_episode(simulator, seed)[:3]
+        _, grippers, _ = tracks(observations)
+        if outcome == 'success':
+            opens = closing(actions) + int(np.argmax(actions[closing(actions):, 3] == 1))
+            still = np.linalg.norm(grippers[:opens + 1] - grippers[opens], axis=1) < 0.01
+            rests.append(int(still[opens - 2:opens].sum()))
+    simulator.close()
+    assert len(rests) >= 8 and np.mean(np.array(rests) == 2) >= 0.7, rests
