@@ -43,6 +43,7 @@ GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
 ENCODINGS = {
     'rgb8': (3, (0, 1, 2)), 'bgr8': (3, (2, 1, 0)),
     'rgba8': (4, (0, 1, 2)), 'bgra8': (4, (2, 1, 0)), 'mono8': (1, (0, 0, 0))}
+MAX_PICTURE_BYTES = 32 * 2**20  # of one picture: rgb8 of 3840x2160 pixels has 24 MiB
 PICTURE_ENCODING = 'rgb8'  # in which pictures are sent and recorded
 MAP_ENCODING = '32FC1'  # of object maps
 

@@ -19,6 +19,7 @@ from tap_ros.options import Bags, Folder, ShippedFile, Topic
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.reading import Reading
 from tap_ros.weights import FORWARD_MODEL
 
 METHODS = {'map_error': 'forward_model', 'nothing_moves': 'nothing',
@@ -58,7 +59,8 @@ def run(args: Options) -> None:
     model = load_forward_model(args.weights, args.device)
     rows = []
     for recording in args.recordings:
-        store = open_recordings([recording], image_topic=args.image_topic)
+        store = open_recordings([recording], reading=Reading(
+            args.image_topic, model.config.crop, model.config.crop_size))
         if store.image_size != (model.config.image_size,) * 2:
             raise ConfigError(f'{args.weights}: made for {model.config.image_size} pixels a side, '
                               f'{recording} has {store.image_size}; use matching ones')

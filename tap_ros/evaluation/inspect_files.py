@@ -10,11 +10,17 @@ from typing import Annotated
 
 import numpy as np
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
+from tap_ros.crop import check_trainable
 from tap_ros.files import write_atomically
-from tap_ros.options import File, Topic
+from tap_ros.learning.split import split_episodes, warn_if_none
+from tap_ros.options import File
 from tap_ros.pictures import film_strip, grid, png_bytes
-from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.bags import find_bags, find_topics, list_topics
+from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.reading import Reading, reading_of
+from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.recording.topics import IMAGE
 from tap_ros.text import escaped, listing
 from tyro import conf
 
@@ -28,29 +34,41 @@ class Options:
     :param picture: write film strips of the first episodes to this PNG.
     :param episodes: episodes in the picture.
     :param robot_mask: tint what the robot masks mark: the arm red, the hand blue.
-    :param image_topic: the camera's topic; needed where several topics of pictures are in it.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
     picture: File = ''
     episodes: int = 8
     robot_mask: bool = False
-    image_topic: Topic = ''
+    reading: ReadingOptions = ReadingOptions()
 
 
 def run(args: Options) -> None:
-    """Print a summary; write a picture when asked to."""
+    """
+    Print a summary; write a picture when asked to.
+
+    :raises TapError: for what cannot be read, and for a recording that `train` would refuse.
+    """
     if Path(args.path).suffix == '.safetensors':
         from tap_ros.learning.weights import load_tensors  # torch takes seconds
         _, about = load_tensors(args.path)
         print(json.dumps(about, indent=2))
         return
-    store = open_recordings([args.path], image_topic=args.image_topic)
+    for number, (topic, kind, count) in enumerate(list_topics(args.path)):
+        print(f'{"" if number else "topics":<11} {escaped(topic)}  {escaped(kind)}  '
+              + ('unknown' if count is None else f'{count} messages'))
+    reading = reading_of(args.reading)
+    store = open_recordings([args.path], reading=reading)
+    cameras = {find_topics(bag, reading.image_topic)[IMAGE] for bag in find_bags(args.path)}
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})
     print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
+    if store.camera_size not in (store.image_size, None):
+        print('cut         from pictures of {1}x{0} pixels'.format(*store.camera_size))
+    print(f'told apart  {_told_apart(store, reading)}')
+    print(f'camera      {listing(sorted(cameras))}')
     print(f'length      {lengths.min()} to {lengths.max()} frames, median {np.median(lengths):g}')
     print(f'objects     {", ".join(map(str, objects))}')
     masked = sum(e.robot_masks is not None for e in episodes)
@@ -66,6 +84,18 @@ def run(args: Options) -> None:
                   for e in episodes[:args.episodes]]
         write_atomically(args.picture, png_bytes(grid(strips, scale=2)))
         print(f'picture     {escaped(args.picture)}')
+    check_trainable(store.image_size, 'the predictor')
+    training, held_out = split_episodes(store)
+    print(f'train       {len(training)} episodes to learn from, {len(held_out)} held out')
+    warn_if_none(held_out)
+
+
+def _told_apart(store: EpisodeStore, reading: Reading) -> str:
+    """Say how episodes are told apart."""
+    if store.marked:
+        return 'by marks'
+    return (f'no marks: by pauses of more than {reading.gap:g} s (--gap), or else cut into parts '
+            f'of at most {reading.episode_seconds:g} s (--episode-seconds)')
 
 
 def _tinted(episode: Episode) -> np.ndarray:

@@ -39,6 +39,7 @@ from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.networks import Predictor
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.reading import trained_reading
 from tap_ros.weights import PREDICTORS
 import torch
 from tyro import conf
@@ -226,7 +227,8 @@ class Options:
     """
     Options of `python -m tap_ros evaluate prediction`.
 
-    :param recordings: bag folders, folders of bag folders, or .mcap files.
+    :param recordings: bag folders, folders of bag folders, or .mcap files; read as those of the
+        training were.
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param all: take every episode, not only those that training held out.
     :param goal_picture: the episode's last frame, or the goal's own picture where reached, with
@@ -258,7 +260,8 @@ def run(args: Options) -> None:
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
     network, training = load_network(args.weights)
-    store = open_recordings(args.recordings, image_topic=args.image_topic)
+    store = open_recordings(
+        args.recordings, reading=trained_reading(training, args.image_topic))
     if store.image_size != (network.config.image_size,) * 2:
         raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')

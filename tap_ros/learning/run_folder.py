@@ -54,7 +54,9 @@ def run_facts(state: TrainingState[Any], seed: int, store: 'EpisodeStore', train
     chosen = {'precision': state.precision} if state.precision else {}
     return chosen | {
         'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': seed,
-        'data_hash': store.data_hash, 'episodes': len(training), 'held_out': len(held_out),
+        'data_hash': store.data_hash,
+        'camera_size': list(store.camera_size) if store.camera_size else None,
+        'episodes': len(training), 'held_out': len(held_out),
         'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device}',
         'torch': torch.__version__, 'python': platform.python_version()}
 

@@ -106,8 +106,8 @@ def make_config(config_class: type[Config], values: Mapping[str, Any], path: str
     """
     Turn the configuration found in a file back into its dataclass.
 
-    :param config_class: the dataclass, of fields that are bool, int, float, tuple of numbers or
-        Literal of words. Files of earlier versions lack those whose metadata says LATER.
+    :param config_class: the dataclass, of fields that are bool, int, float, str, tuple of numbers
+        or Literal of words. Files of earlier versions lack those whose metadata says LATER.
     :param values: the dict of load_weights.
     :param path: the file, for the message.
     :return: the dataclass.
@@ -137,7 +137,7 @@ def make_config(config_class: type[Config], values: Mapping[str, Any], path: str
 
 
 _EXPECTED = {bool: 'true or false', int: 'a whole number', float: 'a finite number',
-             tuple: 'a list of finite numbers', Literal: 'a word'}
+             tuple: 'a list of finite numbers', Literal: 'a word', str: 'a text'}
 
 
 def _is_a(value: object, kind: Any) -> bool:
@@ -146,8 +146,8 @@ def _is_a(value: object, kind: Any) -> bool:
         return isinstance(value, list) and all(_is_a(each, float) for each in value)
     if isinstance(value, bool) or kind is bool:
         return isinstance(value, bool) and kind is bool
-    if isinstance(value, str) or kind is Literal:
-        return isinstance(value, str) and kind is Literal
+    if isinstance(value, str) or kind in (Literal, str):
+        return isinstance(value, str) and kind in (Literal, str)
     if isinstance(value, int):
         return abs(value) < 2 ** 31
     return kind is float and isinstance(value, float) and math.isfinite(value)

@@ -65,8 +65,8 @@ class GoalSource:
         if found is None:
             missing = self._newest.missing(self._needed) or self._needed
             raise PlanningError(
-                f'goal: nothing has come on {self._names(missing)}; publish there (the simulator '
-                'does at sim/reset), or send goal_image and goal_objects along')
+                f'goal: nothing has come on {self._explained(missing)}; publish there (the '
+                'simulator does at sim/reset), or send goal_image and goal_objects along')
         self._stamp = to_nanoseconds(found[self._needed[0]].header.stamp)
         masks = [topic for topic in self._types if topic == 'mask' and 'image' in self._needed]
         if masks and 'mask' not in found and not self._newest.missing(masks):
@@ -88,6 +88,9 @@ class GoalSource:
             raise PlanningError('the scene has changed: a new goal has come on '
                                 f'{self._names(self._needed)}')
         return True
+
+    def _explained(self, topics: Iterable[str]) -> str:
+        return ', '.join(self._newest.explained(topic, self._names([topic])) for topic in topics)
 
     def _names(self, topics: Iterable[str]) -> str:
         return ', '.join(self._node.resolve_topic_name(TOPICS[topic][1]) for topic in topics)

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""sensor_msgs/Image to arrays and back; what cannot be used is refused with the reason."""
+"""Picture messages to arrays and back; what cannot be used is refused with the reason."""
 
 import array
 from collections.abc import Collection, Sequence
@@ -8,8 +8,9 @@ import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
-from sensor_msgs.msg import Image
-from tap_ros.contract import ENCODINGS, MAP_ENCODING, MASK_ENCODING, PICTURE_ENCODING
+from sensor_msgs.msg import CompressedImage, Image
+from tap_ros.contract import MAP_ENCODING, MASK_ENCODING, MAX_PICTURE_BYTES, PICTURE_ENCODING
+from tap_ros.encodings import decompress, pixel_bytes, to_rgb
 from tap_ros.errors import ImageError
 from tap_ros.images import check_image, resize_image
 from tap_ros.recording.pictures import wrong_mask_value
@@ -18,7 +19,6 @@ from tap_ros.text import escaped
 if TYPE_CHECKING:
     from builtin_interfaces.msg import Time
 
-MAX_BYTES = 32 * 2**20  # of one picture: rgb8 of 3840x2160 pixels has 24 MiB
 MAX_FRAME_ID = 100  # characters; it comes back with every picture and map of an answer
 
 
@@ -64,27 +64,34 @@ def encode_mask(mask: np.ndarray, stamp: 'Time', frame_id: str) -> Image:
     return _pack(mask, MASK_ENCODING, stamp, frame_id)
 
 
-def decode_image(message: Image, name: str, size: Sequence[int] | None = None,
+def decode_image(message: Image | CompressedImage, name: str, size: Sequence[int] | None = None,
                  resize: bool = False) -> np.ndarray:
     """
     Turn a message into a picture.
 
-    :param message: sensor_msgs/Image in one of ENCODINGS; rows may be padded.
+    :param message: sensor_msgs/Image in one of encodings.READABLE, rows may be padded; or
+        sensor_msgs/CompressedImage.
     :param name: how an error calls it, for example 'goal'.
     :param size: the (height, width) wanted, or None for any.
     :param resize: resize to `size` instead of refusing another size.
     :return: uint8 (H, W, 3) rgb.
-    :raises ImageError: for another encoding, size, step or length, and for more than MAX_BYTES.
+    :raises ImageError: for another encoding, size, step or length, and for more than
+        MAX_PICTURE_BYTES.
     """
-    _check_encoding(message, name, ENCODINGS)
-    channels, order = ENCODINGS[message.encoding]
-    rows = _rows(message, name, channels)
-    image = rows.reshape(message.height, message.width, channels)
-    if order != tuple(range(channels)):
-        image = image[..., list(order)]
+    try:
+        if isinstance(message, CompressedImage):
+            _check_length(message, name)
+            image = decompress(np.frombuffer(message.data, np.uint8), message.format)
+        else:
+            channels = pixel_bytes(message.encoding)
+            image = to_rgb(_rows(message, name, channels).reshape(
+                message.height, message.width, channels), message.encoding)
+    except ImageError as error:
+        raise error if str(error).startswith(f'{name}: ') else ImageError(
+            f'{name}: {error}') from error
     if resize and size is not None and image.shape[:2] != tuple(size):
         return resize_image(image, size)
-    return check_image(np.ascontiguousarray(image), name, size)
+    return check_image(image, name, size)
 
 
 def decode_map(message: Image, name: str, size: Sequence[int] | None = None) -> np.ndarray:
@@ -139,12 +146,7 @@ def _check_encoding(message: Image, name: str, valid: Collection[str]) -> None:
 def _rows(message: Image, name: str, bytes_per_pixel: int) -> np.ndarray:
     """Check the layout and return uint8 (height, width * bytes_per_pixel) without padding."""
     height, width, step = message.height, message.width, message.step
-    if len(message.data) > MAX_BYTES:
-        raise ImageError(f'{name}: data has {len(message.data)} bytes; at most {MAX_BYTES} are '
-                         'taken, send a smaller picture')
-    if len(message.header.frame_id) > MAX_FRAME_ID:
-        raise ImageError(f'{name}: frame_id has {len(message.header.frame_id)} characters; '
-                         f'at most {MAX_FRAME_ID} are taken')
+    _check_length(message, name)
     if height == 0 or width == 0:
         raise ImageError(f'{name}: is empty ({width}x{height} pixels); send a whole image')
     row_bytes = width * bytes_per_pixel
@@ -158,6 +160,16 @@ def _rows(message: Image, name: str, bytes_per_pixel: int) -> np.ndarray:
             f'{step} * {height} = {step * height}')
     data = np.frombuffer(message.data, np.uint8).reshape(height, step)
     return data[:, :row_bytes]
+
+
+def _check_length(message: Image | CompressedImage, name: str) -> None:
+    """Refuse a message that is longer than any of use."""
+    if len(message.data) > MAX_PICTURE_BYTES:
+        raise ImageError(f'{name}: data has {len(message.data)} bytes; at most '
+                         f'{MAX_PICTURE_BYTES} are taken, send a smaller picture')
+    if len(message.header.frame_id) > MAX_FRAME_ID:
+        raise ImageError(f'{name}: frame_id has {len(message.header.frame_id)} characters; '
+                         f'at most {MAX_FRAME_ID} are taken')
 
 
 def _pack(values: np.ndarray, encoding: str, stamp: 'Time', frame_id: str) -> Image:

@@ -11,6 +11,7 @@ from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import ObjectState, ObjectStates
 from tap_ros import ur10e
 from tap_ros.contract import GRIPPER_JOINTS
+from tap_ros.crop import Crop
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.images import in_picture
 from tap_ros.text import escaped, listing
@@ -76,6 +77,29 @@ def decode_objects(message: ObjectStates, name: str,
                 f'at most {MAX_NAME} are taken')
         _check_pixel(f'{name}: {escaped(object_name)}', pixels[index], size)
     return names, pixels.astype(np.float32)
+
+
+def decode_cut_objects(message: ObjectStates, name: str, size: Sequence[int],
+                       crop: Crop) -> tuple[tuple[str, ...], np.ndarray]:
+    """
+    Decode objects of a picture of which only a part is used.
+
+    :param message: tap_msgs/ObjectStates, pixels in the whole picture.
+    :param name: how an error calls it.
+    :param size: (height, width) of the whole picture.
+    :param crop: Crop.
+    :return: names, and pixels float32 (K, 2) in the part, scaled like it.
+    :raises PlanningError: as decode_objects, and for an object that is not in the part.
+    """
+    names, pixels = decode_objects(message, name, size)
+    cut = crop.pixels(pixels, size)
+    outside = [names[i] for i in np.flatnonzero(~in_picture(cut, crop.cut_size(size)))]
+    if outside:
+        left, top, width, height = crop.window(size)
+        raise PlanningError(
+            f'{name}: {listing(outside)} not in the part of the picture that the weights see, '
+            f'{width}x{height} pixels from ({left}, {top}) on; leave it out')
+    return names, cut
 
 
 def _check_pixel(name: str, pixel: np.ndarray, size: Sequence[int] | None) -> None:

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 import math
 import threading
 import time
+from types import MappingProxyType
 from typing import Any, TYPE_CHECKING
 
+from rclpy.clock import Clock, ClockType
+from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD, named_with_reason
 from tap_ros.nodes.topics import to_nanoseconds
 
 if TYPE_CHECKING:
@@ -60,10 +63,12 @@ class Observations:
         # topic -> stamps in a row that are not believed
         self._suspects: dict[str, list[int]] = {topic: [] for topic in topics}
         self.count, self.jumps = 0, 0
+        self._heard: dict[str, Heard] = {}
 
     def subscribe(self, node: 'Node', types: Mapping[str, tuple[type, str]], qos: 'QoSProfile',
                   callback_group: 'CallbackGroup | None' = None,
-                  on_message: Callable[[str], object] | None = None) -> None:
+                  on_message: Callable[[str], object] | None = None,
+                  others: Mapping[str, Callable[..., Any]] = MappingProxyType({})) -> None:
         """
         Subscribe to the topics.
 
@@ -72,6 +77,7 @@ class Observations:
         :param qos: QoSProfile of all of them.
         :param callback_group: callback group, None for the node's own.
         :param on_message: called with the topic name after each message, or None.
+        :param others: {short name: what is called with message and info instead}.
         """
         for topic, (message_type, name) in types.items():
             def receive(message: Any, info: dict[str, Any], topic: str = topic,
@@ -80,9 +86,19 @@ class Observations:
                 if on_message is not None:
                     on_message(name)
 
-            node.create_subscription(
-                message_type, name, receive,  # type: ignore[arg-type]  # may take the info, too
-                qos, callback_group=callback_group)
+            self._heard[topic] = Heard(
+                node, message_type, name, others.get(topic, receive), qos, callback_group)
+
+        def look_after() -> None:
+            for heard in self._heard.values():
+                heard.look_after()
+
+        node.create_timer(LOOK_PERIOD, look_after, callback_group=callback_group,
+                          clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def explained(self, topic: str, name: str) -> str:
+        """Return the name of a topic, and why nothing comes on it where that is known."""
+        return named_with_reason(self._heard.get(topic), name)
 
     def put(self, topic: str, message: Any, received: float | None = None) -> None:
         """

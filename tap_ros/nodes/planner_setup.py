@@ -15,6 +15,7 @@ from tap_ros.contract import (
 )
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.arm_joints import declare_mount, declare_opening
+from tap_ros.nodes.camera_topic import declare_transport
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.forward_model import ForwardModel
@@ -44,6 +45,7 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
                        'with more samples, or what the paper says.', choices=list(PRESETS))
     parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
+    declare_transport(parameters)
     declare_robot_mask(parameters)
     parameters.declare('control_period', CONTROL_PERIOD,
                        'Seconds (of image stamps) that the arm takes for one command.',

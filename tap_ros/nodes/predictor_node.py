@@ -60,7 +60,7 @@ class PredictorNode(Node):
         self.params = declare_parameters(self)
         self._queue = RequestQueue(
             self._load, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
-        topics = request_topics(self.params['robot_mask'])
+        topics = request_topics(self.params)
         self._diagnostics = Diagnostics(self, {
             **dict.fromkeys((name for _, name in topics['start'].values()), STALE_S),
             **dict.fromkeys((name for _, name in topics['goal'].values()), math.inf)},

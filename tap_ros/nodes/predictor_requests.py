@@ -13,10 +13,12 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import CAMERA_FRAME
+from tap_ros.crop import TrainedCrop
 from tap_ros.errors import ImageError, TapError
-from tap_ros.images import resize_pixels
+from tap_ros.images import check_image, resize_image, resize_pixels
+from tap_ros.nodes.camera_topic import camera_topic
 from tap_ros.nodes.image_messages import decode_image, is_empty
-from tap_ros.nodes.object_messages import decode_objects, match_objects
+from tap_ros.nodes.object_messages import decode_cut_objects, match_objects
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.predictor_setup import (
     check_count,
@@ -35,17 +37,22 @@ from tap_ros.text import listing
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-TOPICS = {  # what stands in for the fields that a request leaves empty
-    'start': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
-    'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
 OBJECTS_TIMEOUT = 0.1  # s that objects and mask of the newest picture may come after it
 
 
-def request_topics(robot_mask: str) -> dict[str, dict[str, tuple[type, str]]]:
-    """Return TOPICS, and those of the robot masks when they are used."""
-    if robot_mask == 'none':
-        return TOPICS
-    return {'start': TOPICS['start'] | CAMERA_MASK, 'goal': TOPICS['goal'] | GOAL_MASK}
+def request_topics(params: Parameters) -> dict[str, dict[str, tuple[type, str]]]:
+    """
+    Return what stands in for the fields that a request leaves empty.
+
+    :return: for 'start' and 'goal' {short name: (message type, topic name)}, with the robot masks
+        when they are used.
+    """
+    topics = {
+        'start': {'image': camera_topic(params), 'objects': (ObjectStates, 'objects')},
+        'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
+    if params['robot_mask'] != 'none':
+        topics = {'start': topics['start'] | CAMERA_MASK, 'goal': topics['goal'] | GOAL_MASK}
+    return topics
 
 
 @dataclass(frozen=True)
@@ -92,7 +99,7 @@ class RequestReader:
                  on_message: Callable[[str], object]) -> None:
         self._node, self._params, self._predictors = node, params, predictors
         self._robot = RobotView(params['robot_mask'])
-        self._types = request_topics(params['robot_mask'])
+        self._types = request_topics(params)
         self._newest = {
             'start': PulledObservations(
                 node, self._types['start'], STREAM, on_message=on_message),
@@ -122,10 +129,10 @@ class RequestReader:
         check_work(num_samples, depth, 0)
         mode = choose_mode(request, self._predictors)
         predictor = self._predictors[mode]
-        start = self._view('start', request.start, request.start_objects, predictor.image_size)
+        start = self._view('start', request.start, request.start_objects, predictor.camera_crop)
         goal = None
         if mode == 'bidirectional':
-            goal = self._view('goal', request.goal, request.goal_objects, predictor.image_size)
+            goal = self._view('goal', request.goal, request.goal_objects, predictor.camera_crop)
         views = [view for view in (start, goal) if view]
         lacking = '; '.join(view.lacking for view in views if view.lacking)
         names = () if lacking else start.names
@@ -138,7 +145,7 @@ class RequestReader:
                             num_samples, depth, request.seed)
         return Task(mode, question, names, lacking, start.stamp, start.frame_id)
 
-    def _view(self, name: str, image: Image, objects: ObjectStates, size: Sequence[int]) -> View:
+    def _view(self, name: str, image: Image, objects: ObjectStates, crop: TrainedCrop) -> View:
         """Decode a picture and its objects; take the newest ones if it was left empty."""
         lacking = '' if objects.objects else f'{name}_objects are empty'
         if is_empty(image):
@@ -147,10 +154,15 @@ class RequestReader:
             if not objects.objects:
                 objects = found.get('objects', objects)
                 lacking = '' if objects.objects else self._explain(name, found)
-        picture = decode_image(image, name, size, resize=self._params['resize_images'])
-        given_size = (image.height, image.width)
-        names, pixels = decode_objects(objects, f'{name}_objects', given_size)
-        pixels = resize_pixels(pixels, given_size, size)
+        picture = decode_image(image, name)
+        given_size = picture.shape[:2]
+        cut = crop.of(given_size, name)
+        picture = cut.image(picture)
+        names, pixels = decode_cut_objects(objects, f'{name}_objects', given_size, cut)
+        if self._params['resize_images']:
+            pixels = resize_pixels(pixels, picture.shape[:2], crop.size)
+            picture = resize_image(picture, crop.size)
+        check_image(picture, name, crop.size)
         return View(picture, names, pixels, lacking, image.header.stamp,
                     image.header.frame_id or CAMERA_FRAME)
 
@@ -168,7 +180,8 @@ class RequestReader:
                 advice = '; or ask for mode forward, which needs no goal'
             raise ImageError(
                 f'{name}: the request has none and nothing has come on '
-                f'{self._topic(name, "image")}; publish one there (the simulator does at '
+                f'{newest.explained("image", self._topic(name, "image"))}; publish one there '
+                '(the simulator does at '
                 f'sim/reset), or send it along{advice}')
         needed, stamp = ('image',), to_nanoseconds(found['image'].header.stamp)
         if self._robot.used and (name == 'start' or not newest.missing(['mask'])):
@@ -199,7 +212,7 @@ class RequestReader:
         if 'objects' in found:
             return f'the list on {topic} is empty'
         if newest is None:
-            return f'nothing has come on {topic}'
+            return f'nothing has come on {self._newest[name].explained("objects", topic)}'
         stamps = [f'{to_nanoseconds(message.header.stamp) / 1e9:.9f} s'
                   for message in (newest['objects'], found['image'])]
         return (f'the newest on {topic} has the stamp {stamps[0]}, the picture on '

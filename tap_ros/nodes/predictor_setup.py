@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from tap_ros.errors import ConfigError
 from tap_ros.learning.robot_mask import trained_robot_mask
+from tap_ros.nodes.camera_topic import declare_transport
 from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
@@ -48,6 +49,7 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('resize_images', False,
                        'Resize pictures of another size than the weights are made for, instead of '
                        'refusing them; answers have the size of the weights.', read_only=False)
+    declare_transport(parameters)
     declare_robot_mask(parameters)
     return parameters
 

@@ -3,12 +3,14 @@
 """Observations that are taken only when somebody asks for them."""
 
 from collections.abc import Callable, Collection, Mapping
+import math
 import threading
 import time
 from typing import Any, TYPE_CHECKING
 
 from rclpy.callback_groups import CallbackGroup
 from tap_ros.nodes.observations import Observations, reception_time
+from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD, named_with_reason
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -53,10 +55,10 @@ class PulledObservations:
         self._on_message = on_message
         self._names = {topic: name for topic, (_, name) in types.items()}
         group = Unwatched()
-        self._subscriptions = {
-            topic: node.create_subscription(
-                message_type, name, lambda message: None, qos, callback_group=group)
+        self._heard = {
+            topic: Heard(node, message_type, name, lambda message: None, qos, group)
             for topic, (message_type, name) in types.items()}
+        self._looked = -math.inf  # monotonic time of the last look at what is offered
 
     def newest(self, *topics: str) -> dict[str, Any] | None:
         """Return the newest {topic: message} that has all of `topics`; None if there is none."""
@@ -91,11 +93,20 @@ class PulledObservations:
         self.pull()
         return self._observations.missing(topics)
 
+    def explained(self, topic: str, name: str) -> str:
+        """Return the name of a topic, and why nothing comes on it where that is known."""
+        return named_with_reason(self._heard.get(topic), name)
+
     def pull(self) -> None:
         """Take what has come, all topics together in the order in which it came."""
         with self._taking:
             come = []
-            for topic, subscription in self._subscriptions.items():
+            if time.monotonic() - self._looked > LOOK_PERIOD:
+                self._looked = time.monotonic()
+                for heard in self._heard.values():
+                    heard.look_after()
+            for topic, heard in self._heard.items():
+                subscription = heard.subscription
                 with subscription.handle:
                     for _ in range(MOST):
                         taken = subscription.handle.take_message(subscription.msg_type, False)

@@ -29,6 +29,7 @@ from tap_ros.nodes.robot_mask_setup import (
     named_robot,
 )
 from tap_ros.nodes.run import run_node
+from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 from tap_ros.robot.silhouette import Body, draw_mask, View
 from tap_ros.robot.urdf import read_urdf, Robot
@@ -67,18 +68,18 @@ class RobotMaskNode(Node):
             'camera/camera_info': STALE_S, 'joint_states': STALE_S,
             'robot_description': math.inf})
         self._masks = self.create_publisher(Image, 'camera/robot_mask', STREAM)
+        self._heard: list[Heard] = []
         robot = named_robot(self.params)
         if robot is None:
-            self.create_subscription(
-                String, 'robot_description', self._on_description, LATCHED)
+            self._heard.append(Heard(
+                self, String, 'robot_description', self._on_description, LATCHED))
         else:
             self._use(robot)
-        self.create_subscription(
-            JointState, 'joint_states',
-            self._on_joints, STREAM)  # type: ignore[arg-type]  # with the info
-        self.create_subscription(
-            CameraInfo, 'camera/camera_info',
-            self._on_camera_info, STREAM)  # type: ignore[arg-type]  # with the info
+        self._heard += [
+            Heard(self, JointState, 'joint_states', self._on_joints, STREAM),
+            Heard(self, CameraInfo, 'camera/camera_info', self._on_camera_info, STREAM)]
+        self.create_timer(
+            LOOK_PERIOD, self._look_after, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.create_timer(
             0.2, self._give_up_waiting, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f'ready: {self.params["urdf"] or "waits for robot_description"}')
@@ -137,6 +138,11 @@ class RobotMaskNode(Node):
                 header = picture.info.header
                 self._masks.publish(encode_mask(mask, header.stamp, header.frame_id))
             self._waiting.remove(picture)
+
+    def _look_after(self) -> None:
+        """Ask for what is offered."""
+        for heard in self._heard:
+            heard.look_after()
 
     def _give_up_waiting(self) -> None:
         """Say why pictures that have waited for too long get no mask."""

@@ -2,20 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """What visual_mpc_node sees: messages put together by their stamp, and decoded once."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import replace
 import time
 from typing import Any, TYPE_CHECKING
 
-from sensor_msgs.msg import Image, JointState
+import numpy as np
+from sensor_msgs.msg import CompressedImage, Image, JointState
 from tap_msgs.msg import Episode, ObjectStates
+from tap_ros.crop import TrainedCrop
 from tap_ros.errors import KinematicsError, PlanningError, TapError
+from tap_ros.images import check_image
 from tap_ros.nodes.arm_joints import ArmJoints, tells_gripper
-from tap_ros.nodes.image_messages import decode_image
-from tap_ros.nodes.object_messages import decode_gripper, decode_objects, match_objects
+from tap_ros.nodes.camera_topic import camera_topic
+from tap_ros.nodes.image_messages import decode_image, encode_image
+from tap_ros.nodes.object_messages import decode_cut_objects, decode_gripper, match_objects
 from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
 from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
+from tap_ros.nodes.subscriptions import overridable
 from tap_ros.nodes.topics import STREAM, to_nanoseconds
 from tap_ros.planning.reach import Seen
 
@@ -23,13 +28,11 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from tap_ros.nodes.parameters import Parameters
 
-TOPICS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
-          'joints': (JointState, 'joint_states')}
-
-
-def sensor_topics(robot_mask: str) -> dict[str, tuple[type, str]]:
-    """Return TOPICS, and that of the robot mask when one is used."""
-    return TOPICS | (CAMERA_MASK if robot_mask != 'none' else {})
+def sensor_topics(params: 'Parameters') -> dict[str, tuple[type, str]]:
+    """Return {short name: (message type, topic name)}, with the robot mask when one is used."""
+    topics = {'image': camera_topic(params), 'objects': (ObjectStates, 'objects'),
+              'joints': (JointState, 'joint_states')}
+    return topics | (CAMERA_MASK if params['robot_mask'] != 'none' else {})
 
 
 class Sight:
@@ -43,32 +46,29 @@ class Sight:
 
     :param node: rclpy Node.
     :param params: its Parameters.
-    :param image_size: (height, width) that pictures must have.
+    :param crop: TrainedCrop: what the planner makes of pictures, and the size that they get.
     :param on_message: called with the topic name after each message.
     :ivar sensors: Observations.
     :ivar robot: RobotView.
     :ivar messages: {topic: message} that the newest Seen was decoded from.
     """
 
-    def __init__(self, node: 'Node', params: 'Parameters', image_size: Sequence[int],
+    def __init__(self, node: 'Node', params: 'Parameters', crop: TrainedCrop,
                  on_message: Callable[[str], object]) -> None:
-        self._node, self._params, self._size = node, params, image_size
+        self._node, self._params, self._crop = node, params, crop
+        self._camera_size = crop.size
         self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
         self.robot = RobotView(params['robot_mask'])
-        self._types = sensor_topics(params['robot_mask'])
+        self._types = sensor_topics(params)
         self._tell = on_message
         self.sensors = Observations(*self._types)
         self._arm = ArmJoints(params)
         self._useless = ''  # why the joint states cannot be used
         self.begin(0.0)
-        node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
-        joints_type, joints_name = self._types['joints']
-        node.create_subscription(
-            joints_type, joints_name,
-            self._on_joints, STREAM)  # type: ignore[arg-type]  # with the info
-        self.sensors.subscribe(
-            node, {topic: kind for topic, kind in self._types.items() if topic != 'joints'},
-            STREAM, on_message=self._on_message)
+        self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
+                               others={'joints': self._on_joints})
+        node.create_subscription(Episode, 'episode', self._on_episode, STREAM,
+                                 qos_overriding_options=overridable())
 
     def topics(self, objects: bool = True) -> tuple[str, ...]:
         """Return the names of what is looked at, with or without the objects."""
@@ -121,12 +121,32 @@ class Sight:
         return begun_ns if known else 0
 
     def _without_robot(self, moment: Moment) -> Moment:
-        """Take the robot out of the picture of a Moment, if that is wanted."""
-        if not self.robot.used:
-            return moment
+        """Take the robot out of the picture of a Moment, if that is wanted; it is raw then."""
         messages = moment.messages
-        image = self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
+        if self.robot.used:
+            image = self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
+        elif isinstance(messages['image'], CompressedImage):
+            header = messages['image'].header
+            image = encode_image(decode_image(messages['image'], self._types['image'][1]),
+                                 header.stamp, header.frame_id)
+        else:
+            return moment
         return replace(moment, messages=messages | {'image': image})
+
+    def decode_positions(self, message: ObjectStates, name: str,
+                         picture: Image | None = None) -> tuple[tuple[str, ...], np.ndarray]:
+        """
+        Decode where objects are, in the pixels that the planner works with.
+
+        :param message: tap_msgs/ObjectStates, in pixels of a picture.
+        :param name: how errors call it.
+        :param picture: the picture; None: the one that was seen last.
+        :return: names, and pixels (K, 2) float32.
+        :raises TapError: see object_messages.decode_objects; also outside of the part that is
+            used.
+        """
+        size = self._camera_size if picture is None else (picture.height, picture.width)
+        return decode_cut_objects(message, name, size, self._crop.of(size, name))
 
     def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
         """Take joint states; they may be the gripper's, the arm's, or another driver's."""
@@ -181,13 +201,17 @@ class Sight:
         """Return a Seen; the objects keep the order in which they were seen first."""
         first, pixels = self._seen, None
         names = first.names if first else ()
+        name = self._types['image'][1]
+        picture = decode_image(moment.messages['image'], name)
+        self._camera_size = picture.shape[:2]
         if 'objects' in topics:
-            found, pixels = decode_objects(moment.messages['objects'], 'objects', self._size)
+            found, pixels = self.decode_positions(moment.messages['objects'], 'objects')
             if set(found) == set(names):
                 pixels = match_objects(names, found, pixels, 'the first objects', 'objects')
             else:
                 names = found
-        image = decode_image(moment.messages['image'], 'camera/image_raw', self._size)
+        image = check_image(self._crop.of(self._camera_size, name).image(picture), name,
+                            self._crop.size)
         gripper = decode_gripper(moment.messages['joints'])
         return Seen(image, gripper, names, pixels, moment.stamp_ns, **times)
 
@@ -196,12 +220,12 @@ class Sight:
         if 'joints' in missing and self._useless:
             return self._useless
         if missing:
-            return f'nothing has come on {self._names(missing)}'
+            return f'nothing has come on {self._names(missing, explained=True)}'
         ages = self.sensors.ages(topics, time.monotonic())
         silent = [topic for topic in topics if ages[topic] > self._params['max_silence']]
         if 'joints' in silent and self._useless:
             return self._useless
-        return f'nothing new has come on {self._names(silent)}' if silent else ''
+        return f'nothing new has come on {self._names(silent, explained=True)}' if silent else ''
 
     def _count_publishers(self) -> dict[str, int]:
         return {topic: self._node.count_publishers(name)
@@ -215,8 +239,10 @@ class Sight:
                     f'the scene has changed: {count} nodes publish on {self._names([topic])} '
                     'now; leave one, and send the goal again')
 
-    def _names(self, topics: Collection[str]) -> str:
-        return ', '.join(self._node.resolve_topic_name(self._types[topic][1]) for topic in topics)
+    def _names(self, topics: Collection[str], explained: bool = False) -> str:
+        names = {topic: self._node.resolve_topic_name(self._types[topic][1]) for topic in topics}
+        return ', '.join(self.sensors.explained(*pair) if explained else pair[1]
+                         for pair in names.items())
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:

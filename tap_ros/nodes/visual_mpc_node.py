@@ -23,7 +23,8 @@ from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.goal_source import goal_topics, GoalSource, needed_topics
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.object_messages import decode_objects, match_objects
+from tap_ros.nodes.image_messages import is_empty
+from tap_ros.nodes.object_messages import match_objects
 from tap_ros.nodes.planner_setup import (
     check_request,
     declare_parameters,
@@ -33,6 +34,7 @@ from tap_ros.nodes.planner_setup import (
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.sight import sensor_topics, Sight
 from tap_ros.nodes.subgoal_messages import decode_subgoals
+from tap_ros.nodes.subscriptions import overridable
 from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import ForwardModel
@@ -70,15 +72,17 @@ class VisualMpcNode(Node):
         self._busy = threading.Lock()  # held while a goal is executed
         self._refusals: deque[tuple[int, str]] = deque(maxlen=10)
         robot_mask = self.params['robot_mask']
+        assert isinstance(self._mpc.model, ForwardModel)
         self._diagnostics = Diagnostics(self, {
-            **dict.fromkeys((name for _, name in sensor_topics(robot_mask).values()), STALE_S),
+            **dict.fromkeys((name for _, name in sensor_topics(self.params).values()), STALE_S),
             **dict.fromkeys((name for _, name in goal_topics(robot_mask).values()), math.inf)})
         heard = self._diagnostics.received
         self._goal = GoalSource(self, robot_mask, heard)
-        self._sight = Sight(self, self.params, self._mpc.image_size, heard)
+        self._sight = Sight(self, self.params, self._mpc.model.camera_crop, heard)
         self._sensors = self._sight.sensors
         self._arm = Arm(self, self.params, self._sensors)
-        self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM)
+        self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM,
+                                 qos_overriding_options=overridable())
         group = ReentrantCallbackGroup()  # answers and cancels arrive while a goal is executed
         self._predict = self.create_client(
             PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS, callback_group=group)
@@ -232,7 +236,8 @@ class VisualMpcNode(Node):
         goal = self._goal.take(request, self.params['image_timeout'],
                                lambda: self._cancelled_or_ending(handle))
         self._go_on(handle)
-        names, pixels = decode_objects(goal['objects'], 'goal_objects', self._mpc.image_size)
+        names, pixels = self._sight.decode_positions(
+            goal['objects'], 'goal_objects', None if is_empty(goal['image']) else goal['image'])
         goal_pixels = match_objects(seen.names, names, pixels, 'objects', 'goal_objects')
         subgoals = []
         if mode == 'subgoal':

@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 from tap_ros.contract import ACTION_LIMIT, CLEAR, ROBOT_MASKS, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.crop import Crop, TrainedCrop
 from tap_ros.errors import ConfigError
 from tap_ros.learning.devices import has_bfloat16, placed
 from tap_ros.learning.robot_mask import RobotMask
@@ -69,6 +70,9 @@ class ForwardModelConfig:
     sprite_size: int = 24  # pixels, side of the picture of the arm
     # what the pictures are without, see robot_mask.hidden_pixels
     robot_mask: RobotMask = field(default='none', metadata=LATER)
+    crop: str = field(default='', metadata=LATER)  # of the camera's pictures, see crop.Crop
+    crop_size: int = field(default=0, metadata=LATER)  # likewise, Crop.size
+    camera_size: tuple[int, int] = field(default=(0, 0), metadata=LATER)  # (0, 0): unknown
 
     def __post_init__(self) -> None:
         if len(self.table) != 9 or len(self.arm) != 12:
@@ -143,6 +147,14 @@ class ForwardModel(nn.Module):
         high = torch.tensor([*config.workspace_high, 1.0])
         constant('limits', torch.stack([low, high]))
         constant('move_limit', torch.tensor(ACTION_LIMIT))
+
+    @property
+    def camera_crop(self) -> TrainedCrop:
+        """What it makes of a camera's pictures."""
+        config = self.config
+        return TrainedCrop(Crop(config.crop, config.crop_size),
+                           config.camera_size if any(config.camera_size) else None,
+                           self.image_size)
 
     @property
     def image_size(self) -> tuple[int, int]:

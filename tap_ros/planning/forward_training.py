@@ -13,7 +13,7 @@ from pathlib import Path
 import time
 
 import numpy as np
-from tap_ros.errors import ConfigError
+from tap_ros.crop import check_trainable
 from tap_ros.images import to_uint8
 from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.learning.devices import pick_device
@@ -32,6 +32,7 @@ from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig
 from tap_ros.planning.table import fit_arm, fit_shift, fit_table
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.reading import reading_of
 import torch
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -59,7 +60,7 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
     store = open_recordings(list(config.recordings), progress=progress,
-                            image_topic=config.image_topic)
+                            reading=reading_of(config))
     with run_folder(config.out):
         _train(config, device, store, stop_at, progress)
     return str(Path(config.out) / 'forward_model.safetensors')
@@ -120,20 +121,18 @@ def model_config(config: ForwardTrainingConfig, store: EpisodeStore,
     :param config: ForwardTrainingConfig.
     :param store: EpisodeStore; training: indices of its training episodes.
     :return: ForwardModelConfig.
-    :raises ConfigError: if the pictures are not square.
+    :raises ConfigError: if the pictures are not square, or of a size that it cannot have.
     :raises RecordingError: if gripper positions are missing.
     """
-    height, width = store.image_size
-    if height != width:
-        raise ConfigError(f'recordings: pictures are {width}x{height} pixels, the forward model '
-                          'needs square ones such as 64x64; record or crop them so')
+    check_trainable(store.image_size, 'the forward model')
     chosen = training[np.linspace(0, len(training) - 1, FITTED_EPISODES).astype(int)]
     episodes = [store[int(i)] for i in np.unique(chosen)]
     arm = fit_arm(episodes)
     return ForwardModelConfig(
         table=tuple(fit_table(episodes, arm).ravel().tolist()), arm=tuple(arm.ravel().tolist()),
-        image_size=height, width=config.width, features=config.features,
-        robot_mask=config.robot_mask)
+        image_size=store.image_size[0], width=config.width, features=config.features,
+        robot_mask=config.robot_mask, crop=config.crop, crop_size=config.size,
+        camera_size=store.camera_size or (0, 0))
 
 
 def episode_tables(store: EpisodeStore, model: ForwardModel) -> torch.Tensor:

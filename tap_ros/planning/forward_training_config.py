@@ -8,16 +8,28 @@ from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
 from tap_ros.learning.robot_mask import RobotMask
 from tap_ros.learning.split import TEST_FRACTION
+from tap_ros.recording.reading import Reading
 
 
 @dataclass(frozen=True)
-class ForwardTrainingConfig:
+class ForwardRun:
     """
-    Settings of a training run of the forward model.
+    Where a training run of the forward model happens.
 
     :param recordings: bag folders, folders of bag folders, or .mcap files.
     :param out: folder of the run; an interrupted run goes on there.
-    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    """
+
+    recordings: tuple[str, ...]
+    out: str
+
+
+# Of the bases the last has its fields first.
+@dataclass(frozen=True)
+class ForwardTrainingConfig(Reading, ForwardRun):
+    """
+    Settings of a training run of the forward model.
+
     :param steps: optimiser steps in all.
     :param batch_size: windows per step.
     :param horizon: control periods of the longest windows.
@@ -45,9 +57,6 @@ class ForwardTrainingConfig:
     :param save_every: steps between checkpoints, scores and sample pictures.
     """
 
-    recordings: tuple[str, ...]
-    out: str
-    image_topic: str = ''
     steps: int = 6000
     batch_size: int = 16
     horizon: int = 8
@@ -73,6 +82,7 @@ class ForwardTrainingConfig:
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be trained with."""
+        super().__post_init__()
         if self.robot_mask not in ROBOT_MASKS:
             raise ConfigError(f'robot_mask: expected one of {", ".join(ROBOT_MASKS)}, '
                               f'got {self.robot_mask!r}')

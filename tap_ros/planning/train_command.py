@@ -10,6 +10,7 @@ from typing import Annotated
 from tap_ros.learning.model_option import ModelOption
 from tap_ros.options import Bags, default_text, Folder, Topic
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
+from tap_ros.recording.reading_options import Part
 from tyro import conf
 
 
@@ -20,6 +21,7 @@ class Training(ForwardTrainingConfig):
     recordings: Bags
     out: Folder = 'runs/forward_model'
     image_topic: Topic = ''
+    crop: Part = ''
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from typing import Annotated, TYPE_CHECKING
 
 import cv2
 import numpy as np
+from tap_ros.crop import Crop
 from tap_ros.errors import ConfigError, ImageError
 from tap_ros.files import write_atomically
 from tap_ros.images import in_picture, resize_image, resize_pixels
@@ -33,7 +34,7 @@ class Options:
     """
     Options of the command.
 
-    :param start: picture file, square.
+    :param start: picture file; square, unless the weights were trained on a part of such.
     :param goal: likewise; left out for weights that predict from the start alone.
     :param objects: where the objects are in the start picture: column and row of each, in the
         pixels of the file.
@@ -82,8 +83,14 @@ def run(args: Options) -> None:
         raise ConfigError(
             f'--objects and --goal-objects: {len(pixels["start"])} and {len(pixels["goal"])} '
             'positions; give those of the same objects in both pictures')
-    scaled, places = {}, {}
+    scaled, places, corner = {}, {}, (0, 0)
     for name, picture in pictures.items():
+        cut = predictor.camera_crop.of(picture.shape[:2], name)
+        if cut.part:
+            place, part = cut.window(picture.shape[:2]), Crop(cut.part)
+            pixels[name] = part.pixels(pixels[name], picture.shape[:2])
+            picture = pictures[name] = part.image(picture)
+            corner = place[:2] if name == 'start' else corner
         scaled[name], places[name] = fit(picture, pixels[name], size, name)
     subgoals = predictor.predict(
         scaled['start'], scaled.get('goal'), places['start'], places.get('goal'),
@@ -92,7 +99,7 @@ def run(args: Options) -> None:
     for subgoal in subgoals:
         print(f'{_title(subgoal, len(subgoals))}{":" if len(places["start"]) else ""}')
         for k, (where, mass) in enumerate(zip(subgoal.expected_pixels, subgoal.mass), start=1):
-            u, v = (where + 0.5) * factor - 0.5
+            u, v = (where + 0.5) * factor - 0.5 + corner
             faint = ', hardly in the picture' if mass < FAINT else ''
             print(f'  object {k} at {u:.1f},{v:.1f} (mass {mass:.2f}{faint})')
     write_atomically(args.out, labelled(scaled, places, subgoals))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+from tap_ros.crop import trained_crop
 from tap_ros.errors import ConfigError, ImageError, WeightsError
 from tap_ros.images import check_image, check_pixels, to_float, to_uint8
 from tap_ros.learning.devices import placed
@@ -63,6 +64,7 @@ class SubgoalPredictor:
     :ivar num_context: pictures it is conditioned on: 2, start and goal, or 1, the start.
     :ivar mode: 'bidirectional' for two of them, 'forward' for one.
     :ivar training: dict saying how the weights were made.
+    :ivar camera_crop: TrainedCrop: what to make of a camera's pictures before it sees them.
     """
 
     def __init__(self, network: Predictor, training: dict[str, Any] | None = None,
@@ -84,6 +86,7 @@ class SubgoalPredictor:
         self.mode = 'forward' if self.num_context == 1 else 'bidirectional'
         self.image_size = (network.config.image_size, network.config.image_size)
         self.training = training or {}
+        self.camera_crop = trained_crop(self.training, self.image_size)
         self._network = network.eval().requires_grad_(False)
         self._device = next(network.parameters()).device
         grey = np.full((*self.image_size, 3), 128, np.uint8)

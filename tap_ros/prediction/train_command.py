@@ -5,7 +5,7 @@
 from dataclasses import asdict, dataclass
 
 from tap_ros.learning.model_option import ModelOption
-from tap_ros.options import Bags, Folder, Topic
+from tap_ros.options import Bags, Folder
 from tap_ros.prediction.training_config import (
     DataSettings,
     NetworkSettings,
@@ -14,6 +14,7 @@ from tap_ros.prediction.training_config import (
     RunSettings,
     TrainingConfig,
 )
+from tap_ros.recording.reading_options import ReadingOptions
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,6 @@ class RunOptions(RunSettings):
 
     recordings: Bags
     out: Folder
-    image_topic: Topic = ''
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +30,7 @@ class Options(ModelOption):
     """Options of the command."""
 
     run: RunOptions
+    reading: ReadingOptions = ReadingOptions()
     objective: ObjectiveSettings = ObjectiveSettings()
     data: DataSettings = DataSettings()
     network: NetworkSettings = NetworkSettings()
@@ -38,7 +39,8 @@ class Options(ModelOption):
     @property
     def config(self) -> TrainingConfig:
         """All of them as a TrainingConfig."""
-        parts = (self.run, self.objective, self.data, self.network, self.optimizer)
+        parts = (self.run, self.reading, self.objective, self.data, self.network,
+                 self.optimizer)
         return TrainingConfig(**{
             name: value for part in parts for name, value in asdict(part).items()})
 

@@ -14,6 +14,7 @@ import time
 from typing import Any
 
 import numpy as np
+from tap_ros.crop import check_trainable
 from tap_ros.errors import ConfigError
 from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.learning.devices import Autocast, make_autocast, pick_device, pick_precision
@@ -42,6 +43,7 @@ from tap_ros.prediction.pretraining import pretrain_decoders
 from tap_ros.prediction.recognition import Recognition
 from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.reading import reading_of
 import torch
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
@@ -76,7 +78,7 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
     with joined(device) as processes:
         progress = progress and processes.first
         store = open_recordings(list(config.recordings), progress=progress,
-                                image_topic=config.image_topic)
+                                reading=reading_of(config))
         with run_folder(config.out) if processes.first else nullcontext():
             _train(config, device, processes, store, stop_at, deadline, progress, after_step)
     return str(Path(config.out) / 'predictor.safetensors')
@@ -171,13 +173,10 @@ def network_config(config: TrainingConfig, image_size: tuple[int, int]) -> Predi
     :param config: TrainingConfig.
     :param image_size: (height, width) of the recordings.
     :return: PredictorConfig.
-    :raises ConfigError: if the pictures are not square.
+    :raises ConfigError: if the pictures are not square, or of a size that it cannot have.
     """
-    height, width = image_size
-    if height != width:
-        raise ConfigError(f'recordings: pictures are {width}x{height} pixels, the predictor needs '
-                          'square ones such as 64x64; record or crop them so')
-    return PredictorConfig(image_size=height, base_width=config.base_width,
+    check_trainable(image_size, 'the predictor')
+    return PredictorConfig(image_size=image_size[0], base_width=config.base_width,
                            num_context=1 if config.forward else 2,
                            latent_size=config.latent_size if config.chosen.vae else 0,
                            new_pixels=config.new_pixels, flow_scale=config.flow_scale,

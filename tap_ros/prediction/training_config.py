@@ -15,6 +15,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.learning.robot_mask import RobotMask
 from tap_ros.learning.split import TEST_FRACTION
 from tap_ros.prediction.methods import Method, Mode, parse_method
+from tap_ros.recording.reading import Reading
 
 Decoder = Literal['separate', 'shared']
 GoalPicture = Literal['last', 'recorded', 'mixed']
@@ -29,7 +30,6 @@ class RunSettings:
 
     :param recordings: .mcap files, bag folders, or folders of these.
     :param out: the run's folder; if it holds a checkpoint, training goes on from there.
-    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
     :param test_fraction: share of episodes held out, by seed.
     :param seed: of the weights, batches and augmentation.
     :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
@@ -43,7 +43,6 @@ class RunSettings:
 
     recordings: tuple[str, ...]
     out: str
-    image_topic: str = ''
     test_fraction: float = TEST_FRACTION
     seed: int = 0
     device: str = 'auto'
@@ -270,7 +269,8 @@ class OptimizerSettings:
 # Of the bases the last has its fields first.
 @dataclass(frozen=True)
 class TrainingConfig(
-        OptimizerSettings, NetworkSettings, DataSettings, ObjectiveSettings, RunSettings):
+        OptimizerSettings, NetworkSettings, DataSettings, ObjectiveSettings, Reading,
+        RunSettings):
     """All that a training run is made from: the fields of its parts."""
 
     def __post_init__(self) -> None:

@@ -3,8 +3,9 @@
 """
 Cut recordings into episodes and align what was done and measured to the frames.
 
-By the marks on /episode, by header stamps where messages have them and by log time where they do
-not: a frame belongs to an episode whose marks enclose its stamp, and that is nearest in the log.
+By the marks on /episode, or by pauses of the camera where there are none; by header stamps where
+messages have them and by log time where they do not: a frame belongs to an episode whose marks
+enclose its stamp, and that is nearest in the log.
 """
 
 from collections.abc import Sequence
@@ -19,6 +20,7 @@ from tap_ros.recording.columns import Columns, pad_objects
 from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.lost import EVERYTHING, FAR, seconds
 from tap_ros.recording.mounts import ArmMount
+from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.spans import assign, in_gaps, Mark, MAX_JITTER_NS, read_spans, Span
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
@@ -128,12 +130,14 @@ def follows(before: Columns, after: Columns) -> bool:
     return not ends or not starts or min(starts) >= max(ends) - MAX_JITTER_NS
 
 
-def assemble(parts: Sequence[Columns], arm: ArmMount) -> EpisodeTable:
+def assemble(parts: Sequence[Columns], arm: ArmMount,
+             reading: Reading = AS_RECORDED) -> EpisodeTable:
     """
     Cut files that follow each other into episodes.
 
     :param parts: list of Columns, frames included, in playing order.
     :param arm: where the arm stood.
+    :param reading: Reading; it says where episodes are cut that no marks tell apart.
     :return: EpisodeTable; episodes without any frame are left out.
     """
     data, names, marks = _join(parts)
@@ -142,7 +146,7 @@ def assemble(parts: Sequence[Columns], arm: ArmMount) -> EpisodeTable:
     _drop_stops(data)
     for name in ('twist', 'joint', 'arm', 'object'):
         _stamp_unstamped(data, name)
-    spans = read_spans(data, marks)
+    spans = read_spans(data, marks, reading.gap, reading.episode_seconds)
     owner = _owner(spans, data, parts)
     order = np.lexsort((data['frame_stamp'], owner))
     order = order[owner[order] >= 0]

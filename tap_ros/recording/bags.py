@@ -75,6 +75,25 @@ def find_topics(files: Sequence[Path], image_topic: str = '') -> dict[str, str]:
     return found
 
 
+def list_topics(path: str | Path) -> list[tuple[str, str, int | None]]:
+    """
+    List what recordings hold, whether it can be used or not.
+
+    :param path: .mcap file, bag folder, or folder of bag folders.
+    :return: (topic, type, number of messages, None where unknown), by name.
+    :raises RecordingError: when there is no recording, or nothing of a file can be read.
+    """
+    found: dict[str, tuple[str, int | None]] = {}
+    for file in (McapFile(file) for bag in find_bags(path) for file in bag):
+        channels, counts = file.topics(), file.counts()
+        for topic, channel in channels.items():
+            before = found.get(topic, ('', 0))[1]
+            count = counts.get(topic)
+            found[topic] = channel.type_name, (
+                None if before is None or count is None else before + count)
+    return [(topic, kind, count) for topic, (kind, count) in sorted(found.items())]
+
+
 def check_sizes(parts: Sequence[Columns]) -> None:
     """Refuse recordings whose images differ in size, naming them."""
     sizes: dict[tuple[int, int], str] = {}

@@ -11,7 +11,7 @@ may build and read it at once.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import hashlib
 import json
 import multiprocessing
@@ -31,9 +31,10 @@ from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_pat
 from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.mounts import ArmMount, read_mount
+from tap_ros.recording.reading import AS_RECORDED, Reading
 from tqdm import tqdm
 
-FORMAT = 3  # of a cache folder; another number makes all files be decoded again
+FORMAT = 4  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
 _NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
@@ -47,6 +48,9 @@ class EpisodeStore:
 
     :param tables: list of EpisodeTable.
     :param file_hashes: hex digests of the files, in order, and what else tells them apart.
+    :ivar image_size: (height, width) of the frames.
+    :ivar camera_size: likewise, as they were recorded; None where that differs.
+    :ivar marked: whether marks tell episodes apart, in some of the recordings at least.
     """
 
     def __init__(self, tables: Sequence[EpisodeTable], file_hashes: Iterable[str]) -> None:
@@ -56,6 +60,10 @@ class EpisodeStore:
         self.num_frames = int(self.lengths.sum())
         self.image_size = next(
             part.image_size for table in tables for part in table.parts if part.image_size)
+        cameras = {part.camera_size for table in tables for part in table.parts
+                   if part.camera_size}
+        self.camera_size = cameras.pop() if len(cameras) == 1 else None
+        self.marked = any(part.marks for table in tables for part in table.parts)
         self.data_hash = hashlib.sha256(''.join(file_hashes).encode()).hexdigest()
 
     def __len__(self) -> int:
@@ -79,14 +87,14 @@ class EpisodeStore:
 
 
 def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | Path | None = None,
-                    progress: bool = True, image_topic: str = '') -> EpisodeStore:
+                    progress: bool = True, reading: Reading = AS_RECORDED) -> EpisodeStore:
     """
     Open recordings, decoding what is not in the cache yet.
 
     :param paths: one or a list of .mcap files, bag folders, or folders of bag folders.
     :param cache_dir: by default $TAP_ROS_CACHE or ~/.cache/tap_ros.
     :param progress: show a progress bar when decoding takes long.
-    :param image_topic: the camera's topic, see topics.resolve.
+    :param reading: Reading: which pictures, which part of them, and where episodes are cut.
     :return: EpisodeStore.
     :raises RecordingError: when a recording is missing, empty, damaged or lacks the image topic,
         or when the images differ in size; the message names the file.
@@ -97,7 +105,8 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     with tqdm(total=sum(file.stat().st_size for bag in bags for file in bag),
               desc='opening recordings', unit='B', unit_scale=True, disable=not progress,
               delay=1) as bar:
-        jobs = _jobs(bags, [find_topics(bag, image_topic) for bag in bags], cache_dir)
+        jobs = _jobs(bags, [find_topics(bag, reading.image_topic) for bag in bags], reading,
+                     cache_dir)
         loaded = {job: _load(job.folder, job.path) for bag in jobs for job in bag}
         bar.update(sum(job.size for job, part in loaded.items() if part is not None))
         missing = [job for job, part in loaded.items() if part is None]
@@ -112,10 +121,13 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     for part in (part for bag in columns for part in bag):
         warn_of_damage(part)
     arms = [read_mount(bag[0].parent) for bag in bags]
-    tables = [assemble(run, arm) for bag, arm in zip(columns, arms) for run in _runs(bag)]
-    # What is read depends on where the arm stood, too.
-    placed = [repr(arm) for arm in arms if arm != ArmMount()]
-    store = EpisodeStore(tables, [*(job.digest for bag in jobs for job in bag), *placed])
+    tables = [
+        assemble(run, arm, reading) for bag, arm in zip(columns, arms) for run in _runs(bag)]
+    # What is read depends on these, too.
+    apart = [repr(arm) for arm in arms if arm != ArmMount()]
+    if replace(reading, image_topic='') != AS_RECORDED:
+        apart.append(repr(replace(reading, image_topic='')))
+    store = EpisodeStore(tables, [*(job.digest for bag in jobs for job in bag), *apart])
     if not len(store):
         raise RecordingError(f'{list_paths(paths)}: no camera image lies within an episode')
     return store
@@ -134,17 +146,20 @@ class _Job:
     size: int
     digest: str
     found: tuple[tuple[str, str], ...]  # pairs of a name in topics and the file's topic
+    reading: Reading
     folder: Path  # of the cache
 
 
-def _jobs(bags: Sequence[Sequence[Path]], found: Sequence[Mapping[str, str]],
+def _jobs(bags: Sequence[Sequence[Path]], found: Sequence[Mapping[str, str]], reading: Reading,
           cache_dir: Path) -> list[list[_Job]]:
     """Return a list of _Job for each bag."""
     def job(path: Path, names: Mapping[str, str]) -> _Job:
         with open(path, 'rb') as stream:
             digest = hashlib.file_digest(stream, 'sha256').hexdigest()
-        key = hashlib.sha256(json.dumps([FORMAT, sorted(names.items())]).encode()).hexdigest()[:8]
-        return _Job(path, path.stat().st_size, digest, tuple(names.items()),
+        key = hashlib.sha256(json.dumps([
+            FORMAT, sorted(names.items()), reading.crop, reading.size, reading.rate,
+        ]).encode()).hexdigest()[:8]
+        return _Job(path, path.stat().st_size, digest, tuple(names.items()), reading,
                     cache_dir / f'{digest}-{key}')
     with ThreadPoolExecutor(_workers()) as pool:
         waiting = [[pool.submit(job, path, names) for path in bag]
@@ -213,7 +228,7 @@ def _build(job: _Job) -> None:
 
             restart()
             columns = decode_file(path, dict(job.found), lambda pixels: frames.write(pixels.data),
-                                  lambda mask: masks.write(mask.data), restart)
+                                  lambda mask: masks.write(mask.data), restart, job.reading)
             size = columns.image_size or (0, 0)
             _write_header(frames, (len(columns.arrays.get('frame_log', ())), *size, 3))
             _write_header(masks, (len(columns.arrays.get('mask_log', ())), *size))
@@ -295,7 +310,8 @@ def _load(folder: Path, source: Path) -> Columns | None:
     except (OSError, EOFError, SafetensorError, ValueError, KeyError):
         return None
     return Columns(
-        str(source), tuple(about['image_size']) if count else None, frames,
+        str(source), tuple(about['image_size']) if count else None,
+        tuple(about['camera_size']) if count else None, frames,
         **{key: arrays.pop(key, None) for key in _GOALS}, masks=masks, arrays=arrays,
         names=[tuple(n) for n in about['names']], marks=[tuple(m) for m in about['marks']],
         damage=about['damage'])

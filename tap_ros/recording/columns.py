@@ -11,6 +11,7 @@ from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 import json
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,13 @@ from typing import Any
 import numpy as np
 from tap_ros import ur10e
 from tap_ros.contract import GRIPPER_JOINTS
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ImageError, RecordingError
 from tap_ros.recording import topics
 from tap_ros.recording.container import McapFile
-from tap_ros.recording.lost import describe, EVERYTHING, FRAMES, gaps, Loss, NOTHING
+from tap_ros.recording.lost import describe, EVERYTHING, FAR, FRAMES, gaps, Loss, NOTHING
 from tap_ros.recording.messages import decode
-from tap_ros.recording.pictures import read_mask, read_pixels
+from tap_ros.recording.pictures import read_compressed, read_mask, read_pixels
+from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import Mark
 from tap_ros.text import escaped
 
@@ -60,6 +62,7 @@ class Columns:
 
     source: str  # what messages call the file
     image_size: tuple[int, int] | None = None  # (H, W); None without any image
+    camera_size: tuple[int, int] | None = None  # likewise, before they were cut and scaled
     frames: np.ndarray | None = None  # (F, H, W, 3) uint8, rows belong to frame_log
     goal_frames: np.ndarray | None = None  # (G, H, W, 3) uint8
     masks: np.ndarray | None = None  # (M, H, W) uint8, of the robot; see mask_index
@@ -72,14 +75,14 @@ class Columns:
     def describe(self) -> str:
         """Return all that is not an array as JSON text."""
         return json.dumps({
-            'image_size': self.image_size, 'names': self.names, 'marks': self.marks,
-            'damage': self.damage})
+            'image_size': self.image_size, 'camera_size': self.camera_size,
+            'names': self.names, 'marks': self.marks, 'damage': self.damage})
 
 
 def decode_file(path: str | Path, found: dict[str, str],
                 write_frame: Callable[[np.ndarray], object],
                 write_mask: Callable[[np.ndarray], object],
-                restart: Callable[[], object]) -> Columns:
+                restart: Callable[[], object], reading: Reading) -> Columns:
     """
     Read a file from front to back.
 
@@ -93,6 +96,7 @@ def decode_file(path: str | Path, found: dict[str, str],
     :param write_mask: called likewise with robot masks, (H, W) uint8.
     :param restart: called without arguments when all that was written is to be forgotten, because
         the first picture was not of the size that most are.
+    :param reading: Reading; pictures, masks and pixels are cut and scaled as it says.
     :return: Columns without frames and masks; its 'frame_order' (F,) int64 puts the frames that
         were written in order.
     :raises RecordingError: when no size of pictures is that of more than half of them, or the
@@ -100,12 +104,12 @@ def decode_file(path: str | Path, found: dict[str, str],
     """
     size = None
     while True:
-        decoder = _Decoder(McapFile(path), found, write_frame, write_mask, size)
+        decoder = _Decoder(McapFile(path), found, write_frame, write_mask, size, reading)
         try:
             for topic, log, data in decoder.file.messages(set(found.values())):
                 decoder.take(topic, log, data)
             most = decoder.most_frequent_size()
-            if most == decoder.columns.image_size and (
+            if most == decoder.columns.camera_size and (
                     most is None or decoder.mask_size in (None, most)):
                 return decoder.finish()
         except RecordingError as error:
@@ -120,13 +124,15 @@ class _Decoder:
     def __init__(self, file: McapFile, found: dict[str, str],
                  write_frame: Callable[[np.ndarray], object],
                  write_mask: Callable[[np.ndarray], object],
-                 size: tuple[int, int] | None) -> None:
+                 size: tuple[int, int] | None, reading: Reading) -> None:
         self.file = file
         self.found = found
+        self.reading = reading
+        self.due = -FAR  # ns, when the next picture is to be taken, with a rate
         self.write_frame, self.write_mask = write_frame, write_mask
         self.mask_size = size  # (H, W) of the first robot mask that was written
         self.num_masks = 0
-        self.columns = Columns(str(file.path), size)
+        self.columns = Columns(str(file.path), camera_size=size)
         self.sizes: Counter[tuple[int, int]] = Counter()  # (H, W) -> camera images
         self.losses: list[Loss] = []
         self.integers: defaultdict[str, array[int]] = defaultdict(
@@ -134,13 +140,17 @@ class _Decoder:
         self.numbers: defaultdict[str, array[float]] = defaultdict(
             lambda: array('d'))  # column -> as many as its rows have
         self.names: dict[tuple[str, ...], int] = {}  # tuple of object names -> number
-        self.goals: dict[str, list[np.ndarray]] = {'goal': [], 'goal_mask': []}
+        # name -> pictures, each with the size that it came with
+        self.goals: dict[str, list[tuple[np.ndarray, tuple[int, ...]]]] = {
+            'goal': [], 'goal_mask': []}
         self.state_bytes = 0  # of messages that are no pictures
         self.most_state_bytes = _FREE_STATES + _STATES_PER_BYTE * len(file.data)
         decoders = {
             topics.IMAGE: self._image, topics.ROBOT_MASK: self._mask,
-            topics.GOAL_IMAGE: lambda *a: self._goal_picture('goal', read_pixels, *a),
-            topics.GOAL_ROBOT_MASK: lambda *a: self._goal_picture('goal_mask', read_mask, *a),
+            topics.GOAL_IMAGE: lambda *a: self._goal_picture(
+                'goal', read_pixels, reading.cut.image, *a),
+            topics.GOAL_ROBOT_MASK: lambda *a: self._goal_picture(
+                'goal_mask', read_mask, reading.cut.mask, *a),
             topics.TWIST: self._twist, topics.GRIPPER_COMMAND: self._command,
             topics.JOINT_STATES: self._joints, topics.EPISODE: self._mark,
             topics.OBJECTS: lambda *a: self._objects('object', *a),
@@ -158,13 +168,22 @@ class _Decoder:
             try:
                 if state and len(data) > _MAX_STATE:
                     raise RecordingError(f'a message of more than {_MAX_STATE} bytes')
-                decoder(log, decode(topics.TYPES[name], data))
-            except RecordingError as error:
+                kind = topics.COMPRESSED if (
+                    name == topics.IMAGE and self.compressed) else topics.TYPES[name]
+                decoder(log, decode(kind, data))
+            except (RecordingError, ImageError) as error:
                 self._lose(name, log, error)
                 if name in _GOALS:  # what was said before holds no more
                     self._add(_GOALS[name], log, stamp=0, index=-1)
                 elif name == topics.GOAL_OBJECTS:
                     self._add_objects('goal_object', log, 0, (), ())
+
+    @cached_property
+    def compressed(self) -> bool:
+        """Whether the camera's pictures are compressed; known once a message has come."""
+        return any(channel.type_name == topics.COMPRESSED
+                   for channel in self.file.channels.values()
+                   if channel.topic == self.found[topics.IMAGE])
 
     def most_frequent_size(self) -> tuple[int, int] | None:
         """Return the size of more than half of the camera images, None without any."""
@@ -182,7 +201,10 @@ class _Decoder:
         """Make arrays, rows in the order of their log times."""
         for topic, name in _GOALS.items():
             self._drop_goals(topic, name)
-        if self.columns.image_size is None:  # masks of nothing, whose size nothing tells
+        columns = self.columns
+        if columns.camera_size is not None:
+            columns.image_size = self.reading.cut.cut_size(columns.camera_size)
+        else:  # masks of nothing, whose size nothing tells
             for key in ('mask_log', 'mask_stamp', 'mask_index'):
                 self.integers.pop(key, None)
         arrays = {key: np.array(column, np.int64) for key, column in self.integers.items()}
@@ -190,11 +212,13 @@ class _Decoder:
             for key, (width, dtype) in _NUMBERS.items():
                 if key in self.numbers:
                     arrays[key] = np.array(self.numbers[key]).reshape(-1, *width).astype(dtype)
-        columns = self.columns
         for name in ('object', 'goal_object'):
             if f'{name}_log' in arrays:
                 arrays[name] = pad_objects(
                     np.array(self.numbers[name]).reshape(-1, 9), arrays.pop(f'{name}_count'))
+                if columns.camera_size is not None:
+                    arrays[name][..., :2] = self.reading.cut.pixels(
+                        arrays[name][..., :2], columns.camera_size)
         for name in [key.removesuffix('_log') for key in arrays if key.endswith('_log')]:
             order = np.argsort(arrays[f'{name}_log'], kind='stable')
             for key in (name, *(name + end for end in _ENDINGS)):
@@ -210,28 +234,29 @@ class _Decoder:
         columns.arrays = arrays
         columns.names = list(self.names)
         columns.goal_frames, columns.goal_masks = (
-            np.stack(pictures) if pictures else None for pictures in self.goals.values())
+            np.stack([picture for picture, _ in pictures]) if pictures else None
+            for pictures in self.goals.values())
         return columns
 
     def _drop_goals(self, topic: str, name: str) -> None:
         """Take back goal pictures that are not of the size of the others, or of the camera's."""
         goals = self.goals[name]
-        size = self.columns.image_size or (goals[0].shape[:2] if goals else None)
-        kept = [goal for goal in goals if goal.shape[:2] == size]
+        size = self.columns.camera_size or (goals[0][1] if goals else None)
+        kept = [goal for goal in goals if goal[1] == size]
         if size is None or len(kept) == len(goals):
             return
         logs, index, number = self.integers[f'{name}_log'], self.integers[f'{name}_index'], 0
         for row, old in enumerate(index):
             if old < 0:
                 continue
-            good = goals[old].shape[:2] == size
+            good = goals[old][1] == size
             index[row], number = (number, number + 1) if good else (-1, number)
             if not good:
                 self._lose(topic, logs[row], RecordingError(
                     f'a goal of another size than {size[1]}x{size[0]} pixels'))
         self.goals[name] = kept
 
-    def _lose(self, name: str, log: int, error: RecordingError) -> None:
+    def _lose(self, name: str, log: int, error: Exception) -> None:
         """Note a message that cannot be used."""
         self.losses.append(Loss(
             str(error), f'topic {self.found[name]}', None, log, log, _CUTS.get(name, NOTHING)))
@@ -251,41 +276,55 @@ class _Decoder:
         self.numbers[name].extend(numbers)
 
     def _image(self, log: int, message: Any) -> None:
-        pixels, columns = read_pixels(message), self.columns
-        size = pixels.shape[:2]
+        if not self._is_due(_stamp(message) or log):
+            return
+        pixels = read_compressed(message) if self.compressed else read_pixels(message)
+        columns, size = self.columns, pixels.shape[:2]
         if 0 in size:
             raise RecordingError('an empty picture')
+        cut = self.reading.cut.image(pixels)
         self.sizes[size] += 1
-        if columns.image_size is None:
-            columns.image_size = size
-        if size != columns.image_size:
+        if columns.camera_size is None:
+            columns.camera_size = size
+        if size != columns.camera_size:
             raise RecordingError('a picture of {1}x{0} pixels among those of {3}x{2}'.format(
-                *size, *columns.image_size))
-        self.write_frame(pixels)
+                *size, *columns.camera_size))
+        self.write_frame(cut)
         self._add('frame', log, stamp=_stamp(message))
+
+    def _is_due(self, time: int) -> bool:
+        """Tell whether a picture of this time, ns, is taken, so that no more than the rate are."""
+        if not self.reading.rate:
+            return True
+        period = int(1e9 / self.reading.rate)
+        if self.due - 2 * period <= time < self.due - period // 4:  # else the clock was set back
+            return False
+        self.due = (self.due if abs(time - self.due) <= period else time) + period
+        return True
 
     def _mask(self, log: int, message: Any) -> None:
         mask = read_mask(message)
         if 0 in mask.shape:
             raise RecordingError('an empty robot mask')
         # A mask may come before the first picture; its size is judged at the end.
-        size = self.columns.image_size or self.mask_size or mask.shape
+        size = self.columns.camera_size or self.mask_size or mask.shape
         if mask.shape != size:
             raise RecordingError('a robot mask of {1}x{0} pixels among pictures of {3}x{2}'.format(
                 *mask.shape, *size))
         self.mask_size = self.mask_size or mask.shape
-        self.write_mask(mask)
+        self.write_mask(self.reading.cut.mask(mask))
         self._add('mask', log, stamp=_stamp(message), index=self.num_masks)
         self.num_masks += 1
 
-    def _goal_picture(self, name: str, read: Callable[[Any], np.ndarray], log: int,
-                      message: Any) -> None:
+    def _goal_picture(self, name: str, read: Callable[[Any], np.ndarray],
+                      cut: Callable[[np.ndarray], np.ndarray], log: int, message: Any) -> None:
         pixels = read(message)
         if 0 in pixels.shape:
             self._add(name, log, stamp=_stamp(message), index=-1)
         else:
+            picture = np.array(cut(pixels)), pixels.shape[:2]
             self._add(name, log, stamp=_stamp(message), index=len(self.goals[name]))
-            self.goals[name].append(pixels.copy())
+            self.goals[name].append(picture)
 
     def _twist(self, log: int, message: Any) -> None:
         linear = message.twist.linear

@@ -99,6 +99,12 @@ class McapFile:
                 pass
         return {channel.topic: channel for channel in self.channels.values()}
 
+    def counts(self) -> dict[str, int]:
+        """Return the number of messages by topic, as the summary says; empty where it does not."""
+        known = (self._summary.counts if self._summary else None) or {}
+        return {channel.topic: known.get(number, 0) for number, channel in self.channels.items()
+                } if known else {}
+
     def messages(self, wanted: Collection[str]) -> Iterator[tuple[str, int, memoryview]]:
         """
         Yield the messages of some topics in the order of the file.

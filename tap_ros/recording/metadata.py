@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 import re
+import shlex
 from typing import Any
 
 from tap_ros.errors import RecordingError
@@ -140,13 +141,13 @@ def bag_files(folder: str | Path) -> list[Path]:
         ) from error
     if storage != 'mcap':
         raise RecordingError(
-            f'{path}: the bag is stored as {escaped(storage, 40)}; only mcap is read '
-            '(record with -s mcap, or ros2 bag convert)')
+            f'{path}: the bag is stored as {escaped(storage, 40)}; only mcap is read; '
+            f'{_convert(folder)}, or record with -s mcap')
     if compression:
         raise RecordingError(
-            f'{path}: the bag is compressed by rosbag2 ({escaped(compression, 40)}); use the '
-            'compression inside mcap instead (--storage-preset-profile zstd_fast, or ros2 '
-            'bag convert)')
+            f'{path}: the bag is compressed by rosbag2 ({escaped(compression, 40)}); only '
+            f'compression inside mcap is read; {_convert(folder)}, or record with '
+            '--storage-preset-profile zstd_fast')
     files = [folder / Path(name).name for name in names]
     missing = [file.name for file in files if not _is_file(file)]
     if missing:
@@ -154,6 +155,13 @@ def bag_files(folder: str | Path) -> list[Path]:
             f'{path} names files that are not there: {listing(missing)}; bring them back, or '
             'make metadata.yaml anew (ros2 bag reindex)')
     return files
+
+
+def _convert(folder: Path) -> str:
+    """Return the command that makes a bag which can be read; rosbags is installed with tap_ros."""
+    name = shlex.quote(escaped(folder))
+    return (f'convert it: rosbags-convert --src {name} --dst {shlex.quote(escaped(folder))}_mcap '
+            '--dst-storage mcap')
 
 
 def _read(path: Path) -> str:

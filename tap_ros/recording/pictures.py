@@ -1,19 +1,18 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The pixels of sensor_msgs/Image messages, whatever their encoding and padding."""
+"""The pixels of recorded picture messages, whatever their encoding and padding."""
 
 from typing import Any
 
 import numpy as np
 from tap_ros.contract import (
-    ENCODINGS,
     MASK_ENCODING,
-    PICTURE_ENCODING,
     ROBOT_MASK_ARM,
     ROBOT_MASK_FREE,
     ROBOT_MASK_HAND,
 )
-from tap_ros.errors import RecordingError
+from tap_ros.encodings import decompress, pixel_bytes, to_rgb
+from tap_ros.errors import ImageError, RecordingError
 
 _MASK_VALUES = (ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM)
 _IS_MASK_VALUE = np.isin(np.arange(256), _MASK_VALUES)
@@ -28,14 +27,25 @@ def read_pixels(message: Any) -> np.ndarray:
     """
     if _is_empty(message):
         return np.empty((0, 0, 3), np.uint8)
-    channels, order = ENCODINGS.get(message.encoding, (0, (0, 0, 0)))
-    if not channels:
-        raise RecordingError(f'encoding {message.encoding[:40]!r} cannot be read; choose one of '
-                             f'{", ".join(ENCODINGS)}')
-    pixels = _rows(message, channels)
-    if message.encoding != PICTURE_ENCODING:
-        pixels = pixels[..., list(order)]
-    return np.ascontiguousarray(pixels)
+    try:
+        return to_rgb(_rows(message, pixel_bytes(message.encoding)), message.encoding)
+    except ImageError as error:
+        raise RecordingError(str(error)) from error
+
+
+def read_compressed(message: Any) -> np.ndarray:
+    """
+    Return the pixels of a compressed image message, (H, W, 3) uint8 rgb; see read_pixels.
+
+    :param message: sensor_msgs/CompressedImage as messages.decode returns it.
+    :raises RecordingError: when it cannot be read.
+    """
+    if not len(message.data):
+        return np.empty((0, 0, 3), np.uint8)
+    try:
+        return decompress(message.data, message.format)
+    except ImageError as error:
+        raise RecordingError(str(error)) from error
 
 
 def read_mask(message: Any) -> np.ndarray:

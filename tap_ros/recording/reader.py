@@ -13,41 +13,42 @@ from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.lost import EVERYTHING
 from tap_ros.recording.mounts import ArmMount, read_mount
+from tap_ros.recording.reading import AS_RECORDED, Reading
 
 _NO_EVENT = np.empty(0, np.int64)
 _NO_GAP = np.empty((0, 3), np.int64)
 
 
-def iter_episodes(path: str | Path, image_topic: str = '') -> Iterator[Episode]:
+def iter_episodes(path: str | Path, reading: Reading = AS_RECORDED) -> Iterator[Episode]:
     """
     Yield the episodes of a recording; at most about one file is in memory at a time.
 
     :param path: .mcap file, bag folder, or folder of bag folders.
-    :param image_topic: the camera's topic, see topics.resolve.
+    :param reading: Reading: which pictures, which part of them, and where episodes are cut.
     :return: iterator over Episode.
     :raises RecordingError: when the recording is missing, empty, damaged or lacks the image topic.
     """
     for files in find_bags(path):
-        found, arm = find_topics(files, image_topic), read_mount(files[0].parent)
+        found, arm = find_topics(files, reading.image_topic), read_mount(files[0].parent)
         waiting: list[Columns] = []
         checked: list[Columns] = []
         for file in files:
-            part = _decode(file, found)
+            part = _decode(file, found, reading)
             checked.append(Columns(part.source, part.image_size, damage=part.damage))
             if part.image_size is not None:
                 check_sizes(checked)
             if waiting and not follows(waiting[-1], part):
-                yield from _episodes(waiting, arm)
+                yield from _episodes(waiting, arm, reading)
                 waiting = []
             waiting.append(part)
             if _closed(part):
-                yield from _episodes(waiting, arm)
+                yield from _episodes(waiting, arm, reading)
                 waiting = _kept(waiting)
-        yield from _episodes(waiting, arm)
+        yield from _episodes(waiting, arm, reading)
         check_sizes(checked)
 
 
-def _decode(file: Path, found: dict[str, str]) -> Columns:
+def _decode(file: Path, found: dict[str, str], reading: Reading) -> Columns:
     """Return the Columns of a file, frames in memory."""
     pieces: list[bytes] = []
     masks: list[bytes] = []
@@ -57,7 +58,7 @@ def _decode(file: Path, found: dict[str, str]) -> Columns:
         masks.clear()
 
     part = decode_file(file, found, lambda pixels: pieces.append(pixels.tobytes()),
-                       lambda mask: masks.append(mask.tobytes()), restart)
+                       lambda mask: masks.append(mask.tobytes()), restart, reading)
     order = part.arrays.pop('frame_order', None)
     if pieces and order is not None and part.image_size is not None:
         frames = np.frombuffer(b''.join(pieces), np.uint8).reshape(-1, *part.image_size, 3)
@@ -67,8 +68,8 @@ def _decode(file: Path, found: dict[str, str]) -> Columns:
     return part
 
 
-def _episodes(parts: Sequence[Columns], arm: ArmMount) -> Iterator[Episode]:
-    table = assemble(parts, arm)
+def _episodes(parts: Sequence[Columns], arm: ArmMount, reading: Reading) -> Iterator[Episode]:
+    table = assemble(parts, arm, reading)
     for i in range(len(table)):
         yield table.episode(i)
 

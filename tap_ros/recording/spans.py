@@ -39,15 +39,20 @@ class Span:
     first_cut: int | None = None  # log time of the gap where the first part of this one ends
 
 
-def read_spans(data: dict[str, np.ndarray], marks: Sequence[Mark]) -> list[Span]:
+def read_spans(data: dict[str, np.ndarray], marks: Sequence[Mark], pause: float = 0,
+               longest: float = 0) -> list[Span]:
     """
     Read the marks: a list of spans in the order of the log.
 
-    :param data: dict with mark_log, mark_stamp, mark_event (N,), and gap (G, 3) as losses.gaps.
+    :param data: dict with mark_log, mark_stamp, mark_event (N,), frame_log, frame_stamp (F,), and
+        gap (G, 3) as losses.gaps.
     :param marks: N triples (task, seed, outcome).
+    :param pause: s; without marks, a longer one between two frames begins an episode; 0: none.
+    :param longest: s; without marks and pauses, longer episodes are cut into equal parts; 0: none.
     """
     gaps = data['gap'][np.argsort(data['gap'][:, 0], kind='stable')].tolist()
-    spans = _marked(data, marks, gaps) if marks else [Span()]
+    spans = _marked(data, marks, gaps) if marks else _unmarked(
+        data['frame_log'], data['frame_stamp'], int(pause * 1e9), int(longest * 1e9))
     if gaps:
         spans = [part for span in spans for part in _cut(span, gaps)]
         spans = sorted((s for s in spans if s.start_log <= s.end_log), key=lambda s: s.start_log)
@@ -103,6 +108,22 @@ def _marked(data: dict[str, np.ndarray], marks: Sequence[Mark],
             current.end_log, current.outcome = log, about[2]
             current.end_stamp = stamp or FAR
             current, last_end = None, log + 1
+    return spans
+
+
+def _unmarked(log: np.ndarray, stamps: np.ndarray, pause: int, longest: int) -> list[Span]:
+    """Return spans that end where the camera pauses, or its clock was set; times in ns."""
+    order = np.argsort(log, kind='stable')
+    log, stamps = log[order], stamps[order]
+    begins = np.flatnonzero(np.abs(np.diff(stamps)) > pause) + 1 if pause else np.empty(0, int)
+    if not len(begins) and longest and len(stamps):
+        since = np.maximum.accumulate(stamps) - stamps[0]
+        parts = max(-(-int(since[-1]) // longest), 1)  # rounded up
+        begins = np.unique(np.searchsorted(since, since[-1] / parts * np.arange(1, parts)))
+    edges = [0, *begins.tolist(), len(log)]
+    spans = [Span(int(log[first]), int(log[end - 1]))
+             for first, end in zip(edges, edges[1:]) if end > first] or [Span()]
+    spans[0].start_log, spans[-1].end_log = -FAR, FAR
     return spans
 
 

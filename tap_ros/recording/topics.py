@@ -22,6 +22,7 @@ GOAL_OBJECTS = '/goal/objects'
 EPISODE = '/episode'
 CLOCK = '/clock'
 
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'  # the camera's pictures may have this type
 TYPES = {
     IMAGE: 'sensor_msgs/msg/Image',
     ROBOT_MASK: 'sensor_msgs/msg/Image',
@@ -74,14 +75,15 @@ def resolve(available: Mapping[str, str], source: str,
     :param available: dict topic -> type of what the recording holds.
     :param source: what messages call the recording.
     :param image_topic: the camera's topic; by default the one that ends in /camera/image_raw, else
-        the only one of images.
+        the only one of images, else the only one of compressed images.
     :return: dict from the names above to topics of the recording; what it lacks is left out.
     :raises RecordingError: without an image topic, or when several would do.
     """
     known = listing((f'{t} ({k})' for t, k in sorted(available.items())), 20) or 'none'
-    if image_topic and available.get(image_topic) != TYPES[IMAGE]:
+    if image_topic and available.get(image_topic) not in (TYPES[IMAGE], COMPRESSED):
         raise RecordingError(
-            f'{source}: no topic {image_topic} of type {TYPES[IMAGE]}; topics found: {known}')
+            f'{source}: no topic {image_topic} of type {TYPES[IMAGE]} or {COMPRESSED}; topics '
+            f'found: {known}')
     found = {IMAGE: image_topic} if image_topic else {}
     for name, kind in TYPES.items():
         if name in found or name in (CAMERA_INFO, CLOCK):
@@ -101,8 +103,9 @@ def resolve(available: Mapping[str, str], source: str,
         if candidates:
             found[name] = candidates[0]
     if IMAGE not in found:
-        images = [topic for topic, kind in available.items()
-                  if kind == TYPES[IMAGE] and topic not in found.values()]
+        images = next((names for kind in (TYPES[IMAGE], COMPRESSED) if (names := [
+            topic for topic in available
+            if available[topic] == kind and topic not in found.values()])), [])
         if len(images) != 1:
             raise RecordingError(
                 f'{source}: no topic ends in {IMAGE} with type {TYPES[IMAGE]}; name the camera '

@@ -67,10 +67,10 @@ class NodeProcess:
 class Client:
     """A node of the test's own with a thread that spins it; several may live side by side."""
 
-    def __init__(self, name='test_client'):
+    def __init__(self, name='test_client', **options):
         self.context = Context()
         self.context.init()
-        self.node = Node(name, context=self.context)
+        self.node = Node(name, context=self.context, **options)
         self.spinner = Spinner(self.node)
 
     def __enter__(self):

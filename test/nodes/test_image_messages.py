@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
+from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.nodes import image_messages, object_messages
 
@@ -52,7 +53,8 @@ def test_grey_becomes_three_equal_channels():
 
 
 @pytest.mark.parametrize('change, words', [
-    ({'encoding': 'yuv422'}, ['yuv422', 'rgb8', 'bgr8', 'mono8']),
+    ({'encoding': 'yuv444'}, ['yuv444', 'rgb8', 'bgr8', 'mono8']),
+    ({'encoding': '16UC1'}, ['16UC1', 'more than 8 bits', 'rgb8']),
     ({'encoding': ''}, ["''", 'rgb8']),
     ({'step': 20}, ['step', '20', '21']),
     ({'step': 22}, ['data', '105', '110']),
@@ -83,7 +85,7 @@ def test_a_frame_id_without_end_is_refused():
 def test_what_is_just_within_the_limits_is_taken():
     message = image_messages.encode_image(picture(), STAMP, image_messages.MAX_FRAME_ID * 'x')
     assert np.array_equal(image_messages.decode_image(message, 'goal'), picture())
-    step = image_messages.MAX_BYTES
+    step = MAX_PICTURE_BYTES
     message = Image(height=1, width=1, step=step, encoding='rgb8')
     message.data = array.array('B', bytes([1, 2, 3]) + bytes(step - 3))
     assert image_messages.decode_image(message, 'goal').tolist() == [[[1, 2, 3]]]

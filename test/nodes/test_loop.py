@@ -75,7 +75,7 @@ def test_recursion_gives_as_many_subgoals_and_a_bad_request_says_why(loop):
     one = ObjectStates(objects=goal_objects.objects[:1])
     name = objects.objects[1].name
     for fields, words in (
-            ({'start': changed(start, encoding='yuv422')}, ['start', 'yuv422', 'rgb8', 'bgr8']),
+            ({'start': changed(start, encoding='yuv444')}, ['start', 'yuv444', 'rgb8', 'bgr8']),
             ({'goal': changed(goal, step=64)}, ['goal', 'step', '64', '192']),
             ({'goal': changed(goal, data=goal.data[:-1])}, ['goal', 'data', '12287', '12288']),
             ({'start': small}, ['start', '64x64', '48x32']),

@@ -126,7 +126,7 @@ def test_the_loss_is_that_of_the_chosen_pictures_and_what_moves_costs_a_little(m
 class Store(list):
     """Episodes in memory, read like an EpisodeStore."""
 
-    image_size = (32, 32)
+    image_size = camera_size = (32, 32)
 
     @property
     def lengths(self):

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 from tap_ros.cli import main
+from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.predict_command import fit
-from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.recording.reader import iter_episodes
 
 
@@ -106,3 +107,23 @@ def test_pictures_are_scaled_and_positions_with_them():
     picture, pixels = fit(ramp, np.array([[1.5, 1.5], [31.5, -0.5]]), (8, 8), 'start')
     assert picture[3, 1:-1, 0].tolist() == [16 * i + 6 for i in range(1, 7)]
     assert pixels == pytest.approx(np.array([[0, 0], [7.5, -0.5]]))
+
+
+def test_the_part_that_the_weights_were_trained_on_is_cut_out(episode, tmp_path, capsys):
+    network, _ = load_network('push2')
+    weights = tmp_path / 'cut.safetensors'
+    save_weights(weights, network, 'predictor', network.config, {
+        'settings': {'crop': 'centre', 'size': 64}, 'camera_size': [192, 256]})
+    files = [tmp_path / 'start.png', tmp_path / 'goal.png']
+    for path, frame in zip(files, (episode.frames[0], episode.frames[-1])):
+        wide = np.zeros((192, 256, 3), np.uint8)
+        wide[:, 32:224] = frame[..., ::-1].repeat(3, 0).repeat(3, 1)
+        cv2.imwrite(str(path), wide)
+    start, goal = ((pixels + 0.5) * 3 - 0.5 + [32, 0] for pixels in episode.object_pixels[[0, -1]])
+    assert main(['predict', *map(str, files), '--weights', str(weights), '--objects',
+                 *words(start), '--goal-objects', *words(goal),
+                 '--out', str(tmp_path / 'out.png')]) == 0
+    subgoal, = SubgoalPredictor.load('push2').predict(
+        episode.frames[0], episode.frames[-1], *episode.object_pixels[[0, -1]])
+    told = np.array(re.findall(r'object \d at ([\d.]+),([\d.]+)', capsys.readouterr().out), float)
+    assert told == pytest.approx((subgoal.expected_pixels + 0.5) * 3 - 0.5 + [32, 0], abs=0.2)

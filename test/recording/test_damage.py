@@ -20,6 +20,7 @@ from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode, schema_text
 from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import BagWriter, EpisodeWriter
 import zstandard
 
@@ -136,7 +137,7 @@ def test_no_image_topic_lists_the_topics_found(tmp_path):
     with pytest.raises(RecordingError, match=r'a.mcap: .*/camera/image_raw.*found: /speed \(std'):
         open_recordings(tmp_path)
     with pytest.raises(RecordingError, match='no topic /cam of type .*found: /speed'):
-        list(iter_episodes(tmp_path, image_topic='/cam'))
+        list(iter_episodes(tmp_path, Reading('/cam')))
 
 
 def test_image_topic_without_any_image(tmp_path):
@@ -303,9 +304,10 @@ def test_bag_writer_splits_files(tmp_path, monkeypatch):
             'step': 30, 'data': bytes([t] * 300)}), (t + 1) * 10**9)
     writer.close()
     assert len(list((tmp_path / 'bag').glob('*.mcap'))) > 3
-    (episode,) = iter_episodes(tmp_path / 'bag')  # one episode in many files
+    whole = Reading(episode_seconds=0)
+    (episode,) = iter_episodes(tmp_path / 'bag', whole)  # one episode in many files
     assert episode.frames[:, 0, 0, 0].tolist() == list(range(40))
-    (episode,) = open_recordings(tmp_path / 'bag')
+    (episode,) = open_recordings(tmp_path / 'bag', reading=whole)
     assert episode.frames[:, 0, 0, 0].tolist() == list(range(40))
 
 

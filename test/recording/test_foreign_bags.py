@@ -11,6 +11,7 @@ from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.reading import Reading
 from tap_ros.recording.topics import resolve
 from tap_ros.recording.writer import BagWriter, EpisodeWriter
 
@@ -138,7 +139,10 @@ def test_frames_of_changing_headers_stay_in_order(tmp_path):
 
 
 @pytest.mark.parametrize('changes, words', [
-    ({'encoding': '32FC1'}, "encoding '32FC1' cannot be read; choose one of rgb8, bgr8"),
+    ({'encoding': 'cmyk8'}, "encoding 'cmyk8' cannot be used; valid encodings: rgb8, bgr8"),
+    ({'encoding': '32FC1'}, "encoding '32FC1' .*more than 8 bits a channel, as depth cameras"),
+    ({'encoding': 'bayer_rggb16'}, 'more than 8 bits a channel'),
+    ({'encoding': 'yuv422', 'step': 6, 'data': bytes(12)}, '3x2 pixels of encoding yuv422'),
     ({'step': 8}, '3x2 pixels with step 8'),
     ({'data': bytes(17)}, '17 bytes of data'),
     ({'width': 2**31}, 'step 9')])
@@ -162,7 +166,7 @@ def test_of_two_other_image_topics_one_has_to_be_named(tmp_path):
            + [camera(t, topic='/side/rgb') for t in range(4, 7)])
     with pytest.raises(RecordingError, match='--image-topic.*/front/rgb.*/side/rgb'):
         open_recordings(tmp_path / 'bag')
-    (episode,) = open_recordings(tmp_path / 'bag', image_topic='/side/rgb')
+    (episode,) = open_recordings(tmp_path / 'bag', reading=Reading('/side/rgb'))
     assert episode.frames[:, 0, 0, 0].tolist() == [4, 5, 6]
 
 

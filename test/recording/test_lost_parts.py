@@ -13,7 +13,7 @@ from made_episodes import assert_all_equal, make_episode
 from mcap.writer import CompressionType, Writer
 import numpy as np
 import pytest
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.evaluation import inspect_files
 from tap_ros.recording import writer as writer_module
 from tap_ros.recording.cache import open_recordings
@@ -401,7 +401,8 @@ def test_inspect_shows_names_in_one_line(tmp_path, capsys):
     with EpisodeWriter(tmp_path / 'a.mcap') as writer:
         writer.write(make_episode(task='push2\n\x1b[2Jall is well'))
     args = inspect_files.Options(str(tmp_path / 'a.mcap'), episodes=1)
-    inspect_files.run(args)
+    with pytest.raises(ConfigError, match='12x8 pixels; the predictor needs square ones'):
+        inspect_files.run(args)  # as train would refuse it
     lines = capsys.readouterr().out.splitlines()
     assert all(line.isprintable() for line in lines)
     assert r'task        push2\n\x1b[2Jall is well 1' in lines

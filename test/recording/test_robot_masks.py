@@ -10,7 +10,7 @@ from made_episodes import assert_all_equal, cover, make_episode, write_bag
 import numpy as np
 import pytest
 from tap_ros.contract import ROBOT_MASK_ARM
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.evaluation import inspect_files
 from tap_ros.recording import cache as cache_module
 from tap_ros.recording import topics
@@ -214,12 +214,14 @@ def test_inspect_tints_what_masks_mark(episodes, tmp_path, capsys):
     path = tmp_path / 'bag'
     with EpisodeWriter(path) as writer:
         writer.write(covered)
-    inspect_files.run(inspect_files.Options(
-        str(path), str(tmp_path / 'strips.png'), robot_mask=True))
+    with pytest.raises(ConfigError, match='12x8 pixels'):  # too small to train on
+        inspect_files.run(inspect_files.Options(
+            str(path), str(tmp_path / 'strips.png'), robot_mask=True))
     tinted = inspect_files._tinted(covered)
     marked = covered.robot_masks > 0
     assert marked.any() and np.array_equal(tinted[~marked], covered.frames[~marked])
     assert (tinted[covered.robot_masks == ROBOT_MASK_ARM, 0] >= 127).all()
     plain = tmp_path / 'plain.png'
-    inspect_files.run(inspect_files.Options(str(path), str(plain)))
+    with pytest.raises(ConfigError, match='12x8 pixels'):
+        inspect_files.run(inspect_files.Options(str(path), str(plain)))
     assert plain.read_bytes() != (tmp_path / 'strips.png').read_bytes()

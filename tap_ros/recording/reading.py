@@ -1,0 +1,78 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""How recordings are read: which pictures of which camera, and where episodes are cut."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, TYPE_CHECKING
+
+from tap_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tap_ros.crop import Crop
+
+
+@dataclass(frozen=True)
+class Reading:
+    """
+    Which pictures of recordings are used.
+
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param crop: the square part of the pictures that is used: 'centre', the largest one in the
+        middle, or LEFT,TOP,SIDE in pixels of the camera. Without it pictures are used whole.
+    :param size: pixels a side that pictures are scaled to, such as 64; 0: not scaled.
+    :param rate: pictures a second, at most; 0: all of them.
+    :param gap: s; where no marks tell episodes apart, a longer pause between two pictures does;
+        0: never.
+    :param episode_seconds: s; where neither marks nor pauses do, episodes are cut into equal
+        parts of at most this length; 0: never.
+    """
+
+    image_topic: str = ''
+    crop: str = ''
+    size: int = 0
+    rate: float = 0.0
+    gap: float = 5.0
+    episode_seconds: float = 20.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be read with."""
+        if self.crop or self.size:
+            self.cut  # noqa: B018  it says what is wrong
+        for name in ('rate', 'gap', 'episode_seconds'):
+            if not 0 <= getattr(self, name) <= 1e6:
+                raise ConfigError(f'{name}: expected 0 to 1000000, got {getattr(self, name)}')
+
+    @cached_property
+    def cut(self) -> 'Crop':
+        """What part of the pictures is used, as a Crop."""
+        from tap_ros.crop import Crop  # here, as numpy takes a moment, and --help does without
+        return Crop(self.crop, self.size)
+
+
+AS_RECORDED = Reading()
+
+
+def reading_of(settings: Reading) -> Reading:
+    """Return the part of larger settings, a subclass, that says how recordings are read."""
+    return Reading(**{field.name: getattr(settings, field.name) for field in fields(Reading)})
+
+
+def trained_reading(training: Mapping[str, Any], image_topic: str = '') -> Reading:
+    """
+    Return how the recordings of a training were read.
+
+    :param training: the training dict of a weights file, of any version.
+    :param image_topic: the camera's topic in other recordings, if it is called otherwise.
+    :return: Reading; what the file does not tell is as by default.
+    """
+    settings = training.get('settings')
+    known = {} if not isinstance(settings, dict) else {
+        field.name: settings[field.name] for field in fields(Reading)
+        if field.name != 'image_topic'
+        and isinstance(settings.get(field.name), (str,) if field.type is str else (int, float))}
+    try:
+        return replace(Reading(**known), image_topic=image_topic)
+    except ConfigError:
+        return Reading(image_topic)

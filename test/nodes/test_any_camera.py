@@ -1,0 +1,196 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras as people have them: 640x480, compressed, best effort; heard by real nodes over DDS."""
+
+import io
+import time
+
+from lively import lively_network
+import numpy as np
+from PIL import Image as Picture
+from processes import Client, NodeProcess
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import CompressedImage, Image
+from tap_msgs.msg import ObjectStates
+from tap_msgs.srv import PredictSubgoal
+from tap_ros.crop import Crop, TrainedCrop
+from tap_ros.learning.weights import save_weights
+from tap_ros.nodes.clients import call
+from tap_ros.nodes.image_messages import decode_image, encode_image
+from tap_ros.nodes.object_messages import encode_joints, encode_objects
+from tap_ros.nodes.planner_setup import declare_parameters
+from tap_ros.nodes.sight import Sight
+from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.recording.messages import encode
+from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.reading import trained_reading
+from tap_ros.recording.writer import BagWriter
+
+pytestmark = pytest.mark.slow
+STAMP = to_stamp(2_500_000_000)
+PIXELS = np.array([(200.0, 100.0), (320.0, 240.0)])  # in pictures of 640x480
+TRAINING = {'settings': {'crop': 'centre', 'size': 32}, 'camera_size': [480, 640]}
+
+
+def photograph(seed):
+    """Return a picture of 640x480 pixels with much in it."""
+    coarse = np.random.default_rng(seed).integers(0, 256, (12, 16, 3), np.uint8)
+    return np.array(Picture.fromarray(coarse).resize((640, 480), Picture.Resampling.BICUBIC))
+
+
+START, GOAL = photograph(0), photograph(1)
+
+
+def jpeg(picture):
+    buffer = io.BytesIO()
+    Picture.fromarray(picture).save(buffer, 'JPEG', quality=90)
+    message = CompressedImage(format='rgb8; jpeg compressed bgr8')
+    message.header.stamp, message.header.frame_id = STAMP, 'eye'
+    message.data = buffer.getvalue()
+    return message
+
+
+@pytest.fixture(scope='module')
+def weights(tmp_path_factory):
+    path = tmp_path_factory.mktemp('weights') / 'cut.safetensors'
+    network = lively_network()
+    save_weights(path, network, 'predictor', network.config, TRAINING)
+    return path
+
+
+class Running:
+    """A predictor node of its own namespace, and what asks it."""
+
+    def __init__(self, client, folder, name, parameters, overrides=()):
+        self.node, self.name = client, name
+        self.process = NodeProcess('predictor_node', folder / f'{name}.log', parameters,
+                                   [f'-r __ns:=/{name}', *overrides])
+        self.client = client.create_client(PredictSubgoal, f'/{name}/predict_subgoal')
+
+    def __enter__(self):
+        self.process.wait_for('ready', 120)
+        assert self.client.wait_for_service(30)
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+
+    def publisher(self, kind, topic, qos):
+        return self.node.create_publisher(kind, f'/{self.name}/{topic}', qos)
+
+    def until(self, words, sends, timeout_s=30, **fields):
+        """Publish and ask again and again until the answer is that; return it."""
+        deadline, answer = time.monotonic() + timeout_s, None
+        while time.monotonic() < deadline:
+            for publisher, message in sends:
+                publisher.publish(message)
+            answer = call(self.client, PredictSubgoal.Request(**fields), 60)
+            if words in answer.message:
+                return answer
+            time.sleep(0.2)
+        raise AssertionError(f'no {words!r} in time, but: {answer.message}')
+
+
+@pytest.mark.parametrize('transport', ['raw', 'compressed'])
+def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(
+        client, weights, tmp_path, transport):
+    start, topic = (jpeg(START), 'camera/image_raw/compressed') if transport == 'compressed' else (
+        encode_image(START, STAMP, 'eye'), 'camera/image_raw')
+    goal = encode_image(GOAL, STAMP, 'eye')
+    objects, goal_objects = (
+        encode_objects(('cup', 'box'), pixels, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP, 'world',
+                       ObjectStates.SOURCE_TRACKED) for pixels in (PIXELS, PIXELS[::-1]))
+    parameters = {'weights': weights, 'image_transport': transport}
+    with Running(client, tmp_path, transport, parameters) as running:
+        volatile = QoSProfile(depth=1)  # of a goal, as `ros2 topic pub` has it
+        sends = [
+            (running.publisher(type(start), topic, qos_profile_sensor_data), start),
+            (running.publisher(ObjectStates, 'objects', qos_profile_sensor_data), objects),
+            (running.publisher(Image, 'goal/image', volatile), goal),
+            (running.publisher(ObjectStates, 'goal/objects', volatile), goal_objects)]
+        answer = running.until('maps of', sends)
+        assert 'taken best_effort and volatile, as it is published' in running.process.text
+    # What was recorded is read as the same picture, so the answer is that of the recording.
+    with BagWriter(tmp_path / 'bag') as writer:
+        kind = f'sensor_msgs/msg/{type(start).__name__}'
+        if transport == 'compressed':
+            fields = {'format': start.format, 'data': np.frombuffer(start.data, np.uint8)}
+        else:
+            fields = {'height': 480, 'width': 640, 'encoding': 'rgb8', 'step': 1920,
+                      'data': START}
+        writer.write_raw(f'/{topic}', kind, encode(kind, {
+            'header': {'stamp': {'sec': 2}}, **fields}), 2)
+    (episode,) = iter_episodes(tmp_path / 'bag', trained_reading(TRAINING))
+    predictor = SubgoalPredictor.load(weights)
+    live = predictor.camera_crop.of((480, 640), 'start').image(decode_image(start, 'start'))
+    assert np.array_equal(episode.frames[0], live)
+    cut = predictor.camera_crop.of((480, 640), 'goal')
+    pixels = cut.pixels(PIXELS.astype(np.float32), (480, 640))
+    (expected,) = predictor.predict(
+        episode.frames[0], cut.image(GOAL), pixels, pixels[::-1].copy())
+    found = decode_image(answer.subgoals[0].image, 'subgoal').astype(int)
+    assert np.abs(found - expected.image).max() <= 1
+    assert to_nanoseconds(answer.subgoals[0].header.stamp) == to_nanoseconds(STAMP)
+
+
+def test_an_object_beside_the_part_that_is_seen_is_named(client, weights, tmp_path):
+    beside = encode_objects(('cup',), [(20.0, 200.0)], [[0, 0, 0, 0, 0, 0, 1]], STAMP, 'world',
+                            ObjectStates.SOURCE_TRACKED)
+    with Running(client, tmp_path, 'beside', {'weights': weights}) as running:
+        picture = encode_image(START, STAMP, 'eye')
+        answer = call(running.client, PredictSubgoal.Request(
+            start=picture, goal=picture, start_objects=beside, goal_objects=beside), 60)
+        assert not answer.success
+        assert ('start_objects: cup not in the part of the picture that the weights see, 480x480 '
+                'pixels from (80, 0) on') in answer.message
+        # Pictures that are cut already are taken as they are.
+        small = encode_image(np.ascontiguousarray(START[:32, :32]), STAMP, 'eye')
+        assert call(running.client, PredictSubgoal.Request(start=small, goal=small), 60).success
+
+
+def test_who_is_not_heard_because_of_its_quality_of_service_is_named(client, weights, tmp_path):
+    override = ('-p qos_overrides./strict/camera/image_raw.subscription.reliability:=reliable',)
+    with Running(client, tmp_path, 'strict', {'weights': weights}, override) as running:
+        running.until('nothing has come on /strict/camera/image_raw (no node publishes it)', [])
+        camera = running.publisher(Image, 'camera/image_raw', qos_profile_sensor_data)
+        message = encode_image(START, STAMP, 'eye')
+        answer = running.until('its quality of service does not fit', [(camera, message)])
+        assert client.get_name() in answer.message
+        assert 'qos_overrides./strict/camera/image_raw.subscription.*' in answer.message
+        reliable = running.publisher(Image, 'camera/image_raw', STREAM)
+        running.until('nothing has come on /strict/goal/image', [(reliable, message)])
+
+
+@pytest.mark.parametrize('transport', ['raw', 'compressed'])
+def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transport):
+    crop = TrainedCrop(Crop('centre', 64), (480, 640), (64, 64))
+    with Client('planner', parameter_overrides=[
+            Parameter('image_transport', value=transport)]) as node:
+        params = declare_parameters(node)
+        sight = Sight(node, params, crop, lambda name: None)
+        message = jpeg(START) if transport == 'compressed' else encode_image(START, STAMP, 'eye')
+        name = sight._types['image'][1]
+        objects = encode_objects(('cup', 'box'), PIXELS, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP,
+                                 'world', ObjectStates.SOURCE_TRACKED)
+        joints = encode_joints(np.array([0.1, 0.2, 0.05, 0.5]), STAMP, 'world')
+        publishers = [(client.create_publisher(type(one), topic, qos_profile_sensor_data), one)
+                      for topic, one in ((name, message), ('objects', objects),
+                                         ('joint_states', joints))]
+        deadline, seen = time.monotonic() + 30, None
+        while seen is None and time.monotonic() < deadline:
+            for publisher, one in publishers:
+                publisher.publish(one)
+            time.sleep(0.2)
+            seen, lacking = sight.look(sight.topics())
+        assert seen is not None, lacking
+        shown = decode_image(message, 'start')
+        assert np.array_equal(seen.image, crop.crop.image(shown))
+        np.testing.assert_allclose(seen.pixels, (PIXELS - [80, 0] + 0.5) * 64 / 480 - 0.5)
+        # What it asks the predictor about is the whole picture, raw.
+        assert isinstance(sight.messages['image'], Image)
+        assert np.array_equal(decode_image(sight.messages['image'], 'start'), shown)
+        names, pixels = sight.decode_positions(objects, 'goal_objects', None)
+        np.testing.assert_allclose(pixels, seen.pixels)

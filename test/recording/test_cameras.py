@@ -1,0 +1,262 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of any camera: compressed, large, fast, unmarked."""
+
+import io
+
+import cv2
+from made_episodes import make_episode
+import numpy as np
+from PIL import Image as Picture
+import pytest
+from tap_ros.cli import main
+from tap_ros.crop import Crop
+from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.messages import encode
+from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.reading import Reading
+from tap_ros.recording.writer import BagWriter, EpisodeWriter
+
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+IMAGE = 'sensor_msgs/msg/Image'
+TOPIC = '/camera/color/image_raw/compressed'
+SECOND = 10**9
+
+
+def scene(t, size=(48, 64)):
+    """Return a smooth picture with a dot that moves."""
+    y, x = np.mgrid[:size[0], :size[1]]
+    picture = np.stack([x * 255 // size[1], y * 255 // size[0], np.full_like(x, 90)], -1)
+    return cv2.circle(picture.astype(np.uint8), (20 + t % 20, 24), 4, (250, 40, 20), -1)
+
+
+def packed(picture, form='JPEG'):
+    buffer = io.BytesIO()
+    Picture.fromarray(picture).save(buffer, form, **({'quality': 90} if form == 'JPEG' else {}))
+    return buffer.getvalue()
+
+
+def header(stamp):
+    return {'stamp': {'sec': stamp // SECOND, 'nanosec': stamp % SECOND}, 'frame_id': 'camera'}
+
+
+def record(folder, pictures, stamps, form='JPEG', text='rgb8; jpeg compressed bgr8'):
+    """Write compressed pictures, some of them raw bytes, into a bag without marks."""
+    with BagWriter(folder) as writer:
+        for picture, stamp in zip(pictures, stamps):
+            data = picture if isinstance(picture, bytes) else packed(picture, form)
+            writer.write_raw(TOPIC, COMPRESSED, encode(COMPRESSED, {
+                'header': header(stamp), 'format': text, 'data': np.frombuffer(data, np.uint8)}),
+                stamp)
+    return folder
+
+
+@pytest.mark.parametrize('form', ['JPEG', 'PNG', 'WEBP'])
+def test_compressed_pictures_are_read(tmp_path, form):
+    pictures = [scene(t) for t in range(3)]
+    bag = record(tmp_path / 'bag', pictures, [SECOND * (t + 1) for t in range(3)], form)
+    for (episode,) in (open_recordings(bag), iter_episodes(bag)):
+        error = np.abs(episode.frames.astype(int) - np.stack(pictures))
+        assert error.max() == 0 if form == 'PNG' else error.mean() < 4
+        assert episode.stamps.tolist() == [SECOND, 2 * SECOND, 3 * SECOND]
+
+
+@pytest.mark.parametrize('bad, words', [
+    (packed(scene(0))[:400], 'damaged compressed picture'),
+    (b'no picture', "format 'rgb8; jpeg compressed bgr8' cannot be used; valid are JPEG, PNG"),
+    (b'', 'an empty picture')])
+def test_a_compressed_picture_that_cannot_be_read_is_named_and_left_out(tmp_path, bad, words):
+    bag = record(tmp_path / 'bag', [scene(0), bad, scene(2)], [SECOND, 2 * SECOND, 3 * SECOND])
+    with pytest.warns(match=f'{TOPIC}: 1 message cannot be used: {words}'):
+        episodes = list(iter_episodes(bag))
+    assert [len(episode.frames) for episode in episodes] == [1, 1]  # cut where one is missing
+
+
+def test_depth_pictures_are_refused_with_the_reason(tmp_path):
+    buffer = io.BytesIO()
+    Picture.fromarray(np.full((8, 8), 40000, np.uint16)).save(buffer, 'PNG')
+    bag = record(tmp_path / 'a', [buffer.getvalue()], [SECOND], text='16UC1; png compressed')
+    with pytest.raises(RecordingError, match='more than 8 bits a channel'):
+        open_recordings(bag)
+    bag = record(tmp_path / 'b', [buffer.getvalue()], [SECOND],
+                 text='16UC1; compressedDepth png')
+    with pytest.raises(RecordingError, match='name the topic of the colour camera'):
+        open_recordings(bag)
+
+
+def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path):
+    bomb = packed(np.zeros((4000, 4000, 3), np.uint8), 'PNG')
+    assert len(bomb) < 100_000
+    bag = record(tmp_path / 'bag', [bomb], [SECOND])
+    with pytest.raises(RecordingError, match='4000x4000 pixels are more than'):
+        open_recordings(bag)
+
+
+@pytest.mark.parametrize('encoding, pattern', [
+    ('bayer_rggb8', 'rggb'), ('bayer_bggr8', 'bggr'), ('bayer_gbrg8', 'gbrg'),
+    ('bayer_grbg8', 'grbg')])
+def test_bayer_patterns_have_the_colours_of_the_scene(tmp_path, encoding, pattern):
+    colours = np.array([[200, 30, 60], [10, 180, 90]], np.uint8)
+    picture = np.repeat(np.repeat(colours[None], 16, 0), 12, 1)  # left red, right green
+    raw = np.empty((16, 24), np.uint8)
+    for k, letter in enumerate(pattern):
+        rows, columns = slice(k // 2, None, 2), slice(k % 2, None, 2)
+        raw[rows, columns] = picture[rows, columns, 'rgb'.index(letter)]
+    frames = read_raw(tmp_path, raw, encoding, 24)
+    np.testing.assert_array_equal(frames[0][2:-2, 2:9], picture[2:-2, 2:9])
+    np.testing.assert_array_equal(frames[0][2:-2, 15:-2], picture[2:-2, 15:-2])
+
+
+@pytest.mark.parametrize('encoding, order', [
+    ('yuv422', 'uyvy'), ('uyvy', 'uyvy'), ('yuv422_yuy2', 'yuyv'), ('yuyv', 'yuyv')])
+def test_yuv_has_the_colours_of_the_scene(tmp_path, encoding, order):
+    colour = np.array([200, 60, 30])
+    y = 16 + np.array([65.481, 128.553, 24.966]) @ colour / 255  # ITU-R BT.601
+    u = 128 + np.array([-37.797, -74.203, 112.0]) @ colour / 255
+    v = 128 + np.array([112.0, -93.786, -18.214]) @ colour / 255
+    pair = [round({'y': y, 'u': u, 'v': v}[letter]) for letter in order]
+    raw = np.tile(np.array(pair, np.uint8), (4, 3))
+    frames = read_raw(tmp_path, raw, encoding, 12)
+    assert frames.shape == (1, 4, 6, 3)
+    assert np.abs(frames.astype(int) - colour).max() <= 3
+
+
+def read_raw(tmp_path, raw, encoding, step):
+    """Return the frames of a bag with one raw picture."""
+    width = raw.shape[1] // (1 if encoding.startswith('bayer') else 2)
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_raw('/image_raw', IMAGE, encode(IMAGE, {
+            'header': header(SECOND), 'height': len(raw), 'width': width, 'encoding': encoding,
+            'step': step, 'data': raw}), SECOND)
+    (episode,) = open_recordings(tmp_path / 'bag')
+    return episode.frames
+
+
+def test_pictures_are_cut_and_scaled_while_they_are_decoded(tmp_path):
+    pictures = [scene(t, (480, 640)) for t in range(4)]
+    stamps = [SECOND * (t + 1) for t in range(4)]
+    bag = record(tmp_path / 'bag', pictures, stamps, 'PNG')
+    store = open_recordings(bag, tmp_path / 'cache', reading=Reading(crop='centre', size=64))
+    assert (store.image_size, store.camera_size) == ((64, 64), (480, 640))
+    expected = np.stack([Crop('centre', 64).image(picture) for picture in pictures])
+    np.testing.assert_array_equal(store[0].frames, expected)
+    (episode,) = iter_episodes(bag, Reading(crop='centre', size=64))
+    np.testing.assert_array_equal(episode.frames, expected)
+    # What is kept is as large as what is used.
+    assert sum(f.stat().st_size for f in (tmp_path / 'cache').rglob('*.npy')) < 5 * 64 * 64 * 3
+    whole = open_recordings(bag, tmp_path / 'cache')
+    np.testing.assert_array_equal(whole[0].frames, pictures)
+    assert whole.data_hash != store.data_hash
+
+
+def test_objects_goals_and_masks_are_cut_with_the_picture(tmp_path):
+    episode = make_episode()
+    masks = np.zeros(episode.frames.shape[:3], np.uint8)
+    masks[:, 2:4, 5:7] = 255
+    goal_mask = masks[0]
+    with EpisodeWriter(tmp_path / 'a.mcap') as writer:
+        writer.write(type(episode)(**vars(episode) | {
+            'robot_masks': masks, 'goal_mask': goal_mask}))
+    (cut,) = open_recordings(tmp_path, reading=Reading(crop='3,1,6'))
+    np.testing.assert_array_equal(cut.frames, episode.frames[:, 1:7, 3:9])
+    np.testing.assert_array_equal(cut.goal_frame, episode.goal_frame[1:7, 3:9])
+    np.testing.assert_array_equal(cut.robot_masks, masks[:, 1:7, 3:9])
+    np.testing.assert_array_equal(cut.goal_mask, goal_mask[1:7, 3:9])
+    np.testing.assert_allclose(cut.object_pixels, episode.object_pixels - [3, 1], atol=1e-4)
+    np.testing.assert_allclose(cut.goal_pixels, episode.goal_pixels - [3, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize('reading, words', [
+    (Reading(size=32), 'pictures of 64x48 pixels .* are not square; .*--crop centre'),
+    (Reading(crop='40,0,48'), 'crop 40,0,48 reaches beyond a picture of 64x48 pixels')])
+def test_a_cut_that_cannot_be_made_is_refused_with_the_reason(tmp_path, reading, words):
+    bag = record(tmp_path / 'bag', [scene(0)], [SECOND])
+    with pytest.raises(RecordingError, match=words):
+        open_recordings(bag, reading=reading)
+
+
+@pytest.mark.parametrize('changes, words', [
+    ({'crop': 'middle'}, 'crop: expected centre, or LEFT,TOP,SIDE'),
+    ({'crop': '1,2,0'}, 'crop: expected'), ({'size': -1}, 'size: expected 0 to 4096'),
+    ({'rate': -1.0}, 'rate: expected 0 to')])
+def test_readings_that_make_no_sense_are_refused(changes, words):
+    with pytest.raises(ConfigError, match=words):
+        Reading(**changes)
+
+
+@pytest.mark.parametrize('hertz, rate, least, most', [
+    (30, 4, 3.6, 4.1), (30, 10, 9.5, 10.1), (4, 4, 4, 4.1), (4, 10, 4, 4.1)])
+def test_the_rate_thins_out_what_comes_faster(tmp_path, hertz, rate, least, most):
+    rng = np.random.default_rng(0)
+    stamps = (np.arange(1, 10 * hertz + 1) / hertz * SECOND).astype(int)
+    stamps += rng.integers(-SECOND // 200, SECOND // 200, len(stamps))  # jitter
+    bag = record(tmp_path / 'bag', [scene(0)] * len(stamps), stamps.tolist())
+    (episode,) = open_recordings(bag, reading=Reading(rate=rate))
+    assert least <= len(episode.frames) / 10 <= most
+    assert np.isin(episode.stamps, stamps).all()
+
+
+def test_a_clock_that_is_set_back_does_not_stop_the_rate(tmp_path):
+    stamps = [SECOND * (t + 100) for t in range(4)] + [SECOND * (t + 1) for t in range(4)]
+    with BagWriter(tmp_path / 'bag') as writer:
+        for log, stamp in enumerate(stamps):
+            writer.write_raw(TOPIC, COMPRESSED, encode(COMPRESSED, {
+                'header': header(stamp), 'format': 'jpeg',
+                'data': np.frombuffer(packed(scene(0)), np.uint8)}), log * SECOND)
+    episodes = list(open_recordings(tmp_path / 'bag', reading=Reading(rate=1)))
+    assert [len(e.frames) for e in episodes] == [4, 4]  # two, as the clock jumped
+
+
+def at(*pieces):
+    """Return stamps, a second apart, of pieces (first, last)."""
+    return [SECOND * t for first, last in pieces for t in range(first, last + 1)]
+
+
+@pytest.mark.parametrize('stamps, reading, lengths', [
+    (at((1, 9), (70, 75)), Reading(), [9, 6]),  # a pause of a minute
+    (at((1, 9), (70, 75)), Reading(gap=0), [9, 6]),  # by length: quarters, two of them empty
+    (at((1, 9), (70, 75)), Reading(gap=0, episode_seconds=0), [15]),
+    (at((1, 9), (13, 15)), Reading(), [12]), (at((1, 9), (13, 15)), Reading(gap=2), [9, 3]),
+    (at((1, 60)), Reading(), [20, 20, 20]), (at((1, 60)), Reading(episode_seconds=0), [60]),
+    (at((1, 20)), Reading(), [20]),
+    (at((1, 40), (60, 64)), Reading(), [40, 5])])  # where pauses tell, length does not
+def test_unmarked_recordings_are_cut_by_pauses_or_by_length(tmp_path, stamps, reading, lengths):
+    bag = record(tmp_path / 'bag', [scene(t) for t in range(len(stamps))], stamps)
+    for opened in (open_recordings(bag, reading=reading), iter_episodes(bag, reading)):
+        episodes = list(opened)
+        assert [len(e.frames) for e in episodes] == lengths
+        assert np.concatenate([e.stamps for e in episodes]).tolist() == stamps
+
+
+def test_marked_recordings_are_not_cut(tmp_path):
+    episode = make_episode()
+    stamps = (np.arange(len(episode.stamps)) * 60 + 1) * SECOND
+    with EpisodeWriter(tmp_path / 'a.mcap') as writer:
+        writer.write(type(episode)(**vars(episode) | {'stamps': stamps}))
+    (found,) = open_recordings(tmp_path)
+    assert found.stamps.tolist() == stamps.tolist()
+
+
+def test_inspect_lists_topics_and_says_what_train_makes_of_them(tmp_path, capsys):
+    bag = record(tmp_path / 'bag', [scene(t) for t in range(45)], at((1, 45)))
+    assert main(['inspect', str(bag)]) == 1
+    said = capsys.readouterr()
+    assert f'topics      {TOPIC}  {COMPRESSED}  45 messages' in said.out
+    assert 'pictures are 64x48 pixels; the predictor needs square ones' in said.err
+    assert '--crop centre --size 64' in said.err
+    assert main(['inspect', str(bag), '--crop', 'centre', '--size', '32']) == 0
+    out = capsys.readouterr().out
+    assert 'bag: 3 episodes, 45 frames of 32x32 pixels' in out.replace(str(tmp_path) + '/', '')
+    assert 'cut         from pictures of 64x48 pixels' in out
+    assert 'train       2 episodes to learn from, 1 held out' in out
+
+
+def test_a_recording_without_pictures_still_lists_its_topics(tmp_path, capsys):
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_raw('/speed', 'std_msgs/msg/Float64',
+                         encode('std_msgs/msg/Float64', {'data': 1.0}), 1)
+    assert main(['inspect', str(tmp_path / 'bag')]) == 1
+    said = capsys.readouterr()
+    assert '/speed  std_msgs/msg/Float64  1 messages' in said.out
+    assert 'no topic ends in /camera/image_raw' in said.err
