@@ -4,7 +4,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eo pipefail -c
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
-export PYTHON PIP_ARGS
+export PYTHON PIP_ARGS ROS2_SOURCES
 
 ENTER := . scripts/environment.bash
 # A domain of its own, so that other ROS nodes on this machine neither hear nor disturb a run.
@@ -22,7 +22,7 @@ $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 # Two processes share two cores best when each takes one.
 paper: export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test mutants paper faults build lint bench clean
+.PHONY: help demo test mutants paper faults build lint bench ros2 clean
 
 help:
 	@echo 'make demo    push objects to where a goal picture shows them, predict a stack'
@@ -38,6 +38,8 @@ help:
 	@echo 'make lint    check the style of the code and its types'
 	@echo 'make build   only the set-up: .venv, install/; then, to work in it:'
 	@echo '             . scripts/environment.bash'
+	@echo 'make ros2    the ros2 command, launch and tf2_msgs, which have no wheels, from the official'
+	@echo '             sources; ROS2_SOURCES=FOLDER: from repositories in that folder'
 	@echo 'make clean   remove what the set-up made'
 	@echo 'Each sets up what it needs first. PYTHON=python3.12 chooses the interpreter,'
 	@echo 'PIP_ARGS=... adds options to pip install.'
@@ -74,5 +76,9 @@ build: .venv/build.done
 	@scripts/setup.bash build
 	@touch $@
 
+# In the environment of `make build`; apart from it, so that nothing else depends on it.
+ros2: build
+	@scripts/ros2.bash
+
 clean:
-	rm -rf .venv build install log
+	rm -rf .venv build install log ros2

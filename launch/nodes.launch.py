@@ -38,6 +38,9 @@ def generate_launch_description():
         DeclareLaunchArgument(
             'mask', default_value='false', choices=['true', 'false'],
             description='Publish masks of a real robot; the simulation publishes its own.'),
+        DeclareLaunchArgument(
+            'use_sim_time', default_value=LaunchConfiguration('sim'), choices=['true', 'false'],
+            description='All but the simulation take the time from /clock.'),
         start('sim_node', {'lock_step': typed('lock_step', bool)},
               condition=IfCondition(LaunchConfiguration('sim'))),
         start('predictor_node'),
@@ -56,9 +59,12 @@ def start(executable, parameters=None, condition=None):
     :param parameters: dict of those that override the parameter file.
     :param condition: launch condition, None for always.
     """
+    parameters = parameters or {}
+    if executable != 'sim_node':  # which publishes /clock
+        parameters['use_sim_time'] = typed('use_sim_time', bool)
     return Node(
         package='tap_ros', executable=executable, namespace=LaunchConfiguration('namespace'),
-        parameters=[LaunchConfiguration('params_file'), *([parameters] if parameters else [])],
+        parameters=[LaunchConfiguration('params_file'), parameters],
         condition=condition, output='screen', emulate_tty=True)
 
 

@@ -16,10 +16,14 @@ unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 . "$tap_root/.venv/bin/activate"
 export AMENT_PREFIX_PATH=$VIRTUAL_ENV CMAKE_PREFIX_PATH=$VIRTUAL_ENV
+export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
 export RMW_IMPLEMENTATION=rmw_fastrtps_cpp
 export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
 export MUJOCO_GL=${MUJOCO_GL:-egl}
 
+if [ -f "$tap_root/ros2/install/local_setup.bash" ]; then  # of `make ros2`
+  . "$tap_root/ros2/install/local_setup.bash"
+fi
 if [ -f "$tap_root/install/setup.bash" ]; then
   . "$tap_root/install/setup.bash"
 fi

@@ -39,6 +39,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'faults': ('inject faults into real nodes and files', 'experiments.faults.nodes.command'),
     }),
     'predict': ('predict subgoals from picture files', 'tap_ros.prediction.predict_command'),
+    'call': ('ask a running predictor node', 'tap_ros.nodes.call_command'),
     'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo'),

@@ -3,26 +3,30 @@
 """Show what a recording or a weights file holds."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import json
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
-from tap_ros.crop import check_trainable
+from tap_ros.crop import CENTRE, check_trainable
+from tap_ros.errors import ConfigError
 from tap_ros.files import write_atomically
 from tap_ros.learning.split import split_episodes, warn_if_none
 from tap_ros.options import File
 from tap_ros.pictures import film_strip, grid, png_bytes
-from tap_ros.recording.bags import find_bags, find_topics, list_topics
+from tap_ros.recording.bags import check_first_picture, find_bags, find_topics, list_topics
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.columns import first_size
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.reading import Reading, reading_of
 from tap_ros.recording.reading_options import ReadingOptions
 from tap_ros.recording.topics import IMAGE
 from tap_ros.text import escaped, listing
 from tyro import conf
+
+LARGE = 256  # px; pictures with a longer side are not decoded whole
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,17 @@ def run(args: Options) -> None:
         print(f'{"" if number else "topics":<11} {escaped(topic)}  {escaped(kind)}  '
               + ('unknown' if count is None else f'{count} messages'))
     reading = reading_of(args.reading)
-    store = open_recordings([args.path], reading=reading)
+    shown = reading
+    try:
+        check_first_picture([args.path], reading, 'the predictor')
+        refusal = None
+    except ConfigError as error:
+        refusal = error
+        bags = find_bags(args.path)
+        size = first_size(bags[0], find_topics(bags[0], reading.image_topic))
+        if size is not None and max(size) > LARGE and not reading.cut:
+            shown = replace(reading, crop=CENTRE, size=64)  # else the cache takes gigabytes
+    store = open_recordings([args.path], reading=shown)
     cameras = {find_topics(bag, reading.image_topic)[IMAGE] for bag in find_bags(args.path)}
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
@@ -66,7 +80,8 @@ def run(args: Options) -> None:
     print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     if store.camera_size not in (store.image_size, None):
-        print('cut         from pictures of {1}x{0} pixels'.format(*store.camera_size))
+        how = '' if shown == reading else ', here as with --crop centre --size 64'
+        print('cut         from pictures of {1}x{0} pixels{2}'.format(*store.camera_size, how))
     print(f'told apart  {_told_apart(store, reading)}')
     print(f'camera      {listing(sorted(cameras))}')
     print(f'length      {lengths.min()} to {lengths.max()} frames, median {np.median(lengths):g}')
@@ -84,6 +99,8 @@ def run(args: Options) -> None:
                   for e in episodes[:args.episodes]]
         write_atomically(args.picture, png_bytes(grid(strips, scale=2)))
         print(f'picture     {escaped(args.picture)}')
+    if refusal is not None:
+        raise refusal
     check_trainable(store.image_size, 'the predictor')
     training, held_out = split_episodes(store)
     print(f'train       {len(training)} episodes to learn from, {len(held_out)} held out')
@@ -94,8 +111,8 @@ def _told_apart(store: EpisodeStore, reading: Reading) -> str:
     """Say how episodes are told apart."""
     if store.marked:
         return 'by marks'
-    return (f'no marks: by pauses of more than {reading.gap:g} s (--gap), or else cut into parts '
-            f'of at most {reading.episode_seconds:g} s (--episode-seconds)')
+    return (f'no marks: by pauses of more than {reading.gap:g} s (--gap); a bag alone without '
+            f'any is cut into parts of at most {reading.episode_seconds:g} s (--episode-seconds)')
 
 
 def _tinted(episode: Episode) -> np.ndarray:

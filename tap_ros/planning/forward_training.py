@@ -31,6 +31,7 @@ from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig
 from tap_ros.planning.table import fit_arm, fit_shift, fit_table
+from tap_ros.recording.bags import check_first_picture
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.reading import reading_of
 import torch
@@ -59,8 +60,9 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
     """
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
-    store = open_recordings(list(config.recordings), progress=progress,
-                            reading=reading_of(config))
+    reading = reading_of(config)
+    check_first_picture(config.recordings, reading, 'the forward model')
+    store = open_recordings(list(config.recordings), progress=progress, reading=reading)
     with run_folder(config.out):
         _train(config, device, store, stop_at, progress)
     return str(Path(config.out) / 'forward_model.safetensors')

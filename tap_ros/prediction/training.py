@@ -42,6 +42,7 @@ from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.pretraining import pretrain_decoders
 from tap_ros.prediction.recognition import Recognition
 from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
+from tap_ros.recording.bags import check_first_picture
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.reading import reading_of
 import torch
@@ -77,8 +78,9 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
     deadline = time.monotonic() + 60 * (minutes or math.inf)
     with joined(device) as processes:
         progress = progress and processes.first
-        store = open_recordings(list(config.recordings), progress=progress,
-                                reading=reading_of(config))
+        reading = reading_of(config)
+        check_first_picture(config.recordings, reading, 'the predictor')
+        store = open_recordings(list(config.recordings), progress=progress, reading=reading)
         with run_folder(config.out) if processes.first else nullcontext():
             _train(config, device, processes, store, stop_at, deadline, progress, after_step)
     return str(Path(config.out) / 'predictor.safetensors')

@@ -3,17 +3,20 @@
 """Find the bags at a path, their files and their topics; say what is wrong with them."""
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 import warnings
 
-from tap_ros.errors import RecordingError
+from tap_ros.crop import check_trainable
+from tap_ros.errors import ImageError, RecordingError
 from tap_ros.recording import topics
-from tap_ros.recording.columns import Columns
+from tap_ros.recording.columns import Columns, first_size
 from tap_ros.recording.container import Channel, McapFile
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.lost import describe
 from tap_ros.recording.messages import check_schema
 from tap_ros.recording.metadata import bag_files, FILE_NAME
+from tap_ros.recording.reading import Reading
 from tap_ros.text import escaped
 
 
@@ -92,6 +95,23 @@ def list_topics(path: str | Path) -> list[tuple[str, str, int | None]]:
             found[topic] = channel.type_name, (
                 None if before is None or count is None else before + count)
     return [(topic, kind, count) for topic, (kind, count) in sorted(found.items())]
+
+
+def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: str) -> None:
+    """
+    Refuse recordings that no network of ours takes, before they are decoded.
+
+    :param paths: .mcap files, bag folders, or folders of bag folders.
+    :param reading: Reading.
+    :param network: what errors call it.
+    :raises ConfigError: for pictures of a size that it cannot have, see crop.check_trainable.
+    :raises RecordingError: when a recording is missing, or lacks the image topic.
+    """
+    for bag in (bag for path in paths for bag in find_bags(path)):
+        size = first_size(bag, find_topics(bag, reading.image_topic))
+        if size is not None:
+            with suppress(ImageError):  # whoever opens it is told
+                check_trainable(reading.cut.cut_size(size), network)
 
 
 def check_sizes(parts: Sequence[Columns]) -> None:

@@ -31,7 +31,7 @@ from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_pat
 from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.mounts import ArmMount, read_mount
-from tap_ros.recording.reading import AS_RECORDED, Reading
+from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tqdm import tqdm
 
 FORMAT = 4  # of a cache folder; another number makes all files be decoded again
@@ -121,8 +121,9 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     for part in (part for bag in columns for part in bag):
         warn_of_damage(part)
     arms = [read_mount(bag[0].parent) for bag in bags]
+    cutting = for_bags(reading, len(bags))
     tables = [
-        assemble(run, arm, reading) for bag, arm in zip(columns, arms) for run in _runs(bag)]
+        assemble(run, arm, cutting) for bag, arm in zip(columns, arms) for run in _runs(bag)]
     # What is read depends on these, too.
     apart = [repr(arm) for arm in arms if arm != ArmMount()]
     if replace(reading, image_topic='') != AS_RECORDED:

@@ -10,6 +10,7 @@ episode goes on in the next one. A message that cannot be used is left out and n
 from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 import json
@@ -118,6 +119,31 @@ def decode_file(path: str | Path, found: dict[str, str],
         restart()
 
 
+def first_size(paths: Iterable[str | Path], found: dict[str, str]) -> tuple[int, int] | None:
+    """
+    Return (height, width) of the first picture of files, before it is cut; None without any.
+
+    :param paths: of the files.
+    :param found: as in decode_file.
+    :raises RecordingError: when nothing can be read.
+    """
+    for file in map(McapFile, paths):
+        for _, _, data in file.messages({found[topics.IMAGE]}):
+            compressed = _is_compressed(file, found)
+            with suppress(RecordingError):
+                pixels = read_compressed(decode(topics.COMPRESSED, data)) if compressed else (
+                    read_pixels(decode(topics.TYPES[topics.IMAGE], data)))
+                if pixels.size:
+                    return pixels.shape[0], pixels.shape[1]
+    return None
+
+
+def _is_compressed(file: McapFile, found: dict[str, str]) -> bool:
+    """Tell whether the camera's pictures are compressed; known once a message has come."""
+    return any(channel.type_name == topics.COMPRESSED for channel in file.channels.values()
+               if channel.topic == found[topics.IMAGE])
+
+
 class _Decoder:
     """Collects the columns of a file message by message; camera images are passed on at once."""
 
@@ -181,9 +207,7 @@ class _Decoder:
     @cached_property
     def compressed(self) -> bool:
         """Whether the camera's pictures are compressed; known once a message has come."""
-        return any(channel.type_name == topics.COMPRESSED
-                   for channel in self.file.channels.values()
-                   if channel.topic == self.found[topics.IMAGE])
+        return _is_compressed(self.file, self.found)
 
     def most_frequent_size(self) -> tuple[int, int] | None:
         """Return the size of more than half of the camera images, None without any."""

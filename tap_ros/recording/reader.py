@@ -13,7 +13,7 @@ from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.lost import EVERYTHING
 from tap_ros.recording.mounts import ArmMount, read_mount
-from tap_ros.recording.reading import AS_RECORDED, Reading
+from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 
 _NO_EVENT = np.empty(0, np.int64)
 _NO_GAP = np.empty((0, 3), np.int64)
@@ -28,7 +28,9 @@ def iter_episodes(path: str | Path, reading: Reading = AS_RECORDED) -> Iterator[
     :return: iterator over Episode.
     :raises RecordingError: when the recording is missing, empty, damaged or lacks the image topic.
     """
-    for files in find_bags(path):
+    bags = find_bags(path)
+    cutting = for_bags(reading, len(bags))
+    for files in bags:
         found, arm = find_topics(files, reading.image_topic), read_mount(files[0].parent)
         waiting: list[Columns] = []
         checked: list[Columns] = []
@@ -38,13 +40,13 @@ def iter_episodes(path: str | Path, reading: Reading = AS_RECORDED) -> Iterator[
             if part.image_size is not None:
                 check_sizes(checked)
             if waiting and not follows(waiting[-1], part):
-                yield from _episodes(waiting, arm, reading)
+                yield from _episodes(waiting, arm, cutting)
                 waiting = []
             waiting.append(part)
             if _closed(part):
-                yield from _episodes(waiting, arm, reading)
+                yield from _episodes(waiting, arm, cutting)
                 waiting = _kept(waiting)
-        yield from _episodes(waiting, arm, reading)
+        yield from _episodes(waiting, arm, cutting)
         check_sizes(checked)
 
 

@@ -25,8 +25,8 @@ class Reading:
     :param rate: pictures a second, at most; 0: all of them.
     :param gap: s; where no marks tell episodes apart, a longer pause between two pictures does;
         0: never.
-    :param episode_seconds: s; where neither marks nor pauses do, episodes are cut into equal
-        parts of at most this length; 0: never.
+    :param episode_seconds: s; a bag alone, without marks and pauses, is cut into equal parts of
+        at most this length; 0: never. Of several bags each is an episode.
     """
 
     image_topic: str = ''
@@ -52,6 +52,11 @@ class Reading:
 
 
 AS_RECORDED = Reading()
+
+
+def for_bags(reading: Reading, count: int) -> Reading:
+    """Return how each of so many bags is read: only one alone is cut by length."""
+    return reading if count == 1 else replace(reading, episode_seconds=0)
 
 
 def reading_of(settings: Reading) -> Reading:

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files start the nodes; only ROS 2 from apt has what it takes to read them."""
+"""The launch files start the nodes; read with launch from apt or of `make ros2`."""
 
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tap_ros.contract import NODE_MODULES
 
-launch_ros = pytest.importorskip('launch_ros.actions', reason='there are no wheels of launch_ros')
+launch_ros = pytest.importorskip('launch_ros.actions', reason='launch_ros is not there: make ros2')
 launch = pytest.importorskip('launch.actions')
 substitutions = pytest.importorskip('launch.substitutions')
 

@@ -229,6 +229,14 @@ def test_unmarked_recordings_are_cut_by_pauses_or_by_length(tmp_path, stamps, re
         assert np.concatenate([e.stamps for e in episodes]).tolist() == stamps
 
 
+def test_of_several_bags_each_is_an_episode(tmp_path):
+    for name in 'ab':
+        record(tmp_path / name, [scene(t) for t in range(50)], at((1, 50)))
+    for episodes in (list(open_recordings(tmp_path)), list(iter_episodes(tmp_path))):
+        assert [len(e.frames) for e in episodes] == [50, 50]
+    assert len(open_recordings(tmp_path / 'a')) == 3
+
+
 def test_marked_recordings_are_not_cut(tmp_path):
     episode = make_episode()
     stamps = (np.arange(len(episode.stamps)) * 60 + 1) * SECOND

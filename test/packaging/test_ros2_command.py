@@ -1,0 +1,128 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The lines of docs/ros.md, word for word, with the real ros2 command: apt, or `make ros2`."""
+
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import time
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+LINES = [line.split('   #')[0].strip() for block in re.findall(
+    r'^```bash\n(.*?)^```$', (ROOT / 'docs' / 'ros.md').read_text(), re.M | re.S)
+    for line in block.splitlines() if line.startswith('ros2 ')]
+RUNS = [line for line in LINES if line.startswith('ros2 run ') and 'runs/' not in line]
+CALLS = [line for line in LINES if line.startswith(('ros2 service', 'ros2 action'))]
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(
+    shutil.which('ros2') is None, reason='the ros2 command is not there: make ros2')]
+
+
+class Started:
+    """A process group that runs a line of a page."""
+
+    def __init__(self, line, folder, name, domain):
+        self.log = folder / f'{name}.log'
+        environment = os.environ | {'ROS_DOMAIN_ID': str(domain), 'ROS_LOG_DIR': str(folder)}
+        with open(self.log, 'wb') as output:
+            self.process = subprocess.Popen(
+                line, shell=True, stdout=output, stderr=subprocess.STDOUT, cwd=folder,
+                env=environment, start_new_session=True)
+
+    def wait_for(self, words, timeout_s=90):
+        """Wait until it prints something."""
+        deadline = time.monotonic() + timeout_s
+        while words not in self.log.read_text(errors='replace'):
+            assert self.process.poll() is None and time.monotonic() < deadline, (
+                self.log.read_text(errors='replace'))
+            time.sleep(0.1)
+
+    def end(self):
+        """End it as Ctrl+C does; return what it printed."""
+        if self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGINT)
+            try:
+                self.process.wait(30)
+            except subprocess.TimeoutExpired:
+                os.killpg(self.process.pid, signal.SIGKILL)
+                self.process.wait()
+        return self.log.read_text(errors='replace')
+
+
+@pytest.fixture
+def domain():
+    """Return a domain beside that of the tests, where the nodes have their names to themselves."""
+    return (int(os.environ.get('ROS_DOMAIN_ID', 0)) + 50) % 100 + 1
+
+
+def call(line, folder, domain):
+    """Return what a line prints that ends by itself."""
+    done = subprocess.run(line, shell=True, capture_output=True, text=True, timeout=180,
+                          cwd=folder, env=os.environ | {'ROS_DOMAIN_ID': str(domain)})
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr
+    return done.stdout
+
+
+def test_the_page_has_lines_of_every_kind():
+    assert len(RUNS) >= 5 and len(CALLS) >= 6
+    assert any('reach_goal' in line for line in CALLS)
+
+
+def test_nodes_run_and_answer_as_the_page_says(tmp_path, domain):
+    started = []
+    try:
+        for number, node in enumerate(('sim_node', 'predictor_node', 'visual_mpc_node',
+                                       'recorder_node')):
+            line = next(line for line in RUNS if f' {node}' in line)
+            started.append(Started(line, tmp_path, f'{number}', domain))
+        for one in started:
+            one.wait_for('ready')
+        assert len(call('ros2 node list', tmp_path, domain).split()) == 4
+        for line in (line for line in CALLS if not re.search('forward|num_samples', line)):
+            answer = call(line, tmp_path, domain)
+            assert 'success=True' in answer or 'SUCCEEDED' in answer, f'{line}\n{answer[-2000:]}'
+        assert call('ros2 topic echo --once /tf_static', tmp_path, domain)
+        assert 'tap_ros predictor_node' in call('ros2 pkg executables tap_ros', tmp_path, domain)
+        assert 'num_samples' in call(
+            'ros2 interface show tap_msgs/srv/PredictSubgoal', tmp_path, domain)
+    finally:
+        logs = [one.end() for one in started]
+    assert not any('Traceback' in log for log in logs), '\n'.join(logs)
+    assert list((tmp_path / 'bags' / 'mine').glob('*.mcap'))
+
+
+def test_kinds_of_prediction_as_the_page_says(tmp_path, domain):
+    sim = Started('ros2 run tap_ros sim_node', tmp_path, 'sim', domain)
+    node = Started(next(line for line in RUNS if 'forward_weights' in line), tmp_path, 'node',
+                   domain)
+    try:
+        sim.wait_for('ready'), node.wait_for('ready')
+        for line in (line for line in CALLS if 'predict_subgoal' in line):
+            answer = call(line, tmp_path, domain)
+            assert 'success=True' in answer, f'{line}\n{answer[-2000:]}'
+    finally:
+        sim.end(), node.end()
+
+
+def test_launch_files_start_what_they_say(tmp_path, domain):
+    launch = Started('ros2 launch tap_ros nodes.launch.py', tmp_path, 'launch', domain)
+    try:
+        deadline, ready = time.monotonic() + 90, 0
+        while ready < 3 and time.monotonic() < deadline:
+            ready = len(re.findall(r'\]: ready', launch.log.read_text(errors='replace')))
+            time.sleep(0.2)
+        assert ready == 3, launch.log.read_text(errors='replace')
+        for name, value in (('sim_node', False), ('predictor_node', True),
+                            ('visual_mpc_node', True)):
+            said = call(f'ros2 param get /{name} use_sim_time', tmp_path, domain)
+            assert said.strip() == f'Boolean value is: {value}'
+        assert 'success=True' in call(
+            'ros2 service call /predict_subgoal tap_msgs/srv/PredictSubgoal', tmp_path, domain)
+    finally:
+        said = launch.end()
+    assert said.count('process has finished cleanly') == 3, said
