@@ -30,6 +30,9 @@ Run: TypeAlias = Callable[[Any], int | None]
 COMMANDS: dict[str, tuple[str, Module]] = {
     'collect': ('simulate the expert and record it', 'sim_bridge.collect_command'),
     'import-bair': ('import the BAIR robot pushing data set', 'tap_ros.recording.bair'),
+    'import-lerobot': ('import a LeRobot data set', 'tap_ros.recording.lerobot_import'),
+    'export-lerobot': ('export recordings as a LeRobot data set',
+                       'tap_ros.recording.lerobot_export'),
     'train': ('train on recordings', 'tap_ros.prediction.train_command'),
     'evaluate': ('score trained weights', {
         'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.prediction'),
@@ -54,7 +57,9 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }
-EXTRAS = ('jinja2', 'pandas')  # what only experiments/ needs
+EXTRAS = {  # what only some commands need, and where it stands
+    'jinja2': 'requirements-experiments.txt', 'pandas': 'requirements-experiments.txt',
+    'pyarrow': 'requirements-lerobot.txt'}
 TRAIN_FORWARD = 'tap_ros.planning.train_command'  # what trains with --model forward
 PROG = 'python -m tap_ros'
 _COMPLETION = ('--tyro-print-completion', '--tyro-write-completion')
@@ -90,8 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.name not in EXTRAS:
             raise
         print(f'error: {error.name} is not installed; type `pip install -r '
-              'requirements-experiments.txt` (`make build` has done it), or, with ROS 2 from apt, '
-              f'`sudo apt install python3-{error.name}`', file=sys.stderr)
+              f'{EXTRAS[error.name]}` (`make build` has done it)', file=sys.stderr)
         return 1
     except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush

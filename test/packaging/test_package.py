@@ -126,7 +126,8 @@ def undeclared(folders, *files):
 
 
 def test_everything_imported_is_declared_with_ros_or_with_pip():
-    assert not undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt')
+    assert not undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
+                          'requirements-lerobot.txt')
     assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt',
                           'requirements-dev.txt')
 
@@ -145,12 +146,14 @@ def test_nothing_is_required_that_nobody_imports():
         used |= distributions_of(name)
     assert set(requirements('requirements.txt')) <= used
     assert set(requirements('requirements-experiments.txt')) <= used
+    assert set(requirements('requirements-lerobot.txt')) <= used
 
 
 def test_requirements_and_constraints_agree():
     pinned = requirements('constraints.txt')
     for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-experiments.txt',
-                 'requirements-ray.txt', 'requirements-ros.txt'):
+                 'requirements-lerobot.txt', 'requirements-ray.txt', 'requirements-ros.txt',
+                 'requirements-ros2.txt'):
         for distribution, version in requirements(name).items():
             assert pinned[distribution] == version, f'{name}: {distribution}'
 

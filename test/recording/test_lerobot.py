@@ -1,0 +1,226 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+LeRobot data sets: what is exported comes back, and what others wrote can be read.
+
+With LEROBOT_PYTHON=/path/to/python of an environment that has lerobot (it needs Python 3.12 and
+another torch), its own loader reads what was exported, too.
+"""
+
+import json
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pyarrow
+from pyarrow import parquet
+import pytest
+from tap_ros.cli import main
+from tap_ros.recording.lerobot import ACTION, CAMERA, OBJECTS, STATE
+from tap_ros.recording.lerobot_import import video_frames
+from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.reading import Reading
+
+SAMPLE = 'bags/sample_push2'
+LOADER = """
+import sys
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+data = LeRobotDataset('local/test', root=sys.argv[1])
+items = [data[i] for i in range(len(data))]
+np.savez(sys.argv[2], **{key: np.stack([item[key].numpy() for item in items]) for key in (
+    'observation.images.camera', 'observation.state', 'observation.environment_state', 'action',
+    'timestamp', 'episode_index')}, task=[item['task'] for item in items])
+"""
+
+
+@pytest.fixture(scope='module')
+def truth():
+    return list(iter_episodes(SAMPLE))
+
+
+@pytest.fixture(scope='module', params=['png', 'video'])
+def exported(request, tmp_path_factory):
+    """Return (folder of a data set, largest mean error of its pictures)."""
+    folder = tmp_path_factory.mktemp('sets') / request.param
+    lossless = ['--lossless'] if request.param == 'png' else []
+    assert main(['export-lerobot', '--recordings', SAMPLE, '--out', str(folder), *lossless]) == 0
+    return folder, 0 if lossless else 5
+
+
+def test_what_is_exported_comes_back(exported, truth, tmp_path, capsys):
+    folder, error = exported
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 0
+    assert f'20 episodes, {sum(map(len, truth))} frames' in capsys.readouterr().out
+    found = list(iter_episodes(tmp_path / 'bag'))
+    assert len(found) == len(truth)
+    for new, old in zip(found, truth):
+        assert np.abs(new.frames.astype(int) - old.frames).mean() <= error
+        np.testing.assert_array_equal(new.actions, old.actions)
+        np.testing.assert_array_equal(new.grippers, old.grippers)
+        np.testing.assert_allclose(new.object_pixels, old.object_pixels)
+        assert (new.object_names, new.task, new.seed, new.outcome) == (
+            old.object_names, old.task, old.seed, old.outcome)
+        np.testing.assert_array_equal(np.diff(new.stamps), np.diff(old.stamps))
+        assert new.robot_masks is None and new.goal_frame is None
+
+
+def test_the_statistics_are_those_of_the_numbers(exported, truth):
+    stats = json.loads((exported[0] / 'meta' / 'stats.json').read_text())
+    pictures = np.concatenate([e.frames for e in truth]) / 255
+    for name, values, axes in (
+            (CAMERA, pictures, (0, 1, 2)), (ACTION, np.concatenate([e.actions for e in truth]), 0),
+            (STATE, np.concatenate([e.grippers for e in truth]), 0)):
+        for key, function in (('min', np.min), ('max', np.max), ('mean', np.mean),
+                              ('std', np.std), ('q50', np.median)):
+            # A median between two values of pixels is either of them.
+            np.testing.assert_allclose(
+                np.ravel(stats[name][key]), function(values.astype(float), axes), atol=1e-6)
+        assert stats[name]['count'] == [len(pictures)]
+
+
+@pytest.mark.skipif('LEROBOT_PYTHON' not in os.environ, reason='LEROBOT_PYTHON names none')
+def test_lerobots_own_loader_reads_the_same(exported, truth, tmp_path):
+    folder, error = exported
+    run = subprocess.run(
+        [os.environ['LEROBOT_PYTHON'], '-c', LOADER, str(folder), str(tmp_path / 'a.npz')],
+        env={'HOME': str(tmp_path), 'PATH': '/usr/bin:/bin', 'HF_HUB_OFFLINE': '1'},
+        capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-3000:]
+    found = np.load(tmp_path / 'a.npz')
+    frames = np.moveaxis(found[CAMERA], 1, -1) * 255
+    assert np.abs(frames - np.concatenate([e.frames for e in truth])).mean() <= error + 1e-4
+    for name, values in ((ACTION, [e.actions for e in truth]),
+                         (STATE, [e.grippers for e in truth]),
+                         (OBJECTS, [e.object_pixels.reshape(len(e), -1) for e in truth]),
+                         ('timestamp', [np.arange(len(e)) / np.float32(4) for e in truth]),
+                         ('episode_index', [np.full(len(e), i) for i, e in enumerate(truth)])):
+        np.testing.assert_array_equal(found[name], np.concatenate(values))
+    assert found['task'].tolist() == [e.task for e in truth for _ in e.frames]
+
+
+def test_a_video_of_an_unknown_codec_is_named_with_the_remedy(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'av', None)
+    (tmp_path / 'a.mp4').write_bytes(b'no video')
+    with pytest.raises(ValueError, match='a.mp4: OpenCV knows no decoder .*pip install av'):
+        next(video_frames(tmp_path / 'a.mp4'))
+
+
+def test_what_opencv_cannot_decode_pyav_does(tmp_path):
+    av = pytest.importorskip('av', reason='PyAV is no dependency')
+    pictures = [np.full((64, 64, 3), 20 * t, np.uint8) for t in range(8)]
+    with av.open(str(tmp_path / 'a.mp4'), 'w') as container:
+        stream = container.add_stream('libsvtav1', rate=4)
+        stream.width = stream.height = 64
+        stream.pix_fmt = 'yuv420p'
+        for picture in pictures:
+            for packet in stream.encode(av.VideoFrame.from_ndarray(picture, 'rgb24')):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    found = list(video_frames(tmp_path / 'a.mp4'))
+    assert len(found) == 8
+    assert np.abs(np.array(found).astype(int) - pictures).max() <= 6
+
+
+def test_pictures_are_cut_on_the_way_in(exported, truth, tmp_path):
+    assert main(['import-lerobot', str(exported[0]), '--out', str(tmp_path / 'bag'),
+                 '--crop', '8,4,48', '--size', '16']) == 0
+    expected = next(iter_episodes(SAMPLE, Reading(crop='8,4,48', size=16)))
+    found = next(iter_episodes(tmp_path / 'bag'))
+    assert np.abs(found.frames.astype(int) - expected.frames).mean() <= exported[1]
+    np.testing.assert_allclose(found.object_pixels, expected.object_pixels, atol=1e-3)
+
+
+@pytest.fixture
+def foreign(tmp_path):
+    """Write a set as of another robot: 7 numbers an action, two cameras, files by their names."""
+    folder = tmp_path / 'foreign'
+    main(['export-lerobot', '--recordings', SAMPLE, '--out', str(folder), '--lossless'])
+    path = folder / 'meta' / 'info.json'
+    info = json.loads(path.read_text())
+    info['features'][ACTION] = {'dtype': 'float32', 'shape': [7], 'names': None}
+    info['features'][STATE] = {'dtype': 'float32', 'shape': [4], 'names': {
+        'motors': ['a', 'b', 'c', 'd']}}
+    del info['features'][OBJECTS]
+    info['features']['observation.images.wrist'] = info['features'][CAMERA]
+    path.write_text(json.dumps(info))
+    file = folder / 'data' / 'chunk-000' / 'file-000.parquet'
+    table = parquet.read_table(file).drop_columns([ACTION, OBJECTS])
+    seven = pyarrow.FixedSizeListArray.from_arrays(
+        pyarrow.array(np.zeros(7 * len(table), np.float32)), 7)
+    parquet.write_table(table.append_column(ACTION, seven), file)
+    rows = folder / 'meta' / 'episodes' / 'chunk-000' / 'file-000.parquet'
+    parquet.write_table(parquet.read_table(rows).drop_columns(
+        ['tap_ros/seed', 'tap_ros/outcome']), rows)
+    return folder
+
+
+def test_of_another_robot_pictures_are_taken_and_the_rest_is_named(
+        foreign, truth, tmp_path, capsys):
+    assert main(['import-lerobot', str(foreign), '--out', str(tmp_path / 'bag')]) == 1
+    assert f'--camera: expected one of {CAMERA}, observation.images.wrist' in (
+        capsys.readouterr().err)
+    assert main(['import-lerobot', str(foreign), '--out', str(tmp_path / 'bag'),
+                 '--camera', CAMERA]) == 0
+    assert f'not taken: {ACTION}, observation.images.wrist, {STATE}' in capsys.readouterr().out
+    found = list(iter_episodes(tmp_path / 'bag'))
+    for i, (new, old) in enumerate(zip(found, truth, strict=True)):
+        np.testing.assert_array_equal(new.frames, old.frames)
+        assert not new.actions.any() and np.isnan(new.grippers).all()
+        assert (new.object_names, new.seed, new.outcome) == ((), i, '')
+
+
+def spoil(folder, what):
+    """Damage a set in one way."""
+    data = folder / 'data' / 'chunk-000' / 'file-000.parquet'
+    info = folder / 'meta' / 'info.json'
+    if what == 'nothing there':
+        info.unlink()
+    elif what == 'no json':
+        info.write_text('{')
+    elif what == 'old version':
+        info.write_text(info.read_text().replace('v3.0', 'v2.1'))
+    elif what == 'no features':
+        info.write_text(info.read_text().replace('"features"', '"other"'))
+    elif what == 'no data':
+        data.unlink()
+    elif what == 'damaged data':
+        data.write_bytes(data.read_bytes()[:5000])
+    elif what == 'a bad picture':
+        table = parquet.read_table(data)
+        cells = table[CAMERA].to_pylist()
+        cells[3]['bytes'] = b'no picture'
+        parquet.write_table(table.set_column(
+            table.column_names.index(CAMERA), CAMERA,
+            pyarrow.array(cells, table.schema.field(CAMERA).type)), data)
+
+
+@pytest.mark.parametrize('what, words', [
+    ('nothing there', 'info.json: not the description of a LeRobot data set: No such file'),
+    ('no json', 'not the description'), ('old version', 'expected v3 .*convert_dataset_v21'),
+    ('no features', "info.json: lacks or garbles 'features'"),
+    ('no data', 'file-000.parquet: cannot be read'),
+    ('damaged data', 'file-000.parquet: cannot be read'),
+    ('a bad picture', 'episode 0 cannot be read: a picture that cannot be read')])
+def test_damage_is_named_in_one_line_and_leaves_no_half_file(what, words, tmp_path, capsys):
+    folder = tmp_path / 'set'
+    main(['export-lerobot', '--recordings', SAMPLE, '--out', str(folder), '--lossless'])
+    spoil(folder, what)
+    capsys.readouterr()
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert re.search(words, error), error
+    assert not list(Path(tmp_path, 'bag').glob('*.mcap*'))
+
+
+def test_a_folder_that_is_there_is_not_touched(tmp_path, capsys):
+    (tmp_path / 'a').mkdir()
+    (tmp_path / 'a' / 'precious').write_text('1')
+    assert main(['export-lerobot', '--recordings', SAMPLE, '--out', str(tmp_path / 'a')]) == 1
+    assert 'is there already' in capsys.readouterr().err
+    assert main(['import-lerobot', str(tmp_path), '--out', str(tmp_path / 'a')]) == 1
+    assert [p.name for p in (tmp_path / 'a').iterdir()] == ['precious']
