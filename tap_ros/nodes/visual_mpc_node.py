@@ -17,6 +17,7 @@ from rclpy.node import Node
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.contract import WORLD_FRAME
 from tap_ros.errors import PlanningError, TapError
 from tap_ros.nodes.arm import Arm
 from tap_ros.nodes.clients import call, CallError
@@ -25,6 +26,7 @@ from tap_ros.nodes.goal_source import goal_topics, GoalSource, needed_topics
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.object_messages import match_objects
+from tap_ros.nodes.plan_markers import encode_plan
 from tap_ros.nodes.planner_setup import (
     check_request,
     declare_parameters,
@@ -42,6 +44,7 @@ from tap_ros.planning.hierarchy import choose_sample, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig
 from tap_ros.text import escaped
+from visualization_msgs.msg import MarkerArray
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
@@ -87,6 +90,7 @@ class VisualMpcNode(Node):
         self._predict = self.create_client(
             PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS, callback_group=group)
         self._predictor = Liveness(self, 'predictor_node', callback_group=group)
+        self._markers = self.create_publisher(MarkerArray, 'plan/markers', STREAM)
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
             goal_callback=self._on_goal, cancel_callback=self._on_cancel)
@@ -198,6 +202,10 @@ class VisualMpcNode(Node):
                            time.monotonic())
                 result.steps = reach.steps
                 self._diagnostics.took(answer.plan.planning_ms, 'plan')
+                if self._markers.get_subscription_count():
+                    self._markers.publish(encode_plan(
+                        answer.plan, answer.seen.gripper, to_stamp(answer.seen.stamp_ns),
+                        WORLD_FRAME))
                 handle.publish_feedback(ReachGoal.Feedback(
                     step=reach.steps, stage=stage_name(answer.stage, num_subgoals),
                     expected_distance=float(answer.plan.expected_distance),

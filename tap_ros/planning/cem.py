@@ -33,7 +33,8 @@ def cem(cost: Callable[[np.ndarray], np.ndarray], mean: np.ndarray, std: np.ndar
         config: CEMConfig, rng: np.random.Generator,
         repair: Callable[[np.ndarray], np.ndarray] | None = None,
         proposals: np.ndarray | None = None,
-        recheck: Callable[[np.ndarray], np.ndarray] | None = None) -> tuple[np.ndarray, float]:
+        recheck: Callable[[np.ndarray], np.ndarray] | None = None
+        ) -> tuple[np.ndarray, float, np.ndarray]:
     """
     Search the minimum of a cost (cross-entropy method, App. F of the paper).
 
@@ -51,7 +52,8 @@ def cem(cost: Callable[[np.ndarray], np.ndarray], mean: np.ndarray, std: np.ndar
         num_samples, else the last count.
     :param recheck: cost that the best num_elites of all iterations are judged by once more, with
         the same convention; of many noisy costs the least is an illusion.
-    :return: best sample (D,) and its cost, not the one by recheck.
+    :return: best sample (D,); its cost, not the one by recheck; the best num_elites of all
+        iterations (E, D), the cheapest first.
     """
     best, best_costs = np.empty((0, len(mean))), np.empty(0)
     for iteration in range(config.num_iterations):
@@ -69,7 +71,7 @@ def cem(cost: Callable[[np.ndarray], np.ndarray], mean: np.ndarray, std: np.ndar
         # refit
         mean, std = elites.mean(0), elites.std(0)
     winner = 0 if recheck is None else int(np.argmin(_finite(recheck(best))))
-    return best[winner], float(best_costs[winner])
+    return best[winner], float(best_costs[winner]), best
 
 
 def _finite(costs: np.ndarray) -> np.ndarray:

@@ -45,6 +45,7 @@ class Found:
 
     shape: SequenceShape
     parameters: np.ndarray  # (D,) of the sequence, for shape
+    elites: np.ndarray  # (E, D) of the best ones that the search has judged
     expected_distance: float  # px, see Plan
     cost: float  # px, see Plan
     goal: Goal  # that it was searched for
@@ -54,7 +55,8 @@ class Found:
     def following(self) -> 'Found':
         """Return what is left one action later."""
         return replace(self, shape=self.shape.following(), age=self.age + 1,
-                       parameters=self.shape.shift(self.parameters))
+                       parameters=self.shape.shift(self.parameters),
+                       elites=np.array([self.shape.shift(one) for one in self.elites]))
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ class Plan:
     current_distance: float  # px, mean over objects, before it
     planning_ms: float
     actions: np.ndarray  # (HORIZON, 4) the whole sequence
+    elites: np.ndarray  # (E, HORIZON, 4) the best ones that were considered
+    places: np.ndarray  # (K, 2) m, of the table cells nearest to the goals
     cost: float  # what the search minimised: px, summed over objects and time
     memory: Memory  # for the next plan
 
@@ -139,8 +143,10 @@ class VisualMPC:
             found = self._search(scene, maps, weights @ self._points, goal, memory, limits)
         actions, = found.shape.actions(found.parameters[None], scene.gripper[2])
         milliseconds = 1000 * (time.perf_counter() - begin)
+        elites = found.shape.actions(found.elites, scene.gripper[2])
         return Plan(actions[0], found.expected_distance, float(current), milliseconds, actions,
-                    found.cost, Memory(memory.seed, memory.count + 1, found.following()))
+                    elites, goal.places, found.cost,
+                    Memory(memory.seed, memory.count + 1, found.following()))
 
     def _search(self, scene: Scene, maps: torch.Tensor, here: np.ndarray, goal: Goal,
                 memory: Memory, limits: Limits) -> Found:
@@ -182,8 +188,8 @@ class VisualMPC:
             mean, std = last.parameters, WARM_STD * std
             proposals = np.concatenate([proposals, mean[None]])
         clip = partial(shape.clip, least_lift=shape.least_lift(gripper[2]))
-        best, best_cost = cem(cost, mean, std, config.search, rng, clip, proposals,
-                              recheck if config.recheck else None)
+        best, best_cost, elites = cem(cost, mean, std, config.search, rng, clip, proposals,
+                                      recheck if config.recheck else None)
         actions = shape.actions(best[None], gripper[2])
         _, ends = judge(goal.distances, actions, gripper[None], HORIZON)
-        return Found(shape, best, float(ends[0]), best_cost, goal, limits)
+        return Found(shape, best, elites, float(ends[0]), best_cost, goal, limits)

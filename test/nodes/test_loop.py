@@ -23,6 +23,7 @@ from tap_ros.nodes.predictor_node import OVERLAY_SCALE
 from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
+from visualization_msgs.msg import MarkerArray
 
 pytestmark = pytest.mark.slow
 
@@ -100,7 +101,8 @@ def test_without_objects_there_is_a_picture_but_no_maps(loop):
 def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
     loop.reset()
     arm, objects = loop.joints.wait(1), positions(loop.objects.wait(1))
-    feedback = []
+    feedback, drawn = [], []
+    loop.node.create_subscription(MarkerArray, 'plan/markers', drawn.append, STREAM)
     budget = 10
     status, result = loop.reach(feedback.append, step_budget=budget, seed=1)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
@@ -120,6 +122,10 @@ def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
     assert result.expected_distance == pytest.approx(
         np.linalg.norm(pixels - goals, axis=1).mean(), abs=1e-3)
     assert loop.stopped()
+    assert len(drawn) >= budget - 1  # the first may come before it is known who listens
+    chosen = next(m for m in drawn[-1].markers if m.ns == 'chosen').points
+    np.testing.assert_allclose(  # the way begins where the gripper was, and its first move is made
+        (chosen[1].x, chosen[1].y), joints.position[:2], atol=0.02)
 
 
 def test_every_node_tells_how_it_is(loop):

@@ -66,6 +66,9 @@ def test_plans_are_within_limits_and_finite(model, preset):
         assert plan.actions.shape == (15, 4)
         assert np.abs(plan.action[:2]).max() <= 0.08 + 1e-6 and plan.action[3] == 0
         assert np.isfinite([plan.expected_distance, plan.current_distance]).all()
+        assert plan.elites.shape[1:] == (15, 4) and plan.places.shape[1:] == (2,)
+        assert any(np.array_equal(one, plan.actions) for one in plan.elites)
+        assert len(np.unique(plan.elites, axis=0)) > 1, 'not all are the same'
 
 
 def test_same_seed_same_plans_and_another_seed_others(model):

@@ -1,0 +1,52 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Plans as markers: where they lead, in metres."""
+
+from types import SimpleNamespace
+
+import numpy as np
+from tap_ros.contract import WORKSPACE_HIGH
+from tap_ros.nodes.plan_markers import encode_plan, way
+from tap_ros.nodes.topics import to_stamp
+from visualization_msgs.msg import Marker
+
+GRIPPER = np.array([0.1, -0.2, 0.05, 0.5], np.float32)
+
+
+def points(marker):
+    return np.array([(p.x, p.y, p.z) for p in marker.points])
+
+
+def test_a_way_is_the_sum_of_its_moves_within_the_workspace():
+    moves = np.array([[0.05, 0.02, 0.01, 1], [0.03, -0.02, 0, 1], [9, 0, 9, 0]])
+    np.testing.assert_allclose(way(moves, GRIPPER), [
+        [0.1, -0.2, 0.05], [0.15, -0.18, 0.06], [0.18, -0.2, 0.06],
+        [WORKSPACE_HIGH[0], -0.2, WORKSPACE_HIGH[2]]], atol=1e-6)
+
+
+def test_a_plan_is_drawn_with_what_it_was_chosen_from():
+    rng = np.random.default_rng(0)
+    elites = rng.uniform(-0.02, 0.02, (3, 15, 4))
+    plan = SimpleNamespace(actions=elites[1], elites=elites, places=np.array([[0.2, 0.1], [0, 0]]))
+    found = {m.ns: m for m in encode_plan(plan, GRIPPER, to_stamp(5 * 10**9), 'world').markers}
+    assert set(found) == {'chosen', 'elites', 'targets', 'gripper'}
+    assert len({m.id for m in found.values()}) == 4
+    for marker in found.values():
+        assert (marker.header.frame_id, marker.header.stamp.sec) == ('world', 5)
+        assert marker.action == Marker.ADD and marker.color.a > 0 and marker.scale.x > 0
+        assert marker.pose.orientation.w == 1
+    np.testing.assert_allclose(points(found['chosen']), way(elites[1], GRIPPER))
+    lines = points(found['elites']).reshape(3, 15, 2, 3)  # beginning and end of each move
+    for line, actions in zip(lines, elites):
+        np.testing.assert_allclose(line[:, 0], way(actions, GRIPPER)[:-1])
+        np.testing.assert_allclose(line[:, 1], way(actions, GRIPPER)[1:])
+    np.testing.assert_allclose(points(found['targets']), [[0.2, 0.1, 0], [0, 0, 0]])
+    assert found['gripper'].pose.position.x == np.float32(0.1)
+
+
+def test_without_elites_the_chosen_way_is_drawn():
+    actions = np.zeros((15, 4))
+    plan = SimpleNamespace(actions=actions, elites=actions[:0].reshape(0, 15, 4),
+                           places=np.zeros((1, 2)))
+    found = encode_plan(plan, GRIPPER, to_stamp(0), 'world').markers
+    assert [len(m.points) for m in found] == [16, 0, 1, 0]
