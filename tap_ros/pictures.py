@@ -11,6 +11,7 @@ OBJECT_COLOURS = (  # rgb, one per object; colour-blind readers tell them apart 
     (255, 176, 0), (100, 143, 255), (220, 38, 127), (0, 158, 115))
 GAP = 2  # white pixels between panels
 MARGIN = 8  # pixels outside a picture from where no mark reaches into it
+HALO_STD, HALO = 1.3, 0.6  # pixels, and strength, of the glow around a map: sharp ones are tiny
 
 
 def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
@@ -40,7 +41,10 @@ def overlay(image: np.ndarray, object_maps: Iterable[np.ndarray], scale: int = 1
     tinted = image.astype(np.float32)
     for k, probability in enumerate(object_maps):
         # The square root makes spread-out maps visible beside sharp ones.
-        strength = np.sqrt(probability / max(probability.max(), 1e-12))[..., None] * 0.85
+        share = np.asarray(probability / max(probability.max(), 1e-12), np.float32)
+        glow = cv2.GaussianBlur(share, (7, 7), HALO_STD, borderType=cv2.BORDER_CONSTANT)
+        glow = HALO * glow / max(float(glow.max()), 1e-12)
+        strength = np.maximum(0.9 * np.sqrt(share), glow)[..., None]
         colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)], np.float32)
         tinted += strength * (colour - tinted)
     canvas = enlarge(np.rint(tinted).astype(np.uint8), scale)

@@ -3,12 +3,13 @@
 """One self-contained HTML page about a few scenes and the subgoals predicted for them."""
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import html
 import io
 from itertools import groupby
 from pathlib import Path
+from types import MappingProxyType
 
 from matplotlib.figure import Figure
 import numpy as np
@@ -86,17 +87,42 @@ def _row(label: str, distances: Iterable[float]) -> str:
     return f'{label:<26}' + ''.join(f'{100 * d:>12.1f}' for d in distances)
 
 
-def write_report(path: str | Path, scenes: Sequence[SceneRuns], note: str = '') -> None:
+def _html_table(scenes: Sequence[SceneRuns]) -> str:
+    """Return the same as results_table as HTML."""
+    modes, rows = list(scenes[0].runs), list[str]()
+
+    def row(label: str, distances: Iterable[float], kind: str = '') -> None:
+        cells = ''.join(f'<td>{100 * d:.1f}</td>' for d in distances)
+        rows.append(f'<tr class="{kind}"><th scope="row">{html.escape(label)}</th>{cells}</tr>')
+
+    for task, group in groupby(scenes, lambda scene: scene.task):
+        kept = list(group)
+        distances = [[scene.runs[modes[0]].distances[0].mean(),
+                      *(scene.runs[mode].distances[-1].mean() for mode in modes)]
+                     for scene in kept]
+        for scene, found in zip(kept, distances):
+            row(scene.name, found)
+        row(f'{task}, mean of {len(kept)}', np.mean(distances, 0), 'mean')
+    head = ''.join(f'<th scope="col">{html.escape(text)}</th>' for text in (
+        'final mean distance, cm', 'nothing done', *(MODE_NAMES[mode] for mode in modes)))
+    return f'<table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
+
+
+def write_report(path: str | Path, scenes: Sequence[SceneRuns], note: str = '',
+                 facts: Mapping[str, str] = MappingProxyType({})) -> None:
     """
     Write the page; everything is inside the one file.
 
     :param path: of the HTML file.
     :param scenes: list of SceneRuns.
     :param note: a sentence on how the numbers were made.
+    :param facts: what made the page: name and value, such as date, commit and command.
     """
+    made = ''.join(f'<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>'
+                   for name, value in facts.items())
     body = ''.join(_scene_section(scene) for scene in scenes)
     pushed = [scene for scene in scenes if scene.runs]
-    table = f'<pre>{html.escape(results_table(pushed))}</pre>' if pushed else ''
+    table = _html_table(pushed) if pushed else ''
     page = f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <title>tap_ros: demo</title>
@@ -108,7 +134,12 @@ figure {{ display: inline-block; margin: 0 .8rem .8rem 0; vertical-align: top; }
 figcaption {{ font-size: .85rem; color: #555; max-width: 16rem; }}
 img {{ image-rendering: pixelated; display: block; max-width: 100%; }}
 img.smooth {{ image-rendering: auto; }}
-pre {{ background: #f4f4f6; padding: 1rem; overflow-x: auto; }}
+table {{ border-collapse: collapse; font-variant-numeric: tabular-nums; }}
+th, td {{ padding: .25rem .9rem; text-align: right; }} th:first-child {{ text-align: left; }}
+thead th {{ border-bottom: 2px solid #222; }} tbody th {{ font-weight: normal; }}
+tr.mean > * {{ font-weight: bold; border-bottom: 1px solid #ccc; }}
+dl {{ display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; font-size: .85rem;
+  color: #555; }} dd {{ margin: 0; overflow-wrap: anywhere; }}
 </style>
 <h1>Predicted subgoals, and objects pushed to a goal picture via them</h1>
 <p>The subgoal is what <code>/predict_subgoal</code> returned: a picture of a moment on the way,
@@ -117,6 +148,7 @@ was pushed twice: directly, and via the subgoal. Where a gripper is needed nothi
 film shows the expert whose recordings the predictor learned from.</p>
 {table}
 <p>{html.escape(note)}</p>
+<dl>{made}</dl>
 {body}</html>
 """
     write_atomically(path, page)
@@ -191,6 +223,7 @@ def _error_plot(scene: SceneRuns) -> bytes:
         colour = MODE_COLOURS[mode]
         axes.plot(100 * run.distances.mean(1), color=colour, label=MODE_NAMES[mode], lw=2)
         axes.plot(100 * run.distances, color=colour, lw=0.7, alpha=0.6)
+    axes.plot([], color='#555', lw=0.7, label='thin: each object; thick: their mean')
     axes.axhline(20, color='#999', ls=':', label='do nothing')
     axes.set(xlabel='step', ylabel='distance to the goal, cm', ylim=(0, None))
     axes.legend(fontsize=8)

@@ -10,7 +10,13 @@ the subgoal is predicted only; nothing here plans grasps.
 
 from dataclasses import dataclass
 from functools import partial
+import os
 from pathlib import Path
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
 import time
 from typing import Annotated, Any
 
@@ -323,7 +329,8 @@ def run(args: Options) -> int:
         folder / 'report.html', scenes,
         f'Tasks {", ".join(tasks)}, seeds {args.seed} to {args.seed + args.scenes - 1} of each, '
         f'at most {_budget(args, tasks[0])} steps of a push, {seconds:.0f} s in all. Object '
-        'pixels at every step, and the distances, are ground truth of the simulator.')
+        'pixels at every step, and the distances, are ground truth of the simulator.',
+        _facts())
     if pushed:
         write_film(folder / 'demo.webp', pushed)
         print(f'\n{results_table(pushed)}\n')
@@ -332,6 +339,17 @@ def run(args: Options) -> int:
         print(f'recording  {folder / "recording"}')
     print(f'page       {folder / "report.html"}')
     return 0
+
+
+def _facts() -> dict[str, str]:
+    """Say what makes a page: when, of which commit, by which command, on what machine."""
+    found = subprocess.run(  # outside of a checkout git says nothing
+        ['git', '-C', str(Path(__file__).parent), 'log', '-1', '--format=%h'],
+        capture_output=True, text=True, check=False) if shutil.which('git') else None
+    commit = found.stdout.strip() if found is not None else ''
+    return {'date': time.strftime('%Y-%m-%d %H:%M'), 'commit': commit or 'unknown',
+            'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
+            'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'}
 
 
 def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:

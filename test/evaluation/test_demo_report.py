@@ -41,8 +41,13 @@ def test_the_table_shows_centimetres_and_their_mean(scenes):
 
 def test_the_page_is_one_file_with_everything_inside(scenes, tmp_path):
     path = tmp_path / 'report.html'
-    write_report(path, scenes, 'made by a test')
+    write_report(path, scenes, 'made by a test', {'command': 'a <b>', 'date': 'today'})
     page = path.read_text()
+    assert '<dt>command</dt><dd>a &lt;b&gt;</dd><dt>date</dt><dd>today</dd>' in page
+    rows = re.findall(r'<tr class="(\w*)"><th scope="row">(.*?)</th>(.*?)</tr>', page)
+    assert [(kind, label, re.findall('<td>(.*?)</td>', cells)) for kind, label, cells in rows] == [
+        ('', 'push2 7', ['20.0', '11.0', '5.0']), ('', 'push2 8', ['20.0', '11.0', '5.0']),
+        ('mean', 'push2, mean of 2', ['20.0', '11.0', '5.0'])]
     assert '<h2>push2 7</h2>' in page and '<h2>push2 8</h2>' in page
     assert page.count('data:image/png;base64,') == page.count('<img ')
     assert 'http' not in page and '<early>' not in page and '&lt;early&gt; &amp;' in page
