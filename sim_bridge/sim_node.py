@@ -38,7 +38,7 @@ from tap_ros.nodes.object_messages import encode_camera_info, encode_joints, enc
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
-from tap_ros.nodes.subscriptions import overridable
+from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.tf_publisher import TransformPublisher
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 
@@ -86,9 +86,7 @@ class SimNode(Node):
                 (Float64, 'gripper/command', self._on_gripper, STREAM),
                 (TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM),
                 (Float64, 'arm/command_timeout', self._on_timeout, LATCHED)):
-            self.create_subscription(  # callbacks may take the info, too
-                kind, topic, callback, qos,  # type: ignore[arg-type]
-                qos_overriding_options=overridable())
+            subscribe(self, kind, topic, callback, qos)
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
                                    (StepScene, 'sim/step', self._on_step),

@@ -71,8 +71,8 @@ class Crop:
             return left, top, side, side
         if self.size and height != width:
             raise ImageError(
-                f'pictures of {width}x{height} pixels (width x height) are not square; say which '
-                f'square of them is used: --crop {CENTRE}, or --crop LEFT,TOP,SIDE')
+                f'pictures of {width}x{height} pixels (width x height) are not square; training '
+                f'says which square of them is used, by --crop {CENTRE} or --crop LEFT,TOP,SIDE')
         return 0, 0, width, height
 
     def cut_size(self, size: Sequence[int]) -> tuple[int, int]:

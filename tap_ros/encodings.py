@@ -84,6 +84,9 @@ def decompress(data: bytes | memoryview | np.ndarray, description: str) -> np.nd
             if width * height * 3 > MAX_PICTURE_BYTES:
                 raise ImageError(f'{width}x{height} pixels are more than {MAX_PICTURE_BYTES} '
                                  'bytes of rgb; send a smaller picture')
+            encoding = description.split(';')[0].strip()
+            if file.mode == 'L' and encoding in _BAYER:  # the raw mosaic
+                return to_rgb(np.array(file)[..., None], encoding)
             if file.mode[:1] in 'IF':
                 raise ImageError('a compressed picture with more than 8 bits a channel; send 8')
             return np.array(file.convert('RGB'))

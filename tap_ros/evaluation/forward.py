@@ -15,11 +15,12 @@ from tap_ros.files import write_rows
 from tap_ros.learning.filled import FilledStore, with_masks
 from tap_ros.learning.robot_mask import fill_from_past
 from tap_ros.learning.split import split_episodes, TEST_FRACTION
+from tap_ros.learning.weights import load_weights
 from tap_ros.options import Bags, Folder, ShippedFile, Topic
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
+from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.reading import Reading
 from tap_ros.weights import FORWARD_MODEL
 
 METHODS = {'map_error': 'forward_model', 'nothing_moves': 'nothing',
@@ -57,10 +58,11 @@ def run(args: Options) -> None:
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
     model = load_forward_model(args.weights, args.device)
+    _, _, training = load_weights(args.weights, 'forward_model')
     rows = []
     for recording in args.recordings:
-        store = open_recordings([recording], reading=Reading(
-            args.image_topic, model.config.crop, model.config.crop_size))
+        store = open_recordings(
+            [recording], reading=reading_like(training, [recording], args.image_topic))
         if store.image_size != (model.config.image_size,) * 2:
             raise ConfigError(f'{args.weights}: made for {model.config.image_size} pixels a side, '
                               f'{recording} has {store.image_size}; use matching ones')

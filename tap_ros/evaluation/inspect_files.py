@@ -3,6 +3,7 @@
 """Show what a recording or a weights file holds."""
 
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import json
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Annotated
 import numpy as np
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.crop import CENTRE, check_trainable
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, ImageError
 from tap_ros.files import write_atomically
 from tap_ros.learning.split import split_episodes, warn_if_none
 from tap_ros.options import File
@@ -70,8 +71,9 @@ def run(args: Options) -> None:
         refusal = error
         bags = find_bags(args.path)
         size = first_size(bags[0], find_topics(bags[0], reading.image_topic))
-        if size is not None and max(size) > LARGE and not reading.cut:
-            shown = replace(reading, crop=CENTRE, size=64)  # else the cache takes gigabytes
+        with suppress(ImageError):  # whoever opens it is told
+            if size is not None and max(reading.cut.cut_size(size)) > LARGE:  # gigabytes
+                shown = replace(reading, crop=reading.crop or CENTRE, size=64)
     store = open_recordings([args.path], reading=shown)
     cameras = {find_topics(bag, reading.image_topic)[IMAGE] for bag in find_bags(args.path)}
     episodes = [store[i] for i in range(len(store))]
@@ -80,7 +82,7 @@ def run(args: Options) -> None:
     print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     if store.camera_size not in (store.image_size, None):
-        how = '' if shown == reading else ', here as with --crop centre --size 64'
+        how = '' if shown == reading else f', here as with --crop {shown.crop} --size 64'
         print('cut         from pictures of {1}x{0} pixels{2}'.format(*store.camera_size, how))
     print(f'told apart  {_told_apart(store, reading)}')
     print(f'camera      {listing(sorted(cameras))}')

@@ -38,8 +38,8 @@ from tap_ros.prediction.batches import Batch, make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.networks import Predictor
 from tap_ros.prediction.predictor import load_network
+from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
-from tap_ros.recording.reading import trained_reading
 from tap_ros.weights import PREDICTORS
 import torch
 from tyro import conf
@@ -261,7 +261,7 @@ def run(args: Options) -> None:
     """
     network, training = load_network(args.weights)
     store = open_recordings(
-        args.recordings, reading=trained_reading(training, args.image_topic))
+        args.recordings, reading=reading_like(training, args.recordings, args.image_topic))
     if store.image_size != (network.config.image_size,) * 2:
         raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
@@ -311,7 +311,8 @@ def _print_table(scores: Mapping[str, EpisodeScores]) -> None:
     for name in _SHOWN:
         if name in columns['prediction']:
             print(f'{name:20s}' + ''.join(
-                f'{_text(column[name]):>28s}' for column in columns.values()))
+                f'{_text(column[name]) if name in column else "-":>28s}'
+                for column in columns.values()))
     for method in METHODS[1:]:
         if method in scores:
             gain = gain_interval(scores['prediction'].min_l1, scores[method].min_l1)

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 import rclpy
 from rclpy.context import Context
+from rclpy.exceptions import InvalidNamespaceException
 from rclpy.signals import SignalHandlerOptions
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
@@ -79,7 +80,11 @@ def run(args: Options) -> None:
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = rclpy.create_node('tap_ros_call', namespace=args.namespace, context=context)
+        try:
+            node = rclpy.create_node('tap_ros_call', namespace=args.namespace, context=context)
+        except InvalidNamespaceException as error:
+            raise ConfigError(f'--namespace {escaped(args.namespace, 60)}: is no name of a '
+                              'namespace, such as /left') from error
         with Spinner(node):
             client = node.create_client(PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS)
             name = client.service_name
@@ -95,6 +100,8 @@ def run(args: Options) -> None:
     names = tuple(first.object_names) if first else ()
     size = (first.image.height, first.image.width) if first else (0, 0)
     subgoals = decode_subgoals(response, names, size)
+    if names:
+        print(f'in pixels of the predicted picture, {size[1]}x{size[0]}:')
     for subgoal in subgoals:
         places = ', '.join(f'{escaped(name, 40)} at {u:.1f},{v:.1f}'
                            for name, (u, v) in zip(names, subgoal.expected_pixels))
@@ -113,6 +120,8 @@ def make_request(args: Options) -> PredictSubgoal.Request:
 
     :raises ConfigError: for positions that cannot be used; ImageError: for a picture file.
     """
+    if not -2**63 <= args.seed < 2**63:
+        raise ConfigError(f'--seed {args.seed}: expected a number of 64 bits')
     request = PredictSubgoal.Request(
         mode='' if args.mode == 'auto' else args.mode,
         num_samples=_count(args.samples, '--samples'),

@@ -68,6 +68,11 @@ class GoalSource:
                 f'goal: nothing has come on {self._explained(missing)}; publish there (the '
                 'simulator does at sim/reset), or send goal_image and goal_objects along')
         self._stamp = to_nanoseconds(found[self._needed[0]].header.stamp)
+        if 'image' not in self._needed and is_empty(goal['image']):
+            # Not needed, but it says how large the picture is that the objects are in.
+            beside = self._newest.newest('image', 'objects')
+            if beside and to_nanoseconds(beside['image'].header.stamp) == self._stamp:
+                goal['image'] = beside['image']
         masks = [topic for topic in self._types if topic == 'mask' and 'image' in self._needed]
         if masks and 'mask' not in found and not self._newest.missing(masks):
             found = self._newest.wait((*self._needed, *masks), MASK_TIMEOUT, self._stamp - 1,

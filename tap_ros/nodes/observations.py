@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of several topics put together by their stamp, with the time of their reception."""
 
-from collections import OrderedDict
+from collections import deque, OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 import math
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 DEPTH = 10  # stamps remembered
 JUMP_NS = 10 * 10**9  # a stamp so far ahead of all others is not believed at once
+REMEMBERED = 100  # messages of a latched topic by which those that come again are known
 PROOF = 3  # messages in a row that show that the clock of a topic has jumped
 
 
@@ -62,6 +63,7 @@ class Observations:
         self._renewed: dict[str, float] = {}  # likewise, with a new stamp
         # topic -> stamps in a row that are not believed
         self._suspects: dict[str, list[int]] = {topic: [] for topic in topics}
+        self._sent: dict[str, deque[int]] = {topic: deque(maxlen=REMEMBERED) for topic in topics}
         self.count, self.jumps = 0, 0
         self._heard: dict[str, Heard] = {}
 
@@ -82,7 +84,7 @@ class Observations:
         for topic, (message_type, name) in types.items():
             def receive(message: Any, info: dict[str, Any], topic: str = topic,
                         name: str = name) -> None:
-                self.put(topic, message, reception_time(info))
+                self.put(topic, message, reception_time(info), info.get('source_timestamp', 0))
                 if on_message is not None:
                     on_message(name)
 
@@ -100,17 +102,24 @@ class Observations:
         """Return the name of a topic, and why nothing comes on it where that is known."""
         return named_with_reason(self._heard.get(topic), name)
 
-    def put(self, topic: str, message: Any, received: float | None = None) -> None:
+    def put(self, topic: str, message: Any, received: float | None = None,
+            sent_ns: int = 0) -> None:
         """
         Add a message with a header.
 
         :param received: monotonic time in seconds of its reception; None: now.
+        :param sent_ns: when its publisher sent it, by its clock; 0: unknown. What is latched comes
+            once more when it is subscribed to anew; then it counts for nothing.
         """
         stamp = to_nanoseconds(message.header.stamp)
         received = time.monotonic() if received is None else received
         with self._changed:
             if not self._latched and not self._believe(topic, stamp):
                 return
+            if self._latched and sent_ns:
+                if sent_ns in self._sent[topic]:
+                    return
+                self._sent[topic].append(sent_ns)
             if stamp != self._newest.get(topic):
                 self._renewed[topic] = received
                 self._previous[topic] = self._newest.get(topic, stamp)

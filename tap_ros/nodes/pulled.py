@@ -101,10 +101,6 @@ class PulledObservations:
         """Take what has come, all topics together in the order in which it came."""
         with self._taking:
             come = []
-            if time.monotonic() - self._looked > LOOK_PERIOD:
-                self._looked = time.monotonic()
-                for heard in self._heard.values():
-                    heard.look_after()
             for topic, heard in self._heard.items():
                 subscription = heard.subscription
                 with subscription.handle:
@@ -112,8 +108,13 @@ class PulledObservations:
                         taken = subscription.handle.take_message(subscription.msg_type, False)
                         if taken is None:
                             break
-                        come.append((reception_time(taken[1]), topic, taken[0]))
-            for received, topic, message in sorted(come, key=lambda one: one[0]):
-                self._observations.put(topic, message, received)
+                        come.append((reception_time(taken[1]), topic, taken[0],
+                                     taken[1].get('source_timestamp', 0)))
+            if time.monotonic() - self._looked > LOOK_PERIOD:
+                self._looked = time.monotonic()
+                for heard in self._heard.values():  # when what has waited is taken
+                    heard.look_after()
+            for received, topic, message, sent_ns in sorted(come, key=lambda one: one[0]):
+                self._observations.put(topic, message, received, sent_ns)
                 if self._on_message is not None:
                     self._on_message(self._names[topic])

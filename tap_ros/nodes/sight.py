@@ -12,7 +12,7 @@ import numpy as np
 from sensor_msgs.msg import CompressedImage, Image, JointState
 from tap_msgs.msg import Episode, ObjectStates
 from tap_ros.crop import TrainedCrop
-from tap_ros.errors import KinematicsError, PlanningError, TapError
+from tap_ros.errors import ImageError, KinematicsError, PlanningError, TapError
 from tap_ros.images import check_image
 from tap_ros.nodes.arm_joints import ArmJoints, tells_gripper
 from tap_ros.nodes.camera_topic import camera_topic
@@ -20,7 +20,7 @@ from tap_ros.nodes.image_messages import decode_image, encode_image
 from tap_ros.nodes.object_messages import decode_cut_objects, decode_gripper, match_objects
 from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
 from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
-from tap_ros.nodes.subscriptions import overridable
+from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.topics import STREAM, to_nanoseconds
 from tap_ros.planning.reach import Seen
 
@@ -67,8 +67,7 @@ class Sight:
         self.begin(0.0)
         self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
                                others={'joints': self._on_joints})
-        node.create_subscription(Episode, 'episode', self._on_episode, STREAM,
-                                 qos_overriding_options=overridable())
+        subscribe(node, Episode, 'episode', self._on_episode, STREAM)
 
     def topics(self, objects: bool = True) -> tuple[str, ...]:
         """Return the names of what is looked at, with or without the objects."""
@@ -132,6 +131,18 @@ class Sight:
         else:
             return moment
         return replace(moment, messages=messages | {'image': image})
+
+    def cut(self, message: Image, name: str) -> np.ndarray:
+        """
+        Return a picture as the planner sees it, uint8 (H, W, 3).
+
+        :param message: sensor_msgs/Image.
+        :param name: how errors call it.
+        :raises ImageError: for one that cannot be used, or cut as in the training.
+        """
+        picture = decode_image(message, name)
+        return check_image(self._crop.of(picture.shape[:2], name).image(picture), name,
+                           self._crop.size)
 
     def decode_positions(self, message: ObjectStates, name: str,
                          picture: Image | None = None) -> tuple[tuple[str, ...], np.ndarray]:
@@ -201,17 +212,22 @@ class Sight:
         """Return a Seen; the objects keep the order in which they were seen first."""
         first, pixels = self._seen, None
         names = first.names if first else ()
-        name = self._types['image'][1]
+        name, crop = self._types['image'][1], self._crop
         picture = decode_image(moment.messages['image'], name)
         self._camera_size = picture.shape[:2]
+        if crop.crop and crop.camera_size and crop.camera_size != self._camera_size:
+            # The model knows where the table is in the pictures of one camera.
+            raise ImageError('{0}: pictures of {2}x{1} pixels; the forward model was trained on '
+                             'those of {4}x{3}, send such ones'.format(
+                                 name, *self._camera_size, *crop.camera_size))
         if 'objects' in topics:
             found, pixels = self.decode_positions(moment.messages['objects'], 'objects')
             if set(found) == set(names):
                 pixels = match_objects(names, found, pixels, 'the first objects', 'objects')
             else:
                 names = found
-        image = check_image(self._crop.of(self._camera_size, name).image(picture), name,
-                            self._crop.size)
+        image = check_image(
+            crop.of(self._camera_size, name).image(picture), name, crop.size)
         gripper = decode_gripper(moment.messages['joints'])
         return Seen(image, gripper, names, pixels, moment.stamp_ns, **times)
 

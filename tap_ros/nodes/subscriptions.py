@@ -11,6 +11,7 @@ from collections.abc import Callable
 import copy
 from typing import Any, TYPE_CHECKING
 
+from rclpy.exceptions import ParameterException
 from rclpy.qos import (
     DurabilityPolicy,
     qos_check_compatible,
@@ -18,7 +19,8 @@ from rclpy.qos import (
     QoSPolicyKind,
     ReliabilityPolicy,
 )
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from tap_ros.errors import ConfigError
 from tap_ros.text import escaped, listing
 
 if TYPE_CHECKING:
@@ -28,13 +30,33 @@ if TYPE_CHECKING:
     from rclpy.subscription import Subscription
 
 LOOK_PERIOD = 0.5  # s between two looks at what is offered
-_POLICIES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
-             QoSPolicyKind.DURABILITY)
+_OVERRIDABLE = QoSOverridingOptions((
+    QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
+    QoSPolicyKind.DURABILITY))
 
 
-def overridable() -> QoSOverridingOptions:
-    """Return what makes a subscription heed the parameters qos_overrides.*."""
-    return QoSOverridingOptions(_POLICIES)
+def subscribe(node: 'Node', message_type: type, topic: str, callback: Callable[..., Any],
+              qos: 'QoSProfile', callback_group: 'CallbackGroup | None' = None,
+              options: QoSOverridingOptions | None = _OVERRIDABLE) -> 'Subscription':
+    """
+    Subscribe to a topic, heeding the parameters qos_overrides.*.
+
+    :param callback: takes a message, or a message and its info.
+    :param qos: QoSProfile; it stays as it is, while rclpy writes overrides into what it is given.
+    :param options: which of them are heeded; None: none.
+    :raises ConfigError: for a parameter that no quality of service has.
+    """
+    try:
+        return node.create_subscription(
+            message_type, topic, callback, copy.copy(qos), callback_group=callback_group,
+            qos_overriding_options=options)
+    except (ValueError, KeyError, TypeError, RuntimeError, ParameterException,
+            InvalidQosOverridesError) as error:
+        raise ConfigError(
+            f'parameters qos_overrides.{node.resolve_topic_name(topic)}.subscription.*: '
+            f'{escaped(error, 200)}; valid are history (keep_last, keep_all), depth (a number), '
+            'reliability (reliable, best_effort), durability (volatile, transient_local)'
+        ) from error
 
 
 class Heard:
@@ -55,11 +77,11 @@ class Heard:
                  qos: 'QoSProfile', callback_group: 'CallbackGroup | None' = None) -> None:
         self.topic = node.resolve_topic_name(topic)
         self._node, self._type, self._callback = node, message_type, callback
-        self._group, self._full = callback_group, qos
+        self._group, self._full = callback_group, copy.copy(qos)
         self._prefix = f'qos_overrides.{self.topic}.subscription.'
         self._fixed = any(name.startswith(self._prefix) for name in node._parameter_overrides)
         self._qos = copy.copy(qos)
-        self.subscription: Subscription = self._subscribe(overridable())
+        self.subscription = subscribe(node, message_type, topic, callback, qos, callback_group)
 
     def look_after(self) -> None:
         """Ask for what is offered, if that has changed."""
@@ -69,7 +91,9 @@ class Heard:
         wanted = copy.copy(self._full)
         if any(one.reliability == ReliabilityPolicy.BEST_EFFORT for one in offered):
             wanted.reliability = ReliabilityPolicy.BEST_EFFORT
-        if any(one.durability == DurabilityPolicy.VOLATILE for one in offered):
+        # Never transient local again: what others keep is older than what has come since.
+        if self._qos.durability == DurabilityPolicy.VOLATILE or any(
+                one.durability == DurabilityPolicy.VOLATILE for one in offered):
             wanted.durability = DurabilityPolicy.VOLATILE
         if (wanted.reliability, wanted.durability) == (
                 self._qos.reliability, self._qos.durability):
@@ -79,7 +103,8 @@ class Heard:
             f'{escaped(self.topic)}: taken {wanted.reliability.name.lower()} and '
             f'{wanted.durability.name.lower()}, as it is published')
         self._node.destroy_subscription(self.subscription)
-        self.subscription = self._subscribe(None)
+        self.subscription = subscribe(
+            self._node, self._type, self.topic, self._callback, wanted, self._group, None)
 
     def why_silent(self) -> str:
         """Say why nothing can come, '' if something can."""
@@ -98,11 +123,6 @@ class Heard:
     def _publishers(self) -> list[Any]:
         """Return what is known of those who publish."""
         return self._node.get_publishers_info_by_topic(self.topic)
-
-    def _subscribe(self, options: QoSOverridingOptions | None) -> 'Subscription':
-        return self._node.create_subscription(
-            self._type, self.topic, self._callback, self._qos, callback_group=self._group,
-            qos_overriding_options=options)
 
 
 def named_with_reason(heard: Heard | None, name: str) -> str:

@@ -3,7 +3,7 @@
 """Serves reach_goal: drives planning.reach by what is seen, and sends its commands."""
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 import math
 import sys
 import threading
@@ -11,11 +11,12 @@ import time
 import traceback
 from typing import Any, cast, TYPE_CHECKING
 
+import numpy as np
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from tap_msgs.action import ReachGoal
-from tap_msgs.msg import CommandRefused
+from tap_msgs.msg import CommandRefused, ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import WORLD_FRAME
 from tap_ros.errors import PlanningError, TapError
@@ -24,8 +25,8 @@ from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.goal_source import goal_topics, GoalSource, needed_topics
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.image_messages import is_empty
-from tap_ros.nodes.object_messages import match_objects
+from tap_ros.nodes.image_messages import encode_image, is_empty
+from tap_ros.nodes.object_messages import encode_objects, match_objects
 from tap_ros.nodes.plan_markers import encode_plan
 from tap_ros.nodes.planner_setup import (
     check_request,
@@ -36,7 +37,7 @@ from tap_ros.nodes.planner_setup import (
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.sight import sensor_topics, Sight
 from tap_ros.nodes.subgoal_messages import decode_subgoals
-from tap_ros.nodes.subscriptions import overridable
+from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import ForwardModel
@@ -84,8 +85,7 @@ class VisualMpcNode(Node):
         self._sight = Sight(self, self.params, self._mpc.model.camera_crop, heard)
         self._sensors = self._sight.sensors
         self._arm = Arm(self, self.params, self._sensors)
-        self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM,
-                                 qos_overriding_options=overridable())
+        subscribe(self, CommandRefused, 'arm/refused', self._on_refused, STREAM)
         group = ReentrantCallbackGroup()  # answers and cancels arrive while a goal is executed
         self._predict = self.create_client(
             PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS, callback_group=group)
@@ -249,22 +249,32 @@ class VisualMpcNode(Node):
         goal_pixels = match_objects(seen.names, names, pixels, 'objects', 'goal_objects')
         subgoals = []
         if mode == 'subgoal':
-            found = self._ask_for_subgoals(handle, goal, seen.names)
+            found = self._ask_for_subgoals(handle, goal, seen, goal_pixels)
             subgoals = choose_sample(
                 self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found,
                 request.seed, limits, lambda: self._go_on(handle))
         return targets_by(subgoals, goal_pixels)
 
-    def _ask_for_subgoals(self, handle: 'ServerGoalHandle', goal: dict[str, Any],
-                          names: Sequence[str]) -> list['Subgoal']:
-        """Return the Subgoals of all samples, their objects in the order of `names`."""
-        wanted, seen = handle.request, self._sight.messages
-        picture = goal['image']
+    def _ask_for_subgoals(self, handle: 'ServerGoalHandle', goal: dict[str, Any], seen: 'Seen',
+                          goal_pixels: np.ndarray) -> list['Subgoal']:
+        """
+        Return the Subgoals of all samples, their objects in the order in which they are seen.
+
+        Pictures are sent as the planner sees them, cut and scaled, so that the maps of the answer
+        are in its pixels whatever the predictor makes of a camera's pictures.
+        """
+        wanted, picture = handle.request, goal['image']
         if 'mask' in goal:
             picture = self._sight.robot.fill_goal(picture, goal['mask'])
+        stamp, frame_id = to_stamp(seen.stamp_ns), self._sight.messages['image'].header.frame_id
+        assert seen.pixels is not None
+        objects, goal_objects = (encode_objects(
+            seen.names, pixels, np.full((len(pixels), 7), np.nan), stamp, frame_id,
+            ObjectStates.SOURCE_TRACKED) for pixels in (seen.pixels, goal_pixels))
         request = PredictSubgoal.Request(
-            start=seen['image'], goal=picture,
-            start_objects=seen['objects'], goal_objects=goal['objects'],
+            start=encode_image(seen.image, stamp, frame_id),
+            goal=encode_image(self._sight.cut(picture, 'goal'), stamp, frame_id),
+            start_objects=objects, goal_objects=goal_objects,
             num_samples=wanted.num_samples, recursion_depth=wanted.recursion_depth,
             seed=wanted.seed)
         begin = time.perf_counter()
@@ -279,7 +289,7 @@ class VisualMpcNode(Node):
         if not response.success:
             raise PlanningError(f'service {self._predict.service_name}: '
                                 f'{escaped(response.message, 1000)}')
-        return decode_subgoals(response, names, self._mpc.image_size)
+        return decode_subgoals(response, seen.names, self._mpc.image_size)
 
     def _send(self, handle: 'ServerGoalHandle', accepted: float, reach: Reach, command: Command,
               topics: Collection[str]) -> bool:

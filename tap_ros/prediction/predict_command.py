@@ -88,7 +88,13 @@ def run(args: Options) -> None:
         cut = predictor.camera_crop.of(picture.shape[:2], name)
         if cut.part:
             place, part = cut.window(picture.shape[:2]), Crop(cut.part)
-            pixels[name] = part.pixels(pixels[name], picture.shape[:2])
+            inside = part.pixels(pixels[name], picture.shape[:2])
+            if in_picture(pixels[name], picture.shape[:2]).all() and not in_picture(
+                    inside, place[:1:-1]).all():
+                raise ImageError(
+                    '{0}: an object is not in the part that the weights see, {3}x{4} pixels from '
+                    'column {1}, row {2} on; leave it out in both pictures'.format(name, *place))
+            pixels[name] = inside
             picture = pictures[name] = part.image(picture)
             corner = place[:2] if name == 'start' else corner
         scaled[name], places[name] = fit(picture, pixels[name], size, name)

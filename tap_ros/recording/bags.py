@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the bags at a path, their files and their topics; say what is wrong with them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 import warnings
 
-from tap_ros.crop import check_trainable
-from tap_ros.errors import ImageError, RecordingError
+from tap_ros.crop import CENTRE, check_trainable
+from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.recording import topics
 from tap_ros.recording.columns import Columns, first_size
 from tap_ros.recording.container import Channel, McapFile
@@ -16,7 +18,7 @@ from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.lost import describe
 from tap_ros.recording.messages import check_schema
 from tap_ros.recording.metadata import bag_files, FILE_NAME
-from tap_ros.recording.reading import Reading
+from tap_ros.recording.reading import Reading, trained_reading
 from tap_ros.text import escaped
 
 
@@ -97,6 +99,25 @@ def list_topics(path: str | Path) -> list[tuple[str, str, int | None]]:
     return [(topic, kind, count) for topic, (kind, count) in sorted(found.items())]
 
 
+def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
+                 image_topic: str = '') -> Reading:
+    """
+    Return how recordings are read as those of a training were.
+
+    :param training: the training dict of a weights file.
+    :param paths: of the recordings.
+    :param image_topic: the camera's topic; by default that of the training where all of them have
+        it, else as topics.resolve finds it.
+    :raises RecordingError: when a recording is missing, or nothing of it can be read.
+    """
+    reading, settings = trained_reading(training, image_topic), training.get('settings')
+    trained = settings.get('image_topic') if isinstance(settings, dict) else None
+    if not image_topic and isinstance(trained, str) and trained and all(
+            trained in {topic for topic, _, _ in list_topics(path)} for path in paths):
+        reading = replace(reading, image_topic=trained)
+    return reading
+
+
 def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: str) -> None:
     """
     Refuse recordings that no network of ours takes, before they are decoded.
@@ -104,14 +125,22 @@ def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: 
     :param paths: .mcap files, bag folders, or folders of bag folders.
     :param reading: Reading.
     :param network: what errors call it.
-    :raises ConfigError: for pictures of a size that it cannot have, see crop.check_trainable.
+    :raises ConfigError: for pictures of a size that it cannot have, see crop.check_trainable, and
+        for one part of pictures of several sizes.
     :raises RecordingError: when a recording is missing, or lacks the image topic.
     """
+    sizes = set()
     for bag in (bag for path in paths for bag in find_bags(path)):
         size = first_size(bag, find_topics(bag, reading.image_topic))
         if size is not None:
+            sizes.add(size)
             with suppress(ImageError):  # whoever opens it is told
                 check_trainable(reading.cut.cut_size(size), network)
+    if len(sizes) > 1 and reading.crop not in ('', CENTRE):
+        found = ', '.join('{1}x{0}'.format(*size) for size in sorted(sizes))
+        raise ConfigError(f'recordings: pictures of different sizes, {found}; --crop '
+                          f'{reading.crop} is another part of each, use --crop {CENTRE} or '
+                          'train on them apart')
 
 
 def check_sizes(parts: Sequence[Columns]) -> None:

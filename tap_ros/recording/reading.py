@@ -22,7 +22,7 @@ class Reading:
     :param crop: the square part of the pictures that is used: 'centre', the largest one in the
         middle, or LEFT,TOP,SIDE in pixels of the camera. Without it pictures are used whole.
     :param size: pixels a side that pictures are scaled to, such as 64; 0: not scaled.
-    :param rate: pictures a second, at most; 0: all of them.
+    :param rate: pictures a second, about; 0: all of them.
     :param gap: s; where no marks tell episodes apart, a longer pause between two pictures does;
         0: never.
     :param episode_seconds: s; a bag alone, without marks and pauses, is cut into equal parts of

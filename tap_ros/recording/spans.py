@@ -115,7 +115,9 @@ def _unmarked(log: np.ndarray, stamps: np.ndarray, pause: int, longest: int) -> 
     """Return spans that end where the camera pauses, or its clock was set; times in ns."""
     order = np.argsort(log, kind='stable')
     log, stamps = log[order], stamps[order]
-    begins = np.flatnonzero(np.abs(np.diff(stamps)) > pause) + 1 if pause else np.empty(0, int)
+    steps = np.diff(stamps)  # a clock that is set back begins another episode, too
+    begins = np.flatnonzero((steps > pause) | (steps < -MAX_JITTER_NS)) + 1 if pause else (
+        np.empty(0, int))
     if not len(begins) and longest and len(stamps):
         since = np.maximum.accumulate(stamps) - stamps[0]
         parts = max(-(-int(since[-1]) // longest), 1)  # rounded up

@@ -103,9 +103,11 @@ def resolve(available: Mapping[str, str], source: str,
         if candidates:
             found[name] = candidates[0]
     if IMAGE not in found:
-        images = next((names for kind in (TYPES[IMAGE], COMPRESSED) if (names := [
-            topic for topic in available
-            if available[topic] == kind and topic not in found.values()])), [])
+        images = [topic for topic, kind in available.items()
+                  if kind == TYPES[IMAGE] and topic not in found.values()]
+        # Of a camera that is there raw, too, nothing more is learned from the compressed pictures.
+        images += [topic for topic, kind in available.items() if kind == COMPRESSED
+                   and topic.removesuffix('/compressed') not in images]
         if len(images) != 1:
             raise RecordingError(
                 f'{source}: no topic ends in {IMAGE} with type {TYPES[IMAGE]}; name the camera '

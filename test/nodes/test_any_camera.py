@@ -11,18 +11,22 @@ from PIL import Image as Picture
 from processes import Client, NodeProcess
 import pytest
 from rclpy.parameter import Parameter
-from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rclpy.qos import qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.crop import Crop, TrainedCrop
+from tap_ros.errors import ConfigError, ImageError
 from tap_ros.learning.weights import save_weights
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import decode_image, encode_image
 from tap_ros.nodes.object_messages import encode_joints, encode_objects
+from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.planner_setup import declare_parameters
+from tap_ros.nodes.pulled import PulledObservations
 from tap_ros.nodes.sight import Sight
-from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.subscriptions import Heard, subscribe
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
@@ -136,6 +140,54 @@ def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(
     assert to_nanoseconds(answer.subgoals[0].header.stamp) == to_nanoseconds(STAMP)
 
 
+def test_what_was_latched_before_does_not_come_back(client):
+    """A goal by hand, volatile, is not undone when its publisher has left."""
+    old, new = (encode_objects(('cup',), [(u, 8.0)], [[0, 0, 0, 0, 0, 0, 1]], to_stamp(u * 10**9),
+                               'world', ObjectStates.SOURCE_TRACKED) for u in (3, 5))
+    kept = client.create_publisher(ObjectStates, 'goal/objects', LATCHED)
+    kept.publish(old)
+    pulled = PulledObservations(client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED, True)
+    observed = Observations('objects', latched=True)
+    observed.subscribe(client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED)
+
+    def newest():
+        return [found['objects'].objects[0].u if (found := each.newest('objects')) else None
+                for each in (pulled, observed)]
+
+    def until(expected):
+        deadline = time.monotonic() + 20
+        while newest() != expected and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert newest() == expected
+
+    until([3, 3])
+    by_hand = client.create_publisher(ObjectStates, 'goal/objects', QoSProfile(depth=1))
+    deadline = time.monotonic() + 20
+    while newest() != [5, 5] and time.monotonic() < deadline:
+        by_hand.publish(new)
+        time.sleep(0.2)
+    assert newest() == [5, 5]
+    client.destroy_publisher(by_hand)
+    for _ in range(20):  # longer than it takes to look at what is offered
+        time.sleep(0.1)
+        assert newest() == [5, 5]
+
+
+def test_overrides_change_that_subscription_alone_and_wrong_ones_are_named(client):
+    topic = client.resolve_topic_name('camera/image_raw')
+    name = f'qos_overrides.{topic}.subscription.reliability'
+    with Client('overridden', parameter_overrides=[Parameter(name, value='best_effort')]) as node:
+        made = subscribe(node, Image, 'camera/image_raw', print, STREAM)
+        assert made.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        heard = Heard(node, Image, 'camera/image_raw', print, STREAM)
+        assert heard.subscription.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert STREAM.reliability == ReliabilityPolicy.RELIABLE, 'others share it'
+    for wrong in ('besteffort', 7):
+        with Client('wrong', parameter_overrides=[Parameter(name, value=wrong)]) as node:
+            with pytest.raises(ConfigError, match='qos_overrides.*reliable, best_effort'):
+                subscribe(node, Image, 'camera/image_raw', print, STREAM)
+
+
 def test_an_object_beside_the_part_that_is_seen_is_named(client, weights, tmp_path):
     beside = encode_objects(('cup',), [(20.0, 200.0)], [[0, 0, 0, 0, 0, 0, 1]], STAMP, 'world',
                             ObjectStates.SOURCE_TRACKED)
@@ -194,3 +246,23 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
         assert np.array_equal(decode_image(sight.messages['image'], 'start'), shown)
         names, pixels = sight.decode_positions(objects, 'goal_objects', None)
         np.testing.assert_allclose(pixels, seen.pixels)
+        # Pixels of a goal picture that is cut already are those of the part.
+        small = encode_image(crop.crop.image(shown), STAMP, 'eye')
+        inside = encode_objects(names, pixels, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP, 'world',
+                                ObjectStates.SOURCE_TRACKED)
+        np.testing.assert_allclose(
+            sight.decode_positions(inside, 'goal_objects', small)[1], pixels)
+        assert np.array_equal(sight.cut(small, 'goal'), seen.image)
+        # Another camera shows the table elsewhere.
+        sight.begin(time.monotonic())
+        other = encode_image(np.ascontiguousarray(START[:240, :320]), to_stamp(9 * 10**9), 'eye')
+        sight.sensors.put('image', other), sight.sensors.put('objects', stamped(objects, 9))
+        sight.sensors.put('joints', stamped(joints, 9))
+        with pytest.raises(ImageError, match='320x240 pixels; the forward model was trained on '
+                                             'those of 640x480'):
+            sight.look(sight.topics())
+
+
+def stamped(message, seconds):
+    message.header.stamp = to_stamp(seconds * 10**9)
+    return message

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of any camera: compressed, large, fast, unmarked."""
 
+from dataclasses import replace
 import io
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 from tap_ros.cli import main
 from tap_ros.crop import Crop
 from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.recording.bags import check_first_picture, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
@@ -206,6 +208,63 @@ def test_a_clock_that_is_set_back_does_not_stop_the_rate(tmp_path):
                 'data': np.frombuffer(packed(scene(0)), np.uint8)}), log * SECOND)
     episodes = list(open_recordings(tmp_path / 'bag', reading=Reading(rate=1)))
     assert [len(e.frames) for e in episodes] == [4, 4]  # two, as the clock jumped
+
+
+def test_a_clock_that_is_set_back_a_little_begins_an_episode(tmp_path):
+    stamps = [SECOND * (t + 10) for t in range(6)] + [SECOND * (t + 13) for t in range(6)]
+    with BagWriter(tmp_path / 'bag') as writer:
+        for log, stamp in enumerate(stamps):
+            writer.write_raw(TOPIC, COMPRESSED, encode(COMPRESSED, {
+                'header': header(stamp), 'format': 'jpeg',
+                'data': np.frombuffer(packed(scene(log), 'PNG'), np.uint8)}), log * SECOND)
+    first, second = open_recordings(tmp_path / 'bag')
+    np.testing.assert_array_equal(first.frames, [scene(t) for t in range(6)])
+    np.testing.assert_array_equal(second.frames, [scene(t) for t in range(6, 12)])
+
+
+def test_a_compressed_mosaic_has_the_colours_of_the_scene(tmp_path):
+    picture = np.full((16, 24, 3), (200, 30, 60), np.uint8)
+    raw = np.empty((16, 24), np.uint8)
+    for k, channel in enumerate((0, 1, 1, 2)):
+        raw[k // 2::2, k % 2::2] = picture[k // 2::2, k % 2::2, channel]
+    buffer = io.BytesIO()
+    Picture.fromarray(raw).save(buffer, 'PNG')
+    bag = record(tmp_path / 'bag', [buffer.getvalue()], [SECOND],
+                 text='bayer_rggb8; png compressed ')
+    (episode,) = open_recordings(bag)
+    np.testing.assert_array_equal(episode.frames[0][2:-2, 2:-2], picture[2:-2, 2:-2])
+
+
+def test_depth_beside_compressed_colour_makes_the_topic_be_named(tmp_path):
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_raw('/depth/image_rect', IMAGE, encode(IMAGE, {'header': header(1)}), 1)
+        writer.write_raw('/color/image_raw/compressed', COMPRESSED, encode(
+            COMPRESSED, {'header': header(2)}), 2)
+    with pytest.raises(RecordingError, match='--image-topic.*/color/image_raw/compressed'):
+        open_recordings(tmp_path / 'bag')
+
+
+def test_one_part_of_two_cameras_is_refused_before_training(tmp_path):
+    for name, size in (('a', (96, 128)), ('b', (120, 160))):
+        record(tmp_path / name, [scene(t, size) for t in range(4)], at((1, 4)))
+    with pytest.raises(ConfigError, match='different sizes, 128x96, 160x120; --crop 0,0,96 is'):
+        check_first_picture([tmp_path], Reading(crop='0,0,96', size=64), 'x')
+    check_first_picture([tmp_path], Reading(crop='centre', size=64), 'x')
+
+
+def test_other_recordings_are_read_as_those_of_the_training(tmp_path):
+    training = {'settings': {'image_topic': '/wrist', 'crop': 'centre', 'size': 32, 'rate': 2.0,
+                             'gap': 3, 'episode_seconds': 0.0}}
+    record(tmp_path / 'a', [scene(0)], [SECOND])
+    with BagWriter(tmp_path / 'b') as writer:
+        for topic in ('/wrist', '/front'):
+            writer.write_raw(topic, IMAGE, encode(IMAGE, {'header': header(1)}), 1)
+    expected = Reading('', 'centre', 32, 2.0, 3, 0.0)
+    assert reading_like(training, [tmp_path / 'a']) == expected  # it has no such topic
+    assert reading_like(training, [tmp_path / 'b']) == replace(expected, image_topic='/wrist')
+    assert reading_like(training, [tmp_path / 'b'], '/front') == replace(
+        expected, image_topic='/front')
+    assert reading_like({}, [tmp_path / 'b']) == Reading()
 
 
 def at(*pieces):
