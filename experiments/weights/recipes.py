@@ -74,6 +74,7 @@ RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push3', 'push3', {'push3': '--episodes 600'},
            f'{_PUSHING} --initial-weights push2 --steps 3000'),
     Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),
+    Recipe('stack3', 'stack3', {'stack3': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('grasp', 'grasp', {'grasp': '--episodes 3000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', {'pick_place': '--episodes 3000'},
            f'{_GRIPPING} --steps 10000'),
