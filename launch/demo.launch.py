@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Run the demo on nodes that launch starts: what `make demo` does, for ROS 2 from apt.
+Run the demo on nodes that launch starts: what `make demo` does, with the ros2 command.
 
 The driver of the demo resets the scenes, sends the goals, and prints the table; when it ends,
 everything ends.

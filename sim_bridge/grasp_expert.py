@@ -4,8 +4,8 @@
 The expert that grasps: a cross-entropy method with the true simulator over where to (App. D).
 
 A sample is a place of the gripper above the object; drop, close and lift follow from there in the
-true physics, all samples at once. Places that lift the object are equally good, so that any of
-them may be chosen. Now and then a random place is taken, which may miss: such episodes are kept.
+true physics, all samples at once. Of the places that lift the object, those near its centre are
+a little better. Now and then a random place is taken, which may miss: such episodes are kept.
 How fast the arm goes, how low and how high, and where it waits varies from episode to episode.
 """
 
@@ -218,7 +218,7 @@ class GraspExpert:
         moved = np.delete(np.linalg.norm(after[..., :3] - before, axis=-1), self._held, axis=1)
         lost = np.linalg.norm(poses[:, :2] - places, axis=1) > LOST
         upright = 1 - 2 * (poses[:, 4] ** 2 + poses[:, 5] ** 2)
-        # What is lifted but for a centimetre is as good as can be: such places tie.
+        # What is lifted but for a centimetre is as good as can be: then the centre decides.
         return lift - np.clip(lifted, 0, lift - 0.01) + 0.1 * (
             (upright < 0.95) | lost) + OTHERS * moved.sum(1) + OFF_CENTRE * np.linalg.norm(
                 places - before[self._held, :2], axis=1)

@@ -87,7 +87,8 @@ def decompress(data: bytes | memoryview | np.ndarray, description: str) -> np.nd
             encoding = description.split(';')[0].strip()
             if file.mode == 'L' and encoding in _BAYER:  # the raw mosaic
                 return to_rgb(np.array(file)[..., None], encoding)
-            if file.mode[:1] in 'IF':
+            raw = file.tile[0][3] if file.tile else ''  # such as RGB;16B
+            if file.mode[:1] in 'IF' or (isinstance(raw, str) and ';16' in raw):
                 raise ImageError('a compressed picture with more than 8 bits a channel; send 8')
             return np.array(file.convert('RGB'))
     except UnidentifiedImageError:

@@ -19,7 +19,7 @@ def declare_transport(parameters: 'Parameters') -> None:
     parameters.declare(
         'image_transport', 'raw',
         'How the camera sends pictures: sensor_msgs/Image on camera/image_raw (raw), or '
-        'CompressedImage, JPEG or PNG, on camera/image_raw/compressed (compressed).',
+        'CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).',
         choices=tuple(_TRANSPORTS))
 
 

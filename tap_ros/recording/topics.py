@@ -75,7 +75,7 @@ def resolve(available: Mapping[str, str], source: str,
     :param available: dict topic -> type of what the recording holds.
     :param source: what messages call the recording.
     :param image_topic: the camera's topic; by default the one that ends in /camera/image_raw, else
-        the only one of images, else the only one of compressed images.
+        the only one of images, compressed or not; X/compressed beside X does not count.
     :return: dict from the names above to topics of the recording; what it lacks is left out.
     :raises RecordingError: without an image topic, or when several would do.
     """

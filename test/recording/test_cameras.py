@@ -87,6 +87,14 @@ def test_depth_pictures_are_refused_with_the_reason(tmp_path):
         open_recordings(bag)
 
 
+def test_sixteen_bits_of_colour_are_refused(tmp_path):
+    good, data = cv2.imencode('.png', np.full((8, 8, 3), 40000, np.uint16))
+    assert good
+    bag = record(tmp_path / 'bag', [data.tobytes()], [SECOND], text='rgb16; png compressed')
+    with pytest.raises(RecordingError, match='more than 8 bits a channel'):
+        open_recordings(bag)
+
+
 def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path):
     bomb = packed(np.zeros((4000, 4000, 3), np.uint8), 'PNG')
     assert len(bomb) < 100_000
