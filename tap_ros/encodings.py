@@ -13,8 +13,9 @@ from tap_ros.text import escaped
 # Names of cv2, which is imported late: --help of training comes without.
 _YUV = {'yuv422': 'COLOR_YUV2RGB_UYVY', 'uyvy': 'COLOR_YUV2RGB_UYVY',
         'yuv422_yuy2': 'COLOR_YUV2RGB_YUY2', 'yuyv': 'COLOR_YUV2RGB_YUY2'}
-_BAYER = {'bayer_rggb8': 'COLOR_BayerRGGB2RGB', 'bayer_bggr8': 'COLOR_BayerBGGR2RGB',
-          'bayer_gbrg8': 'COLOR_BayerGBRG2RGB', 'bayer_grbg8': 'COLOR_BayerGRBG2RGB'}
+# It calls patterns by the second and third pixel of the second row.
+_BAYER = {'bayer_rggb8': 'COLOR_BayerBG2RGB', 'bayer_bggr8': 'COLOR_BayerRG2RGB',
+          'bayer_gbrg8': 'COLOR_BayerGR2RGB', 'bayer_grbg8': 'COLOR_BayerGB2RGB'}
 READABLE = (*ENCODINGS, *_YUV, *_BAYER)
 _DEEP = re.compile(r'(mono|rgb|bgr|rgba|bgra|bayer_[rgb]{4})16|(16|32|64)[US FC]+\d*')
 _COMPRESSED = ('JPEG', 'PNG', 'WEBP')
