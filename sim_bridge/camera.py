@@ -63,18 +63,20 @@ class Camera:
         rays = (np.asarray(points) @ rotation.T + translation) @ self.K.T
         return rays[..., :2] / rays[..., 2:]
 
-    def on_table(self, pixels: ArrayLike) -> np.ndarray:
+    def on_table(self, pixels: ArrayLike, height: ArrayLike = 0.0) -> np.ndarray:
         """
-        Return where the rays of pixels meet the table's plane, z = 0.
+        Return where the rays of pixels meet the table's plane, z = 0, or one above it.
 
         :param pixels: (..., 2) (u, v).
+        :param height: z of the plane in m, beneath the camera, or one for each pixel (...).
         :return: (..., 2) x, y in m; infinite for rays that do not meet it.
         """
         pixels = np.asarray(pixels, np.float64)
         rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1)
         rays = rays @ np.linalg.inv(self.K).T @ self.extrinsics[:, :3]
         with np.errstate(divide='ignore', invalid='ignore'):
-            far = np.where(rays[..., 2] < 0, -self.position[2] / rays[..., 2], np.inf)
+            far = np.where(
+                rays[..., 2] < 0, (np.asarray(height) - self.position[2]) / rays[..., 2], np.inf)
             return np.array(self.position[:2]) + far[..., None] * rays[..., :2]
 
     def moved(self, appearance: Appearance) -> 'Camera':

@@ -16,6 +16,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from sim_bridge.appearance import CHOICES
 from sim_bridge.looks import DEFAULT_LOOK, LOOKS, OBSERVER
+from sim_bridge.moved_goal import move_goal
 from sim_bridge.robot_description import robot_description
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import TASKS
@@ -23,7 +24,7 @@ from sim_bridge.transforms import arm_transforms, camera_transform, fixed_arm_tr
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
-from tap_msgs.srv import ResetScene, StepScene
+from tap_msgs.srv import ResetScene, SetGoal, StepScene
 from tap_ros.contract import (
     ACTION_LIMIT,
     CAMERA_FRAME,
@@ -34,7 +35,12 @@ from tap_ros.contract import (
 from tap_ros.errors import TapError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image, encode_mask
-from tap_ros.nodes.object_messages import encode_camera_info, encode_joints, encode_objects
+from tap_ros.nodes.object_messages import (
+    decode_objects,
+    encode_camera_info,
+    encode_joints,
+    encode_objects,
+)
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import answering, run_node
@@ -75,6 +81,7 @@ class SimNode(Node):
         self._stamp_ns = FIRST_STAMP  # of the newest image; never goes back, unlike the physics
         self._answered_ns = 0  # stamp of the newest image that was answered by a command
         self._reset_ns = FIRST_STAMP
+        self._goal_ns = 0  # stamp of the newest goal
         self._num_steps = 0
         self._in_episode = False
         self._paused = False
@@ -89,6 +96,7 @@ class SimNode(Node):
             subscribe(self, kind, topic, callback, qos)
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
+                                   (SetGoal, 'sim/set_goal', self._on_set_goal),
                                    (StepScene, 'sim/step', self._on_step),
                                    (SetBool, 'sim/pause', self._on_pause)):
             self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
@@ -219,6 +227,21 @@ class SimNode(Node):
         response.message = f'{self._sim.task.name}, seed {request.seed}'
         return response
 
+    def _on_set_goal(self, request: SetGoal.Request,
+                     response: SetGoal.Response) -> SetGoal.Response:
+        camera, poses = self._sim.camera, self._sim.goal().object_poses
+        try:
+            names, pixels = decode_objects(
+                request.objects, 'objects', (camera.height, camera.width))
+            self._sim.set_goal(move_goal(camera, poses, names, pixels))
+        except TapError as error:
+            response.message = str(error)
+            return response
+        self._publish_goal()
+        response.success = True
+        response.message = f'moved {", ".join(names)}'
+        return response
+
     def _on_step(self, request: StepScene.Request,
                  response: StepScene.Response) -> StepScene.Response:
         periods = request.num_periods or 1
@@ -267,7 +290,7 @@ class SimNode(Node):
         self._in_episode = True
         self._publish_episode(Episode.START, '')
         self._publish_fixed_transforms()
-        self._publish_goal(sim.goal(hide_arm or self.params['hide_arm_in_goal']))
+        self._publish_goal()
         self._publish(observation)
 
     def _step(self, move: np.ndarray) -> None:
@@ -322,8 +345,11 @@ class SimNode(Node):
         for topic, message in self._newest.items():
             self._streams[topic].publish(message)
 
-    def _publish_goal(self, goal: Observation) -> None:
-        stamp = to_stamp(self._stamp_ns)
+    def _publish_goal(self) -> None:
+        goal = self._sim.goal(self._hide_arm or self.params['hide_arm_in_goal'])
+        # Goals are told apart by their stamps, also where no time has passed between them.
+        self._goal_ns = max(self._stamp_ns, self._goal_ns + 1)
+        stamp = to_stamp(self._goal_ns)
         self._goal_objects.publish(encode_observed(goal, stamp))
         self._goal_image.publish(encode_image(goal.image, stamp, CAMERA_FRAME))
         if self._goal_mask is not None and goal.robot_mask is not None:
@@ -332,7 +358,8 @@ class SimNode(Node):
     def _publish_episode(self, event: int, outcome: str) -> None:
         scene = self._sim.scene
         message = Episode(event=event, task=scene.task.name, seed=scene.seed, outcome=outcome)
-        message.header.stamp = to_stamp(self._stamp_ns)
+        # Not before its goal, else a recording would not count that.
+        message.header.stamp = to_stamp(max(self._stamp_ns, self._goal_ns))
         message.header.frame_id = WORLD_FRAME
         self._episode.publish(message)
 
@@ -365,7 +392,7 @@ def declare_parameters(node: Node) -> Parameters:
                        'stands still. Its sender may say otherwise on arm/command_timeout.',
                        low=0.001, high=60.0)
     parameters.declare('hide_arm_in_goal', False,
-                       'Leave the arm out of the goal picture, from the next reset on.',
+                       'Leave the arm out of the goal picture, from the next one on.',
                        read_only=False)
     return parameters
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated world: reset, step, observe. Knows nothing of ROS."""
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -11,6 +12,7 @@ from sim_bridge.appearance import choose_appearance, USUAL
 from sim_bridge.camera import Renderer
 from sim_bridge.grasping import grasp_place
 from sim_bridge.looks import DEFAULT_LOOK, get_look, OBSERVER
+from sim_bridge.moved_goal import check_apart, check_places
 from sim_bridge.places import gripper_away_from
 from sim_bridge.scene import (
     build_scene,
@@ -179,11 +181,35 @@ class Simulator:
         Return the Observation of the goal.
 
         The arm stands as after pushing one object there, holds the object that is to be grasped,
-        is above the one that it has put down, or lets go of the top of a tower.
+        is above the one that it has put down, or lets go of the top of a tower. After set_goal it
+        is somewhere beside the objects.
 
         :param hide_arm: leave the arm out of the picture.
         """
         return self._goal[1 if hide_arm else 0]
+
+    def set_goal(self, places: ArrayLike) -> None:
+        """
+        Put the goal elsewhere, until the next reset; nothing moves, and `scene` stays as drawn.
+
+        goal, distances and outcome follow. The objects keep the heights and yaws of the goal
+        before, the arm is somewhere beside them.
+
+        :param places: (K, 2) x, y in m of the object origins.
+        :raises SceneError: for a task without pushing, another shape, places beyond
+            Task.object_range, and objects that would overlap; then the goal stays as it was.
+        """
+        places = np.asarray(places, np.float64)
+        check_places(self.task, places)
+        poses = self.goal().object_poses.copy()
+        poses[:, :2] = places
+        before = copy(self.data)  # photograph keeps the state, but not the solver's warm start
+        try:
+            self._place(poses, self.target)
+            check_apart(self.model, self.data, object_names(self.task.num_objects))
+            self._goal = [self.photograph(poses, hide_arm=hide_arm) for hide_arm in (False, True)]
+        finally:
+            mujoco.mj_copyData(self.data, self.model, before)
 
     def step(self, action: ArrayLike) -> Observation:
         """

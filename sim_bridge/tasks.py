@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from sim_bridge.grasping import grasp_place, graspable_shape, graspable_yaw
-from sim_bridge.order_tasks import draw_chain, draw_shapes, ORDER_SEPARATION
+from sim_bridge.order_tasks import draw_chain, draw_shapes, EDGE_RANGE, ORDER_SEPARATION
 from sim_bridge.places import (
     apart,
     GOAL_DISTANCE,
@@ -64,6 +64,11 @@ class Task:
     def gripping(self) -> bool:
         """Whether the gripper has to hold the object."""
         return self.kind != 'push'
+
+    @property
+    def object_range(self) -> float:
+        """Return the largest |x| and |y| in m of objects that are pushed, at start and goal."""
+        return EDGE_RANGE[1] if self.ordered else OBJECT_RANGE
 
 
 TASKS = {

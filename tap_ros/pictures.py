@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures for people: object maps over a frame, panels side by side, film strips."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -48,27 +48,40 @@ def overlay(image: np.ndarray, object_maps: Iterable[np.ndarray], scale: int = 1
         colour = np.array(OBJECT_COLOURS[k % len(OBJECT_COLOURS)], np.float32)
         tinted += strength * (colour - tinted)
     canvas = enlarge(np.rint(tinted).astype(np.uint8), scale)
-    for pixels, draw in ((start_pixels, _circle), (goal_pixels, _cross)):
-        for k, pixel in enumerate(() if pixels is None else pixels):
-            if np.isfinite(pixel).all():
-                # Far outside, where no mark is seen, numbers may be too large to draw.
-                near = (min(max(x, -MARGIN), limit + MARGIN)
-                        for x, limit in zip(pixel, image.shape[1::-1]))
-                u, v = (int((x + 0.5) * scale) for x in near)
-                draw(canvas, (u, v), scale, OBJECT_COLOURS[k % len(OBJECT_COLOURS)])
+    for centre, colour in _marks(canvas, start_pixels, scale):
+        cv2.circle(canvas, centre, 3 * scale, colour, max(scale // 3, 1), cv2.LINE_AA)
+    draw_crosses(canvas, goal_pixels, scale)
     return canvas
 
 
-def _circle(canvas: np.ndarray, centre: tuple[int, int], scale: int,
-            colour: tuple[int, int, int]) -> None:
-    cv2.circle(canvas, centre, 3 * scale, colour, max(scale // 3, 1), cv2.LINE_AA)
+def draw_crosses(canvas: np.ndarray, pixels: np.ndarray | None, scale: int,
+                 edge: tuple[int, int, int] | None = None) -> None:
+    """
+    Draw a cross in the colour of each object into an enlarged picture.
+
+    :param canvas: uint8 (H * scale, W * scale, 3) rgb.
+    :param pixels: (K, 2) (u, v) before it was enlarged, or None; those not finite are left out.
+    :param scale: how many times it was enlarged.
+    :param edge: (r, g, b) around the crosses, or None.
+    """
+    width = max(scale // 3, 1)
+    for centre, colour in _marks(canvas, pixels, scale):
+        for shade, wide in ((edge, 3 * width), (colour, width)):
+            if shade is not None:
+                cv2.drawMarker(canvas, centre, shade, cv2.MARKER_TILTED_CROSS, 4 * scale, wide,
+                               cv2.LINE_AA)
 
 
-def _cross(canvas: np.ndarray, centre: tuple[int, int], scale: int,
-           colour: tuple[int, int, int]) -> None:
-    cv2.drawMarker(
-        canvas, centre, colour, cv2.MARKER_TILTED_CROSS, 4 * scale, max(scale // 3, 1),
-        cv2.LINE_AA)
+def _marks(canvas: np.ndarray, pixels: np.ndarray | None,
+           scale: int) -> Iterator[tuple[tuple[int, int], tuple[int, int, int]]]:
+    """Yield where the mark of each object is in an enlarged picture, and its colour."""
+    size = canvas.shape[1] // scale, canvas.shape[0] // scale
+    for k, pixel in enumerate(() if pixels is None else pixels):
+        if np.isfinite(pixel).all():
+            # Far outside, where no mark is seen, numbers may be too large to draw.
+            near = (min(max(x, -MARGIN), limit + MARGIN) for x, limit in zip(pixel, size))
+            u, v = (int((x + 0.5) * scale) for x in near)
+            yield (u, v), OBJECT_COLOURS[k % len(OBJECT_COLOURS)]
 
 
 def grid(rows: Sequence[Sequence[np.ndarray]], scale: int = 1) -> np.ndarray:

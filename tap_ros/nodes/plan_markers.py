@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from geometry_msgs.msg import Point
 import numpy as np
 from std_msgs.msg import ColorRGBA
-from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.planning.plan_picture import way
 from visualization_msgs.msg import Marker, MarkerArray
 
 if TYPE_CHECKING:
@@ -55,21 +55,6 @@ def encode_plan(plan: 'Plan', gripper: np.ndarray, stamp: 'Time', frame_id: str)
             marker.points = [_point(each) for each in points[number]]
         markers.markers.append(marker)
     return markers
-
-
-def way(actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
-    """
-    Return where actions lead the fingertips.
-
-    :param actions: (N, 4) m per control period.
-    :param gripper: (4,), where they begin.
-    :return: (N + 1, 3) m, within the workspace.
-    """
-    points = np.empty((len(actions) + 1, 3))
-    points[0] = gripper[:3]
-    for step, move in enumerate(np.asarray(actions, float)[:, :3]):
-        points[step + 1] = np.clip(points[step] + move, WORKSPACE_LOW, WORKSPACE_HIGH)
-    return points
 
 
 def _point(values: np.ndarray) -> Point:

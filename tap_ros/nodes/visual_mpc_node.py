@@ -15,6 +15,7 @@ import numpy as np
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from sensor_msgs.msg import Image
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused, ObjectStates
 from tap_msgs.srv import PredictSubgoal
@@ -43,6 +44,7 @@ from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.hierarchy import choose_sample, targets_by
 from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.plan_picture import draw_plan
 from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig
 from tap_ros.text import escaped
 from visualization_msgs.msg import MarkerArray
@@ -91,6 +93,7 @@ class VisualMpcNode(Node):
             PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS, callback_group=group)
         self._predictor = Liveness(self, 'predictor_node', callback_group=group)
         self._markers = self.create_publisher(MarkerArray, 'plan/markers', STREAM)
+        self._overlay = self.create_publisher(Image, 'plan/overlay', STREAM)
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
             goal_callback=self._on_goal, cancel_callback=self._on_cancel)
@@ -171,7 +174,8 @@ class VisualMpcNode(Node):
         self._goal.begin(needed_topics(request, mode))
         self._sight.begin(accepted)
         self._refusals.clear()
-        config, num_subgoals = self._config(request), 0
+        config = self._config(request)
+        targets: list[Target] = []
         reach = Reach(self._mpc, config, request.seed, accepted)
         while True:
             self._go_on(handle)
@@ -192,7 +196,6 @@ class VisualMpcNode(Node):
                 return
             if isinstance(answer, Aim):
                 targets = self._aim(handle, mode, answer.seen, config.limits)
-                num_subgoals = len(targets) - 1
                 reach.head_for(targets, time.monotonic())
                 continue
             # Before sending: the picture that answers may come at once.
@@ -202,16 +205,25 @@ class VisualMpcNode(Node):
                            time.monotonic())
                 result.steps = reach.steps
                 self._diagnostics.took(answer.plan.planning_ms, 'plan')
-                if self._markers.get_subscription_count():
-                    self._markers.publish(encode_plan(
-                        answer.plan, answer.seen.gripper, to_stamp(answer.seen.stamp_ns),
-                        WORLD_FRAME))
+                self._show(answer, targets[answer.stage])
                 handle.publish_feedback(ReachGoal.Feedback(
-                    step=reach.steps, stage=stage_name(answer.stage, num_subgoals),
+                    step=reach.steps, stage=stage_name(answer.stage, len(targets) - 1),
                     expected_distance=float(answer.plan.expected_distance),
                     planning_ms=float(answer.plan.planning_ms)))
             else:
                 self._sensors.wait_for_change(0.1, count)
+
+    def _show(self, command: Command, target: 'Target') -> None:
+        """Publish a plan for those who look at it, if there are any."""
+        plan, seen = command.plan, command.seen
+        stamp = to_stamp(seen.stamp_ns)
+        if self._markers.get_subscription_count():
+            self._markers.publish(encode_plan(plan, seen.gripper, stamp, WORLD_FRAME))
+        if self._overlay.get_subscription_count():
+            learned = cast(ForwardModel, self._mpc.model)
+            picture = draw_plan(seen.image, learned.config, plan, seen.gripper, target.pixels)
+            frame_id = self._sight.messages['image'].header.frame_id
+            self._overlay.publish(encode_image(picture, stamp, frame_id))
 
     def _config(self, request: ReachGoal.Goal) -> ReachConfig:
         """Return the settings of a goal."""

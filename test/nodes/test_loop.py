@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 import numpy as np
 from processes import Client, NodeProcess
 import pytest
+from sensor_msgs.msg import Image
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
@@ -21,6 +22,8 @@ from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
 from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.predictor_node import OVERLAY_SCALE
 from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
+from tap_ros.pictures import OBJECT_COLOURS
+from tap_ros.planning.plan_picture import CHOSEN
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 from visualization_msgs.msg import MarkerArray
@@ -126,10 +129,11 @@ def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
 def test_plans_are_drawn_for_whoever_listens(loop, client):
     loop.reset()
     markers = Newest(client, MarkerArray, 'plan/markers', STREAM)
+    overlay = Newest(client, Image, 'plan/overlay', STREAM)
     for _ in range(10):  # until the planner knows of the listener
         status, result = loop.reach(mode='direct', step_budget=2)
         assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-        if markers.count:
+        if markers.count and overlay.count:
             break
     drawn = {marker.ns: marker for marker in markers.wait(10).markers}
     assert set(drawn) == {'chosen', 'elites', 'targets', 'gripper'}
@@ -137,6 +141,13 @@ def test_plans_are_drawn_for_whoever_listens(loop, client):
     assert len(chosen) == 16 and len(drawn['targets'].points) == 2
     assert (chosen[0].x, chosen[0].y, chosen[0].z) == (gripper.x, gripper.y, gripper.z)
     assert len(drawn['elites'].points) >= 2 * 15
+    picture = overlay.wait(10, lambda m: m.header.stamp == drawn['chosen'].header.stamp)
+    assert picture.header.frame_id == loop.image.wait(1).header.frame_id
+    shown = decode_image(picture, 'plan/overlay', (384, 384))
+    assert (shown == CHOSEN).all(-1).sum() > 30
+    _, goals = decode_objects(loop.goal_objects.wait(1), 'goal_objects')
+    for (u, v), colour in zip((6 * (goals + 0.5)).astype(int), OBJECT_COLOURS):
+        assert tuple(shown[v, u]) == colour
 
 
 def test_every_node_tells_how_it_is(loop):
@@ -146,7 +157,8 @@ def test_every_node_tells_how_it_is(loop):
     loop.node.create_subscription(
         DiagnosticArray, '/diagnostics',
         lambda array: told.update({status.name: status for status in array.status}), STREAM)
-    wanted = [*(f'{name}: service' for name in NODE_MODULES if name != 'robot_mask_node'),
+    wanted = [*(f'{name}: service' for name in NODE_MODULES
+                if name not in ('robot_mask_node', 'explorer_node')),
               'visual_mpc_node: /joint_states', 'predictor_node: /goal/image',
               'sim_node: /arm/delta_twist_cmds', 'recorder_node: /objects']
     for _ in range(200):

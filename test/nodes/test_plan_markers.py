@@ -5,9 +5,9 @@
 from types import SimpleNamespace
 
 import numpy as np
-from tap_ros.contract import WORKSPACE_HIGH
-from tap_ros.nodes.plan_markers import encode_plan, way
+from tap_ros.nodes.plan_markers import encode_plan
 from tap_ros.nodes.topics import to_stamp
+from tap_ros.planning.plan_picture import way
 from visualization_msgs.msg import Marker
 
 GRIPPER = np.array([0.1, -0.2, 0.05, 0.5], np.float32)
@@ -15,13 +15,6 @@ GRIPPER = np.array([0.1, -0.2, 0.05, 0.5], np.float32)
 
 def points(marker):
     return np.array([(p.x, p.y, p.z) for p in marker.points])
-
-
-def test_a_way_is_the_sum_of_its_moves_within_the_workspace():
-    moves = np.array([[0.05, 0.02, 0.01, 1], [0.03, -0.02, 0, 1], [9, 0, 9, 0]])
-    np.testing.assert_allclose(way(moves, GRIPPER), [
-        [0.1, -0.2, 0.05], [0.15, -0.18, 0.06], [0.18, -0.2, 0.06],
-        [WORKSPACE_HIGH[0], -0.2, WORKSPACE_HIGH[2]]], atol=1e-6)
 
 
 def test_a_plan_is_drawn_with_what_it_was_chosen_from():

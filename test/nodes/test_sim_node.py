@@ -12,10 +12,11 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
+from sim_bridge.simulator import Simulator
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
-from tap_msgs.msg import CommandRefused, Episode, ObjectStates
-from tap_msgs.srv import ResetScene, StepScene
+from tap_msgs.msg import CommandRefused, Episode, ObjectState, ObjectStates
+from tap_msgs.srv import ResetScene, SetGoal, StepScene
 from tap_ros.nodes.clients import call, Newest
 from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.object_messages import decode_gripper
@@ -38,7 +39,11 @@ class Rig:
         self.marks = []
         node.create_subscription(Episode, 'episode', self.marks.append, STREAM)
         self.twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
+        self.goal_image = Newest(node, Image, 'goal/image', LATCHED)
+        self.goal_mask = Newest(node, Image, 'goal/robot_mask', LATCHED)
+        self.goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
         self.reset_client = node.create_client(ResetScene, 'sim/reset')
+        self.goal_client = node.create_client(SetGoal, 'sim/set_goal')
         self.step_client = node.create_client(StepScene, 'sim/step')
         self.pause_client = node.create_client(SetBool, 'sim/pause')
 
@@ -54,6 +59,17 @@ class Rig:
             while len(self.marks) < count + 2:
                 sleep(0.01)
         return response
+
+    def set_goal(self, **pixels):
+        """Put objects of the goal elsewhere, {name: (u, v)}."""
+        return call(self.goal_client, SetGoal.Request(objects=ObjectStates(objects=[
+            ObjectState(name=name, u=float(u), v=float(v))
+            for name, (u, v) in pixels.items()])), 20)
+
+    def goal(self, stamp):
+        """Return the goal of a stamp: picture, mask and objects, once they have come."""
+        return [topic.wait(10, lambda m: m.header.stamp == stamp)
+                for topic in (self.goal_image, self.goal_mask, self.goal_objects)]
 
     def step(self, periods):
         return call(self.step_client, StepScene.Request(num_periods=periods), 20)
@@ -113,6 +129,80 @@ def test_the_goal_waits_for_late_joiners(rig):
         move = [start.pose.position.x - goal.pose.position.x,
                 start.pose.position.y - goal.pose.position.y]
         assert np.hypot(*move) == pytest.approx(0.2, abs=0.01)
+
+
+@pytest.mark.parametrize('hide_arm', [False, True])
+def test_a_goal_that_is_moved_is_published_as_that_of_a_reset(rig, hide_arm):
+    rig.reset(seed=5, hide_arm=hide_arm)
+    stamp = rig.image.wait(10).header.stamp
+    *_, before = rig.goal(stamp)
+    marks, taken = len(rig.marks), [to_nanoseconds(stamp)]
+    sim = Simulator('push2')
+    try:
+        sim.reset(5)
+        # Two goals at the same moment are told apart.
+        for pixel in ((50.0, 20.0), (14.5, 44.25)):
+            answer = rig.set_goal(object_1=pixel)
+            assert answer.success, answer.message
+            image = rig.goal_image.wait(
+                10, lambda m: to_nanoseconds(m.header.stamp) > taken[-1])
+            taken.append(to_nanoseconds(image.header.stamp))
+            image, mask, objects = rig.goal(image.header.stamp)
+            kept, moved = objects.objects
+            assert (kept, moved.name) == (before.objects[0], 'object_1')
+            assert (moved.u, moved.v) == pytest.approx(pixel, abs=1e-4)
+            position, orientation = moved.pose.position, moved.pose.orientation
+            assert position.z == before.objects[1].pose.position.z
+            assert orientation == before.objects[1].pose.orientation
+            sim.set_goal([[o.pose.position.x, o.pose.position.y] for o in objects.objects])
+            goal = sim.goal(hide_arm)
+            assert bytes(image.data) == goal.image.tobytes()
+            assert bytes(mask.data) == goal.robot_mask.tobytes()
+        late = Newest(rig.node, Image, 'goal/image', LATCHED).wait(10)
+        assert late.data == image.data
+        # No time has passed, and what follows does so as without it.
+        assert to_nanoseconds(rig.step(1).stamp) == to_nanoseconds(stamp) + PERIOD_NS
+        picture = rig.image.wait(
+            10, lambda m: to_nanoseconds(m.header.stamp) > to_nanoseconds(stamp))
+        sim.step(np.zeros(4))
+        assert bytes(picture.data) == sim.observe(hide_arm).image.tobytes()
+    finally:
+        sim.close()
+    assert len(rig.marks) == marks
+    rig.reset(seed=5)
+    *_, again = rig.goal(rig.image.wait(10).header.stamp)
+    assert again.objects == before.objects
+
+
+def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(rig):
+    rig.reset(seed=5)
+    *_, goal = rig.goal(rig.image.wait(10).header.stamp)
+    first, second = goal.objects
+    count = rig.goal_image.count
+    for pixels, words in (
+            ({}, ['objects', 'empty', 'object_0, object_1']),
+            ({'cup': (30, 30)}, ['cup', 'object_0, object_1']),
+            ({'object_1': (64, 30)}, ['object_1', '64', '63.5']),
+            ({'object_1': (float('nan'), 30)}, ['object_1', 'nan', 'finite']),
+            ({'object_1': (63, 10)}, ['object_1', 'out of reach', '0.35 m']),
+            ({'object_1': (first.u + 1, first.v)}, ['object_0', 'object_1', 'overlap'])):
+        answer = rig.set_goal(**pixels)
+        assert not answer.success
+        for word in words:
+            assert word in answer.message, answer.message
+    twice = SetGoal.Request(objects=ObjectStates(objects=[second, second]))
+    answer = call(rig.goal_client, twice, 20)
+    assert not answer.success and 'object_1' in answer.message and 'own' in answer.message
+    # Poses do not count: it stays where its pixel is.
+    second.pose.position.x = float('nan')
+    assert call(rig.goal_client, SetGoal.Request(objects=ObjectStates(objects=[second])),
+                20).success
+    rig.goal_image.wait(10, lambda m: m.header.stamp != goal.header.stamp)
+    assert rig.goal_image.count == count + 1, 'nothing was published for what was refused'
+    assert rig.reset(task='grasp', seed=1).success
+    answer = rig.set_goal(object_0=(30, 30))
+    assert not answer.success and 'grasp' in answer.message and 'push2' in answer.message
+    rig.reset(seed=5)
 
 
 def test_in_lock_step_a_late_joiner_gets_the_newest_moment(rig):

@@ -196,4 +196,3 @@ def outcome(function, *args, **options):
         return function(*args, **options), ''
     except TapError as error:
         return None, str(error)
-

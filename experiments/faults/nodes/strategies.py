@@ -36,7 +36,8 @@ LATCHED_TOPICS = ('goal/image', 'goal/objects', 'goal/robot_mask', 'robot_descri
                   'arm/command_timeout')
 SERVICES = {
     'predict_subgoal': 'tap_msgs/srv/PredictSubgoal', 'sim/reset': 'tap_msgs/srv/ResetScene',
-    'sim/step': 'tap_msgs/srv/StepScene', 'sim/pause': 'std_srvs/srv/SetBool',
+    'sim/set_goal': 'tap_msgs/srv/SetGoal', 'sim/step': 'tap_msgs/srv/StepScene',
+    'sim/pause': 'std_srvs/srv/SetBool',
     'recorder/record': 'std_srvs/srv/SetBool'}
 ACTION = 'reach_goal'
 

@@ -1,0 +1,132 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A goal that is moved: what the planner goes to, what it does meanwhile, what is recorded."""
+
+from contextlib import contextmanager
+import threading
+
+from action_msgs.msg import GoalStatus
+from loop import SEED
+import numpy as np
+import pytest
+from sim_bridge.moved_goal import move_goal
+from sim_bridge.simulator import Simulator
+from std_srvs.srv import SetBool
+from tap_msgs.action import ReachGoal
+from tap_msgs.msg import ObjectState, ObjectStates
+from tap_msgs.srv import SetGoal
+from tap_ros.nodes.clients import call, send_goal, wait_for_result
+from tap_ros.nodes.object_messages import decode_objects
+from tap_ros.nodes.topics import to_nanoseconds
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.recording.reader import iter_episodes
+from tap_ros.weights import FORWARD_MODEL
+
+pytestmark = pytest.mark.slow
+MOVED = {'object_1': (14.5, 44.25)}
+
+
+def set_goal(loop, pixels):
+    """Move objects of the goal, {name: (u, v)}; return all its pixels (K, 2) once they came."""
+    before = to_nanoseconds(loop.goal_objects.wait(10).header.stamp)
+    client = loop.node.create_client(SetGoal, 'sim/set_goal')
+    answer = call(client, SetGoal.Request(objects=ObjectStates(objects=[
+        ObjectState(name=name, u=float(u), v=float(v)) for name, (u, v) in pixels.items()])), 30)
+    assert answer.success, answer.message
+    for topic in (loop.goal_image, loop.goal_objects):
+        topic.wait(10, lambda m: to_nanoseconds(m.header.stamp) > before)
+    return decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
+
+
+@contextmanager
+def moved_simulator(seed):
+    """Reset a simulator of this process and move its goal likewise."""
+    sim = Simulator('push2')
+    try:
+        seen, goal = sim.reset(seed), sim.goal()
+        sim.set_goal(move_goal(
+            sim.camera, goal.object_poses, list(MOVED), np.array(list(MOVED.values()))))
+        yield sim, seen
+    finally:
+        sim.close()
+
+
+def test_the_planner_goes_to_where_the_goal_was_moved(loop):
+    loop.reset()
+    drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
+    pixels = set_goal(loop, MOVED)
+    np.testing.assert_allclose(pixels, [drawn[0], MOVED['object_1']], atol=1e-4)
+    status, result = loop.reach(mode='direct', step_budget=3, seed=5)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    mpc, memory, actions = VisualMPC.load(FORWARD_MODEL), Memory(5), []
+    with moved_simulator(SEED) as (sim, seen):
+        goal = mpc.goal(sim.goal().object_pixels)
+        for _ in range(3):
+            plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels), goal, memory)
+            memory = plan.memory
+            actions.append(plan.action[:3])
+            seen = sim.step(plan.action)
+        distance = np.linalg.norm(seen.object_pixels - sim.goal().object_pixels, axis=1).mean()
+    assert np.array_equal(loop.moves().astype(np.float32), np.array(actions))
+    assert result.expected_distance == pytest.approx(distance, abs=1e-3)
+
+
+def test_a_subgoal_is_predicted_for_the_goal_that_was_moved(loop):
+    loop.reset()
+    before = loop.predict()
+    set_goal(loop, MOVED)
+    after = loop.predict()
+    assert before.success and after.success, after.message
+    assert list(after.subgoals[0].object_names) == ['object_0', 'object_1']
+    assert len(after.subgoals[0].object_maps) == 2, 'objects and picture of the goal go together'
+    assert before.subgoals[0].image.data != after.subgoals[0].image.data
+
+
+@pytest.mark.parametrize('mode', ['direct', 'subgoal'])
+def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_it(loop, mode):
+    loop.reset()
+    moving = threading.Event()
+    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode=mode, step_budget=1000), 30,
+                       lambda feedback: moving.set())
+    assert moving.wait(120)
+    set_goal(loop, MOVED)
+    status, result = wait_for_result(handle, 60)
+    assert status == GoalStatus.STATUS_ABORTED and result.steps >= 1
+    assert 'a new goal has come on' in result.message and '/goal/objects' in result.message
+    assert loop.stopped()
+    count = len(loop.moves())
+    # The goal is where the objects are now: nothing is left to do.
+    last = loop.image.wait(10)
+    objects = loop.objects.wait(10, lambda m: m.header.stamp == last.header.stamp)
+    names, pixels = decode_objects(objects, 'objects')
+    np.testing.assert_allclose(set_goal(loop, dict(zip(names, pixels))), pixels, atol=1e-3)
+    status, result = loop.reach(mode='direct')
+    assert status == GoalStatus.STATUS_SUCCEEDED and result.success, result.message
+    assert 'reached' in result.message and result.expected_distance < 0.1
+    assert len(loop.moves()) == count
+
+
+def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
+    recorder = loop.node.create_client(SetBool, 'recorder/record')
+    loop.reset()
+    assert call(recorder, SetBool.Request(data=False), 30).success
+    folder = call(recorder, SetBool.Request(data=True), 30).message.removeprefix('recording to ')
+    loop.reset(seed=7)
+    set_goal(loop, {'object_1': (31.5, 44.25)})
+    status, result = loop.reach(mode='direct', step_budget=2)
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    # Twice at the last moment of the episode: the later one counts.
+    set_goal(loop, {'object_1': (30.0, 44.25)})
+    pixels = set_goal(loop, MOVED)
+    picture = loop.goal_image.wait(1)
+    loop.reset()
+    drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
+    assert call(recorder, SetBool.Request(data=False), 30).success
+    episode, following = [e for e in iter_episodes(folder) if e.task]
+    assert (episode.seed, len(episode), episode.outcome) == (7, 3, 'failure')
+    np.testing.assert_array_equal(episode.goal_pixels, pixels)
+    np.testing.assert_allclose(episode.goal_pixels[1], MOVED['object_1'], atol=1e-4)
+    assert episode.goal_frame.tobytes() == bytes(picture.data)
+    assert episode.goal_mask is not None
+    np.testing.assert_array_equal(following.goal_pixels, drawn)

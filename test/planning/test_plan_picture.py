@@ -1,0 +1,112 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of plans drawn over pictures: where they lead, at which size."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from sim_bridge.looks import get_look
+from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.pictures import OBJECT_COLOURS
+from tap_ros.planning.forward_model import ForwardModelConfig, load_forward_model
+from tap_ros.planning.plan_picture import (
+    CHOSEN,
+    draw_plan,
+    ELITES,
+    fingertip_pixels,
+    GRIPPER,
+    LARGEST,
+    SCALE,
+    scale_of,
+    way,
+)
+from tap_ros.weights import FORWARD_MODEL
+
+# Seen from above: 60 px a metre, and what is higher is seen farther up, by 40 px a metre.
+ABOVE = ForwardModelConfig(
+    table=(60, 0, 32, 0, -60, 32, 0, 0, 1), arm=(60, 0, 0, 35, 0, -60, -40, 30, 0, 0, 0, 1))
+HAND = np.array([0.1, -0.2, 0.05, 0.5], np.float32)
+GREY = np.full((64, 64, 3), 90, np.uint8)
+TARGETS = np.array([[20, 10], [50, 20]], np.float32)
+
+
+def plan_of(*elites):
+    """Return a plan that takes the first of these sequences of moves."""
+    elites = np.array(elites, float)
+    return SimpleNamespace(actions=elites[0], elites=elites)
+
+
+def straight(x, y, steps=15):
+    return np.tile([x / steps, y / steps, 0, 0], (steps, 1))
+
+
+def shown(canvas, pixel):
+    """Return the colour at a pixel (u, v) of the picture before it was enlarged."""
+    scale = len(canvas) // 64
+    u, v = ((np.asarray(pixel) + 0.5) * scale).astype(int)
+    return tuple(canvas[v, u].tolist())
+
+
+def test_a_way_is_the_sum_of_its_moves_within_the_workspace():
+    moves = np.array([[0.05, 0.02, 0.01, 1], [0.03, -0.02, 0, 1], [9, 0, 9, 0]])
+    np.testing.assert_allclose(way(moves, HAND), [
+        [0.1, -0.2, 0.05], [0.15, -0.18, 0.06], [0.18, -0.2, 0.06],
+        [WORKSPACE_HIGH[0], -0.2, WORKSPACE_HIGH[2]]], atol=1e-6)
+
+
+def test_fingertips_are_drawn_where_the_camera_sees_them():
+    camera = get_look('hand').camera(False, 64, 64)
+    config = load_forward_model(FORWARD_MODEL).config
+    points = np.random.default_rng(0).uniform(WORKSPACE_LOW, WORKSPACE_HIGH, (200, 3))
+    gaps = np.linalg.norm(fingertip_pixels(config, points) - camera.project(points), axis=1)
+    assert gaps.max() < 3 and gaps.mean() < 1.5
+    # At the table, where objects are pushed, the arm's offset counts for nothing.
+    low = np.array([[0.2, -0.1, 0.0]])
+    np.testing.assert_allclose(fingertip_pixels(ABOVE, low), [[44, 38]])
+    np.testing.assert_allclose(fingertip_pixels(ABOVE, low + [0, 0, 0.1]), [[44, 34]])
+
+
+def test_all_ways_the_targets_and_the_gripper_are_where_they_belong():
+    ways = [straight(-0.3, 0), straight(0.2, 0.4), straight(-0.1, 0.5)]
+    before = GREY.copy()
+    canvas = draw_plan(GREY, ABOVE, plan_of(*ways), HAND, TARGETS)
+    assert canvas.shape == (64 * SCALE, 64 * SCALE, 3) and canvas.dtype == np.uint8
+    np.testing.assert_array_equal(GREY, before)
+    middle = [fingertip_pixels(ABOVE, way(one, HAND)[8:9])[0] for one in ways]
+    assert shown(canvas, middle[0]) == CHOSEN
+    for place in middle[1:]:  # a thin line has no pixel of its own colour alone
+        assert np.abs(np.subtract(shown(canvas, place), ELITES)).max() < 60
+    assert shown(canvas, fingertip_pixels(ABOVE, HAND[None, :3].astype(float))[0]) == GRIPPER
+    for k, target in enumerate(TARGETS):
+        assert shown(canvas, target) == OBJECT_COLOURS[k]
+    thin, bold = ((canvas == colour).all(-1).sum() for colour in (ELITES, CHOSEN))
+    assert bold > thin / 2, 'one bold line, two thin ones'
+    touched = (canvas != 90).any(-1).mean()
+    assert 0.01 < touched < 0.1, 'most of the picture stays as it is'
+    np.testing.assert_array_equal(canvas[-60:], 90)
+
+
+def test_without_elites_the_chosen_way_is_drawn():
+    canvas = draw_plan(GREY, ABOVE, SimpleNamespace(
+        actions=straight(-0.3, 0), elites=np.empty((0, 15, 4))), HAND, TARGETS)
+    assert (canvas == CHOSEN).all(-1).sum() > 200 and not (canvas == ELITES).all(-1).any()
+
+
+@pytest.mark.parametrize('width, times', [
+    (16, 6), (64, 6), (106, 6), (107, 5), (128, 5), (320, 2), (321, 1), (640, 1), (1000, 1)])
+def test_pictures_are_enlarged_as_far_as_a_page_has_room(width, times):
+    assert scale_of(width) == times
+    picture = np.zeros((width // 2, width, 3), np.uint8)
+    canvas = draw_plan(picture, ABOVE, plan_of(straight(0, 0.3)), HAND, TARGETS)
+    assert canvas.shape == (width // 2 * times, width * times, 3)
+    assert canvas.shape[1] <= max(LARGEST, width)
+
+
+def test_what_cannot_be_seen_is_not_drawn_and_does_no_harm():
+    absurd = ForwardModelConfig(table=(0.0,) * 9, arm=(1e30,) * 12)
+    far = ForwardModelConfig(table=(60, 0, 1e9, 0, -60, 32, 0, 0, 1), arm=ABOVE.arm)
+    nowhere = np.array([[np.nan, 3], [1e30, -1e30]], np.float32)
+    for config in (absurd, far):
+        canvas = draw_plan(GREY, config, plan_of(straight(0.1, 0.1)), HAND, nowhere)
+        np.testing.assert_array_equal(canvas, 90)
