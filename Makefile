@@ -23,11 +23,13 @@ $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 # Two processes share two cores best when each takes one.
 paper: export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test mutants paper faults build lint bench ros2 clean
+.PHONY: help demo explore test mutants paper faults build lint bench ros2 clean
 
 help:
 	@echo 'make demo    push objects to where a goal picture shows them, predict a stack'
 	@echo '             SCENES=20: that many of each task; ARGS=...: more options of the demo'
+	@echo 'make explore a page in the browser: move objects of the goal picture, see what is predicted'
+	@echo '             and planned, push; ARGS="--task push3"'
 	@echo 'make test    all tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'
 	@echo 'make mutants change the code a little, thousands of times, and see whether a test fails, in'
 	@echo '             docs/results: hours; goes on; ARGS="--sample 300": so many, drawn at random'
@@ -47,6 +49,9 @@ help:
 
 demo: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros demo $(if $(SCENES),--scenes $(SCENES)) $(ARGS)
+
+explore: build
+	@$(ENTER); $(DOMAIN); python -m tap_ros explore $(ARGS)
 
 test: build
 	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) $(ARGS)

@@ -19,7 +19,8 @@ setup(
     python_requires='>=3.11',
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
     package_data={
-        NAME: ['*.pyi', 'nodes/*.xml', 'py.typed', 'weights/*.safetensors', 'weights/*.md'],
+        NAME: ['*.pyi', 'explorer/page/*', 'nodes/*.xml', 'py.typed', 'weights/*.safetensors',
+               'weights/*.md'],
         'sim_bridge': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -28,6 +29,7 @@ setup(
         (f'share/{NAME}/launch', glob('launch/*.launch.py')),
     ],
     install_requires=['setuptools'],
+    extras_require={'test': ['pytest']},  # so that `colcon test` runs pytest
     zip_safe=False,
     entry_points={
         'console_scripts': [f'{name} = {module}:main' for name, module in NODE_MODULES.items()],

@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Start the simulation, the predictor, the planner and, if asked for, recorder and robot masks.
+Start simulation, predictor, planner and, if asked for, recorder, robot masks and explorer.
 
 Parameters come from config/tap_ros.yaml of the package or from params_file; for a real camera and
 arm start with sim:=false.
@@ -39,6 +39,9 @@ def generate_launch_description():
             'mask', default_value='false', choices=['true', 'false'],
             description='Publish masks of a real robot; the simulation publishes its own.'),
         DeclareLaunchArgument(
+            'explorer', default_value='false', choices=['true', 'false'],
+            description='Serve a page for browsers at http://127.0.0.1:8000/.'),
+        DeclareLaunchArgument(
             'use_sim_time', default_value=LaunchConfiguration('sim'), choices=['true', 'false'],
             description='All but the simulation take the time from /clock.'),
         start('sim_node', {'lock_step': typed('lock_step', bool)},
@@ -48,6 +51,7 @@ def generate_launch_description():
         start('recorder_node', {'folder': typed('record', str)},
               condition=IfCondition(NotEqualsSubstitution(record, ''))),
         start('robot_mask_node', condition=IfCondition(LaunchConfiguration('mask'))),
+        start('explorer_node', condition=IfCondition(LaunchConfiguration('explorer'))),
     ])
 
 

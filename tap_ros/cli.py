@@ -46,6 +46,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo'),
+    'explore': ('see and try all nodes on a page in the browser',
+                'tap_ros.nodes.explore_command'),
     'bench': ('measure speed; without a name, all of it', {
         'collect': ('speed of collecting', 'experiments.bench.collect'),
         'engine': ('what a task costs beside its own work', 'experiments.bench.engine'),

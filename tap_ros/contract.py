@@ -6,8 +6,6 @@ The contract between simulator, recordings, planner and nodes: what they share s
 Constants and a function of them. Nothing is imported, so that setup.py can read this file, too.
 """
 
-
-
 # Motion: an action is (dx, dy, dz, opening).
 CONTROL_PERIOD = 0.25  # s that one action takes
 MOVE_LIMIT = 0.08  # m per control period, |dx| and |dy|
@@ -61,6 +59,7 @@ NODE_MODULES = {
     'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
     'recorder_node': 'tap_ros.nodes.recorder_node',
     'robot_mask_node': 'tap_ros.nodes.robot_mask_node',
+    'explorer_node': 'tap_ros.nodes.explorer_node',
 }
 
 

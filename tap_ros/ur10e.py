@@ -196,4 +196,4 @@ def _check(share: np.ndarray, of: str, values: np.ndarray, unit: str) -> None:
     worst = int(share.argmax())
     if share[worst] > 1:
         raise KinematicsError(f'{JOINTS[worst]} would be at {share[worst]:.2f} of {of} '
-                         f'({values[worst]:.0f} {unit})')
+                              f'({values[worst]:.0f} {unit})')

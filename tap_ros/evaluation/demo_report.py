@@ -33,6 +33,7 @@ class Run:
     message: str  # how the planner said that it ended
     planning_ms: float  # median time of one plan
     side: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 from the side, if there are any
+    plans: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 of what the planner considered
 
     @property
     def pictures(self) -> Sequence[np.ndarray]:
@@ -187,6 +188,10 @@ def _scene_section(scene: SceneRuns) -> str:
     figures = ''.join(
         _figure(f'{MODE_NAMES[mode]}, seen from the side', _film(run.side), 'smooth', 'webp')
         for mode, run in scene.runs.items() if len(run.side))
+    figures += ''.join(
+        _figure(f'{MODE_NAMES[mode]}: ways that the planner considered; bold: the chosen one; '
+                'crosses: where it pushes to', _film(run.plans), 'smooth', 'webp')
+        for mode, run in scene.runs.items() if len(run.plans))
     if len(scene.expert):
         figures += _figure('the expert, seen from the side', _film(scene.expert), 'smooth', 'webp')
     figures += ''.join(_figure(caption, png_bytes(image)) for caption, image in pictures)

@@ -66,7 +66,7 @@ STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
 
 class Watch:
     """
-    Keep every camera picture of a scene, the objects in it, and the view from the side if any.
+    Keep every camera picture of a scene, the objects in it, and what else is shown for people.
 
     :param node: rclpy Node that another thread spins.
     """
@@ -74,7 +74,8 @@ class Watch:
     def __init__(self, node: Node) -> None:
         self._kept: dict[str, dict[int, Any]] = {}
         self._topics = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
-                        'side': (Image, 'observer/image_raw')}
+                        'side': (Image, 'observer/image_raw'),
+                        'plan': (Image, 'plan/overlay')}
         for topic, (message_type, name) in self._topics.items():
             node.create_subscription(message_type, name, partial(self._keep, topic), STREAM)
         self.begin()
@@ -90,9 +91,9 @@ class Watch:
         stamps = self._in_order(set(images) & set(objects))
         return [images[stamp] for stamp in stamps], [objects[stamp] for stamp in stamps]
 
-    def from_the_side(self) -> list[Image]:
-        """Return the pictures of the observer's camera, in order of their stamps."""
-        pictures = dict(self._kept['side'])
+    def shown(self, topic: str) -> list[Image]:
+        """Return the pictures from the 'side' or of each 'plan', in order of their stamps."""
+        pictures = dict(self._kept[topic])
         return [pictures[stamp] for stamp in self._in_order(set(pictures))]
 
     def _in_order(self, stamps: set[int]) -> list[int]:
@@ -210,7 +211,8 @@ class DemoClient:
             distances=np.array([np.linalg.norm(positions(o) - goals, axis=1) for o in objects]),
             message=result.message, planning_ms=float(np.median(planning_ms or [np.nan])),
             side=[decode_image(image, 'observer/image_raw')
-                  for image in self._camera.from_the_side()])
+                  for image in self._camera.shown('side')],
+            plans=[decode_image(image, 'plan/overlay') for image in self._camera.shown('plan')])
 
 
 def positions(message: ObjectStates) -> np.ndarray:
@@ -392,4 +394,3 @@ def new_folder(wanted: str | Path) -> Path:
         except FileExistsError:
             continue
     raise TapError(f'{wanted}: thousands of folders of that name; remove some')
-

@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
+import yaml
 
 
 class NodeEnded(TapError):
@@ -36,9 +37,14 @@ class NodeProcesses:
         :param parameters: its ROS parameters.
         """
         command = [sys.executable, '-m', NODE_MODULES[name], '--ros-args']
-        for key, value in parameters.items():
-            text = str(value).lower() if isinstance(value, bool) else str(value)
-            command += ['-p', f'{key}:={text}']
+        if parameters:
+            # In a file that others cannot read: a token is no argument for all to see.
+            file = self._folder / f'{name}.yaml'
+            file.touch(mode=0o600)
+            file.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
+                key: str(value) if isinstance(value, Path) else value
+                for key, value in parameters.items()}}}))
+            command += ['--params-file', str(file)]
         with self._log(name).open('wb') as log:
             # A session of its own: Ctrl-C reaches us, and we end the nodes in order.
             self._processes[name] = subprocess.Popen(

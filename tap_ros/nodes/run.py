@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rclpy.executors import Executor
     from rclpy.node import Node
 
+
 class _Ended(BaseException):
     """A signal came while the node started."""
 

@@ -230,7 +230,7 @@ class NetworkSettings:
         if self.skips and self.decoder != 'shared':
             raise ConfigError("skips: they go with decoder 'shared'; give --decoder shared, too")
         if self.pretrain_steps and self.decoder != 'separate':
-            raise ConfigError("pretrain_steps: only the decoders of appendix C are pretrained; "
+            raise ConfigError('pretrain_steps: only the decoders of appendix C are pretrained; '
                               "expected 0 with decoder 'shared'")
         _check_least(self, 1, 'base_width', 'latent_size', 'video_frames')
         _check_least(self, 0, 'pretrain_steps')

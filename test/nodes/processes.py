@@ -4,6 +4,7 @@
 
 import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -81,3 +82,8 @@ class Client:
         self.spinner.__exit__()
         self.node.destroy_node()
         self.context.try_shutdown()
+
+
+def page_address(process):
+    """Return where the page of an explorer_node is."""
+    return re.search(r'ready: open (http://\S+)', process.wait_for('ready').text)[1]

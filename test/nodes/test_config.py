@@ -17,9 +17,10 @@ NODES = {key.removeprefix('/**/'): values['ros__parameters']
 DECLARED_IN = {'sim_node': 'sim_bridge.sim_node', 'recorder_node': 'tap_ros.nodes.recorder_node',
                'predictor_node': 'tap_ros.nodes.predictor_setup',
                'visual_mpc_node': 'tap_ros.nodes.planner_setup',
-               'robot_mask_node': 'tap_ros.nodes.robot_mask_setup'}
+               'robot_mask_node': 'tap_ros.nodes.robot_mask_setup',
+               'explorer_node': 'tap_ros.nodes.explorer_node'}
 LEFT_OUT = {'sim_node': set(), 'predictor_node': set(), 'visual_mpc_node': {'weights'},
-            'recorder_node': {'topics'}, 'robot_mask_node': set()}
+            'recorder_node': {'topics'}, 'robot_mask_node': set(), 'explorer_node': set()}
 
 
 def declared(name, *arguments):
