@@ -23,6 +23,7 @@ def pytest_xdist_make_scheduler(config, log):
     from xdist.scheduler import LoadFileScheduling
 
     class Scheduling(LoadFileScheduling):
+
         def _split_scope(self, nodeid):
             file = nodeid.split('::', 1)[0]
             return 'nodes' if 'nodes' in file else file

@@ -58,4 +58,3 @@ share of the workers' time: physics               {physics / busy:.0%}
 mean final distance                               {100 * result['mean_final_distance']:.1f} cm
 success rate (all objects within 5 cm)            {result['success_rate']:.0%}
 size of the recording per frame                   {size / result['frames'] / 1024:.1f} KiB""")
-

@@ -61,9 +61,23 @@ def ship(recipe, bags, runs, out):
         collect=collect, again=again, train=train, earlier=recipe.earlier,
         run=json.loads((run / 'run.json').read_text()), method=about['settings']['method'],
         fresh=len(store), pushing=np.isfinite(scores['last frame']['prediction'].bottleneck).any(),
+        metrics=headline(scores['last frame']['prediction']),
         scores=tabulate(scores), succeed=int(good[shown].sum()),
         fail=int((~good[shown]).sum())))
     return card
+
+
+def headline(scores):
+    """
+    Choose what the card's front matter tells: (name, title, value) each, for model hubs.
+
+    :param scores: EpisodeScores of predictions.
+    """
+    known = scores.intervals()
+    titles = {name: (title, digits) for title, (name, digits) in _COLUMNS.items()}
+    names = ('min_l1', _BOTTLENECKS if _BOTTLENECKS in known else 'shows_both')
+    return [(name, titles[name][0], round(known[name].value, titles[name][1]))
+            for name in names if name in known]
 
 
 def found(scores):

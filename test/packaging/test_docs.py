@@ -15,6 +15,7 @@ from tap_ros.cli import read
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.md',
+           ROOT / 'QUALITY_DECLARATION.md',
            *sorted((ROOT / 'docs').glob('*.md'))]
 PAGES = [*WRITTEN, *(page for page in sorted((ROOT / 'docs' / 'results').glob('*.md'))
                      if not page.stem.endswith('findings'))]  # those are parts of pages

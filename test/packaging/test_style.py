@@ -10,8 +10,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = ('tap_ros', 'sim_bridge', 'experiments', 'test', 'launch', 'scripts')
-FILES = [ROOT / 'setup.py', *(path for folder in FOLDERS
-                              for path in sorted((ROOT / folder).rglob('*.py')))]
+FILES = [ROOT / 'setup.py', ROOT / 'docs' / 'conf.py',
+         *(path for folder in FOLDERS for path in sorted((ROOT / folder).rglob('*.py')))]
 HEADER = ['# Copyright 2026 The tap_ros authors', '# SPDX-License-Identifier: Apache-2.0']
 
 

@@ -132,6 +132,7 @@ def test_held_out_scores_are_means_over_episodes():
     shown = torch.cat([to_float(batch.targets[:, 2]) for batch in batches])
 
     class Next(torch.nn.Module):
+
         def forward(self, context, z=None):
             nonlocal shown
             image, shown = shown[:len(context)], shown[len(context):]
@@ -296,6 +297,7 @@ def test_appendix_b_is_the_minimum_over_the_whole_loss():
     assert outcome.match.tolist() == [2, 1]
     assert outcome.loss.item() == pytest.approx(divergence.amin(1).mean().item(), abs=1e-6)
     assert all(seen.shape[1] == 3 for seen in networks.recognition.seen)  # context and one frame
+
     # With genmin, preferences choose among whole losses too.
     def latest(error, copy_error, batch, config):
         assert error.allclose(divergence, atol=1e-6) and copy_error().shape == (2, 2, 5)
