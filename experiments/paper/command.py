@@ -37,7 +37,7 @@ class Options:
     :param collect: make the recordings only.
     :param results_only: only write the page and its data from the runs that are done.
     :param limit: stop after so many; the next call goes on.
-    :param seeds: of the trainings.
+    :param seeds: of the trainings; none: 0, and 0 1 2 of the main rows.
     :param episodes: collect so many of each task; 0: as the scale says.
     :param steps: train for so many steps; 0: as the scale says.
     :param fresh: begin runs anew that were begun with other settings or recordings.
@@ -51,7 +51,7 @@ class Options:
     results_only: Flag = False
     limit: Annotated[float | None, conf.arg(
         aliases=('--slice-minutes',), metavar='MINUTES', help_behavior_hint=default_text)] = None
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] = ()
     episodes: int = 0
     steps: int = 0
     fresh: Flag = False
@@ -85,7 +85,7 @@ def run(args):
     hashes = data_hashes(runs, places)
     states = [find_state(run, places, hashes) for run in runs]
     print(f"{sum(state.kind == 'done' for state in states)} of {len(runs)} runs are done")
-    elsewhere = [run for run in runs if not hashes.keys() >= set(run.training_tasks)]
+    elsewhere = [run for run in runs if run.task not in hashes]
     if elsewhere and not ends:
         print(f'{len(elsewhere)} of them elsewhere: their scores are in {places.results}, their '
               'recordings are not here. To make them again beside these: '

@@ -4,17 +4,19 @@
 
 import io
 
-from experiments.paper.names import COPIES, method_order, variant_of
+from experiments.paper.names import COPIES, method_order, short_name, variant_of
 from experiments.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
-    FRAMES,
     GAINS,
+    TIMED_TITLES,
     TITLES,
 )
 from experiments.paper.rows import find, lower_hull, select
+from experiments.paper.runs import OURS
 from matplotlib.figure import Figure
 import numpy as np
+from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.evaluation.bottleneck import THRESHOLDS
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
@@ -38,11 +40,12 @@ def family(method):
     """
     Say which family a method belongs to, a key of COLOURS.
 
-    :param method: its name; a form that is not in the paper ('+...') is of 'ours'.
+    :param method: its name; a form that is not in the paper ('+...') is of 'ours', whatever the
+        network.
     """
     if method in COPIES:
         return 'copy'
-    if '+' in method:
+    if '+' in method.removesuffix(OURS):
         return 'ours'
     if '-vae' in method:
         return 'vae'
@@ -100,17 +103,18 @@ def forward_scatter(rows, task='grasp'):
     ours = {}  # a panel for each variant: errors are compared with fix of the same one
     for method in errors.index.intersection(steps.index):
         error, step, variant = errors.loc[method], steps.loc[method], variant_of(method)
-        ours.setdefault(variant, {})[method.removesuffix(variant)] = (
+        ours.setdefault(variant, {})[short_name(method.removesuffix(variant))] = (
             step['value'], error['value'], step, error)
     if not ours:
         return None
-    panels = [(f'ours {variant}'.strip(), ours[variant]) for variant in sorted(ours)]
+    panels = [('ours' if variant == OURS else f"ours, the paper's network {variant}".strip(),
+               ours[variant]) for variant in sorted(ours)]
     if task == 'grasp':
         panels.append(("the authors'", {
             name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
     figure, axes = _new_figure(3.9, len(panels))
     for axis, (title, points) in zip(axes[0], panels):
-        _scatter(axis, points, FRAMES[task])
+        _scatter(axis, points, EPISODE_FRAMES[task])
         axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
         axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
     axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)
@@ -159,8 +163,8 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
     :return: bytes of a PNG, or None without such rows.
     """
     own = select(rows, task, 'bidirectional', new_pixels)
-    methods = sorted(own['method'][own['metric'] == 'bottleneck_frequency_0px'],
-                     key=method_order)
+    methods = sorted((name for name in own['method'][own['metric'] == 'bottleneck_frequency_0px']
+                      if name in COPIES or variant_of(name) in ('', OURS)), key=method_order)
     if not set(methods) - set(COPIES):
         return None
     figure, axes = _new_figure(4.2, 2, sharey=True)
@@ -196,6 +200,49 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
                   clip_on=False)
         axis.annotate(method, (10.9, y), fontsize=8.5, color=colour, va='center',
                       annotation_clip=False)
+    return _png(figure)
+
+
+def timing(rows):
+    """
+    Draw the bottleneck frequency of methods over when the bottleneck comes.
+
+    :param rows: of rows.as_frame, of one scale.
+    :return: bytes of a PNG, or None without such rows.
+    """
+    found = {}
+    for at, task in enumerate(TIMED_TITLES):
+        own = select(rows, task, 'bidirectional', new_pixels=False)
+        own = own[own['metric'] == 'bottleneck_frequency_2px']
+        for row in own[~own['method'].isin(COPIES)].to_dict('records'):
+            found.setdefault(row['method'], []).append(
+                (at, *(100 * row[name] for name in ('value', 'ci_low', 'ci_high'))))
+    if not found:
+        return None
+    figure, axes = _new_figure(3.8, 1)
+    axis, methods = axes[0, 0], sorted(found, key=method_order)
+    styles = _line_styles(methods)
+    for n, method in enumerate(methods):
+        at, value, low, high = np.array(found[method]).T
+        at, colour = at + 0.04 * (n - (len(methods) - 1) / 2), COLOURS[family(method)]
+        axis.errorbar(at, value, [value - low, high - value], color=colour, fmt='none', alpha=0.5)
+        axis.plot(at, value, 'o', color=colour, markeredgecolor='white')
+        timed = at < len(TIMED_TITLES) - 1.5  # 'any' is no later time
+        axis.plot(at[timed], value[timed], linestyle=styles[method], color=colour)
+    ends = {method: found[method][-1][1] for method in methods}
+    for method, y in zip(methods, _spread(list(ends.values()), 5.0)):
+        axis.plot([3.3, 3.42], [y, y], linestyle=styles[method], color=COLOURS[family(method)],
+                  clip_on=False)
+        axis.annotate(short_name(method), (3.46, y), fontsize=8.5, va='center',
+                      color=COLOURS[family(method)], annotation_clip=False)
+    axis.set(xlim=(-0.3, 3.3), ylim=(0, 100))
+    axis.set_xticks(range(len(TIMED_TITLES)), TIMED_TITLES.values())
+    axis.grid(axis='y', color='#f0f0f0')
+    axis.set_xlabel('when the first object is home and the other untouched', fontsize=9,
+                    color=_INK)
+    axis.set_ylabel('bottlenecks at 2 px, %', fontsize=9, color=_INK)
+    axis.set_title('Pushing two objects: whether the time has to be known', fontsize=10,
+                   loc='left', color=_INK)
     return _png(figure)
 
 

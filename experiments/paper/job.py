@@ -19,7 +19,9 @@ from experiments.paper.places import (
     collect_command,
     collected_episodes,
     read_json,
+    recording_hash,
 )
+from experiments.paper.recordings import RECORDINGS
 import numpy as np
 from tap_ros.engines.task import LOCAL
 from tap_ros.errors import ConfigError, TapError
@@ -36,7 +38,7 @@ def collect_task(task, episodes, places, engine=LOCAL, deadline=math.inf,
     """
     Collect the recording of a task, or what it lacks; wait if another sweep is at it.
 
-    :param task: of sim_bridge.tasks.
+    :param task: of recordings.RECORDINGS.
     :param episodes: how many at least.
     :param places: Places.
     :param engine: Engine.
@@ -44,12 +46,12 @@ def collect_task(task, episodes, places, engine=LOCAL, deadline=math.inf,
     :param progress: whether to show a progress bar.
     :return: DONE, or UNFINISHED if the time was not enough.
     """
-    from sim_bridge.collect import collect, CollectConfig
+    from sim_bridge.collect import collect
 
     folder = places.recording(task)
     with locked(Path(places.recordings) / f'.{task}.lock', wait=True):
         episodes = max(episodes, collected_episodes(folder))
-        found = collect(folder, CollectConfig(task=task, episodes=episodes), engine,
+        found = collect(folder, RECORDINGS[task].collection(episodes), engine,
                         progress, stop=lambda: time.time() > deadline)
     return DONE if found['whole'] else UNFINISHED
 
@@ -83,7 +85,6 @@ def perform(run, places, minutes=None, fresh=False):
     :param minutes: stop training after so many; None: never.
     :param fresh: forget a training that was begun.
     :return: DONE, UNFINISHED if the time was not enough, BUSY if another process is at it.
-    :raises ConfigError: if the run that it begins with is not trained.
     """
     from tap_ros.prediction.training import train
 
@@ -91,7 +92,6 @@ def perform(run, places, minutes=None, fresh=False):
     with locked(folder / 'lock') as mine:
         if not mine:
             return BUSY
-        _check_before(run.before, places)
         for name in _LEFT_BY_TRAINING if fresh else ():
             (folder / name).unlink(missing_ok=True)
         weights = train(config, minutes=minutes, progress=False)
@@ -100,18 +100,6 @@ def perform(run, places, minutes=None, fresh=False):
         write_atomically(places.result(run),
                          json.dumps(score(run, config, weights, places)) + '\n')
     return DONE
-
-
-def _check_before(run, places):
-    """Refuse to begin with weights that are not there or half trained."""
-    if run is None:
-        return
-    from experiments.paper.sweep import trained_steps
-
-    steps = trained_steps(run, places)
-    if steps < run.num_steps:
-        raise ConfigError(f'the weights of {run.name}, to begin with, are trained for {steps} of '
-                          f'{run.num_steps} steps with these settings; first: {run.command}')
 
 
 def score(run, config, weights, places):
@@ -125,7 +113,8 @@ def score(run, config, weights, places):
     :return: dict for a JSON file: what the run was, and a number for each held-out episode.
     :raises ConfigError: if no episode was held out.
     """
-    from tap_ros.evaluation.bottleneck import target_bottlenecks
+    from experiments.paper.recursion import score_recursion
+    from tap_ros.evaluation.bottleneck import bottleneck_share, target_bottlenecks
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.evaluation.samples import score_samples
     from tap_ros.learning.devices import pick_device
@@ -135,14 +124,20 @@ def score(run, config, weights, places):
 
     network, about = load_network(weights, pick_device(config.device))
     store = open_recordings(list(config.recordings), progress=False)
-    own = open_recordings(list(config.recordings[-1:]), progress=False)
     _, held_out = split_episodes(store, config.test_fraction)
-    held_out = held_out[held_out >= len(store) - len(own)]
     if not len(held_out):
-        raise ConfigError(f'{config.recordings[-1]}: no episode of it is held out; collect more')
+        raise ConfigError(f'{config.recordings[0]}: no episode of it is held out; collect more')
     began = time.perf_counter()
     scores = {method: _rounded(value) for method, value in
               evaluate(network, store, held_out).items()}
+    if run.shifted:
+        scores['shifted'] = _shifted(run, network, store, held_out, places)
+    if config.new_pixels and config.mode == 'bidirectional' and not config.chosen.vae:
+        scores['recursion'] = [_rounded(level) for level in score_recursion(
+            network, store, held_out)]
+    if not config.new_pixels:
+        scores['bottleneck_at'] = _rounded_list(
+            [bottleneck_share(store[i]) for i in held_out])
     fraction = config.chosen.fraction
     if fraction is not None and config.mode == 'bidirectional':
         scores['target_bottleneck'] = _rounded_list(
@@ -158,13 +153,30 @@ def score(run, config, weights, places):
         'new_pixels': run.new_pixels, 'seed': run.seed, 'scale': run.scale,
         'recursion': run.recursion, 'variant': run.variant, 'command': run.command,
         'config': asdict(config),
-        'data': {'hash': own.data_hash, 'trained_on': store.data_hash,
-                 'episodes': about['episodes'], 'held_out': len(held_out),
+        'data': {'hash': store.data_hash, 'episodes': about['episodes'],
+                 'held_out': len(held_out),
+                 'shifted': {name: recording_hash(places.recording(name))
+                             for name in run.shifted},
                  'command': '; '.join(filter(None, (collect_command(
-                     places.recording(task)) for task in run.training_tasks)))},
+                     places.recording(task)) for task in (run.task, *run.shifted))))},
         'training': {name: about[name]
                      for name in ('steps', 'seconds', 'machine', 'torch', 'python')},
         'evaluation': {'margin': 0, 'goal_picture': 'last', 'seconds': seconds, **scores}}
+
+
+def _shifted(run, network, store, held_out, places):
+    """Score on other looks of scenes, and on goal pictures with the arm elsewhere."""
+    from tap_ros.evaluation.prediction import evaluate
+    from tap_ros.recording.cache import open_recordings
+
+    scores = {'arm_elsewhere': evaluate(
+        network, store, [i for i in held_out if store[i].goal_frame is not None],
+        goal_picture='recorded')}
+    for name in run.shifted:
+        other = open_recordings([str(places.recording(name))], progress=False)
+        scores[name] = evaluate(network, other, range(len(other)))
+    return {name: {method: _rounded(value) for method, value in found.items()
+                   if method != 'copy-start'} for name, found in scores.items()}
 
 
 def _rounded(scores):
@@ -175,4 +187,3 @@ def _rounded(scores):
 def _rounded_list(values):
     return [None if np.isnan(x) else round(float(x), _DIGITS) if x % 1 else int(x)
             for x in values]
-

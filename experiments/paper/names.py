@@ -1,10 +1,10 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of methods in results: copying, the best of 100 samples, variants; and their order."""
+"""Names of methods in results: copying, the best of 100, networks, variants; and their order."""
 
 import re
 
-from experiments.paper.runs import VARIANTS
+from experiments.paper.runs import OURS, VARIANTS
 from tap_ros.prediction.methods import parse_method
 
 COPIES = ('copy-start', 'copy-goal')
@@ -33,14 +33,26 @@ def variant_of(method):
     return max((variant for variant in VARIANTS if name.endswith(variant)), key=len)
 
 
+def network_of(method):
+    """Return OURS for a method with our network, '' for the paper's; both are variants."""
+    return OURS if variant_of(method).startswith(OURS) else ''
+
+
+def short_name(method):
+    """Name a method without its network and without -wo-gan, as plots of one network do."""
+    name = re.sub(r'-r\d+$', '', method)
+    return name.removesuffix(OURS).replace('-wo-gan', '') + method[len(name):]
+
+
 def method_order(method):
     """
-    Give the place of a method in tables and pictures, as a sort key: copying, fix, min, genmin.
+    Give the place of a method in tables and pictures, as a sort key.
 
-    Forward genmin is ordered by beta from large to small, as its match-steps rise.
+    Copying first, then the paper's network, then ours; of each: fix, min, genmin. Forward genmin
+    is ordered by beta from large to small, as its match-steps rise.
     """
     if method in COPIES:
-        return (0, 0, COPIES.index(method), False, method)
+        return (0, 0, 0, COPIES.index(method), False, method)
     name = method.replace(f'-wo-gan-{BEST}', '').replace(f'-{BEST}', '')
     name = re.sub(r'-r\d+$', '', name)
     variant = variant_of(name)
@@ -48,4 +60,5 @@ def method_order(method):
     number = (parsed.fraction if parsed.loss == 'fix' else
               -parsed.beta if parsed.beta is not None else 0)
     kind = ('fix', 'min', 'genmin').index(parsed.loss) + 1 + 3 * parsed.vae + 3 * (BEST in method)
-    return (kind, parsed.selection != 'time_preference', number, bool(variant), method)
+    network = 1 + (network_of(method) == OURS)
+    return (network, kind, parsed.selection != 'time_preference', number, variant, method)

@@ -7,10 +7,11 @@ Sentences that judge depend on the numbers; what a person has to say stands in f
 """
 
 from experiments.pages import render
+from experiments.paper.claims import claims_table
 from experiments.paper.figures import file_name
-from experiments.paper.names import BEST, method_order
-from experiments.paper.published import BOTTLENECK_2PX, FRAMES, TITLES
-from experiments.paper.rows import find
+from experiments.paper.names import method_order
+from experiments.paper.published import TIMED_TITLES, TITLES
+from experiments.paper.rows import BESIDE, find, PICK, PLACE
 from experiments.paper.runs import paper_runs
 from experiments.paper.tables import (
     best_table,
@@ -18,22 +19,32 @@ from experiments.paper.tables import (
     EQUAL,
     forward_table,
     gains_table,
+    lowest_best,
     lowest_deterministic,
+    parts_table,
+    recursion_table,
     scores_table,
+    shift_table,
+    timing_table,
 )
 import pandas as pd
+from sim_bridge.timing import MORE_FRAMES
+from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.evaluation.bottleneck import MIN_MOTION
 from tap_ros.evaluation.samples import NEAR
+from tap_ros.evaluation.shown import SHOWN
 from tap_ros.prediction.losses import CHANGED
 
-SETTINGS = ('margin', 'outer_power', 'goal_picture', 'learning_rate', 'gan_weight', 'kl_weight',
-            'pretrain_steps')  # may differ between the methods of a scale, see runs.py
+# May differ between the methods of a scale, see runs.py.
+SETTINGS = ('decoder', 'skips', 'margin', 'progress_margin', 'match_temperature', 'colour',
+            'brightness', 'learning_rate', 'gan_weight', 'kl_weight', 'recursion',
+            'detach_recursion', 'pretrain_steps')
 GRIDS = {  # what follows <task>-<mode>[-warp] in the name of a picture
     '': 'inputs, each method, and the true frame that matches best',
     '-masks': 'what the output is blended from: warped inputs under their masks, and new pixels',
     '-recursion': 'recursion: with the prediction r = 1 as the goal, r = 2',
     '-samples': 'samples of the VAE, from the same inputs'}
-PLOTS = ('gains', 'match_steps', 'forward_scatter', 'bottleneck_curve')
+PLOTS = ('gains', 'match_steps', 'forward_scatter', 'bottleneck_curve', 'timing')
 
 
 def make_page(rows, runs, left_out, scales, pictures, findings=''):
@@ -53,19 +64,20 @@ def make_page(rows, runs, left_out, scales, pictures, findings=''):
              for scale in scales]
     return render('paper/templates/results.md.j2', scales=parts, left_out=left_out,
                   findings=findings.strip(), equal=EQUAL, min_motion=MIN_MOTION,
-                  published=BOTTLENECK_2PX, changed=CHANGED, near=NEAR)
+                  changed=CHANGED, near=NEAR, beside=BESIDE,
+                  place=PLACE, pick=PICK, shown=SHOWN)
 
 
 def _of_scale(scale, rows, runs, pictures, scales):
     """Return what the template shows of a scale."""
     plots = {name: file_name(name, scale) for name in PLOTS}
-    by_frequency = rows[(rows['metric'] == 'bottleneck_frequency_2px') & (rows['task'] == 'push2')
-                        & ~rows['new_pixels'].fillna(True)]
     copied = {metric: find(rows, task='push2', mode='bidirectional', method='copy-start',
                            metric=metric) for metric in ('bottleneck_frequency_2px', 'min_l1')}
     return {
         'name': scale, 'runs': runs, 'wanted': len(paper_runs(scale)),
         'missing': missing_runs(runs, scale),
+        'claims': claims_table(rows), 'timing': timing_table(rows), 'shifts': shift_table(rows),
+        'recursion': recursion_table(rows), 'parts': parts_table(rows),
         'settings': _settings(runs), 'differences': _differences(runs),
         'machines': sorted({run['training']['machine'] for run in runs}),
         'collected': sorted({
@@ -81,8 +93,6 @@ def _of_scale(scale, rows, runs, pictures, scales):
         'bottlenecks': [(title, bottleneck_table(rows, task)) for task, title in TITLES.items()
                         if task == 'push2' or find(
                             rows, task=task, metric='bottleneck_frequency_2px')],
-        'most': by_frequency.loc[by_frequency['value'].idxmax()] if len(by_frequency) else None,
-        'genmin': find(by_frequency, method='genmin'), 'fix': find(by_frequency, method='fix'),
         'best': best_table(rows), 'verdicts': list(_verdicts(rows)),
         'plots': {name: file if file in pictures else '' for name, file in plots.items()},
         'grids': list(_grids(scale, scales, pictures)),
@@ -94,27 +104,30 @@ def _of_scale(scale, rows, runs, pictures, scales):
 
 def missing_runs(runs, scale):
     """
-    List what a complete set of results has and these runs lack, whatever their seeds.
+    List what a complete set of results has and these runs lack.
 
     :param runs: dicts of the runs of one scale.
     :param scale: its name.
     :return: list of runs.PaperRun.
     """
-    have = {(run['task'], run['mode'], run['new_pixels'], run['method']) for run in runs}
+    have = {(run['task'], run['mode'], run['new_pixels'], run['method'], run['seed'])
+            for run in runs}
     return [run for run in paper_runs(scale) if (
-        run.task, run.mode, run.new_pixels, run.label) not in have]
+        run.task, run.mode, run.new_pixels, run.label, run.seed) not in have]
 
 
 def _settings(runs):
     """Tabulate what was run, on what, and how long."""
     lines = []
-    for task, title in TITLES.items():
+    timed = {task: f'{TITLES["push2"]}, {when}' for task, when in TIMED_TITLES.items()}
+    frames = EPISODE_FRAMES | dict.fromkeys(timed, EPISODE_FRAMES['push2'] + MORE_FRAMES)
+    for task, title in (TITLES | timed).items():
         own = [run for run in runs if run['task'] == task]
         if own:
             data, config = own[0]['data'], own[0]['config']
             steps = sorted({run['training']['steps'] for run in own})
             lines.append({
-                'task': title, 'frames': FRAMES[task], 'trained on': data['episodes'],
+                'task': title, 'frames': frames[task], 'trained on': data['episodes'],
                 'held out': data['held_out'], 'data': f'`{data["hash"][:8]}`',
                 'steps': ' to '.join(map(str, dict.fromkeys((steps[0], steps[-1])))),
                 'batch': config.get('batch_size'), 'base width': config.get('base_width'),
@@ -148,15 +161,14 @@ def _table_1_settings(rows, scale):
 
 
 def _verdicts(rows):
-    """Say of each task whether the best of 100 is below the lowest without VAE, and of which."""
+    """Say of each task how the best of 100 stands to the lowest without VAE, and of which."""
     for task, title in TITLES.items():
-        best = find(rows, task=task, mode='bidirectional', new_pixels=True, metric='min_l1',
-                    method=f'genmin-vae-{BEST}')
-        other = lowest_deterministic(rows, task)
+        best, other = lowest_best(rows, task), lowest_deterministic(rows, task)
         if best and other:
-            yield title, ('below' if best['ci_high'] < other['ci_low'] else
-                          'above' if best['ci_low'] > other['ci_high'] else
-                          'not significantly different from'), other['method']
+            yield title, best['method'], (
+                'below' if best['ci_high'] < other['ci_low'] else
+                'above' if best['ci_low'] > other['ci_high'] else
+                'not significantly different from'), other['method']
 
 
 def _grids(scale, scales, pictures):

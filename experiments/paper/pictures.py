@@ -50,7 +50,7 @@ class Shown:
 
 def write_grids(folder, runs, weights, recordings='bags'):
     """
-    Write the grids of every task and mode of one scale.
+    Write the grids of every task of Table 1 and mode of one scale.
 
     A picture that is there stays where not all the weights are at hand that it could show.
 
@@ -60,7 +60,8 @@ def write_grids(folder, runs, weights, recordings='bags'):
     :param recordings: folder with the recordings of each task, where those that a run was trained
         on are no longer.
     """
-    settings = sorted({(run['task'], run['mode'], run['new_pixels']) for run in runs})
+    settings = sorted({(run['task'], run['mode'], run['new_pixels']) for run in runs
+                       if run['task'] in TITLES})
     for task, mode, new_pixels in settings:
         same = [run for run in runs if (run['task'], run['mode'], run['new_pixels']) == (
             task, mode, new_pixels)]
@@ -75,7 +76,7 @@ def write_grids(folder, runs, weights, recordings='bags'):
             continue
         shown = [Shown(method, load_network(paths[method])[0]) for method in at_hand]
         variant = '' if new_pixels else '-warp'
-        title = f'{TITLES.get(task, task)}, {mode}' + ('' if new_pixels else ', no new pixels')
+        title = f'{TITLES[task]}, {mode}' + ('' if new_pixels else ', no new pixels')
         for name, make in GRIDS.items():
             sheet = make(task, mode, shown, *episodes)
             path = Path(folder) / file_name(f'{task}-{mode}{variant}{name}', chosen[
@@ -86,7 +87,7 @@ def write_grids(folder, runs, weights, recordings='bags'):
 
 def _held_out(run, recordings):
     """Return (store, indices of the first held-out episodes, goal picture), or None."""
-    own = run['config'].get('recordings', ())[-1:]
+    own = run['config'].get('recordings', ())
     paths = [path for path in own if Path(path).exists()]
     paths = paths or [Path(recordings) / run['task']]
     if not Path(paths[0]).exists():
@@ -179,8 +180,9 @@ def _methods(task, mode, shown, store, episodes, goal_picture):
     """Show inputs, the output of each method, and matches of genmin and ours (Figs. 5, 6)."""
     batch, context = _gather(store, episodes, mode, goal_picture)
     headings, rows = _inputs(batch)
-    matched = _preferred(shown, ('genmin', 'genmin4', 'genmin-wo-gan'))
-    ours = next((one for one in _contrast(shown) if '+' in one.method), None)
+    chosen = _contrast(shown)
+    matched = next((one for one in chosen if family(one.method) == 'genmin'), None)
+    ours = next((one for one in chosen if family(one.method) == 'ours'), None)
     matches = []
     for one in shown:
         image = _predict(one, episodes, context).image
@@ -204,10 +206,10 @@ def _preferred(shown, names):
 
 def _contrast(shown):
     """Choose fix, genmin and a form of ours that finds bottlenecks, those that are at hand."""
-    ours = [one.method for one in shown if re.match(r'genmin.*\+', one.method)]
-    ours = ['genmin+relative', 'genmin+changed', *ours]
-    found = [_preferred(shown, names) for names in (
-        ('fix', 'fix-wo-gan', 'fix0.50'), ('genmin', 'genmin-wo-gan', 'genmin4'), ours)]
+    ends = ('-wo-gan+skips', '+skips', '-wo-gan', '')
+    found = [_preferred(shown, [f'{stem}{end}' for end in ends for stem in stems])
+             for stems in (('fix', 'fix0.50'), ('genmin', 'genmin4'))]
+    found.append(_preferred(shown, ('genmin-wo-gan+progress+skips', 'genmin-wo-gan+progress')))
     return [one for one in found if one is not None]
 
 

@@ -13,6 +13,7 @@ from tap_ros.recording.bags import find_bags
 from tap_ros.recording.writer import count_episodes
 
 _SETTINGS = 'collection.json'  # as sim_bridge.collect leaves it
+_USUAL = {'seed': 0, 'frames': 0, 'timing': 'natural', 'appearance': 'usual'}
 
 
 @dataclass(frozen=True)
@@ -82,16 +83,16 @@ def collect_command(folder):
         return ''
     words = ['python', '-m', 'tap_ros', 'collect', '--task', settings['task'], '--out',
              str(folder), '--episodes', str(settings['episodes'])]
-    for option in ('seed', 'frames', 'timing'):
-        if settings.get(option):
+    for option, usual in _USUAL.items():
+        if settings.get(option, usual) != usual:
             words += [f'--{option}', str(settings[option])]
     return shlex.join(words)
 
 
-def recording_hash(*folders):
-    """Compute EpisodeStore.data_hash of recordings without decoding anything."""
+def recording_hash(folder):
+    """Compute EpisodeStore.data_hash of a recording without decoding anything."""
     digests = []
-    for file in (file for folder in folders for bag in find_bags(folder) for file in bag):
+    for file in (file for bag in find_bags(folder) for file in bag):
         with open(file, 'rb') as stream:
             digests.append(hashlib.file_digest(stream, 'sha256').hexdigest())
     return hashlib.sha256(''.join(digests).encode()).hexdigest()

@@ -56,7 +56,8 @@ def on_same_recordings(runs):
         return run['scale'], run['task']
 
     def data(run):
-        return run['data']['hash'], len(run['evaluation']['prediction']['min_l1'])
+        return (run['data']['hash'], len(run['evaluation']['prediction']['min_l1']),
+                tuple(sorted(run['data'].get('shifted', {}).items())))
     counts = {}
     for run in runs:
         counts.setdefault(of(run), Counter())[data(run)] += 1
@@ -126,6 +127,7 @@ def _write_plots(folder, scale, rows, groups):
         'forward_scatter': figures.forward_scatter(rows),
         'bottleneck_curve': figures.bottleneck_curve(rows),
         'gains': figures.gains(rows),
+        'timing': figures.timing(rows),
         'match_steps': figures.match_histograms(groups)}
     for name, png in plots.items():
         path = folder / figures.file_name(name, scale)

@@ -4,26 +4,28 @@
 From the scores of runs to rows: one number each, with an interval and the command that makes it.
 
 Intervals are 95% bootstrap intervals over the held-out episodes. Runs that differ by the seed only
-are averaged, episode by episode; the interval does not tell how far another training would be off.
+are averaged, episode by episode; by_seed tells how far trainings differ.
 """
 
 from dataclasses import dataclass
 import re
 
-from experiments.paper.names import BEST, best_of_name, COPIES, variant_of
+from experiments.paper.names import BEST, best_of_name, COPIES, network_of, variant_of
 import numpy as np
 import pandas as pd
 from tap_ros.evaluation.bottleneck import THRESHOLDS, VISIBLE
 from tap_ros.evaluation.intervals import bootstrap
+from tap_ros.evaluation.shown import SHOWN
 
 # Of the samples of a VAE.
 SPREADS = ('sample_spread', 'sample_spread_near', 'sample_spread_elsewhere', 'sample_spread_px')
 RESAMPLES = 1000
 BESIDE = 0.1  # a match within this share of the episode from an input lies beside it
+PLACE, PICK = 0.8, 0.2  # least and most of the object's way behind it, for these two moments
 _DIGITS = 6
 _NONE = np.empty((1, 0))
-COLUMNS = ['task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n', 'seeds', 'scale',
-           'command', 'new_pixels', 'of', 'baseline']
+COLUMNS = ['task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n', 'seeds',
+           'by_seed', 'scale', 'command', 'new_pixels', 'of', 'baseline']
 
 
 @dataclass(frozen=True)
@@ -68,19 +70,38 @@ def group_runs(runs):
             if copy in same[0]['evaluation'] and (task, mode, scale, copy) not in copied:
                 copied.add((task, mode, scale, copy))
                 groups.append(_group({**key, 'method': copy}, same[:1], copy))
+        for name in same[0]['evaluation'].get('shifted', ()):
+            other = shifted_task(task, name)
+            shifted = [{**run, 'evaluation': run['evaluation']['shifted'][name]} for run in same]
+            groups.append(_group({**trained, 'task': other}, shifted, 'prediction'))
+            if (other, mode, scale) not in copied:
+                copied.add((other, mode, scale))
+                groups.append(_group({**key, 'task': other, 'method': 'copy-goal'}, shifted[:1],
+                                     'copy-goal'))
     return groups
+
+
+def shifted_task(task, name):
+    """Name the recording of a shift: arm_elsewhere of push2 is push2_arm_elsewhere."""
+    return name if name.startswith(task) else f'{task}_{name}'
 
 
 def _group(key, runs, part, of=''):
     """Stack the scores of runs."""
     parts = [run['evaluation'][part] for run in runs]
     names = [name for name in ('min_l1', 'match_step', 'match_fraction', 'changed_l1',
-                              'bottleneck', 'object_mass')
+                               'bottleneck', 'object_mass', 'hand', 'objects')
              if all(name in part for part in parts)]
     scores = {name: np.array([part[name] for part in parts], float) for name in names}
-    for name in (*SPREADS, 'target_bottleneck') if part == 'prediction' else ():
+    wanted = (*SPREADS, 'target_bottleneck', 'bottleneck_at') if part == 'prediction' else ()
+    for name in wanted:
         if all(name in run['evaluation'] for run in runs):
             scores[name] = np.array([run['evaluation'][name] for run in runs], float)
+    if part == 'prediction' and all('recursion' in run['evaluation'] for run in runs):
+        for name in ('way', 'hand', 'objects'):
+            scores[f'recursion_{name}'] = np.array(
+                [[level[name] for level in run['evaluation']['recursion']] for run in runs],
+                float).swapaxes(1, 2)  # S, N, levels
     command = ' && '.join(run['command'] for run in runs)
     return Group(key, scores, command, runs[0]['data']['hash'], of)
 
@@ -97,10 +118,15 @@ def make_rows(groups):
         min_l1 is the per-pixel mean on [0, 1], match_step counts frames from the start picture
         (0), bottleneck_frequency and gains are shares, bottleneck_median_px is in pixels. In
         visible_bottleneck_frequency no object may be left out, see bottleneck.VISIBLE;
-        target_bottleneck_frequency is that of the true frames at a fixed time.
+        target_bottleneck_frequency is that of the true frames at a fixed time, bottleneck_at when
+        in an episode, 0 to 1, the bottleneck is. shows_both is the share of predictions that show
+        the hand and the objects (shown.ShownScorer). place is the share whose match has the
+        objects PLACE of their way behind them, pick_after_place the share of those of which the
+        next level's match has them PICK of it behind them; with _shown it shows both as well.
     """
     rows = [_row(group, metric, lambda array, statistic=statistic: statistic(array, -1).mean(0),
-                 values) for group in groups for metric, statistic, values in _measures(group)
+                 values, by_seed=[round(float(x), _DIGITS) for x in statistic(values, -1)])
+            for group in groups for metric, statistic, values in _measures(group)
             if values.size]
     return rows + _gain_rows(groups) + _equal_gain_rows(groups)
 
@@ -115,8 +141,13 @@ def _measures(group):
     yield 'match_beside_input', np.mean, (share < BESIDE) | (share > 1 - BESIDE) & has_goal
     for metric in ('changed_l1', *SPREADS):
         yield metric, np.mean, known.get(metric, _NONE)
+    if {'hand', 'objects'} <= set(group.scores):
+        both = np.minimum(group.scores['hand'], group.scores['objects'])
+        yield 'shows_both', np.mean, both[:, np.isfinite(both).all(0)] >= SHOWN
+    yield from _recursion_measures(group.scores)
     if group.key.get('new_pixels'):
         return
+    yield 'bottleneck_at', np.mean, known.get('bottleneck_at', _NONE)
     if 'bottleneck' in known:
         placed = known['bottleneck']
         visible = group.scores['object_mass'][
@@ -127,6 +158,33 @@ def _measures(group):
             yield f'visible_bottleneck_frequency_{threshold}px', np.mean, found & visible
         yield 'bottleneck_median_px', np.median, placed
     yield 'target_bottleneck_frequency_2px', np.mean, known.get('target_bottleneck', _NONE) <= 2
+
+
+def _recursion_measures(scores):
+    """Yield what recursion_way tells; NaN marks episodes that a share is not of."""
+    if 'recursion_way' not in scores:
+        return
+    first, second = scores['recursion_way'][..., 0], scores['recursion_way'][..., 1]
+    known = np.isfinite(first).all(0)
+    if not known.any():
+        return
+    place = first >= PLACE
+    yield 'place', np.mean, place[:, known]
+    # Where the matched frame does not show them, nothing is known of hand and objects.
+    shown = np.minimum(*(scores[f'recursion_{name}'][..., 1] for name in ('hand', 'objects')))
+    pick = second <= PICK
+    for metric, of, found in (
+            ('pick_after_place', place, pick),
+            ('pick_after_place_shown', place & np.isfinite(shown), pick & (shown >= SHOWN))):
+        if of.any(1).all():
+            yield metric, _mean_of_known, np.where(of, found, np.nan)[:, of.any(0)]
+
+
+def _mean_of_known(values, axis):
+    """Average what is not NaN; NaN without any."""
+    known = np.isfinite(values)
+    with np.errstate(invalid='ignore'):
+        return np.where(known, values, 0).sum(axis) / known.sum(axis)
 
 
 def _row(group, metric, statistic, *arrays, **more):
@@ -156,20 +214,21 @@ def find_baseline(group, groups):
     """
     Find the fixed-time predictor that a method is to be compared with: fix in the same setting.
 
-    A method without GAN is compared with fix-wo-gan where that was run, a variant with fix of that
-    variant.
+    A method is compared with fix of the same network; without GAN, with fix-wo-gan where that was
+    run; a variant with fix of that variant where that was run.
 
     :return: Group or None.
     """
     name = group.key['method']
     wo_gan = '-wo-gan' in name or (re.search(r'-vae(?!-gan)', name) and BEST not in name)
     names = ('fix-wo-gan', 'fix') if wo_gan else ('fix', 'fix-wo-gan')
-    for method in (*(['fix' + variant_of(name)] if variant_of(name) else []), *names):
-        for other in groups:
-            if (other.key == {**group.key, 'new_pixels': group.key.get('new_pixels', True),
-                              'method': method}
-                    and other.data_hash == group.data_hash):
-                return other
+    for variant in dict.fromkeys((variant_of(name), network_of(name))):
+        for method in names:
+            for other in groups:
+                if (other.key == {**group.key, 'new_pixels': group.key.get('new_pixels', True),
+                                  'method': method + variant}
+                        and other.data_hash == group.data_hash):
+                    return other
     return None
 
 
@@ -200,7 +259,8 @@ def _equal_gain_rows(groups):
 
     That of fixed-time prediction is the lower hull of the fix models: what choosing at random
     between two of them would score. Between start and goal, copying belongs to them: it is the
-    best prediction for the times 0 and 1. A method with a match-step beyond theirs gets no row.
+    best prediction for the times 0 and 1. A method with a match-step beyond theirs, or whose
+    interval reaches beyond, gets no row.
     """
     rows = []
     for group in groups:
@@ -211,11 +271,16 @@ def _equal_gain_rows(groups):
                 and all(other.key[part] == group.key[part] for part in ('task', 'mode', 'scale'))
                 and other.key.get('new_pixels') in (None, group.key['new_pixels'])]
         fixed = [[other for other in same if re.fullmatch(
-            r'fix[\d.]*' + re.escape(variant), other.key['method'])]
-            for variant in (variant_of(name), '')]
+            r'fix[\d.]*(-wo-gan)?' + re.escape(variant), other.key['method'])]
+            for variant in (variant_of(name), network_of(name))]
         copies = [other for other in same if other.key['method'] in COPIES]
         baselines = (fixed[0] or fixed[1]) + (copies if mode == 'bidirectional' else [])
         if not any(fixed) or len(baselines) < 2:
+            continue
+        step = bootstrap(lambda array: array.mean((0, -1)), group.scores['match_step'],
+                         resamples=RESAMPLES)
+        ends = [other.scores['match_step'].mean() for other in baselines]
+        if not min(ends) <= step.low <= step.high <= max(ends):
             continue
         row = _row(group, 'gain_over_fix_at_match_step', _gain_at_match_step,
                    *(g.scores[score] for g in (group, *baselines)
@@ -283,5 +348,3 @@ def find(rows, **wanted):
     for name, value in wanted.items():
         rows = rows[(rows[name] == value).fillna(name == 'new_pixels')]
     return None if rows.empty else rows.iloc[0].dropna().to_dict()
-
-

@@ -10,15 +10,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 import shlex
 
+from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED, TIMED
+from sim_bridge.tasks import TASKS
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.methods import parse_method
 from tap_ros.prediction.training_config import TrainingConfig
 
 SINGLE = ('grasp', 'pick_place', 'push2')  # the tasks of Table 1
 EPOCHS, PRETRAIN_EPOCHS = 200, 10  # of the paper (appendix C)
-# Three objects alone make it forget what the order of two looks like.
-TRAINED_ON = {'push3': ('push2', 'push3')}
-LONGER = {'push3': 2.4}  # times the steps
+MAIN_SEEDS = (0, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -26,54 +26,56 @@ class Scale:
     """
     How large everything is.
 
-    :param episodes: task to how many to collect.
-    :param steps: length of a training, but see LONGER; 0: the paper's epochs.
+    :param steps: length of a training; 0: the paper's epochs.
     :param settings: of every training, beside the method's own.
     """
 
-    episodes: dict
     steps: int = 0
     settings: dict = field(default_factory=dict)
 
 
 SCALES = {
     'small': Scale(
-        episodes={'push2': 3000, 'grasp': 3000, 'pick_place': 3000, 'push3': 1500},
-        steps=1500,
-        settings={'base_width': 16, 'batch_size': 32, 'threads': 1}),
+        steps=2500,
+        settings={'base_width': 16, 'batch_size': 24, 'threads': 1, 'save_every': 1250}),
     'full': Scale(
-        episodes={'push2': 55000, 'grasp': 50000, 'pick_place': 75000, 'push3': 55000},
         settings={'base_width': 32, 'batch_size': 64, 'learning_rate': 1e-4,
                   'discriminator_rate': 1e-4, 'precision': 'bfloat16', 'compile': True,
                   'save_every': 5000}),
 }
 
-# The paper's rows: every frame between the inputs is a target, the error is its own mean.
+# As in the paper: every frame between the inputs is a target, the error is its own mean.
 _PAPER = {'margin': 0, 'outer_power': 1.0, 'goal_picture': 'last'}
-# Choosing by the error relative to copying needs both, see docs/paper_map.md.
-_RELATIVE = {**_PAPER, 'margin': 3, 'outer_power': 0.5}
-# With the default of 1e-4 samples hardly differed: z is worth less than 0.005 of error here.
+# An input's neighbours show no progress, so that their preference would be next to nothing.
+_PROGRESS = {'margin': 3}
+_PROGRESS_PUSHING = {'progress_margin': 0.5}
+# A hand on an object is told by its colour; other colours teach that it has none.
+_GRIPPING = {'colour': False, 'brightness': 0.0}
+# With the default of 1e-4 samples hardly differ: z is worth less than 0.005 of error here.
 _VAE = {'kl_weight': 1e-5}
+# Else the loss of level 2 bends the picture of level 1, which serves it as an input.
+_RECURSION = {'detach_recursion': True}
+_OURS = {'decoder': 'shared', 'skips': True}
+OURS = '+skips'
+# The paper's network has none of these.
 VARIANTS = {
     '': {},
-    # What each part of that does: all but the selection error, and all but the root.
-    '+root': {'margin': 3, 'outer_power': 0.5},
-    '+mean': {'outer_power': 1.0},
-    # Against leaving out what is small and uncertain, see losses.weighted_l1_error.
-    '+changed': {'changed_weight': 2.0},
-    # For use: goal pictures with the arm elsewhere too, as people photograph goals.
-    '+mixed': {'goal_picture': 'mixed'},
+    OURS: _OURS,
+    # What the parts of genmin+progress are worth.
+    '+skips+margin': {**_OURS, 'margin': 3},
+    '+skips+edge': {**_OURS, 'progress_margin': 0.0},
+    '+skips+annealed': {**_OURS, 'match_temperature': 1.0},
 }
 
 
 def label(method, variant='', recursion=1):
     """
-    Name a method in results: genmin+root is a variant, genmin-r2 was trained for recursion.
+    Name a method in results: genmin+skips is a variant, genmin-r2 was trained for recursion.
 
     :param method: as for training.
     :param variant: one of VARIANTS.
     :param recursion: levels of Eq. 3 in training.
-    :return: for example 'genmin+relative+mean'.
+    :return: for example 'genmin+progress+skips'.
     """
     return method + variant + (f'-r{recursion}' if recursion > 1 else '')
 
@@ -83,7 +85,7 @@ class PaperRun:
     """
     One training and its evaluation.
 
-    :param task: of sim_bridge.tasks.
+    :param task: the recording, of recordings.RECORDINGS.
     :param mode: 'bidirectional' or 'forward'.
     :param method: see prediction.methods.
     :param new_pixels: whether the network may paint; if not, it has object maps.
@@ -121,29 +123,22 @@ class PaperRun:
     @property
     def num_episodes(self):
         """How many episodes to collect."""
-        return self.episodes or SCALES[self.scale].episodes[self.task]
-
-    @property
-    def training_tasks(self):
-        """The tasks whose recordings it is trained on, its own last."""
-        return TRAINED_ON.get(self.task, (self.task,))
+        return self.episodes or RECORDINGS[self.task].episodes[self.scale]
 
     @property
     def num_steps(self):
         """Length of the training."""
-        usual = round(SCALES[self.scale].steps * LONGER.get(self.task, 1))
-        return self.steps or usual or self._steps_of(EPOCHS)
+        return self.steps or SCALES[self.scale].steps or self._steps_of(EPOCHS)
 
     @property
-    def before(self):
-        """The run whose weights this one begins with: three objects with those for two."""
-        return replace(self, task='push2') if self.task == 'push3' else None
+    def shifted(self):
+        """The recordings that it is scored on besides its own: other looks of the same scenes."""
+        return SHIFTED if self.task == 'push2' and self.mode == 'bidirectional' else ()
 
     @property
     def command(self):
         """The command that makes this run."""
-        names = [run.name for run in (self.before, self) if run]
-        words = ['python', '-m', 'tap_ros', 'paper', '--scale', self.scale, '--only', *names]
+        words = ['python', '-m', 'tap_ros', 'paper', '--scale', self.scale, '--only', self.name]
         for option, value in (('--seeds', self.seed), ('--episodes', self.episodes),
                               ('--steps', self.steps)):
             words += [option, str(value)] if value else []
@@ -153,28 +148,26 @@ class PaperRun:
         """
         Say how to train.
 
-        :param recordings: folder with a recording for each task.
+        :param recordings: folder with the recordings.
         :param runs: folder of all runs.
         :return: TrainingConfig.
         """
-        settings = dict(SCALES[self.scale].settings)
-        if parse_method(self.method).selection == 'relative_to_copying':
-            settings |= _RELATIVE
-        else:
-            settings |= _PAPER
+        pushing = TASKS[RECORDINGS[self.task].task].kind == 'push'
+        settings = {**SCALES[self.scale].settings, **_PAPER, **({} if pushing else _GRIPPING)}
+        if parse_method(self.method).selection == 'picture_progress':
+            settings |= _PROGRESS | (_PROGRESS_PUSHING if pushing else {})
         if parse_method(self.method).vae:
             settings |= _VAE
         settings |= VARIANTS[self.variant]
-        if self.before:
-            settings['initial_weights'] = str(
-                self.before.folder(runs) / 'predictor.safetensors')
-        elif not SCALES[self.scale].steps:
+        if self.recursion > 1:
+            settings |= _RECURSION
+        if not SCALES[self.scale].steps and settings.get('decoder') != 'shared':
             settings['pretrain_steps'] = self._steps_of(PRETRAIN_EPOCHS)
         return TrainingConfig(
-            recordings=tuple(str(Path(recordings) / task) for task in self.training_tasks),
-            out=str(self.folder(runs)), mode=self.mode, method=self.method,
-            new_pixels=self.new_pixels, seed=self.seed,
-            recursion=self.recursion, steps=self.num_steps, **settings)
+            recordings=(str(Path(recordings) / self.task),), out=str(self.folder(runs)),
+            mode=self.mode, method=self.method, new_pixels=self.new_pixels, seed=self.seed,
+            test_fraction=held_out_share(self.num_episodes), recursion=self.recursion,
+            steps=self.num_steps, **settings)
 
     def folder(self, runs):
         """Return the Path of this run's folder in the folder of all runs."""
@@ -182,18 +175,18 @@ class PaperRun:
 
     def _steps_of(self, epochs):
         """Turn passes over the episodes into steps."""
-        batch_size = SCALES[self.scale].settings['batch_size']
-        episodes = sum(replace(self, task=task).num_episodes for task in self.training_tasks)
-        return max(1, round(epochs * episodes / batch_size))
+        return max(1, round(
+            epochs * self.num_episodes / SCALES[self.scale].settings['batch_size']))
 
 
-def paper_runs(scale, seeds=(0,), episodes=0, steps=0):
+def paper_runs(scale, seeds=(), episodes=0, steps=0):
     """
     List all runs of a scale, the most important first.
 
     :param scale: name in SCALES.
-    :param seeds: of the trainings; all runs of the first seed come before those of the second.
-    :param episodes: how many to collect of each task instead of the scale's; 0: those.
+    :param seeds: of the trainings; none: MAIN_SEEDS of the main rows, 0 of the others. All runs of
+        the first seed come before those of the second.
+    :param episodes: how many to collect of each recording instead of the scale's; 0: those.
     :param steps: length of each training instead of the scale's; 0: that.
     :return: list of PaperRun.
     :raises ConfigError: for an unknown scale.
@@ -202,34 +195,41 @@ def paper_runs(scale, seeds=(0,), episodes=0, steps=0):
         raise ConfigError(f'scale: expected one of {", ".join(SCALES)}, got {scale!r}')
     rows = []
 
-    def add(tasks, methods, mode='bidirectional', **options):
-        rows.extend(PaperRun(task, mode, method, scale=scale, episodes=episodes, steps=steps,
-                             **options) for task in tasks for method in methods)
+    def add(tasks, methods, mode='bidirectional', variant='', main=False, **options):
+        rows.extend((PaperRun(task, mode, method, scale=scale, episodes=episodes, steps=steps,
+                              variant=variant, **options), main)
+                    for task in tasks for method in methods)
 
+    l1_rows = ['genmin-wo-gan+progress', 'fix-wo-gan', 'genmin-wo-gan', 'min-wo-gan']
     # App. E: bottlenecks, with warped pixels only.
-    add(['push2'], ['genmin+relative', 'fix', 'genmin'], new_pixels=False)
-    # For planning with two and three objects.
-    add(['push3'], ['genmin+relative', 'fix', 'genmin'], new_pixels=False)
-    # Table 1, and ours beside it.
-    add(SINGLE, ['fix', 'genmin', 'genmin-wo-gan', 'min', 'genmin+relative'])
-    add(['push2', 'grasp', 'pick_place'], ['genmin-vae-gan'])
-    add(['pick_place', 'grasp', 'push2'], ['genmin', 'fix'], variant='+changed')
+    add(['push2'], l1_rows, variant=OURS, new_pixels=False, main=True)
+    # For planning where the order matters.
+    add(['order2', 'order3'], l1_rows[:3], variant=OURS, new_pixels=False)
+    # Table 1 with our network.
+    add(SINGLE, l1_rows, variant=OURS, main=True)
+    # Fig. 7, trained as Eq. 3 says.
+    add(['pick_place'], l1_rows[:1], variant=OURS, recursion=2)
+    # When the bottleneck happens.
+    add(TIMED, ['genmin-wo-gan+progress', 'fix-wo-gan', 'genmin-wo-gan', 'fix0.25-wo-gan',
+                'fix0.75-wo-gan'], variant=OURS, new_pixels=False)
     # Fig. 4.
-    for methods in (['genmin4', 'fix0.50', 'min', 'genmin0.5', 'genmin10'],
-                    ['fix0.25', 'fix0.75', 'fix1.00']):
-        add(['grasp'], methods, mode='forward', variant='+changed')
-    add(['grasp'], ['genmin4', 'fix0.50', 'min'], mode='forward')
-    add(['pick_place'], ['genmin-vae-gan'], variant='+changed')
-    # Fixed-time prediction at other match-steps.
-    add(['push2'], ['fix0.75', 'fix0.25'], new_pixels=False)
-    # What the parts of genmin+relative are worth.
-    add(['push2'], ['genmin', 'fix'], new_pixels=False, variant='+root')
-    add(['push2'], ['genmin+relative'], new_pixels=False, variant='+mean')
-    add(['push2'], ['min'], new_pixels=False)
-    # Goal pictures with the arm elsewhere, too.
-    add(['push2'], ['genmin+relative'], new_pixels=False, variant='+mixed')
-    # The rest of Fig. 4.
-    add(['grasp'], ['genmin2', 'genmin7', 'genmin30'], mode='forward', variant='+changed')
-    add(['grasp'], ['fix0.75', 'genmin0.5', 'genmin10', 'fix0.25', 'fix1.00', 'genmin2', 'genmin7',
-                    'genmin30'], mode='forward')
-    return [replace(run, seed=seed) for seed in seeds for run in rows]
+    add(['grasp'], ['fix0.25-wo-gan', 'fix0.50-wo-gan', 'fix0.75-wo-gan', 'fix1.00-wo-gan',
+                    'genmin4-wo-gan', 'min-wo-gan', 'genmin0.5-wo-gan', 'genmin10-wo-gan',
+                    'genmin2-wo-gan', 'genmin7-wo-gan', 'genmin30-wo-gan'],
+        mode='forward', variant=OURS)
+    # Best of 100.
+    add(['pick_place', 'push2', 'grasp'], ['genmin-vae'], variant=OURS)
+    # Table 1 with the paper's network.
+    add(SINGLE, ['fix', 'genmin', 'min', 'genmin-wo-gan', 'genmin-vae-gan'])
+    # Three objects, and stacking.
+    add(['stack2', 'push3'], l1_rows, variant=OURS)
+    add(['push3'], l1_rows[:3], variant=OURS, new_pixels=False)
+    # What the parts of genmin+progress are worth.
+    add(['push2'], ['genmin-wo-gan+progress', 'genmin-wo-gan', 'fix-wo-gan'], new_pixels=False)
+    add(['push2'], ['genmin+progress', 'genmin'], variant=OURS, new_pixels=False)
+    add(['push2'], ['genmin-wo-gan+progress', 'genmin-wo-gan'], variant='+skips+annealed',
+        new_pixels=False)
+    add(['push2'], ['genmin-wo-gan'], variant='+skips+margin', new_pixels=False)
+    add(['push2'], ['genmin-wo-gan+progress'], variant='+skips+edge', new_pixels=False)
+    return [replace(run, seed=seed) for seed in seeds or MAIN_SEEDS for run, main in rows
+            if seeds or main or not seed]

@@ -10,7 +10,6 @@ them.
 from dataclasses import asdict, dataclass, replace
 import json
 import math
-from pathlib import Path
 import sys
 import time
 
@@ -68,63 +67,29 @@ def find_state(run, places, hashes=None):
         is taken as it is.
     :return: State.
     """
-    hashes = hashes or {}
-    scored = hashes.get(run.task)
+    recorded = (hashes or {}).get(run.task)
     config, folder = run.config(places.recordings, places.runs), run.folder(places.runs)
     result = read_json(places.result(run))
     if (result is not None and _same(result['config'], config)
-            and scored in (None, result['data']['hash'])
-            and _training_hash(run, places, hashes) in (None, trained_on(result))):
+            and recorded in (None, result['data']['hash'])
+            and all((hashes or {}).get(name) in (None, result['data']['shifted'].get(name))
+                    for name in run.shifted)):
         return State('done', config.steps, result)
     about = read_json(folder / 'run.json')
     if about is not None:
         if (_same(read_json(folder / 'config.json') or {}, config)
-                and _training_hash(run, places, hashes) in (None, about['data_hash'])):
+                and recorded in (None, about['data_hash'])):
             return State('partial', about['steps'])
         return State('other')
     return State('missing' if result is None else 'other')
 
 
-def trained_on(result):
-    """Return the hash of the recordings that the run of a result was trained on."""
-    return result['data'].get('trained_on', result['data']['hash'])
-
-
-def _training_hash(run, places, hashes):
-    """Return the hash of what a run is trained on; None where not all of it is at hand."""
-    if any(task not in hashes for task in run.training_tasks):
-        return None
-    if len(run.training_tasks) == 1:
-        return hashes[run.task]
-    return recording_hash(*map(places.recording, run.training_tasks))
-
-
-def trained_steps(run, places):
-    """
-    Find out for how many steps a run is trained, whatever its recording.
-
-    :param run: PaperRun.
-    :param places: Places.
-    :return: 0 too where it was trained with other settings.
-    """
-    folder, config = run.folder(places.runs), run.config(places.recordings, places.runs)
-    about = read_json(folder / 'run.json')
-    if about is None or not _same(read_json(folder / 'config.json') or {}, config):
-        return 0
-    return about['steps']
-
-
 def _same(settings, config):
     """Compare settings of a run, all that training depends on; new ones count as the default."""
     from tap_ros.learning.checkpoints import FREE  # torch takes seconds, --help does without
-    wanted = _comparable(json.loads(json.dumps(asdict(config))))
-    settings = _comparable({**DEFAULTS, **settings})
+    wanted = json.loads(json.dumps(asdict(config)))
+    settings = {**DEFAULTS, **settings}
     return all(settings[name] == value for name, value in wanted.items() if name not in FREE)
-
-
-def _comparable(settings):
-    """Name the weights to begin with by their run alone, wherever the folder of runs is."""
-    return {**settings, 'initial_weights': Path(settings['initial_weights']).parent.name}
 
 
 def data_hashes(runs, places):
@@ -135,12 +100,18 @@ def data_hashes(runs, places):
     :param places: Places.
     :return: dict from tasks to hashes.
     """
+    return {task: recording_hash(places.recording(task))
+            for task, episodes in _needed(runs).items()
+            if is_collected(places.recording(task), episodes)}
+
+
+def _needed(runs):
+    """Return the recordings that runs need: name -> how many episodes."""
     wanted = {}
     for run in runs:
-        for task in run.training_tasks:
-            wanted[task] = max(replace(run, task=task).num_episodes, wanted.get(task, 0))
-    return {task: recording_hash(places.recording(task)) for task, episodes in wanted.items()
-            if is_collected(places.recording(task), episodes)}
+        for name in (run.task, *run.shifted):
+            wanted[name] = max(replace(run, task=name).num_episodes, wanted.get(name, 0))
+    return wanted
 
 
 def sweep(runs, places, engine=LOCAL, minutes=None, fresh=False, collect_only=False,
@@ -164,39 +135,33 @@ def sweep(runs, places, engine=LOCAL, minutes=None, fresh=False, collect_only=Fa
     waiting = [run for run in runs if collect_only or states[run].kind != 'done']
     ends = _collect_missing(waiting, runs, places, hashes, engine, deadline, progress)
     missing = {end.name for end in ends if end.kind != 'done'}
-    waiting = [] if collect_only else [
-        run for run in waiting if missing.isdisjoint(run.training_tasks)]
-    with tqdm(desc='paper', unit='step', total=sum(run.num_steps for run in waiting),
-              initial=sum(states[run].steps for run in waiting), disable=not progress) as bar:
-        # Those that begin with the weights of others come when these are done.
-        for later in (False, True):
-            undone = {end.name for end in ends if end.kind != 'done'}
-            chosen = {run.name: run for run in waiting if later == (run.before in waiting)
-                      and (run.before is None or run.before.name not in undone)}
-            tasks = [Task(run.name, logged, (run, places, deadline, fresh
-                                             and states[run].kind != 'partial'))
-                     for run in chosen.values()]
-            for task, get in run_tasks(
-                    tasks, engine, lambda: time.time() > deadline,
-                    _Shower(bar, states, chosen.values(), places) if progress else lambda: None):
-                ends.append(_end(task.name, get, chosen[task.name].folder(places.runs)))
-                if progress:
-                    bar.write(f'{task.name}: {ends[-1].kind}')
-                if ends[-1].kind == DONE:
-                    on_done()
+    chosen = {} if collect_only else {
+        run.name: run for run in waiting if missing.isdisjoint((run.task, *run.shifted))}
+    tasks = [Task(run.name, logged, (run, places, deadline, fresh
+                                     and states[run].kind != 'partial'))
+             for run in chosen.values()]
+    with tqdm(desc='paper', unit='step', total=sum(run.num_steps for run in chosen.values()),
+              initial=sum(states[run].steps for run in chosen.values()),
+              disable=not progress) as bar:
+        for task, get in run_tasks(
+                tasks, engine, lambda: time.time() > deadline,
+                _Shower(bar, states, chosen.values(), places) if progress else lambda: None):
+            ends.append(_end(task.name, get, chosen[task.name].folder(places.runs)))
+            if progress:
+                bar.write(f'{task.name}: {ends[-1].kind}')
+            if ends[-1].kind == DONE:
+                on_done()
     return ends
 
 
 def _collect_missing(waiting, runs, places, hashes, engine, deadline, progress):
     """Collect the recordings that runs wait for, and note their hashes; return the Ends."""
-    ends = []
-    for task in dict.fromkeys(task for run in waiting for task in run.training_tasks):
+    ends, episodes = [], _needed(runs)
+    for task in _needed(waiting):
         if task in hashes or time.time() > deadline:
             continue
-        episodes = max(replace(run, task=task).num_episodes
-                       for run in runs if task in run.training_tasks)
         try:
-            kind = collect_task(task, episodes, places, engine, deadline, progress)
+            kind = collect_task(task, episodes[task], places, engine, deadline, progress)
             reason = ''
         except TapError as error:
             kind, reason = FAILED, f'error: {error}'

@@ -7,12 +7,14 @@ Their rows are those of rows.as_frame, of one scale.
 """
 
 from experiments.pages import interval, number
-from experiments.paper.names import BEST, best_of_name, COPIES, method_order
+from experiments.paper.names import BEST, best_of_name, COPIES, method_order, short_name
 from experiments.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
     GAINS,
+    SHIFTED_TITLES,
     TABLE_1,
+    TIMED_TITLES,
     TITLES,
 )
 from experiments.paper.rows import of_metric, select
@@ -51,14 +53,23 @@ def scores_table(rows, task, mode, new_pixels=True):
         'min l1 (95% interval)': interval(error).fillna(NOT_RUN),
         'of changed pixels': interval(changed, 3),
         'match-step': _match_steps(own, methods),
-        'beside an input': number(beside['value'], 0, 100) + '%',
-        'seeds': number(error['seeds'], 0)})
+        'beside an input': number(beside['value'], 0, 100) + '%'})
+    shown = of_metric(own, 'shows_both', methods)
+    if shown['value'].notna().any():
+        table['shows hand and objects, %'] = interval(shown, 0, 100)
+    table['by seed'] = error['by_seed'].map(_by_seed)
     if mode == 'bidirectional' and new_pixels and task in TABLE_1:
         theirs = pd.DataFrame.from_dict(
             TABLE_1[task], 'index', columns=['l1', 'step', 'std']).reindex(methods)
         table['paper: min l1'] = number(theirs['l1'])
         table['paper: match-step'] = number(theirs['step'], 1) + ' ± ' + number(theirs['std'], 1)
     return table.rename_axis('method').reset_index()
+
+
+def _by_seed(values):
+    """Write the values of several seeds."""
+    several = isinstance(values, list) and len(values) > 1
+    return ' '.join(f'{value:.4f}' for value in values) if several else None
 
 
 def gains_table(rows, new_pixels=True):
@@ -88,7 +99,8 @@ def forward_table(rows, task='grasp'):
     own = select(rows, task, 'forward')
     methods = _methods_of(own, task, 'forward', True)
     theirs = pd.DataFrame.from_dict(FORWARD_GRASP if task == 'grasp' else {}, 'index',
-                                    columns=['step', 'l1']).reindex(methods)
+                                    columns=['step', 'l1']).reindex(map(short_name, methods))
+    theirs.index = methods
     return pd.DataFrame({
         'min l1 (95% interval)': interval(of_metric(own, 'min_l1', methods)).fillna(NOT_RUN),
         'match-step': _match_steps(own, methods),
@@ -148,3 +160,75 @@ def lowest_deterministic(rows, task, new_pixels=True):
     own = own[(own['metric'] == 'min_l1') & ~own['method'].str.contains('-vae')
               & ~own['method'].isin(COPIES)]
     return None if own.empty else own.loc[own['value'].idxmin()].to_dict()
+
+
+def lowest_best(rows, task):
+    """Find the row (dict) of the best of 100 samples with the lowest error, or None."""
+    own = select(rows, task, 'bidirectional')
+    own = own[(own['metric'] == 'min_l1') & own['method'].str.contains(BEST)]
+    return None if own.empty else own.loc[own['value'].idxmin()].to_dict()
+
+
+def timing_table(rows):
+    """Show bottlenecks of methods on recordings whose bottleneck comes at other times."""
+    parts = []
+    for task, title in TIMED_TITLES.items():
+        own = select(rows, task, 'bidirectional', new_pixels=False)
+        methods = sorted({name for name in own['method'] if name not in COPIES},
+                         key=method_order)
+        at, found, target = (of_metric(own, metric, methods) for metric in (
+            'bottleneck_at', 'bottleneck_frequency_2px', 'target_bottleneck_frequency_2px'))
+        parts.append(pd.DataFrame({
+            'the bottleneck comes': title, 'at, share of the episode': number(at['value'], 2),
+            'method': methods, 'bottlenecks at 2 px, %': interval(found, 0, 100),
+            'no object left out, %': interval(
+                of_metric(own, 'visible_bottleneck_frequency_2px', methods), 0, 100),
+            'the true frame at that time, %': number(target['value'], 0, 100),
+            'match, share of the episode': number(
+                of_metric(own, 'match_fraction', methods)['value'], 2)}))
+    return pd.concat(parts)
+
+
+def shift_table(rows):
+    """Show what other looks of pushing change, for the methods that were scored on them."""
+    parts = []
+    for task, title in SHIFTED_TITLES.items():
+        own = select(rows, task, 'bidirectional', new_pixels=False)
+        methods = [name for name in sorted(set(own['method']), key=method_order)
+                   if name in COPIES or name.endswith('+skips')]
+        parts.append(pd.DataFrame({
+            'pictures': title, 'method': methods,
+            'bottlenecks at 2 px, %': interval(
+                of_metric(own, 'bottleneck_frequency_2px', methods), 0, 100),
+            'min l1 (95% interval)': interval(of_metric(own, 'min_l1', methods))}))
+    return pd.concat(parts)
+
+
+def recursion_table(rows):
+    """Show how often r = 1 is the place, and then r = 2 the pick (Fig. 7); may be empty."""
+    parts = []
+    for task in ('pick_place', 'stack2'):
+        own = select(rows, task, 'bidirectional')
+        methods = sorted(set(own['method'][own['metric'] == 'place']), key=method_order)
+        parts.append(pd.DataFrame({
+            'task': TITLES[task], 'method': methods, **{
+                title: interval(of_metric(own, metric, methods), 0, 100) for title, metric in (
+                    ('r = 1 is the place, %', 'place'),
+                    ('of these r = 2 is the pick, %', 'pick_after_place'),
+                    ('and shows hand and objects, %', 'pick_after_place_shown'))}}))
+    return pd.concat(parts)
+
+
+def parts_table(rows, task='push2'):
+    """Show what each part of genmin+progress is worth: bottlenecks with and without it."""
+    own = select(rows, task, 'bidirectional', new_pixels=False)
+    own = own[own['method'].str.startswith('genmin')]
+    methods = sorted(set(own['method']), key=method_order)
+    return pd.DataFrame({
+        'method': methods, 'bottlenecks at 2 px, %': interval(
+            of_metric(own, 'bottleneck_frequency_2px', methods), 0, 100).array,
+        'match, share of the episode': number(
+            of_metric(own, 'match_fraction', methods)['value'], 2).array,
+        'beside an input, %': number(
+            of_metric(own, 'match_beside_input', methods)['value'], 0, 100).array,
+        'seeds': number(of_metric(own, 'min_l1', methods)['seeds'], 0).array})

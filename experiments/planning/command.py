@@ -10,13 +10,16 @@ from tap_ros.contract import step_budget
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Flag, Folder, one_of, ShippedFile
 from tap_ros.planning.mpc_config import PRESETS, SWITCHES
-from tap_ros.planning.scenes import FIRST_SCENE, PAPER_TASKS, PLANNING_TASKS
+from tap_ros.planning.scenes import FIRST_SCENE, PLANNING_TASKS
 from tap_ros.weights import FORWARD_MODEL
 from tyro import conf
 
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
-DEFAULT_METHODS = ('nothing', 'direct', 'fix', 'genmin', 'one_object', 'oracle_order',
-                   'true_subgoal', 'true_model')
+DEFAULT_METHODS = ('nothing', 'direct', 'direct:twice', 'fix', 'genmin', 'genmin+progress',
+                   'shipped', 'oracle_order', 'true_subgoal', 'true_model')
+# What the command paper calls the predictors that these methods stand for.
+RUNS = {'fix': 'fix-wo-gan+skips', 'genmin': 'genmin-wo-gan+skips',
+        'genmin+progress': 'genmin-wo-gan+progress+skips'}
 TRAINED = 'runs/paper/small/{task}-bidirectional-{name}-warp-s0/predictor.safetensors'
 
 
@@ -27,9 +30,11 @@ class Options:
 
     :param tasks: what is planned.
     :param methods: nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped
-        for the shipped predictor, or the name of another one; with options behind colons: half,
-        recursion<n>, samples<n>, carried, true_maps, true_model, more_search, paper (its search
-        whatever --preset says), plain_cost, every<n>, for example genmin:half:carried.
+        for the shipped predictor; fix, genmin (over time) and genmin+progress for those that the
+        command paper trained with our network and without GAN, or the name of another one; with
+        options behind colons: half, recursion<n>, samples<n>, carried, true_maps, true_model,
+        twice, more_search, paper (its search whatever --preset says), plain_cost, every<n>, for
+        example genmin:half:carried.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
     :param look: of the world, see sim_bridge.looks; pictures are filled behind the robot as the
@@ -54,7 +59,7 @@ class Options:
     :param results_only: run nothing, make planning.json and planning.md again from the scenes.
     """
 
-    tasks: tuple[Annotated[str, one_of(PLANNING_TASKS)], ...] = PAPER_TASKS
+    tasks: tuple[Annotated[str, one_of(PLANNING_TASKS)], ...] = PLANNING_TASKS
     methods: Annotated[tuple[str, ...], conf.arg(metavar='METHOD [METHOD ...]')] = DEFAULT_METHODS
     predictor: Annotated[tuple[str, ...], conf.arg(
         metavar='NAME=FILE [NAME=FILE ...]', help_behavior_hint=f'(default: {TRAINED})')] = ()

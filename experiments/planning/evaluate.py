@@ -7,9 +7,9 @@ import json
 from pathlib import Path
 import shlex
 
-from experiments.planning.command import TRAINED
+from experiments.planning.command import RUNS, TRAINED
 from experiments.planning.films import write_films
-from experiments.planning.methods import parse_method
+from experiments.planning.methods import parse_method, with_samples
 from experiments.planning.page import make_page
 from experiments.planning.results import load_results, make_rows
 from experiments.planning.runs import Job, run_jobs
@@ -83,12 +83,13 @@ def make_jobs(args):
         for method in methods:
             file = ''
             if method.predicted:
-                file = weights.get(method.base, TRAINED.replace('{name}', method.base))
+                run = RUNS.get(method.base, method.base)
+                file = weights.get(method.base, TRAINED.replace('{name}', run))
                 file = str(find_predictor(file.replace('{task}', task)))
                 if not Path(file).is_file():
                     raise ConfigError(
                         f'method {method.name!r}: no weights {file}; train them with `python -m '
-                        f'tap_ros paper --only "{task}-bidirectional-{method.base}-warp-s0"`, '
+                        f'tap_ros paper --only "{task}-bidirectional-{run}-warp-s0"`, '
                         f'name them with --predictor {method.base}=FILE, or leave the method out '
                         'with --methods')
             jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
@@ -98,15 +99,11 @@ def make_jobs(args):
 
 
 def changed(planner, samples, iterations, replan_every):
-    """Return a VisualMPCConfig with what is not 0 changed, its other numbers in proportion."""
-    search = planner.search
-    share = (samples or search.num_samples) / search.num_samples
-    search = replace(
-        search, num_samples=samples or search.num_samples,
-        num_iterations=iterations or search.num_iterations,
-        num_elites=max(2, round(share * search.num_elites)) if samples else search.num_elites)
-    return replace(planner, search=search, proposals=int(share * planner.proposals),
-                   replan_every=replan_every or planner.replan_every)
+    """Return a VisualMPCConfig with what is not 0 changed; see methods.with_samples."""
+    if samples:
+        planner = with_samples(planner, samples)
+    search = replace(planner.search, num_iterations=iterations or planner.search.num_iterations)
+    return replace(planner, search=search, replan_every=replan_every or planner.replan_every)
 
 
 def find_films(out, rows):

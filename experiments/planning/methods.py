@@ -21,7 +21,7 @@ OPTIONS = {  # option: (field, value; None: the number behind it)
     'recursion': ('recursion', None), 'samples': ('samples', None),
     'carried': ('tracking', 'carried'), 'true_maps': ('maps', 'true'),
     'true_model': ('model', 'true'), 'more_search': ('search', 'more'),
-    'paper': ('search', 'paper'), 'plain_cost': ('cost', 'plain'),
+    'twice': ('search', 'twice'), 'paper': ('search', 'paper'), 'plain_cost': ('cost', 'plain'),
     'every': ('replan_every', None)}
 SUBGOALS_ONLY = ('switch', 'recursion', 'samples', 'maps')
 
@@ -40,8 +40,9 @@ class Method:
     :param tracking: 'ground_truth': object pixels from the simulator at every step; 'carried':
         only in the first picture, then followed by planning.tracking.
     :param model: 'learned' or 'true', the simulator itself.
-    :param search: 'preset'; 'more': samples, iterations and proposals of LARGE; 'paper': the
-        paper's planner, mpc_config.PAPER, whatever else is set.
+    :param search: 'preset'; 'twice': twice the samples, elites and proposals; 'more': samples,
+        iterations and proposals of LARGE; 'paper': the paper's planner, mpc_config.PAPER, whatever
+        else is set.
     :param cost: 'preset'; 'plain': the sum of distances alone, as in the paper, nothing that
         prefers to bring one object home before the next (VisualMPCConfig.unfinished).
     :param replan_every: see VisualMPCConfig; 0: as the preset has it.
@@ -84,6 +85,8 @@ class Method:
         """Return a VisualMPCConfig changed as this method wants it."""
         if self.search == 'paper':
             config = PAPER
+        if self.search == 'twice':
+            config = with_samples(config, 2 * config.search.num_samples)
         if self.search == 'more':
             config = replace(config, search=LARGE.search, proposals=LARGE.proposals,
                              batch_size=LARGE.batch_size)
@@ -94,6 +97,14 @@ class Method:
         if self.model == 'true':  # the simulator rolls out all samples by itself
             config = replace(config, batch_size=config.search.num_samples, threads=1)
         return config
+
+
+def with_samples(config, num_samples):
+    """Return a VisualMPCConfig with so many samples, elites and proposals in proportion."""
+    share = num_samples / config.search.num_samples
+    search = replace(config.search, num_samples=num_samples,
+                     num_elites=max(2, round(share * config.search.num_elites)))
+    return replace(config, search=search, proposals=int(share * config.proposals))
 
 
 DEFAULTS = {field.name: field.default for field in fields(Method)}

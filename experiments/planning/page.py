@@ -6,6 +6,7 @@ from functools import partial
 
 from experiments.pages import interval, number, render
 from experiments.paper.published import PLANNING_BOUNDS, TABLE_2
+from experiments.planning.claims import claims_table
 from experiments.planning.methods import BOUNDS
 import pandas as pd
 from tap_ros.planning.forward_scores import MOVED_PIXELS
@@ -17,7 +18,7 @@ PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward mod
          'search': 'the search', 'cost': 'its cost', 'tracking': 'object pixels',
          'switch': 'when to go on', 'recursion': 'number of subgoals',
          'samples': 'number of samples', 'replan_every': 'how often to plan'}
-FIRST = ('nothing', 'direct', 'fix', 'genmin')
+FIRST = ('nothing', 'direct', 'fix', 'genmin', 'genmin+progress', 'shipped')
 
 _interval = partial(interval, digits=1, form='{}{} [{}, {}]')
 
@@ -32,6 +33,7 @@ def make_page(rows, strips, maps=(), findings=''):
     :param findings: Markdown that a person wrote, to stand first.
     :return: Markdown.
     """
+    claims = claims_table(rows)
     rows = pd.DataFrame([{'compares': None, 'against': None, **row} for row in rows])
     maps = pd.DataFrame(maps)
     tasks = [{
@@ -40,7 +42,8 @@ def make_page(rows, strips, maps=(), findings=''):
         'strips': [(method, *strip) for (of, method), strip in strips.items() if of == task],
     } for task, own in rows.groupby('task', sort=False)]
     return render('planning/templates/planning.md.j2', tasks=tasks, findings=findings,
-                  commands=rows['command'].unique(), map_table=_maps(maps), moved=MOVED_PIXELS,
+                  claims=claims, commands=rows['command'].unique(), map_table=_maps(maps),
+                  moved=MOVED_PIXELS,
                   map_commands=[] if maps.empty else maps['command'].unique())
 
 
@@ -67,9 +70,13 @@ def _methods(task, rows):
         'minus fix, cm': _interval(of('final_distance_difference_cm', 'fix'), sign='+'),
         'all within 5 cm': percent(of('success_5cm'), after='%'),
         'minus direct, points': percent(of('success_5cm_difference', 'direct'), sign='+'),
+        'minus fix, points': percent(of('success_5cm_difference', 'fix'), sign='+'),
+        'minus direct with twice the samples, points': percent(
+            of('success_5cm_difference', 'direct, twice'), sign='+'),
         'steps': number(of('steps')['value'], 0),
         'ms a plan': number(of('plan_ms')['value'], 0),
-        'samples': search.mask(search.index == 'nothing'), 'scenes': final['n']})
+        'samples': search.mask(search.index == 'nothing'), 'scenes': final['n']}).dropna(
+            axis='columns', how='all')
 
 
 def _replaced(rows):

@@ -88,7 +88,8 @@ def comparable(compares, settings, others):
     :param settings: of one result; others: of the other.
     """
     same = all(settings[key] == others[key] for key in SAME)
-    if compares not in ('search', 'cost', 'replan_every'):  # which are settings of the planner
+    # These are settings of the planner.
+    if compares not in ('direct, twice', 'search', 'cost', 'replan_every'):
         same &= settings['planner'] == others['planner']
     bases = [parse_method(about['method']).base for about in (settings, others)]
     if bases[0] == bases[1]:
@@ -103,7 +104,8 @@ def partners(method, names):
     :param method: Method.
     :param names: of all methods that there are results of.
     :return: list of (what is compared, name of the other): 'direct' and 'fix' with the same
-        planner (fix with the same switch and recursion, too); for each option the method without
+        planner (fix with the same switch and recursion, too), direct with twice the samples; for
+        each option the method without
         it, under the name of Method's field; for true_subgoal every predictor, as 'subgoal'.
     """
     if method.base == 'nothing':
@@ -112,6 +114,8 @@ def partners(method, names):
     once = {field: DEFAULTS[field] for field in ('samples', 'maps')}
     found = [('direct', replace(method, base='direct', **plain)),
              ('fix', replace(method, base='fix', **once))]
+    if method.search == 'preset' and method.base != 'direct':
+        found.append(('direct, twice', replace(method, base='direct', search='twice', **plain)))
     found += [(field, replace(method, **{field: default})) for field, default in DEFAULTS.items()
               if field != 'base' and getattr(method, field) != default]
     if method.base == 'true_subgoal':

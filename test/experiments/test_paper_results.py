@@ -4,7 +4,7 @@
 
 import json
 
-from experiments.paper.names import best_of_name, method_order
+from experiments.paper.names import best_of_name, method_order, network_of, short_name
 from experiments.paper.results import (
     load_runs,
     on_same_recordings,
@@ -49,6 +49,7 @@ def test_seeds_are_averaged_and_do_not_count_as_episodes():
     both = [np.mean(first['min_l1']), np.mean(second['min_l1'])]
     assert row['value'] == pytest.approx(np.mean(both), abs=1e-6)
     assert (row['n'], row['seeds']) == (EPISODES, 2)
+    assert row['by_seed'] == pytest.approx(both, abs=1e-6)
     assert row['command'] == ('make push2-bidirectional-fix-s0 && '
                               'make push2-bidirectional-fix-s1')
 
@@ -112,12 +113,22 @@ def test_every_row_of_the_data_has_a_place_of_its_own():
 
 
 def test_variants_of_a_method_have_names_of_their_own(tmp_path):
-    run = made_run('genmin', scores(0.01)) | {'variant': '+root'}
+    run = made_run('genmin', scores(0.01)) | {'variant': '+skips'}
     save_runs(tmp_path, [run])
-    assert [run['method'] for run in load_runs(tmp_path / 'runs')] == ['genmin+root']
-    order = ['genmin', 'genmin+root', 'genmin+relative', 'genmin+relative+mean']
-    shuffled = [order[i] for i in (2, 0, 3, 1)]
+    assert [run['method'] for run in load_runs(tmp_path / 'runs')] == ['genmin+skips']
+    order = ['genmin', 'genmin+progress', 'fix-wo-gan+skips', 'genmin+skips',
+             'genmin+skips+margin', 'genmin+progress+skips']
+    shuffled = [order[i] for i in (2, 0, 3, 5, 1, 4)]
     assert sorted(shuffled, key=method_order) == order
+
+
+def test_names_tell_the_network():
+    assert [network_of(name) for name in ('genmin', 'genmin-wo-gan+progress', 'fix+skips',
+                                          'genmin+progress+skips+edge')] == [
+        '', '', '+skips', '+skips']
+    assert short_name('genmin-wo-gan+progress+skips') == 'genmin+progress'
+    assert short_name('genmin-wo-gan+progress+skips-r2') == 'genmin+progress-r2'
+    assert network_of('genmin+skips-r2') == '+skips'
 
 
 def test_copying_is_seen_as_beside_an_input():
@@ -179,12 +190,71 @@ def test_between_start_and_goal_copying_is_fixed_time_prediction_too():
     assert not find(rows_of(run('genmin', 0.01, 0.7)), metric=metric)  # without any fix
 
 
-def test_more_weight_on_changed_pixels_is_compared_with_fix_of_that_kind():
+def test_a_method_is_compared_with_fix_of_its_network():
     rows = rows_of(*(made_run(method, scores(l1)) for method, l1 in (
-        ('fix', 0.04), ('fix+changed', 0.02), ('genmin', 0.02), ('genmin+changed', 0.01))))
-    for method, baseline in (('genmin', 'fix'), ('genmin+changed', 'fix+changed')):
+        ('fix', 0.04), ('fix-wo-gan+skips', 0.02), ('genmin', 0.02), ('genmin-wo-gan', 0.01),
+        ('genmin-wo-gan+skips', 0.01), ('genmin-wo-gan+skips+margin', 0.015))))
+    for method, baseline, gain in (
+            ('genmin', 'fix', 0.5), ('genmin-wo-gan', 'fix', 0.75),
+            ('genmin-wo-gan+skips', 'fix-wo-gan+skips', 0.5),
+            ('genmin-wo-gan+skips+margin', 'fix-wo-gan+skips', 0.25)):
         row = find(rows, method=method, metric='gain_over_fix')
-        assert row['baseline'] == baseline and row['value'] == pytest.approx(0.5, abs=0.01)
+        assert row['baseline'] == baseline and row['value'] == pytest.approx(gain, abs=0.01)
+        row = find(rows, method=method, metric='gain_over_fix_at_match_step')
+        assert row is None or baseline in row['baseline'].split()
+
+
+def test_other_looks_have_rows_of_their_own():
+    placed = scores(0.01, bottleneck=[1.0] * 10 + [9.0] * 30)
+    copied = scores(0.01, bottleneck=[9.0] * 40)
+    shifted = {'arm_elsewhere': {'prediction': scores(0.02, bottleneck=[1.0] * 40),
+                                 'copy-goal': copied},
+               'push2_other_light': {'prediction': scores(0.03, bottleneck=[9.0] * 40),
+                                     'copy-goal': copied}}
+    rows = rows_of(made_run('genmin', placed, new_pixels=False, shifted=shifted))
+    assert [find(rows, task=task, method='genmin', metric='bottleneck_frequency_2px')['value']
+            for task in ('push2', 'push2_arm_elsewhere', 'push2_other_light')] == [0.25, 1, 0]
+    assert find(rows, task='push2_other_light', method='copy-goal', metric='min_l1')
+
+
+def levels(first, second, hand=1.0):
+    """Invent the scores of two levels of recursion from the objects' shares of their way."""
+    return {'recursion': [
+        {'way': way, 'hand': [hand] * EPISODES, 'objects': [1.0] * EPISODES}
+        for way in (first, second)]}
+
+
+def test_the_pick_is_counted_where_the_place_was_found():
+    first = [0.9] * 20 + [0.5] * 10 + [None] * 10
+    second = [0.1] * 15 + [0.6] * 5 + [0.0] * 20
+    rows = rows_of(made_run('genmin', scores(0.01), task='pick_place', **levels(first, second)))
+
+    def value(metric):
+        row = find(rows, method='genmin', metric=metric)
+        assert row['ci_low'] <= row['value'] <= row['ci_high']
+        return row['value']
+
+    assert value('place') == pytest.approx(20 / 30, abs=1e-6)
+    assert value('pick_after_place') == value('pick_after_place_shown') == 0.75
+    assert find(rows, method='genmin', metric='pick_after_place')['n'] == 20
+    unknown = levels(first, second)
+    unknown['recursion'][1]['hand'][:10] = [None] * 10
+    rows = rows_of(made_run('genmin', scores(0.01), task='pick_place', **unknown))
+    assert value('pick_after_place_shown') == 0.5 and value('pick_after_place') == 0.75
+    rows = rows_of(made_run('genmin', scores(0.01), task='pick_place',
+                            **levels(first, second, hand=0.4)))
+    assert value('pick_after_place') == 0.75 and value('pick_after_place_shown') == 0
+    rows = rows_of(made_run('genmin', scores(0.01), task='pick_place',
+                            **levels([0.5] * EPISODES, second)))
+    assert value('place') == 0 and not find(rows, metric='pick_after_place')
+
+
+def test_what_predictions_show_is_counted_where_it_is_known():
+    shown = scores(0.01) | {'hand': [0.9] * 30 + [None] * 10,
+                            'objects': [0.9] * 10 + [0.1] * 20 + [0.9] * 10}
+    row = find(rows_of(made_run('genmin', shown, task='grasp')), method='genmin',
+               metric='shows_both')
+    assert (row['value'], row['n']) == (pytest.approx(1 / 3, abs=1e-6), 30)
 
 
 def test_methods_stand_in_the_order_of_the_paper():

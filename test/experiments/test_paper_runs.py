@@ -5,77 +5,99 @@
 from dataclasses import asdict, replace
 import json
 
-from experiments.paper.runs import paper_runs, PaperRun, SCALES
+from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED
+from experiments.paper.runs import paper_runs, PaperRun, SCALES, SINGLE
 import pytest
-from sim_bridge.tasks import TASKS
 from tap_ros.errors import ConfigError
 
-EVERY = [run for scale in SCALES for run in paper_runs(scale, seeds=(0, 1))]
+EVERY = [run for scale in SCALES for run in paper_runs(scale)]
+MAIN = {'fix-wo-gan', 'min-wo-gan', 'genmin-wo-gan', 'genmin-wo-gan+progress'}
 
 
-def rows(task, mode, new_pixels):
+def rows(task, mode, new_pixels, variant='', seed=0):
     return {run.method for run in paper_runs('small') if run.recursion == 1 and (
-        run.task, run.mode, run.new_pixels, run.variant) == (task, mode, new_pixels, '')}
+        run.task, run.mode, run.new_pixels, run.variant, run.seed) == (
+            task, mode, new_pixels, variant, seed)}
 
 
-@pytest.mark.parametrize('task', ['grasp', 'pick_place', 'push2'])
-def test_table_1_is_complete(task):
+@pytest.mark.parametrize('task', SINGLE)
+def test_table_1_is_complete_with_the_papers_network_and_ours(task):
     assert {'fix', 'min', 'genmin', 'genmin-wo-gan', 'genmin-vae-gan'} <= rows(
         task, 'bidirectional', True)
+    for seed in (0, 1, 2):
+        assert MAIN <= rows(task, 'bidirectional', True, '+skips', seed)
+    assert 'genmin-vae' in rows(task, 'bidirectional', True, '+skips')
 
 
-def test_fig_4_and_the_bottleneck_figure_are_complete():
-    assert rows('grasp', 'forward', True) == {
+@pytest.mark.parametrize('task', ['push3', 'stack2'])
+def test_table_1_has_three_objects_and_stacks_too(task):
+    assert MAIN <= rows(task, 'bidirectional', True, '+skips')
+
+
+def test_fig_4_and_the_bottleneck_figures_are_complete():
+    assert rows('grasp', 'forward', True, '+skips') == {f'{name}-wo-gan' for name in (
         'fix0.25', 'fix0.50', 'fix0.75', 'fix1.00', 'min', 'genmin0.5', 'genmin2', 'genmin4',
-        'genmin7', 'genmin10', 'genmin30'}
-    assert {'fix', 'genmin', 'genmin+relative'} <= rows('push2', 'bidirectional', False)
+        'genmin7', 'genmin10', 'genmin30')}
+    for seed in (0, 1, 2):
+        assert MAIN <= rows('push2', 'bidirectional', False, '+skips', seed)
+    for timing in ('early', 'middle', 'late', 'mixed'):
+        assert rows(f'push2_{timing}', 'bidirectional', False, '+skips') == {
+            'genmin-wo-gan+progress', 'genmin-wo-gan', 'fix0.25-wo-gan', 'fix-wo-gan',
+            'fix0.75-wo-gan'}
 
 
 def test_every_run_can_be_trained_as_its_name_says():
     for run in EVERY:
         config = run.config('bags', 'runs/paper')
         assert config.chosen.name == run.method and config.mode == run.mode
-        assert config.seed == run.seed
-        assert (config.goal_picture == 'last') == (run.variant != '+mixed')
-        tasks = ('push2', 'push3') if run.task == 'push3' else (run.task,)
-        assert run.task in TASKS and config.recordings == tuple(f'bags/{t}' for t in tasks)
+        assert config.seed == run.seed and config.goal_picture == 'last'
+        assert config.outer_power == 1
+        assert config.recordings == (f'bags/{run.task}',)
         assert config.out == f'runs/paper/{run.scale}/{run.name}'
-        if 'relative' not in run.method and not run.variant:
-            assert (config.margin, config.outer_power) == (0, 1)
+        assert config.skips == (config.decoder == 'shared') == ('+skips' in run.variant)
+        if 'progress' not in run.method and 'margin' not in run.variant:
+            assert config.margin == 0
+
+
+def test_recordings_are_collected_as_their_names_say():
+    for name, recording in RECORDINGS.items():
+        config = recording.collection(7)
+        assert config.episodes == 7 and name.startswith(recording.task) and config.look == 'hand'
+        rest = name.removeprefix(recording.task).removeprefix('_')
+        assert {rest} <= {'', config.timing, config.appearance}
+        assert (config.timing, config.appearance).count(rest) == bool(rest)
+    for name in SHIFTED:  # scenes that nothing is trained on
+        seeds = RECORDINGS[name].options['seed']
+        assert seeds >= max(max(recording.episodes.values()) for recording in RECORDINGS.values())
+
+
+def test_about_as_many_episodes_of_each_recording_are_held_out():
+    for name, recording in RECORDINGS.items():
+        share = held_out_share(recording.episodes['small'])
+        assert 0.03 < share <= 0.2
+        assert name in SHIFTED or share * recording.episodes['small'] == pytest.approx(120)
 
 
 def test_names_are_unique_and_the_first_seed_comes_first():
     for scale in SCALES:
         runs = paper_runs(scale, seeds=(0, 1))
         assert len({run.name for run in runs}) == len(runs)
-        assert runs[:len(runs) // 2] == paper_runs(scale)
-        assert runs[0].name == 'push2-bidirectional-genmin+relative-warp-s0'
+        assert runs[:len(runs) // 2] == paper_runs(scale, seeds=(0,))
+        usual = paper_runs(scale)
+        assert sorted(run.seed for run in usual) == [run.seed for run in usual]
+        assert usual[:len(runs) // 2] == paper_runs(scale, seeds=(0,))
+        assert {run.seed for run in usual} == {0, 1, 2}
 
 
-def test_rows_of_a_task_and_mode_differ_in_the_method_only():
-    free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'outer_power', 'goal_picture',
-            'kl_weight', 'initial_weights'}  # and what +changed changes, for all rows with it
+def test_rows_of_a_task_and_mode_differ_in_the_method_and_network_only():
+    free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'progress_margin', 'kl_weight',
+            'seed', 'detach_recursion', 'decoder', 'skips', 'match_temperature', 'pretrain_steps'}
     for scale in SCALES:
         settings = {}
         for run in paper_runs(scale):
             values = {name: value for name, value in asdict(run.config('b', 'r')).items()
                       if name not in free}
-            assert settings.setdefault(
-                (run.task, run.mode, run.variant == '+changed'), values) == values
-
-
-def test_the_command_of_three_objects_makes_what_it_begins_with():
-    run = PaperRun('push3', 'bidirectional', 'fix', new_pixels=False)
-    assert run.before in paper_runs('small')
-    assert f'--only {run.before.name} {run.name}' in run.command
-
-
-def test_three_objects_are_trained_on_two_as_well_and_longer():
-    run = PaperRun('push3', 'bidirectional', 'fix', new_pixels=False)
-    assert run.config('bags', 'r').recordings == ('bags/push2', 'bags/push3')
-    assert run.num_steps == 3600 and replace(run, steps=7).num_steps == 7
-    full = replace(run, scale='full')
-    assert full.num_steps * 64 == 200 * 2 * 55000
+            assert settings.setdefault((run.task, run.mode), values) == values
 
 
 def test_full_has_the_papers_length():
@@ -89,8 +111,8 @@ def test_full_has_the_papers_length():
 def test_the_command_says_what_was_set():
     run = replace(paper_runs('small', episodes=40)[0], seed=2, steps=7)
     assert run.command == ('python -m tap_ros paper --scale small --only '
-                           'push2-bidirectional-genmin+relative-warp-s2 --seeds 2 --episodes 40 '
-                           '--steps 7')
+                           'push2-bidirectional-genmin-wo-gan+progress+skips-warp-s2 --seeds 2 '
+                           '--episodes 40 --steps 7')
     assert PaperRun(**json.loads(json.dumps(vars(run)))) == run
 
 

@@ -21,6 +21,8 @@ from experiments.paper.places import (
     Places,
     recording_hash,
 )
+from experiments.paper.recordings import held_out_share, SHIFTED
+from experiments.paper.recursion import way_behind
 from experiments.paper.runs import paper_runs, PaperRun, SCALES
 from experiments.paper.sweep import find_state, sweep
 from made_episodes import move_squares, write_bag
@@ -34,8 +36,7 @@ from tap_ros.options import parse
 from tap_ros.recording.cache import open_recordings
 
 ROOT = Path(__file__).parents[2]
-SEEDS = (122, 142, *range(6))  # the first two are held out
-SEEDS_3 = (12, 22, 32, *range(6, 9))  # of three objects the first three
+SEEDS = (122, 142, *range(4), 6, 8)  # the first two are held out
 EPISODES = len(SEEDS)
 RUN = PaperRun('push2', 'bidirectional', 'genmin-wo-gan', new_pixels=False, episodes=EPISODES,
                steps=2)
@@ -69,7 +70,8 @@ def small(monkeypatch):
 
 @pytest.fixture
 def places(tmp_path):
-    write_squares(tmp_path / 'bags' / 'push2', SEEDS)
+    for name in ('push2', *SHIFTED):
+        write_squares(tmp_path / 'bags' / name, SEEDS)
     return Places(*(str(tmp_path / name) for name in ('bags', 'runs', 'results')))
 
 
@@ -81,17 +83,22 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places, small):
     result = json.loads(places.result(RUN).read_text())
     assert result == state.result
     store = open_recordings([str(places.recording('push2'))])
-    held_out = len(split_episodes(store, 0.05)[1])
+    held_out = len(split_episodes(store, held_out_share(EPISODES))[1])
     assert held_out == 2
     assert result['data'] == {
-        'hash': store.data_hash, 'trained_on': store.data_hash, 'episodes': EPISODES - held_out,
-        'held_out': held_out, 'command': ''}
+        'hash': store.data_hash, 'episodes': EPISODES - held_out, 'held_out': held_out,
+        'shifted': {name: recording_hash(places.recording(name)) for name in SHIFTED},
+        'command': ''}
     scores = result['evaluation']
     assert (scores['margin'], scores['goal_picture']) == (0, 'last')
     for method in ('prediction', 'copy-start', 'copy-goal'):
         assert {name: len(values) for name, values in scores[method].items()} == dict.fromkeys(
             ('min_l1', 'match_step', 'match_fraction', 'changed_l1', 'bottleneck',
              'object_mass', 'hand', 'objects'), held_out)
+    for name, count in {'arm_elsewhere': held_out, **dict.fromkeys(SHIFTED, EPISODES)}.items():
+        for method in ('prediction', 'copy-goal'):
+            assert len(scores['shifted'][name][method]['min_l1']) == count
+    assert len(scores['bottleneck_at']) == held_out
     assert result['training']['steps'] == 2 and result['config']['method'] == RUN.method
     assert result['name'] == RUN.name and RUN.name in result['command']
 
@@ -116,6 +123,7 @@ def test_other_settings_or_recordings_are_not_done(places, tmp_path, small):
     path, data_hash = places.result(RUN), recording_hash(places.recording('push2'))
     assert find_state(replace(RUN, steps=3), places).kind == 'other'
     assert find_state(RUN, places, {'push2': 'of other recordings'}).kind == 'other'
+    assert find_state(RUN, places, {SHIFTED[0]: 'of other recordings'}).kind != 'done'
     # Elsewhere, without the weights or the recordings, the result alone says that it is done.
     elsewhere = replace(places, runs=str(tmp_path / 'none'), recordings=str(tmp_path / 'none'))
     assert find_state(RUN, elsewhere).kind == 'done'
@@ -193,43 +201,24 @@ def test_what_cannot_be_collected_fails_and_is_tried_once(places):
     assert 'other settings' in ends[0].reason
 
 
-def test_three_objects_begin_with_the_weights_for_two(places, small):
-    write_squares(Path(places.recordings) / 'push3', SEEDS_3)
-    run = replace(RUN, task='push3')
-    assert [(end.name, end.kind) for end in sweep([run], places, progress=False)] == [
-        (run.name, 'failed')]  # those are not trained
-    ends = sweep([run, run.before], places, progress=False)
-    assert [(end.name, end.kind) for end in ends] == [
-        (RUN.name, 'done'), (run.name, 'done')]
-    result = json.loads(places.result(run).read_text())
-    config, data = result['config'], result['data']
-    # trained on both, scored on their own
-    assert config['recordings'] == [str(places.recording(task)) for task in ('push2', 'push3')]
-    hashes = {task: recording_hash(places.recording(task)) for task in ('push2', 'push3')}
-    assert data['hash'] == hashes['push3'] and data['episodes'] == EPISODES - 2 + 3
-    assert data['held_out'] == len(result['evaluation']['prediction']['min_l1']) == 3
-    both = recording_hash(*(places.recording(task) for task in ('push2', 'push3')))
-    about = json.loads((run.folder(places.runs) / 'run.json').read_text())
-    assert about['data_hash'] == data['trained_on'] == both
-    assert find_state(run, places, hashes).kind == 'done'
-    assert find_state(run, places, {'push3': hashes['push3']}).kind == 'done'
-    kept = places.result(run).read_text()
-    places.result(run).unlink()
-    assert find_state(run, places, hashes).kind == 'partial'  # trained, not scored
-    places.result(run).write_text(kept)
-    write_squares(Path(places.recordings) / 'push2', SEEDS[1:])
-    assert find_state(run, places, hashes).kind == 'other'  # trained on another push2
-    assert config['initial_weights'] == str(RUN.folder(places.runs) / 'predictor.safetensors')
+def test_recursion_is_scored_where_the_network_paints(places, small):
+    painting = replace(RUN, new_pixels=True)
+    assert perform(RUN, places) == perform(painting, places) == DONE
+    assert 'recursion' not in find_state(RUN, places).result['evaluation']
+    scores = find_state(painting, places).result['evaluation']
+    first, second = scores['recursion']
+    assert first['min_l1'] == scores['prediction']['min_l1']
+    assert first['match_step'] == scores['prediction']['match_step']
+    assert len(second['way']) == 2 and second['min_l1'] != first['min_l1']
 
 
-def test_what_begins_with_a_run_that_failed_is_not_tried(tmp_path, small):
-    bags = tmp_path / 'bags'
-    write_squares(bags / 'push2', [0])  # one episode: none can be held out
-    write_squares(bags / 'push3', SEEDS_3)
-    run = replace(RUN, task='push3')
-    ends = sweep([run, run.before], Places(str(bags), str(tmp_path / 'runs'), str(
-        tmp_path / 'results')), progress=False)
-    assert [(end.name, end.kind) for end in ends] == [(run.before.name, 'failed')]
+def test_the_way_behind_is_a_share_of_what_moves():
+    pixels = np.zeros((5, 2, 2))
+    pixels[:, 0, 0] = [10, 10, 15, 25, 30]  # the other object stays
+    assert [way_behind(pixels, t) for t in range(5)] == [0, 0, 0.25, 0.75, 1]
+    pixels[3, 0, 0] = 35  # beyond the goal
+    assert way_behind(pixels, 3) == 1
+    assert np.isnan(way_behind(pixels[:2], 1)) and np.isnan(way_behind(pixels * np.nan, 1))
 
 
 @pytest.mark.slow

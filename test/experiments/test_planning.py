@@ -260,6 +260,11 @@ def test_options_change_the_planner():
     more = parse_method('direct:more_search').planner(SMALL)
     assert more == replace(SMALL, search=LARGE.search, proposals=80, batch_size=50)
     assert parse_method('fix:half:paper').planner(SMALL) == PAPER
+    twice = parse_method('direct:twice').planner(SMALL)
+    for name in ('num_samples', 'num_elites'):
+        assert getattr(twice.search, name) == 2 * getattr(SMALL.search, name)
+    assert twice.proposals == 2 * SMALL.proposals
+    assert twice.search.num_iterations == SMALL.search.num_iterations
     assert parse_method('direct:every3').planner(SMALL).replan_every == 3
     assert parse_method('direct:plain_cost').planner(SMALL) == replace(SMALL, unfinished=0)
     assert parse_method('direct').planner(SMALL) == SMALL

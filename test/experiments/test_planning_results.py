@@ -126,6 +126,10 @@ def test_methods_are_compared_in_the_same_planner():
     assert partners(parse_method('true_subgoal'), names)[2:] == [
         ('subgoal', 'fix'), ('subgoal', 'genmin')]
     assert compared('nothing') == {}
+    names.add('direct:twice')
+    assert compared('genmin')['direct, twice'] == 'direct:twice'
+    assert compared('direct:twice') == {'search': 'direct'}
+    assert 'direct, twice' not in {**compared('genmin:half:paper'), **compared('direct')}
 
 
 def test_results_of_other_settings_are_not_subtracted():
@@ -138,6 +142,26 @@ def test_results_of_other_settings_are_not_subtracted():
     assert any('against' in row for row in make_rows(results))
     results['push2', 'genmin'][0]['predictor_weights'] = 'others'
     assert not any('against' in row for row in make_rows(results))
+
+
+def test_claims_follow_the_numbers():
+    results = dict([stored('direct', [3.0, 4.0, 9.0]), stored('shipped', [2.0, 2.0, 3.0])])
+    rows = make_rows(results)
+    page = make_page(rows, {})
+
+    def cells(start):
+        line, = [line for line in page.splitlines() if line.startswith(f'| {start}')]
+        return [cell.strip() for cell in line.strip('|').split('|')]
+
+    assert cells('final distance via the subgoal, two')[1:] == [
+        '11.9 cm', 'at most 2.5 cm', '2.3 cm (2.0 to 3.0), 3 scenes', 'yes']
+    less = cells('the same, minus direct, two objects')
+    assert less[1] == '-1.0 cm' and less[3].startswith('-3.0 cm (') and less[4] == 'yes'
+    assert cells('final distance via the subgoal, three')[3:] == ['-', '*not run*']
+    ordered = [{**row, 'task': 'order2'} for row in rows]
+    page = make_page(ordered, {})
+    more = cells('success via the subgoal minus direct, two, one on')
+    assert more[3].startswith('+33 points (') and more[4] == 'no', 'the interval begins at 0'
 
 
 def test_the_page_shows_the_papers_numbers_beside_ours():

@@ -183,6 +183,7 @@ def fields(type_name):
             'goal_objects': few(objects(), {}) | likely_objects()}),
         'tap_msgs/srv/ResetScene': st.fixed_dictionaries({
             'task': texts(), 'seed': counts(UINT64), 'hide_arm': st.booleans()}),
+        'tap_msgs/srv/SetGoal': st.fixed_dictionaries({'objects': objects() | likely_objects()}),
         'tap_msgs/srv/StepScene': st.fixed_dictionaries({'num_periods': counts(UINT32)}),
         'std_srvs/srv/SetBool': st.fixed_dictionaries({'data': st.booleans()}),
         ACTION: st.fixed_dictionaries({

@@ -1,0 +1,60 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The table that the page begins with: the paper's claims and our targets beside our numbers."""
+
+from experiments.paper.published import TABLE_2
+import pandas as pd
+
+OURS = 'shipped'
+MOST_CM = {'push2': 2.5, 'push3': 3.0}  # via the subgoal
+POINTS = 0.2  # of success, more than direct and than fix
+_OBJECTS = {'push2': 'two objects', 'push3': 'three objects',
+            'order2': 'two, one on the goal of the other',
+            'order3': 'three, two on goals of others'}
+
+
+def claims_table(rows):
+    """
+    Compare every claim with what was measured.
+
+    :param rows: of results.make_rows.
+    :return: DataFrame of text: claim, paper, target, here, met.
+    """
+    lines = []
+
+    def find(task, method, metric, compares=None):
+        return next((row for row in rows if (row['task'], row['method'], row['metric'],
+                                             row.get('compares')) == (
+            task, method, metric, compares)), None)
+
+    for task in ('push2', 'push3'):
+        final = find(task, OURS, 'final_distance_cm')
+        less = find(task, OURS, 'final_distance_difference_cm', 'direct')
+        paper = TABLE_2[task, 'genmin'][0], TABLE_2[task, 'direct'][0]
+        lines.append((
+            f'final distance via the subgoal, {_OBJECTS[task]}', f'{paper[0]} cm',
+            f'at most {MOST_CM[task]} cm', final and _text(final, 1, ' cm'),
+            _met(final and final['value'] <= MOST_CM[task])))
+        lines.append((
+            f'the same, minus direct, {_OBJECTS[task]}', f'{paper[0] - paper[1]:.1f} cm',
+            'interval below 0', less and _text(less, 1, ' cm', '+'),
+            _met(less and less['ci_high'] < 0)))
+    for task in ('order2', 'order3'):
+        for other, name in (('direct', 'direct'), ('fix', 'via the subgoal of `fix`')):
+            more = find(task, OURS, 'success_5cm_difference', other)
+            lines.append((
+                f'success via the subgoal minus {name}, {_OBJECTS[task]}', '',
+                f'at least {100 * POINTS:.0f} points, interval above 0',
+                more and _text(more, 0, ' points', '+', 100),
+                _met(more and more['value'] >= POINTS and more['ci_low'] > 0)))
+    return pd.DataFrame(lines, columns=['claim', 'paper', 'target', 'here', 'met'])
+
+
+def _text(row, digits, after, sign='', unit=1):
+    value, low, high = (f'{unit * row[name]:{sign}.{digits}f}'
+                        for name in ('value', 'ci_low', 'ci_high'))
+    return f'{value}{after} ({low} to {high}), {row["n"]} scenes'
+
+
+def _met(is_met):
+    return {None: '*not run*', True: 'yes', False: 'no'}[is_met]
