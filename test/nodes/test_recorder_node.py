@@ -72,6 +72,17 @@ def finish(client, success=True):
     return answer.message
 
 
+def size_when_written(path, at_least, give_up_after=60):
+    """Wait until a file has so many bytes and grows no more; return how many it has."""
+    sizes = [0, 0]
+    for _ in range(give_up_after):
+        if sizes[-1] == sizes[-2] >= at_least:
+            return sizes[-1]
+        sleep(1.0)  # it is flushed every half second
+        sizes.append(path.stat().st_size)
+    raise AssertionError(f'{path} has {sizes[-1]} bytes')
+
+
 def random_image(stamp):
     rng = np.random.default_rng(stamp)
     return encode_image(rng.integers(0, 256, (32, 32, 3), np.uint8), to_stamp(stamp), 'camera')
@@ -167,9 +178,8 @@ def test_a_bag_that_cannot_be_finished_is_a_failure(client, record, tmp_path):
     for stamp in range(1, 9):  # no more than the publisher keeps
         images.publish(random_image(stamp))
     arrived(images)
-    sleep(1.5)  # it is flushed every half second
     path, = (tmp_path / 'bag').glob('*.mcap')
-    room = path.stat().st_size + 100
+    room = size_when_written(path, 8 * 32 * 32 * 3) + 100
     resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (room, 2 * room))
     assert 'could not be finished' in finish(client, success=False)
     with warnings.catch_warnings(action='ignore'):  # that it was not finished
@@ -181,7 +191,6 @@ def test_a_bag_that_cannot_be_finished_is_a_failure(client, record, tmp_path):
     for stamp in range(1, 9):  # no more than the publisher keeps
         images.publish(random_image(stamp))
     arrived(images)
-    sleep(1.5)
     assert process.end() == 1, process.text
     assert 'Traceback' not in process.text
 
