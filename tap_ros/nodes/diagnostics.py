@@ -48,19 +48,22 @@ class Diagnostics:
     """
     Publishes the state of a node's work and inputs; its methods may be called from any thread.
 
-    Of the work: WARN never, ERROR for some seconds after an error, else OK. Of each input:
-    NotReceived (WARN), Stale (STALE) when its newest message is older than its `max_age_s`, or OK.
+    Of the work: ERROR for some seconds after an error, else WARN while `idle` says why, else OK.
+    Of each input: NotReceived (WARN), Stale (STALE) when its newest message is older than its
+    `max_age_s`, or OK.
 
     :param node: rclpy Node.
     :param inputs: {topic: max_age_s}; names as the node subscribes to them; math.inf for topics
         on which nothing may come for long.
     :param queue: called without arguments, returns how many requests wait; None for no queue.
+    :param idle: called without arguments, returns why the node does not work, '' if it does.
     """
 
     def __init__(self, node: 'Node', inputs: Mapping[str, float],
-                 queue: Callable[[], int] | None = None) -> None:
+                 queue: Callable[[], int] | None = None,
+                 idle: Callable[[], str] = lambda: '') -> None:
         self._node = node
-        self._queue = queue
+        self._queue, self._idle = queue, idle
         self._lock = threading.Lock()
         self._inputs = {node.resolve_topic_name(topic): Input(max_age_s)
                         for topic, max_age_s in inputs.items()}
@@ -133,6 +136,9 @@ class Diagnostics:
             if age < ERROR_SECONDS:
                 return self._status(
                     'service', DiagnosticStatus.ERROR, self._last_error, values)
+        idle = self._idle()
+        if idle:
+            return self._status('service', DiagnosticStatus.WARN, idle, values)
         return self._status('service', DiagnosticStatus.OK, 'OK', values)
 
     def _describe_input(self, topic: str, source: Input, now: float) -> DiagnosticStatus:

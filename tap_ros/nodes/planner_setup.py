@@ -16,6 +16,7 @@ from tap_ros.contract import (
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.arm_joints import declare_mount, declare_opening
 from tap_ros.nodes.camera_topic import declare_transport
+from tap_ros.nodes.managed import declare_autostart
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.forward_model import ForwardModel
@@ -38,8 +39,10 @@ MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two 
 def declare_parameters(node: 'Node') -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
+    declare_autostart(parameters)
     parameters.declare('weights', str(FORWARD_MODEL),
-                       'File of weights (.safetensors) of a forward model.')
+                       'File of weights (.safetensors) of a forward model. Can be changed while '
+                       'the node is inactive.', read_only=False)
     parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
                        choices=['cpu', 'cuda'])
     parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
@@ -98,10 +101,13 @@ def declare_parameters(node: 'Node') -> Parameters:
     return parameters
 
 
-def load_planner(parameters: Parameters) -> VisualMPC:
+def load_planner(parameters: Parameters, weights: str) -> VisualMPC:
     """
     Load weights, and plan once, so that the first command comes as fast as the others.
 
+    :param parameters: of the node.
+    :param weights: file of a forward model.
+    :return: VisualMPC.
     :raises WeightsError: when the file cannot be used.
     :raises ConfigError: when the device is not there.
     """
@@ -109,7 +115,7 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     config = with_preset(
         parameters['preset'],
         arm_hidden=parameters['arm_hidden'] or parameters['robot_mask'] == 'all')
-    mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
+    mpc = VisualMPC.load(weights, config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
     mpc.plan(Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels),

@@ -3,7 +3,8 @@
 """Serves predict_subgoal: decode, predict what waits together, encode."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 import math
 import os
 import sys
@@ -13,14 +14,14 @@ import traceback
 from typing import Any, TYPE_CHECKING
 
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.errors import TapError
+from tap_ros.errors import ConfigError, TapError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.late_answers import create_late_service, take_waiting
+from tap_ros.nodes.managed import ManagedNode
 from tap_ros.nodes.predictor_requests import encode_answer, request_topics, RequestReader, Task
 from tap_ros.nodes.predictor_setup import (
     declare_parameters,
@@ -38,8 +39,10 @@ from tap_ros.text import escaped
 
 if TYPE_CHECKING:
     from tap_ros.prediction.predictor import Subgoal as PredictedSubgoal
+    from tap_ros.prediction.predictor import SubgoalPredictor
 
 Found = tuple[list['PredictedSubgoal'], float]  # of one request, and ms that the network took
+Predictors = dict[str, 'SubgoalPredictor']  # by mode
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 SHOW_PERIOD = 0.1  # s between two looks for a subgoal to publish
@@ -47,24 +50,28 @@ STALE_S = 2.0  # diagnostics call an input stale that has been silent for so lon
 CLOSE_TIMEOUT = 5.0  # s that the batch in progress has to end
 
 
-class PredictorNode(Node):
+class PredictorNode(ManagedNode):
     """
     Offers the service only once the weights are loaded, checked and warmed up.
 
-    The executor takes and checks the requests; one thread predicts what waits together, and sends
-    the answers.
+    Without autostart it offers the service at once, and refuses requests until it is active. The
+    executor takes and checks the requests; one thread predicts what waits together, and sends the
+    answers.
     """
+
+    reloaded = 'weights', 'forward_weights'
 
     def __init__(self) -> None:
         super().__init__('predictor_node')
         self.params = declare_parameters(self)
-        self._queue = RequestQueue(
-            self._load, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
+        self._queue: RequestQueue[Task, Found] | None = None
+        self._predictors: Predictors = {}
+        self.autostart('configure')
         topics = request_topics(self.params)
         self._diagnostics = Diagnostics(self, {
             **dict.fromkeys((name for _, name in topics['start'].values()), STALE_S),
             **dict.fromkeys((name for _, name in topics['goal'].values()), math.inf)},
-            queue=lambda: len(self._queue))
+            queue=lambda: len(self._queue or ()), idle=self.why_not)
         self._reader = RequestReader(
             self, self.params, self._predictors, self._diagnostics.received)
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
@@ -77,20 +84,54 @@ class PredictorNode(Node):
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._service = create_late_service(
             self, PredictSubgoal, 'predict_subgoal', self._on_request)
-        sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
-                 for mode, predictor in self._predictors.items()]
-        files = [path for path in (self.params['weights'], self.params['forward_weights']) if path]
-        unlike = unlike_training(self._predictors, self.params['robot_mask'])
-        if unlike:
-            self.get_logger().warning(unlike)
-        self.get_logger().info(
-            f'ready: {", ".join(sizes)}, {self.params["device"]}, {", ".join(files)}')
+        self.autostart('activate')
 
     def close(self) -> None:
         """Answer all that wait, and let the batch in progress end."""
-        self._queue.close(CLOSE_TIMEOUT)
+        if self._queue is not None:
+            self._queue.close(CLOSE_TIMEOUT)
         take_waiting(self._service)  # they are told that the node is ending
         self._show()
+
+    # Weights
+
+    def load(self, changed: Mapping[str, Any]) -> tuple['RequestQueue[Task, Found]', Predictors]:
+        """Load weights; return what answers with them."""
+        weights, forward = (
+            changed.get(name, self.params[name]) for name in ('weights', 'forward_weights'))
+        predictors: Predictors = {}
+
+        def prepare() -> Callable[[list[Task]], list[Found]]:
+            # Here, since OpenMP is slow where two threads have begun parallel work on few cores.
+            predictors.update(load_predictors(weights, forward, self.params['device']))
+            return partial(predict, predictors)
+
+        queue = RequestQueue(
+            prepare, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
+        return queue, predictors
+
+    def use(self, loaded: tuple['RequestQueue[Task, Found]', Predictors]) -> None:
+        """Answer with other weights."""
+        self.unload()
+        self._queue, predictors = loaded
+        self._predictors.update(predictors)
+        unlike = unlike_training(self._predictors, self.params['robot_mask'])
+        if unlike:
+            self.get_logger().warning(unlike)
+
+    def unload(self) -> None:
+        """Let the weights go, once the batch in progress has ended."""
+        if self._queue is not None:
+            self._queue.close(CLOSE_TIMEOUT)
+        self._queue = None
+        self._predictors.clear()
+
+    def described(self) -> str:
+        """Name the modes, the sizes of pictures, the device and the files."""
+        sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
+                 for mode, predictor in self._predictors.items()]
+        files = [path for path in (self.params['weights'], self.params['forward_weights']) if path]
+        return f'{", ".join(sizes)}, {self.params["device"]}, {", ".join(files)}'
 
     # In the executor: what comes, and what people see
 
@@ -98,6 +139,8 @@ class PredictorNode(Node):
         """Check a request, and let it wait or refuse it."""
         begin = time.perf_counter()
         try:
+            if not self.active or self._queue is None:
+                raise ConfigError(self.why_not())
             task = self._reader.read(request)
             self._queue.put(task, lambda found: self._answer(task, found, send, begin))
         except Exception as error:
@@ -124,27 +167,6 @@ class PredictorNode(Node):
             self._log_unexpected(error, 'subgoal')
 
     # In the thread of the queue
-
-    def _load(self) -> Callable[[list[Task]], list[Found]]:
-        """Load the weights; return what predicts."""
-        # Here, since OpenMP is slow where two threads have begun parallel work on few cores.
-        self._predictors = load_predictors(
-            self.params['weights'], self.params['forward_weights'], self.params['device'])
-        return self._predict
-
-    def _predict(self, tasks: list[Task]) -> list[Found]:
-        """Predict Tasks together; return (subgoals, ms that the network took) for each."""
-        answers: list[Found] = [([], 0.0)] * len(tasks)
-        for mode, predictor in self._predictors.items():
-            chosen = [index for index, task in enumerate(tasks) if task.mode == mode]
-            if not chosen:
-                continue
-            begin = time.perf_counter()
-            found = predictor.predict_together([tasks[index].question for index in chosen])
-            elapsed_ms = (time.perf_counter() - begin) * 1e3
-            for index, subgoals in zip(chosen, found):
-                answers[index] = subgoals, elapsed_ms
-        return answers
 
     def _answer(self, task: Task, found: Found | Exception, send: Callable[[Any], object],
                 begin: float) -> None:
@@ -188,6 +210,27 @@ class PredictorNode(Node):
         except Exception as error:
             self.get_logger().error(
                 f'predict_subgoal: an answer cannot be sent: {escaped(error)}')
+
+
+def predict(predictors: Predictors, tasks: list[Task]) -> list[Found]:
+    """
+    Predict Tasks together.
+
+    :param predictors: {mode: SubgoalPredictor}, with every mode of the tasks.
+    :param tasks: N Tasks.
+    :return: N times (subgoals, ms that the network took).
+    """
+    answers: list[Found] = [([], 0.0)] * len(tasks)
+    for mode, predictor in predictors.items():
+        chosen = [index for index, task in enumerate(tasks) if task.mode == mode]
+        if not chosen:
+            continue
+        begin = time.perf_counter()
+        found = predictor.predict_together([tasks[index].question for index in chosen])
+        elapsed_ms = (time.perf_counter() - begin) * 1e3
+        for index, subgoals in zip(chosen, found):
+            answers[index] = subgoals, elapsed_ms
+    return answers
 
 
 def main(args: list[str] | None = None) -> int:

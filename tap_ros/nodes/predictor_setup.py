@@ -9,6 +9,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.learning.robot_mask import trained_robot_mask
 from tap_ros.nodes.camera_topic import declare_transport
 from tap_ros.nodes.image_messages import is_empty
+from tap_ros.nodes.managed import declare_autostart
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.prediction.methods import MODES
@@ -36,14 +37,17 @@ HOW_TO_GET = {  # weights for each mode
 def declare_parameters(node: 'Node') -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
+    declare_autostart(parameters)
     shipped = ', '.join(PREDICTORS)
     parameters.declare('weights', DEFAULT_PREDICTOR,
                        f'Weights of a subgoal predictor: shipped ones ({shipped}), or a file '
                        '(.safetensors); what they were trained for, bidirectional or forward, is '
-                       'what the node can.')
+                       'what the node can. Can be changed while the node is inactive.',
+                       read_only=False)
     parameters.declare('forward_weights', '',
                        'Weights of a forward predictor, if the node shall answer forward '
-                       'requests beside bidirectional ones; empty: none.')
+                       'requests beside bidirectional ones; empty: none. Likewise.',
+                       read_only=False)
     parameters.declare('device', 'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
                        choices=['cpu', 'cuda'])
     parameters.declare('resize_images', False,

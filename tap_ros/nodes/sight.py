@@ -46,17 +46,18 @@ class Sight:
 
     :param node: rclpy Node.
     :param params: its Parameters.
-    :param crop: TrainedCrop: what the planner makes of pictures, and the size that they get.
+    :param crop: returns the TrainedCrop: what the planner makes of pictures, and the size that
+        they get.
     :param on_message: called with the topic name after each message.
     :ivar sensors: Observations.
     :ivar robot: RobotView.
     :ivar messages: {topic: message} that the newest Seen was decoded from.
     """
 
-    def __init__(self, node: 'Node', params: 'Parameters', crop: TrainedCrop,
+    def __init__(self, node: 'Node', params: 'Parameters', crop: Callable[[], TrainedCrop],
                  on_message: Callable[[str], object]) -> None:
-        self._node, self._params, self._crop = node, params, crop
-        self._camera_size = crop.size
+        self._node, self._params, self._crop_now = node, params, crop
+        self._camera_size: tuple[int, int] | None = None
         self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
         self.robot = RobotView(params['robot_mask'])
         self._types = sensor_topics(params)
@@ -68,6 +69,11 @@ class Sight:
         self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
                                others={'joints': self._on_joints})
         subscribe(node, Episode, 'episode', self._on_episode, STREAM)
+
+    @property
+    def _crop(self) -> TrainedCrop:
+        """Return what the planner makes of pictures now."""
+        return self._crop_now()
 
     def topics(self, objects: bool = True) -> tuple[str, ...]:
         """Return the names of what is looked at, with or without the objects."""
@@ -156,7 +162,8 @@ class Sight:
         :raises TapError: see object_messages.decode_objects; also outside of the part that is
             used.
         """
-        size = self._camera_size if picture is None else (picture.height, picture.width)
+        size = (self._camera_size or self._crop.size if picture is None
+                else (picture.height, picture.width))
         return decode_cut_objects(message, name, size, self._crop.of(size, name))
 
     def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:

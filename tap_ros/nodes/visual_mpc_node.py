@@ -3,7 +3,8 @@
 """Serves reach_goal: drives planning.reach by what is seen, and sends its commands."""
 
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from contextlib import suppress
 import math
 import sys
 import threading
@@ -14,7 +15,6 @@ from typing import Any, cast, TYPE_CHECKING
 import numpy as np
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused, ObjectStates
@@ -27,6 +27,7 @@ from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.goal_source import goal_topics, GoalSource, needed_topics
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.image_messages import encode_image, is_empty
+from tap_ros.nodes.managed import ManagedNode
 from tap_ros.nodes.object_messages import encode_objects, match_objects
 from tap_ros.nodes.plan_markers import encode_plan
 from tap_ros.nodes.planner_setup import (
@@ -53,38 +54,43 @@ if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
     from tap_ros.planning.hierarchy import Target
     from tap_ros.planning.reach import Seen
+    from tap_ros.planning.visual_mpc import VisualMPC
     from tap_ros.prediction.predictor import Subgoal
 
 STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
 
 
 class Cancelled(TapError):
-    """The goal was cancelled, or the node is ending."""
+    """The goal was cancelled, or the node is ending or not active any more."""
 
 
-class VisualMpcNode(Node):
+class VisualMpcNode(ManagedNode):
     """
     Executes one goal at a time, in a thread of the executor that callbacks do not need.
 
     A second goal is rejected meanwhile. Whatever the way a goal ends, the last command is zero.
+    While the node is not active, goals are aborted with the reason.
     """
+
+    reloaded = 'weights',
+    _mpc: 'VisualMPC'  # while configured
 
     def __init__(self) -> None:
         super().__init__('visual_mpc_node')
         self.params = declare_parameters(self)
-        self._mpc = load_planner(self.params)
-        self._ending = False
+        self._halt = ''  # why no goal may go on
         self._cancelled: ServerGoalHandle | None = None  # the goal that was cancelled last
         self._busy = threading.Lock()  # held while a goal is executed
         self._refusals: deque[tuple[int, str]] = deque(maxlen=10)
+        self.autostart('configure')
         robot_mask = self.params['robot_mask']
-        assert isinstance(self._mpc.model, ForwardModel)
         self._diagnostics = Diagnostics(self, {
             **dict.fromkeys((name for _, name in sensor_topics(self.params).values()), STALE_S),
-            **dict.fromkeys((name for _, name in goal_topics(robot_mask).values()), math.inf)})
+            **dict.fromkeys((name for _, name in goal_topics(robot_mask).values()), math.inf)},
+            idle=self.why_not)
         heard = self._diagnostics.received
         self._goal = GoalSource(self, robot_mask, heard)
-        self._sight = Sight(self, self.params, self._mpc.model.camera_crop, heard)
+        self._sight = Sight(self, self.params, lambda: self._model.camera_crop, heard)
         self._sensors = self._sight.sensors
         self._arm = Arm(self, self.params, self._sensors)
         subscribe(self, CommandRefused, 'arm/refused', self._on_refused, STREAM)
@@ -97,23 +103,63 @@ class VisualMpcNode(Node):
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
             goal_callback=self._on_goal, cancel_callback=self._on_cancel)
-        unlike = unlike_training(self._mpc, robot_mask)
-        if unlike:
-            self.get_logger().warning(unlike)
-        self.get_logger().info(f'ready: {self.params["device"]}, {self.params["weights"]}')
+        self.autostart('activate')
 
     def close(self) -> None:
         """End the goal in progress, and see that the command to stop has left."""
-        self._ending = True
+        self.active = False
+        self._end_goal('the node is ending')
+        self._arm.close(1.0)
+
+    # Weights
+
+    def load(self, changed: Mapping[str, Any]) -> 'VisualMPC':
+        """Load weights; return what plans with them."""
+        return load_planner(self.params, changed.get('weights', self.params['weights']))
+
+    def use(self, loaded: 'VisualMPC') -> None:
+        """Plan with other weights."""
+        self._mpc = loaded
+        unlike = unlike_training(loaded, self.params['robot_mask'])
+        if unlike:
+            self.get_logger().warning(unlike)
+
+    def unload(self) -> None:
+        """Let the weights go."""
+        with suppress(AttributeError):  # where there are none
+            del self._mpc
+
+    def described(self) -> str:
+        """Name the device and the file."""
+        return f'{self.params["device"]}, {self.params["weights"]}'
+
+    def resume(self) -> None:
+        """Serve goals again, once the last one has ended."""
+        if self._busy.locked():
+            raise PlanningError('the last goal has not ended yet; activate the node again')
+        self._halt = ''
+
+    def pause(self) -> None:
+        """Stop the arm at once, and let the goal in progress end."""
+        self._end_goal('the node was deactivated')
+
+    def _end_goal(self, reason: str) -> None:
+        """Let no goal go on; wait for the one in progress."""
+        self._halt = reason
         self._arm.end()
         self._sensors.wake()
-        self._busy.acquire(timeout=10.0)  # longer than a plan takes
-        self._arm.close(1.0)
+        if self._busy.acquire(timeout=10.0):  # longer than a plan takes
+            self._busy.release()
+
+    @property
+    def _model(self) -> ForwardModel:
+        """Return the forward model of the weights."""
+        return cast(ForwardModel, self._mpc.model)  # as load_planner has loaded it
 
     # Callbacks
 
     def _on_goal(self, _: ReachGoal.Goal) -> GoalResponse:
-        if self._ending or self._busy.locked():
+        if self._busy.locked():
             self.get_logger().warning(
                 'reach_goal rejected: another goal is in progress; cancel it or wait for its end')
             return GoalResponse.REJECT
@@ -132,6 +178,11 @@ class VisualMpcNode(Node):
     def _execute(self, handle: 'ServerGoalHandle') -> ReachGoal.Result:
         """Run a goal to its end; runs in a thread of the executor."""
         result = ReachGoal.Result()
+        if not self.active:
+            result.message = self.why_not()
+            self.get_logger().warning(f'reach_goal refused: {result.message}')
+            handle.abort()
+            return result
         if not self._busy.acquire(blocking=False):  # two were accepted at the same time
             result.message = 'another goal is in progress; cancel it or wait for its end'
             handle.abort()
@@ -220,16 +271,14 @@ class VisualMpcNode(Node):
         if self._markers.get_subscription_count():
             self._markers.publish(encode_plan(plan, seen.gripper, stamp, WORLD_FRAME))
         if self._overlay.get_subscription_count():
-            learned = cast(ForwardModel, self._mpc.model)
-            picture = draw_plan(seen.image, learned.config, plan, seen.gripper, target.pixels)
+            picture = draw_plan(seen.image, self._model.config, plan, seen.gripper, target.pixels)
             frame_id = self._sight.messages['image'].header.frame_id
             self._overlay.publish(encode_image(picture, stamp, frame_id))
 
     def _config(self, request: ReachGoal.Goal) -> ReachConfig:
         """Return the settings of a goal."""
         params = self.params
-        learned = cast(ForwardModel, self._mpc.model)  # as load_planner has loaded it
-        follower = learned if params['tracking'] == 'carried' else None
+        follower = self._model if params['tracking'] == 'carried' else None
         limits = Limits(params['max_step_xy'], params['max_step_z'])
         return ReachConfig(request.step_budget, params['switch'], params['goal_tolerance'],
                            follower, limits, params['max_age'], params['image_timeout'])
@@ -237,12 +286,12 @@ class VisualMpcNode(Node):
     def _is_cancelled(self, handle: 'ServerGoalHandle') -> bool:
         return self._cancelled is handle or handle.is_cancel_requested
 
-    def _cancelled_or_ending(self, handle: 'ServerGoalHandle') -> bool:
-        return self._is_cancelled(handle) or self._ending
+    def _has_to_end(self, handle: 'ServerGoalHandle') -> bool:
+        return self._is_cancelled(handle) or bool(self._halt)
 
     def _go_on(self, handle: 'ServerGoalHandle') -> None:
-        if self._cancelled_or_ending(handle):
-            raise Cancelled('cancelled' if self._is_cancelled(handle) else 'the node is ending')
+        if self._has_to_end(handle):
+            raise Cancelled('cancelled' if self._is_cancelled(handle) else self._halt)
 
     # Where to go
 
@@ -254,7 +303,7 @@ class VisualMpcNode(Node):
                                 'their pixels')
         request = handle.request
         goal = self._goal.take(request, self.params['image_timeout'],
-                               lambda: self._cancelled_or_ending(handle))
+                               lambda: self._has_to_end(handle))
         self._go_on(handle)
         names, pixels = self._sight.decode_positions(
             goal['objects'], 'goal_objects', None if is_empty(goal['image']) else goal['image'])
@@ -293,7 +342,7 @@ class VisualMpcNode(Node):
         try:
             response = call(
                 self._predict, request, self.params['predictor_timeout'],
-                lambda: self._cancelled_or_ending(handle), self._predictor)
+                lambda: self._has_to_end(handle), self._predictor)
         except CallError:
             self._go_on(handle)
             raise

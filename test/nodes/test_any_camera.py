@@ -223,7 +223,7 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
     with Client('planner', parameter_overrides=[
             Parameter('image_transport', value=transport)]) as node:
         params = declare_parameters(node)
-        sight = Sight(node, params, crop, lambda name: None)
+        sight = Sight(node, params, lambda: crop, lambda name: None)
         message = jpeg(START) if transport == 'compressed' else encode_image(START, STAMP, 'eye')
         name = sight._types['image'][1]
         objects = encode_objects(('cup', 'box'), PIXELS, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP,
