@@ -55,6 +55,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'training': ('speed of training the predictor', 'experiments.bench.training'),
         'planning': ('time of a plan', 'experiments.bench.planning'),
         'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
+        'growth': ('how times grow with the work, as curves', 'experiments.bench.growth'),
     }),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),

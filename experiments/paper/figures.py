@@ -52,7 +52,8 @@ def family(method):
     return next(name for name in ('fix', 'min', 'genmin') if method.startswith(name))
 
 
-def _new_figure(height, columns, rows=1, **options):
+def new_figure(height, columns, rows=1, **options):
+    """Return an empty figure of this height in inches, and its axes (rows, columns)."""
     figure = Figure(figsize=(_WIDTH, height), layout='constrained')
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     for axis in axes.flat:
@@ -65,7 +66,7 @@ def _new_figure(height, columns, rows=1, **options):
     return figure, axes
 
 
-def _png(figure):
+def to_png(figure):
     """Return a figure as bytes that depend on nothing but what it shows."""
     stream = io.BytesIO()
     figure.savefig(stream, format='png', dpi=110, metadata={'Software': None})
@@ -112,13 +113,13 @@ def forward_scatter(rows, task='grasp'):
     if task == 'grasp':
         panels.append(("the authors'", {
             name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
-    figure, axes = _new_figure(3.9, len(panels))
+    figure, axes = new_figure(3.9, len(panels))
     for axis, (title, points) in zip(axes[0], panels):
         _scatter(axis, points, EPISODE_FRAMES[task])
         axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
         axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
     axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)
-    return _png(figure)
+    return to_png(figure)
 
 
 def _scatter(axis, points, frames):
@@ -167,7 +168,7 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
                       if name in COPIES or variant_of(name) in ('', OURS)), key=method_order)
     if not set(methods) - set(COPIES):
         return None
-    figure, axes = _new_figure(4.2, 2, sharey=True)
+    figure, axes = new_figure(4.2, 2, sharey=True)
     styles = _line_styles(methods)
     for axis, prefix, title in zip(axes[0], ('', 'visible_'), (
             ': bottleneck frequency', ', no object left out')):
@@ -200,7 +201,7 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
                   clip_on=False)
         axis.annotate(method, (10.9, y), fontsize=8.5, color=colour, va='center',
                       annotation_clip=False)
-    return _png(figure)
+    return to_png(figure)
 
 
 def timing(rows):
@@ -219,7 +220,7 @@ def timing(rows):
                 (at, *(100 * row[name] for name in ('value', 'ci_low', 'ci_high'))))
     if not found:
         return None
-    figure, axes = _new_figure(3.8, 1)
+    figure, axes = new_figure(3.8, 1)
     axis, methods = axes[0, 0], sorted(found, key=method_order)
     styles = _line_styles(methods)
     for n, method in enumerate(methods):
@@ -243,7 +244,7 @@ def timing(rows):
     axis.set_ylabel('bottlenecks at 2 px, %', fontsize=9, color=_INK)
     axis.set_title('Pushing two objects: whether the time has to be known', fontsize=10,
                    loc='left', color=_INK)
-    return _png(figure)
+    return to_png(figure)
 
 
 def _line_styles(methods):
@@ -273,7 +274,7 @@ def gains(rows):
         return None
     tasks = [task for task in TITLES if task in set(chosen['task'])]
     methods = sorted(set(chosen['method']), key=method_order)
-    figure, axes = _new_figure(1.3 + 0.27 * len(methods), len(tasks), sharey=True)
+    figure, axes = new_figure(1.3 + 0.27 * len(methods), len(tasks), sharey=True)
     for axis, task in zip(axes[0], tasks):
         axis.axvline(0, color='#a0a0a0', linewidth=1)
         for y, method in enumerate(methods):
@@ -296,7 +297,7 @@ def gains(rows):
         axis.grid(color='#f0f0f0')
     for label, method in zip(axes[0, 0].get_yticklabels(), methods):
         label.set_color(COLOURS[family(method)])
-    return _png(figure)
+    return to_png(figure)
 
 
 def match_histograms(groups):
@@ -314,7 +315,7 @@ def match_histograms(groups):
         return None
     tasks = [task for task in TITLES if any(group.key['task'] == task for group in shown)]
     methods = sorted({group.key['method'] for group in shown}, key=method_order)
-    figure, axes = _new_figure(0.75 + 1.0 * len(tasks), len(methods), len(tasks), sharex=True,
+    figure, axes = new_figure(0.75 + 1.0 * len(tasks), len(methods), len(tasks), sharex=True,
                                sharey='row')
     bins = np.linspace(0, 1, 16)
     for row, task in zip(axes, tasks):
@@ -332,4 +333,4 @@ def match_histograms(groups):
     for axis, method in zip(axes[0], methods):
         axis.set_title(method.replace('-', '\n', 1).replace('+', '\n+'),
                        fontsize=8, color=COLOURS[family(method)])
-    return _png(figure)
+    return to_png(figure)

@@ -18,6 +18,7 @@ import traceback
 from experiments.paper.places import (
     collect_command,
     collected_episodes,
+    file_hash,
     read_json,
     recording_hash,
 )
@@ -157,6 +158,8 @@ def score(run, config, weights, places):
                  'held_out': len(held_out),
                  'shifted': {name: recording_hash(places.recording(name))
                              for name in run.shifted},
+                 **({'initial_weights': file_hash(config.initial_weights)}
+                    if config.initial_weights else {}),
                  'command': '; '.join(filter(None, (collect_command(
                      places.recording(task)) for task in (run.task, *run.shifted))))},
         'training': {name: about[name]

@@ -89,10 +89,13 @@ def collect_command(folder):
     return shlex.join(words)
 
 
+def file_hash(path):
+    """Return the SHA-256 of a file, in hexadecimal digits."""
+    with open(path, 'rb') as stream:
+        return hashlib.file_digest(stream, 'sha256').hexdigest()
+
+
 def recording_hash(folder):
     """Compute EpisodeStore.data_hash of a recording without decoding anything."""
-    digests = []
-    for file in (file for bag in find_bags(folder) for file in bag):
-        with open(file, 'rb') as stream:
-            digests.append(hashlib.file_digest(stream, 'sha256').hexdigest())
+    digests = [file_hash(file) for bag in find_bags(folder) for file in bag]
     return hashlib.sha256(''.join(digests).encode()).hexdigest()

@@ -65,7 +65,12 @@ VARIANTS = {
     '+skips+margin': {**_OURS, 'margin': 3},
     '+skips+edge': {**_OURS, 'progress_margin': 0.0},
     '+skips+annealed': {**_OURS, 'match_temperature': 1.0},
+    # Not begun with the weights of push2.
+    '+skips+scratch': _OURS,
 }
+# Few episodes, in which both objects stand close together: they begin with the weights that the
+# same method has from push2.
+FINE_TUNED = ('order2', 'order3')
 
 
 def label(method, variant='', recursion=1):
@@ -131,6 +136,13 @@ class PaperRun:
         return self.steps or SCALES[self.scale].steps or self._steps_of(EPOCHS)
 
     @property
+    def beginning(self):
+        """The PaperRun with whose weights it begins, None for fresh ones."""
+        if self.task not in FINE_TUNED or self.variant != OURS:
+            return None
+        return replace(self, task='push2')
+
+    @property
     def shifted(self):
         """The recordings that it is scored on besides its own: other looks of the same scenes."""
         return SHIFTED if self.task == 'push2' and self.mode == 'bidirectional' else ()
@@ -163,6 +175,9 @@ class PaperRun:
             settings |= _RECURSION
         if not SCALES[self.scale].steps and settings.get('decoder') != 'shared':
             settings['pretrain_steps'] = self._steps_of(PRETRAIN_EPOCHS)
+        if self.beginning:
+            settings['initial_weights'] = str(
+                self.beginning.folder(runs) / 'predictor.safetensors')
         return TrainingConfig(
             recordings=(str(Path(recordings) / self.task),), out=str(self.folder(runs)),
             mode=self.mode, method=self.method, new_pixels=self.new_pixels, seed=self.seed,
@@ -205,6 +220,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(['push2'], l1_rows, variant=OURS, new_pixels=False, main=True)
     # For planning where the order matters.
     add(['order2', 'order3'], l1_rows[:3], variant=OURS, new_pixels=False)
+    add(['order2'], l1_rows[:2], variant='+skips+scratch', new_pixels=False)
     # Table 1 with our network.
     add(SINGLE, l1_rows, variant=OURS, main=True)
     # Fig. 7, trained as Eq. 3 says.

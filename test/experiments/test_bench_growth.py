@@ -1,0 +1,30 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark of growth: what it measures, and what its page says."""
+
+import cv2
+from experiments.bench import growth
+import numpy as np
+import pytest
+
+ROWS = [{'part': 'samples', 'size': size, 'work': 'plan', 'ms': ms}
+        for size, ms in ((64, 200.0), (128, 300.0))] + [
+            {'part': 'sizes', 'size': 64, 'work': 'draw a picture', 'ms': 2.5}]
+
+
+@pytest.mark.slow
+def test_objects_and_pictures_that_grow_are_measured():
+    args = growth.Options(objects=(1, 4), repeats=1)
+    rows = list(growth._objects(args))
+    assert [(row['size'], row['work']) for row in rows] == [
+        (1, 'plan'), (1, 'predict'), (4, 'plan'), (4, 'predict')]
+    assert all(row['ms'] > 0 for row in rows)
+
+
+def test_the_page_tells_each_time_beside_that_of_the_least_work():
+    page = growth.make_page(ROWS)
+    assert '| samples | 64 | plan | 200.0 ms | 1.00 |' in page
+    assert '| samples | 128 | plan | 300.0 ms | 1.50 |' in page
+    assert '| sizes | 64 | draw a picture | 2.5 ms | 1.00 |' in page
+    picture = cv2.imdecode(np.frombuffer(growth.draw(ROWS), np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] > 2 * picture.shape[0], 'a panel for each of two parts'
