@@ -67,7 +67,9 @@ VARIANTS = {
     '+skips+annealed': {**_OURS, 'match_temperature': 1.0},
     # Not begun with the weights of push2.
     '+skips+scratch': _OURS,
+    '+skips+long': _OURS,
 }
+LONG = 2  # times the steps, of '+long'
 # Few episodes, in which both objects stand close together: they begin with the weights that the
 # same method has from push2.
 FINE_TUNED = ('order2', 'order3')
@@ -133,7 +135,8 @@ class PaperRun:
     @property
     def num_steps(self):
         """Length of the training."""
-        return self.steps or SCALES[self.scale].steps or self._steps_of(EPOCHS)
+        usual = SCALES[self.scale].steps or self._steps_of(EPOCHS)
+        return self.steps or usual * (LONG if self.variant.endswith('+long') else 1)
 
     @property
     def beginning(self):
@@ -228,6 +231,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     # When the bottleneck happens.
     add(TIMED, ['genmin-wo-gan+progress', 'fix-wo-gan', 'genmin-wo-gan', 'fix0.25-wo-gan',
                 'fix0.75-wo-gan'], variant=OURS, new_pixels=False)
+    add(['push2_late'], l1_rows[:2], variant='+skips+long', new_pixels=False)
     # Fig. 4.
     add(['grasp'], ['fix0.25-wo-gan', 'fix0.50-wo-gan', 'fix0.75-wo-gan', 'fix1.00-wo-gan',
                     'genmin4-wo-gan', 'min-wo-gan', 'genmin0.5-wo-gan', 'genmin10-wo-gan',
