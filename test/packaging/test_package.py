@@ -127,7 +127,7 @@ def undeclared(folders, *files):
 
 def test_everything_imported_is_declared_with_ros_or_with_pip():
     assert not undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
-                          'requirements-lerobot.txt')
+                          'requirements-lerobot.txt', 'requirements-hub.txt')
     assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt',
                           'requirements-dev.txt')
 
@@ -147,13 +147,14 @@ def test_nothing_is_required_that_nobody_imports():
     assert set(requirements('requirements.txt')) <= used
     assert set(requirements('requirements-experiments.txt')) <= used
     assert set(requirements('requirements-lerobot.txt')) <= used
+    assert set(requirements('requirements-hub.txt')) <= used
 
 
 def test_requirements_and_constraints_agree():
     pinned = requirements('constraints.txt')
     for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-experiments.txt',
-                 'requirements-lerobot.txt', 'requirements-ray.txt', 'requirements-ros.txt',
-                 'requirements-ros2.txt'):
+                 'requirements-hub.txt', 'requirements-lerobot.txt', 'requirements-ray.txt',
+                 'requirements-ros.txt', 'requirements-ros2.txt'):
         for distribution, version in requirements(name).items():
             assert pinned[distribution] == version, f'{name}: {distribution}'
 

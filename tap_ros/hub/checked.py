@@ -1,0 +1,26 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Weights of either kind, loaded as whoever uses them would load them."""
+
+from pathlib import Path
+
+from tap_ros.learning.weights import load_tensors
+from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.prediction.predictor import load_network
+
+
+def check_weights(path: Path) -> dict[str, object]:
+    """
+    Refuse a file that no part of this package could use.
+
+    :param path: absolute, or with a suffix, so that it is no name of shipped weights.
+    :return: what the file says of itself: kind, config, training.
+    :raises WeightsError: if it is damaged, no weights file, or neither of a predictor nor of a
+        forward model.
+    """
+    _, about = load_tensors(path)
+    if about.get('kind') == 'forward_model':
+        load_forward_model(path)
+    else:
+        load_network(path)
+    return about
