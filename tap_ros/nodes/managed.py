@@ -4,13 +4,17 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 import traceback
 from typing import Any, ClassVar, TYPE_CHECKING
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from std_msgs.msg import String
 from tap_ros.errors import TapError
+from tap_ros.nodes.model_card import describe_weights
+from tap_ros.nodes.topics import LATCHED
 from tap_ros.text import escaped, listing
 
 if TYPE_CHECKING:
@@ -31,8 +35,9 @@ class ManagedNode(LifecycleNode):
     Loads its weights in the transition configure, and works while it is active.
 
     Heartbeat, diagnostics, topics and services are there in every state, so that who asks is told
-    why nothing is done. A subclass defines what to load, and calls autostart('configure') and
-    autostart('activate') while it is made; weights that cannot be used are fatal then.
+    why nothing is done. What the weights are is published on <node>/model_card. A subclass defines
+    what to load, and calls autostart('configure') and autostart('activate') while it is made;
+    weights that cannot be used are fatal then.
 
     :cvar reloaded: names of the parameters that can be changed while the node is not active;
         unless it is unconfigured they are tried at once, and refused when they cannot be used.
@@ -47,6 +52,7 @@ class ManagedNode(LifecycleNode):
         self._failure: Exception | None = None  # of the transition that was tried last
         self._starting = False  # by itself: a failure is raised, and logged by who starts nodes
         self._loaded: Any = None  # for parameters that are about to change
+        self._cards = self.create_publisher(String, '~/model_card', LATCHED)
         # First, as rclpy calls the newest callback first: what others refuse is not loaded.
         self.add_on_set_parameters_callback(self._before_set)
         self.add_post_set_parameters_callback(self._after_set)
@@ -75,6 +81,10 @@ class ManagedNode(LifecycleNode):
     @abstractmethod
     def described(self) -> str:
         """Say what the node works with, for the log."""
+
+    @abstractmethod
+    def files(self) -> list[Path]:
+        """Return the files of the weights."""
 
     def resume(self) -> None:
         """
@@ -131,6 +141,7 @@ class ManagedNode(LifecycleNode):
         def begin() -> None:
             self.resume()
             self.active = True
+            self._cards.publish(String(data=describe_weights(self.files())))
             self.get_logger().info(f'ready: {self.described()}')
 
         return self._try('activate', begin)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 import math
 import os
+from pathlib import Path
 import sys
 import threading
 import time
@@ -36,6 +37,7 @@ from tap_ros.nodes.topics import LATCHED
 from tap_ros.pictures import overlay
 from tap_ros.prediction.request_queue import Busy, RequestQueue, THREAD_NAME
 from tap_ros.text import escaped
+from tap_ros.weights import find_predictor
 
 if TYPE_CHECKING:
     from tap_ros.prediction.predictor import Subgoal as PredictedSubgoal
@@ -130,8 +132,15 @@ class PredictorNode(ManagedNode):
         """Name the modes, the sizes of pictures, the device and the files."""
         sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
                  for mode, predictor in self._predictors.items()]
-        files = [path for path in (self.params['weights'], self.params['forward_weights']) if path]
-        return f'{", ".join(sizes)}, {self.params["device"]}, {", ".join(files)}'
+        return f'{", ".join(sizes)}, {self.params["device"]}, {", ".join(self._names())}'
+
+    def files(self) -> list[Path]:
+        """Return the files of the weights."""
+        return [find_predictor(name) for name in self._names()]
+
+    def _names(self) -> list[str]:
+        """Return the weights as the parameters name them."""
+        return [self.params[name] for name in self.reloaded if self.params[name]]
 
     # In the executor: what comes, and what people see
 

@@ -24,17 +24,20 @@ from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import SERVICE_QOS
 from tap_ros.recording import topics
 from tap_ros.recording.mounts import ArmMount, write_mount
+from tap_ros.recording.new_attachments import CARD_TYPE
 from tap_ros.recording.writer import BagWriter
 from tap_ros.text import escaped
 
 DEPTH = 100  # messages that may wait while the disk is slow
+CARDS = ('predictor_node/model_card', 'visual_mpc_node/model_card')
 TYPES = {
     **{name.lstrip('/'): kind for name, kind in topics.TYPES.items()},
     'subgoal': 'tap_msgs/msg/Subgoal',
     'subgoal/image': 'sensor_msgs/msg/Image',
-    'subgoal/overlay': 'sensor_msgs/msg/Image'}
+    'subgoal/overlay': 'sensor_msgs/msg/Image',
+    **dict.fromkeys(CARDS, CARD_TYPE)}
 LATCHED = ('goal/image', 'goal/robot_mask', 'goal/objects', 'subgoal', 'subgoal/image',
-           'subgoal/overlay')
+           'subgoal/overlay', *CARDS)
 PERIODIC = ('camera/image_raw', 'camera/camera_info', 'objects', 'joint_states')
 MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls it stale
 LONG = 1000  # characters of an answer
@@ -51,9 +54,10 @@ class Source:
 
 class RecorderNode(Node):
     """
-    Writes serialized messages without looking into them; ends the bag properly on a signal.
+    Writes serialized messages as they are; ends the bag properly on a signal.
 
-    When the disk is full or gone it says so, keeps what was written readable, and stays up.
+    Goal pictures and model cards are attached, too. When the disk is full or gone it says so,
+    keeps what was written readable, and stays up.
     """
 
     def __init__(self) -> None:

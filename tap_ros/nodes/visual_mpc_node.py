@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 import math
+from pathlib import Path
 import sys
 import threading
 import time
@@ -132,6 +133,10 @@ class VisualMpcNode(ManagedNode):
     def described(self) -> str:
         """Name the device and the file."""
         return f'{self.params["device"]}, {self.params["weights"]}'
+
+    def files(self) -> list[Path]:
+        """Return the file of the weights."""
+        return [Path(self.params['weights'])]
 
     def resume(self) -> None:
         """Serve goals again, once the last one has ended."""

@@ -33,6 +33,7 @@ class Records:
         self.data, self.summary, self.define, self.lose = data, summary, define, lose
         self.missing: set[ChunkEntry] = set(summary.chunks if summary else ())  # not found so far
         self.cut_off: int | None = None  # the byte where an unfinished file ends
+        self.attachments: list[tuple[int, int]] = []  # content found when walked over, start, end
 
     def parts(self, indexed: bool) -> Iterator[tuple[int, int, int, ChunkEntry | None]]:
         """
@@ -92,7 +93,9 @@ class Records:
             position = end
 
     def _is_other(self, kind: int, start: int, end: int) -> bool:
-        """Tell whether a record is one of those that hold no messages."""
+        """Tell whether a record is one of those that hold no messages; note attachments."""
+        if kind == Opcode.ATTACHMENT:
+            self.attachments.append((start, end))
         if kind == Opcode.MESSAGE_INDEX:  # a damaged chunk may look like one
             return end - start >= 6 and struct.unpack_from(
                 '<I', self.data, start + 2)[0] == end - start - 6

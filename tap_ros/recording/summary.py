@@ -8,7 +8,7 @@ import struct
 import zlib
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.recording.chunks import DAMAGE
@@ -38,6 +38,7 @@ class Summary:
     topics: list[Schema | Channel]  # of mcap.records
     chunks: list[ChunkEntry]  # empty when it lists none
     counts: dict[int, int] | None  # channel -> number of messages; None when it does not say
+    attachments: list[AttachmentIndex] | None  # of mcap.records; None when it does not list all
 
 
 def read_summary(data: bytes | memoryview) -> tuple[Summary | None, str]:
@@ -95,7 +96,7 @@ def _data_end(data: memoryview) -> int | None:
 
 
 def _parse(data: memoryview, start: int, placed: bool) -> Summary:
-    topics, chunks, counts = [], [], None
+    topics, chunks, attachments, counts, attached = [], [], [], None, None
     for record in StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records:
         if isinstance(record, (Schema, Channel)):
             topics.append(record)
@@ -103,6 +104,9 @@ def _parse(data: memoryview, start: int, placed: bool) -> Summary:
             chunks.append(ChunkEntry(
                 record.chunk_start_offset, record.chunk_length,
                 min(record.message_start_time, FAR), min(record.message_end_time, FAR)))
+        elif isinstance(record, AttachmentIndex):
+            attachments.append(record)
         elif isinstance(record, Statistics):
-            counts = record.channel_message_counts
-    return Summary(start, placed, topics, chunks, counts)
+            counts, attached = record.channel_message_counts, record.attachment_count
+    return Summary(start, placed, topics, chunks, counts,
+                   attachments if attached == len(attachments) else None)

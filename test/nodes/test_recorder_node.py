@@ -7,6 +7,7 @@ import resource
 from time import sleep
 import warnings
 
+import cv2
 from mcap.reader import make_reader
 import numpy as np
 from processes import NodeProcess
@@ -14,12 +15,13 @@ import pytest
 from rclpy.duration import Duration
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Image, JointState
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 from tap_ros import ur10e
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
+from tap_ros.recording.attachments import read_attachments
 from tap_ros.recording.messages import decode
 from tap_ros.recording.mounts import ArmMount, read_mount
 from tap_ros.recording.reader import iter_episodes
@@ -130,6 +132,35 @@ def test_a_bag_is_never_overwritten_and_each_one_has_the_goal(client, record, tm
     assert [path.name for path in (tmp_path / 'bag').iterdir()] == ['precious.txt']
     for name in ('bag-2', 'bag-3'):
         assert [topic for topic, _, _ in read(tmp_path / name)] == ['/goal/image']
+
+
+def test_goal_pictures_and_model_cards_are_attached(client, record, tmp_path):
+    goal = client.create_publisher(Image, 'goal/image', LATCHED)
+    cards = client.create_publisher(String, 'predictor_node/model_card', LATCHED)
+    goal.publish(random_image(1))  # before the recorder is there
+    cards.publish(String(data='# mine.safetensors'))
+    process = record().wait_for('ready')
+    for stamp in (1, 2, 2):
+        arrived(goal)
+        goal.publish(random_image(stamp))
+    arrived(goal)
+    arrived(cards)
+    path, = (tmp_path / 'bag').glob('*.mcap')
+    size_when_written(path, 4 * 32 * 32 * 3)  # two goals, as messages and as files
+    finish(client)
+    service = client.create_client(SetBool, 'recorder/record')
+    assert call(service, SetBool.Request(data=True), 20).success  # with what holds by now
+    finish(client)
+    assert process.end() == 0, process.text
+    for name, pictures in (('bag', [1, 2]), ('bag-2', [2])):
+        file, = (tmp_path / name).glob('*.mcap')
+        found = {}
+        for each in read_attachments(file):
+            found.setdefault(each.name, []).append(each.data)
+        assert found['predictor_node_model_card.md'] == [b'# mine.safetensors']
+        assert [cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].tobytes()
+                for png in found['goal.png']] == [
+            bytes(random_image(stamp).data) for stamp in pictures]
 
 
 def test_topics_of_any_type_can_be_recorded(client, record, tmp_path):

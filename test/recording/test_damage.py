@@ -44,7 +44,7 @@ def count_with_mcap(path):
         try:
             for _, channel, _ in NonSeekingReader(stream).iter_messages(log_time_order=False):
                 frames += channel.topic == '/camera/image_raw'
-        except McapError:
+        except (McapError, struct.error):
             pass
     return frames
 

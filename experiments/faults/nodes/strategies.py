@@ -31,9 +31,9 @@ TOPICS = {
     'predictor_node/heartbeat': 'std_msgs/Header', 'clock': 'rosgraph_msgs/Clock',
     'camera/camera_info': 'sensor_msgs/CameraInfo', 'camera/robot_mask': MASK,
     'goal/robot_mask': MASK, 'observer/image_raw': 'sensor_msgs/Image',
-    'robot_description': 'std_msgs/String'}
+    'robot_description': 'std_msgs/String', 'predictor_node/model_card': 'std_msgs/String'}
 LATCHED_TOPICS = ('goal/image', 'goal/objects', 'goal/robot_mask', 'robot_description',
-                  'arm/command_timeout')
+                  'arm/command_timeout', 'predictor_node/model_card')
 SERVICES = {
     'predict_subgoal': 'tap_msgs/srv/PredictSubgoal', 'sim/reset': 'tap_msgs/srv/ResetScene',
     'sim/set_goal': 'tap_msgs/srv/SetGoal', 'sim/step': 'tap_msgs/srv/StepScene',
