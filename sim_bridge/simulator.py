@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.appearance import choose_appearance, USUAL
 from sim_bridge.camera import Renderer
+from sim_bridge.entities import check_free, check_pose, check_velocity
 from sim_bridge.grasping import grasp_place
 from sim_bridge.looks import DEFAULT_LOOK, get_look, OBSERVER
 from sim_bridge.moved_goal import check_apart, check_places
@@ -34,6 +35,7 @@ from tap_ros.contract import (
     WORKSPACE_LOW,
 )
 from tap_ros.errors import SceneError
+from tap_ros.text import escaped
 
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
 if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
@@ -42,7 +44,7 @@ RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time
 BENT = 0.1  # share of the fingers' travel that they may be beyond their ends
 GRASP_HEIGHT = 0.012  # m of the gripper when it holds an object on the table, in the goal picture
 LEAVE_HEIGHT = 0.12  # m of the gripper when it has put the object down, in the goal picture
-OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers
+OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
 
 
 @dataclass(frozen=True)
@@ -211,6 +213,33 @@ class Simulator:
         finally:
             mujoco.mj_copyData(self.data, self.model, before)
 
+    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike = (0,) * 6) -> None:
+        """
+        Put an object elsewhere, as a hand would; no time passes, `scene` and goal stay.
+
+        :param name: one of the object_names of an Observation.
+        :param pose: (7,) x, y, z in m, quaternion x, y, z, w.
+        :param velocity: (6,) m/s and rad/s along the axes of the world.
+        :raises PoseError: for a pose that is none or out of reach, and where the object would
+            reach into something; then it stays where it was.
+        :raises SceneError: for a velocity that is not finite or too fast; likewise.
+        """
+        if name not in object_names(self.task.num_objects):
+            raise SceneError(f'{escaped(name)} is not in the scene')
+        pose, velocity = check_pose(pose), check_velocity(velocity)
+        # Of a free joint MuJoCo turns the angular velocity with the body.
+        turning = np.empty(3)
+        mujoco.mju_rotVecQuat(turning, velocity[3:], pose[[6, 3, 4, 5]] * (1, -1, -1, -1))
+        before = copy(self.data)
+        joint = self.data.joint(name)
+        joint.qpos, joint.qvel = pose[[0, 1, 2, 6, 3, 4, 5]], [*velocity[:3], *turning]
+        mujoco.mj_forward(self.model, self.data)
+        try:
+            check_free(self.model, self.data, name)
+        except SceneError:
+            mujoco.mj_copyData(self.data, self.model, before)
+            raise
+
     def step(self, action: ArrayLike) -> Observation:
         """
         Act for one control period.
@@ -278,6 +307,18 @@ class Simulator:
         """Return (K, 7): x, y, z in m, quaternion x, y, z, w."""
         poses = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
         return poses[:, [0, 1, 2, 4, 5, 6, 3]].copy()
+
+    def object_motions(self) -> np.ndarray:
+        """
+        Return (K, 2, 2, 3): velocities and accelerations along the axes of the world.
+
+        Of each the linear one in m/s, m/s^2 and the angular one in rad/s, rad/s^2.
+        """
+        rates = np.stack([self.data.qvel, self.data.qacc])[:, OBJECT_QPOS_START:]
+        motions = rates.reshape(2, -1, 2, 3).swapaxes(0, 1).copy()
+        for name, motion in zip(object_names(self.task.num_objects), motions):
+            motion[:, 1] = motion[:, 1] @ self.data.body(name).xmat.reshape(3, 3).T
+        return motions
 
     def distances(self) -> np.ndarray:
         """Return (K,) metres from each object's origin to its goal, in three dimensions."""
