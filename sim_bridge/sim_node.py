@@ -10,6 +10,7 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Twist, TwistStamped
 import numpy as np
+from numpy.typing import ArrayLike
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
@@ -18,6 +19,7 @@ from sim_bridge.appearance import CHOICES
 from sim_bridge.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from sim_bridge.moved_goal import move_goal
 from sim_bridge.robot_description import robot_description
+from sim_bridge.run_state import MAX_PERIODS, RunState
 from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks import TASKS
 from sim_bridge.transforms import arm_transforms, camera_transform, fixed_arm_transforms
@@ -52,7 +54,6 @@ PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
 MAX_TIMEOUT = 60.0  # s
-MAX_PERIODS = 100  # of one sim/step call: about a second
 
 
 class SimNode(Node):
@@ -66,6 +67,7 @@ class SimNode(Node):
     A command is valid for command_timeout after it came; later the arm stands still.
     A zero twist without a stamp means stop in both modes and lets no time pass. Whoever sends a
     command that is not carried out learns it from arm/refused.
+    Paused or stopped: commands are refused, and what came before or meanwhile is not made up for.
     """
 
     def __init__(self) -> None:
@@ -84,7 +86,8 @@ class SimNode(Node):
         self._goal_ns = 0  # stamp of the newest goal
         self._num_steps = 0
         self._in_episode = False
-        self._paused = False
+        self.state = RunState.PLAYING
+        self._played_at = 0.0  # monotonic time at which it was set so
         self._diagnostics = Diagnostics(
             self, {'arm/delta_twist_cmds': math.inf, 'gripper/command': math.inf})
         self._create_publishers()
@@ -100,6 +103,12 @@ class SimNode(Node):
                                    (StepScene, 'sim/step', self._on_step),
                                    (SetBool, 'sim/pause', self._on_pause)):
             self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
+        try:
+            from tap_ros.nodes.standard_services import StandardServices
+        except ImportError:
+            pass  # no wheel has simulation_interfaces
+        else:
+            StandardServices(self)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         if self.params['lock_step']:
             mode = 'lock-step'
@@ -140,8 +149,13 @@ class SimNode(Node):
 
     # Commands
 
-    def _on_gripper(self, message: Float64) -> None:
+    def _on_gripper(self, message: Float64, info: dict[str, Any]) -> None:
         self._diagnostics.received('gripper/command')
+        reason = self._refuse_paused(info)
+        if reason:
+            self.get_logger().warning(
+                f'gripper/command ignored: {reason}', throttle_duration_sec=5.0)
+            return
         if not math.isfinite(message.data):
             self.get_logger().warning(
                 f'gripper/command ignored: data is {message.data}; expected a number from '
@@ -156,7 +170,8 @@ class SimNode(Node):
         if stamp_ns == 0 and not move.any():
             self._twist = None
             return
-        reason = self._refuse_twist(message.twist, move, stamp_ns)
+        reason = (self._refuse_paused(info)
+                  or self._refuse_twist(message.twist, move, stamp_ns))
         if reason:
             self.get_logger().warning(f'arm/delta_twist_cmds ignored: {reason}')
             self._diagnostics.error(f'arm/delta_twist_cmds ignored: {reason}')
@@ -182,6 +197,14 @@ class SimNode(Node):
             return
         self._timeout = message.data
 
+    def _refuse_paused(self, info: dict[str, Any]) -> str:
+        """Say why a command that came now cannot be used; an empty string if it can."""
+        if self.state is not RunState.PLAYING:
+            return 'the simulation is paused; call sim/pause with data false'
+        if reception_time(info) < self._played_at:
+            return 'it came while the simulation was paused'
+        return ''
+
     def _refuse_twist(self, twist: Twist, move: np.ndarray, stamp_ns: int) -> str:
         """Say why a command cannot be used; an empty string if it can."""
         for axis, value in zip('xyz', move):
@@ -189,8 +212,6 @@ class SimNode(Node):
                 return f'twist.linear.{axis} is {value}; expected finite numbers'
         if any(getattr(twist.angular, axis) != 0 for axis in 'xyz'):
             return 'twist.angular is not zero; this gripper moves but cannot turn'
-        if self._paused:
-            return 'the simulation is paused; call sim/pause with data false'
         try:
             self._sim.check_action(np.append(move, self._opening))
         except TapError as error:
@@ -208,7 +229,7 @@ class SimNode(Node):
         return ''
 
     def _on_timer(self) -> None:
-        if not self._paused:
+        if self.state is RunState.PLAYING:
             move, self._twist = self._twist, None
             if move is None or time.monotonic() > self._valid_until:
                 move = np.zeros(3)
@@ -248,23 +269,62 @@ class SimNode(Node):
         if periods > MAX_PERIODS:
             response.message = (
                 f'num_periods is {periods}; expected 1 to {MAX_PERIODS}, call more often')
-        elif not (self._paused or self.params['lock_step']):
+        elif self.state is RunState.PLAYING and not self.params['lock_step']:
             response.message = (
                 'time passes by itself; pause with sim/pause first, or start with lock_step')
         else:
             for _ in range(periods):
-                self._step(np.zeros(3))
+                self.wait_period()
             response.success = True
             response.message = f'{periods} control periods passed'
-        response.stamp = to_stamp(self._stamp_ns)
+        response.stamp = self.stamp
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._paused = request.data
-        self._twist = None
+        self.set_state(RunState.PAUSED if request.data else RunState.PLAYING)
         response.success = True
         response.message = 'paused' if request.data else 'running'
         return response
+
+    # What all services are made of
+
+    @property
+    def sim(self) -> Simulator:
+        """Return the simulator of the present scene."""
+        return self._sim
+
+    @property
+    def stamp(self) -> Time:
+        """Return the stamp of the newest picture."""
+        return to_stamp(self._stamp_ns)
+
+    def set_state(self, state: RunState) -> None:
+        """Let time pass or not; what was commanded before and is not done yet is forgotten."""
+        if state is not self.state:
+            self._twist = None
+            self._opening = float(self._sim.target[3])
+            self._played_at = time.monotonic() if state is RunState.PLAYING else math.inf
+            self.state = state
+
+    def wait_period(self) -> None:
+        """Let one control period pass in which the arm stands still."""
+        if self.state is RunState.STOPPED:
+            self.state = RunState.PAUSED  # as it is no longer at its start
+        self._step(np.zeros(3))
+
+    def restart(self) -> None:
+        """Start the first scene again, as when the node was started."""
+        self._reset(self.params['task'], self.params['seed'], False)
+
+    def repeat(self) -> None:
+        """Start the present scene again."""
+        self._reset(self._sim.task.name, self._sim.scene.seed, self._hide_arm)
+
+    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike) -> None:
+        """Put an object elsewhere (see Simulator.put_object) and publish what is seen then."""
+        self._sim.put_object(name, pose, velocity)
+        self._stamp_ns += 1  # pictures are told apart by their stamps
+        self._publish(self._sim.observe())
 
     # Simulation
 

@@ -95,12 +95,19 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
     return code
 
 
-def answering(node: 'Node', callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+def refusal(kind: type, message: str) -> Any:
+    """Return a response of this type, with the fields success and message, that refuses."""
+    return kind(success=False, message=message)
+
+
+def answering(node: 'Node', callback: Callable[[Any, Any], Any],
+              refuse: Callable[[type, str], Any] = refusal) -> Callable[[Any, Any], Any]:
     """
     Let a service answer whatever its callback raises.
 
     :param node: rclpy Node, for its log.
-    :param callback: of a service whose response has the fields success and message.
+    :param callback: of a service.
+    :param refuse: makes a response of a type and a message.
     :return: a callback that raises nothing.
     """
     def answer(request: Any, response: Any) -> Any:
@@ -108,9 +115,8 @@ def answering(node: 'Node', callback: Callable[[Any, Any], Any]) -> Callable[[An
             return callback(request, response)
         except Exception as error:
             node.get_logger().error(traceback.format_exc())
-            return type(response)(
-                success=False,
-                message=f'internal error: {type(error).__name__}: {escaped(error)}')
+            return refuse(
+                type(response), f'internal error: {type(error).__name__}: {escaped(error)}')
 
     return answer
 
