@@ -2,22 +2,24 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 #
-# Build the ros2 command, launch and tf2_msgs into ros2/install, from the official sources; there
-# are no wheels of them. scripts/environment.bash finds them there. The Makefile calls this.
+# Build the ros2 command, launch, tf2_msgs and simulation_interfaces into ros2/install, from the
+# official sources; there are no wheels of them. scripts/environment.bash finds them there. The
+# Makefile calls this.
 #   ROS2_SOURCES=FOLDER takes the repositories from there: FOLDER/ros2cli and so on, git
 #   repositories with the tags below, or plain copies of such sources. Else they are cloned.
 
 set -eo pipefail
 cd -P "$(dirname "${BASH_SOURCE[0]}")/.."
 log=$PWD/ros2/build.log
-repositories=(  # name, tag, folders that are needed
-  'ros2cli 0.32.2 ros2action ros2cli ros2component ros2doctor ros2interface ros2lifecycle
+repositories=(  # owner/name, tag, folders that are needed
+  'ros2/ros2cli 0.32.2 ros2action ros2cli ros2component ros2doctor ros2interface ros2lifecycle
    ros2multicast ros2node ros2param ros2pkg ros2run ros2service ros2topic'
-  'launch 3.4.3 launch launch_xml launch_yaml'
-  'launch_ros 0.26.6 launch_ros ros2launch'
-  'rosidl_runtime_py 0.13.1 .'
-  'rcl_interfaces 2.0.2 composition_interfaces'
-  'geometry2 0.36.4 tf2_msgs')
+  'ros2/launch 3.4.3 launch launch_xml launch_yaml'
+  'ros2/launch_ros 0.26.6 launch_ros ros2launch'
+  'ros2/rosidl_runtime_py 0.13.1 .'
+  'ros2/rcl_interfaces 2.0.2 composition_interfaces'
+  'ros2/geometry2 0.36.4 tf2_msgs'
+  'ros-simulation/simulation_interfaces 1.5.1 .')
 
 # step 'what' command...: run quietly into the log, print one line with the time it took.
 step() {
@@ -34,11 +36,12 @@ step() {
 
 # Put the folders of one repository into ros2/src.
 get() {
-  local name=$1 tag=$2 from=${ROS2_SOURCES:+$ROS2_SOURCES/$1} target=ros2/src/$1 folder
+  local repository=$1 name=${1#*/} tag=$2 from target folder
   shift 2
+  from=${ROS2_SOURCES:+$ROS2_SOURCES/$name} target=ros2/src/$name
   mkdir -p "$target"
   if [ -z "$from" ]; then
-    git clone --quiet --depth 1 --branch "$tag" "https://github.com/ros2/$name" "$target.git"
+    git clone --quiet --depth 1 --branch "$tag" "https://github.com/$repository" "$target.git"
     from=$target.git
   fi
   if [ ! -e "$from" ]; then
@@ -74,7 +77,7 @@ mkdir -p ros2/src
 step 'Python packages' pip install --disable-pip-version-check --requirement requirements-ros2.txt \
   --constraint constraints.txt $PIP_ARGS
 step 'sources' get_all
-step 'ros2 command, launch, tf2_msgs' build
+step 'ros2 command, launch, tf2_msgs, simulation_interfaces' build
 rm -rf ros2/build ros2/src
 . scripts/environment.bash
 ros2 --help >/dev/null
