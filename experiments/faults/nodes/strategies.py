@@ -4,6 +4,7 @@
 
 import array
 from importlib import import_module
+from importlib.util import find_spec
 
 from experiments.faults.nodes.world import first_pictures
 from hypothesis import strategies as st
@@ -39,6 +40,12 @@ SERVICES = {
     'sim/set_goal': 'tap_msgs/srv/SetGoal', 'sim/step': 'tap_msgs/srv/StepScene',
     'sim/pause': 'std_srvs/srv/SetBool',
     'recorder/record': 'std_srvs/srv/SetBool'}
+if find_spec('simulation_interfaces') is not None:  # no wheel has it
+    SERVICES |= {f'sim_node/{name}': f'simulation_interfaces/srv/{kind}' for name, kind in (
+        ('get_entities', 'GetEntities'), ('get_entity_state', 'GetEntityState'),
+        ('set_entity_state', 'SetEntityState'), ('step_simulation', 'StepSimulation'),
+        ('reset_simulation', 'ResetSimulation'),
+        ('set_simulation_state', 'SetSimulationState'))}
 ACTION = 'reach_goal'
 
 UINT8, UINT32, UINT64 = 2**8 - 1, 2**32 - 1, 2**64 - 1
@@ -73,6 +80,11 @@ def stamps():
 def headers():
     """Return headers with any stamp."""
     return st.fixed_dictionaries({'stamp': stamps(), 'frame_id': texts()})
+
+
+def vectors():
+    """Return three numbers x, y, z."""
+    return st.fixed_dictionaries({axis: numbers() for axis in 'xyz'})
 
 
 def images():
@@ -146,6 +158,32 @@ def objects():
         max_size=4)})
 
 
+def entities():
+    """Return names of objects, often of one that is there."""
+    return st.sampled_from(('object_0', 'object_1')) | texts()
+
+
+def filters():
+    """Return filters of entities."""
+    points = st.lists(vectors(), max_size=3)
+    return st.fixed_dictionaries({
+        'filter': st.sampled_from(('', 'object', '(', '(.*)*$', 'a{99999}')) | texts(),
+        'tags': st.fixed_dictionaries({
+            'tags': st.lists(texts(), max_size=2), 'filter_mode': counts(UINT8)}),
+        'bounds': st.fixed_dictionaries({
+            'type': st.integers(0, 4) | counts(UINT8), 'points': points})})
+
+
+def entity_states():
+    """Return states of entities: likely places, and any numbers."""
+    places = st.fixed_dictionaries({axis: st.floats(-0.3, 0.3) for axis in 'xyz'})
+    return st.fixed_dictionaries({
+        'header': few(headers(), {}), 'pose': st.fixed_dictionaries({
+            'position': places | vectors(),
+            'orientation': st.sampled_from(({}, {'w': 0.0})) | vectors()}),
+        'twist': few(st.fixed_dictionaries({'linear': vectors(), 'angular': vectors()}), {})})
+
+
 def few(values, empty):
     """Return these values, or more often what is left empty."""
     return st.just(empty) | st.just(empty) | values
@@ -153,7 +191,7 @@ def few(values, empty):
 
 def fields(type_name):
     """Return the strategy of a type, for its fields as a dict."""
-    vector = st.fixed_dictionaries({axis: numbers() for axis in 'xyz'})
+    vector = vectors()
     amounts = st.sampled_from((0, 1, 2, 0, 1, 101, UINT32))
     request = {'num_samples': amounts, 'recursion_depth': amounts,
                'seed': st.sampled_from((0, 1, 2, -1, 2**63 - 1, -2**63)),
@@ -185,6 +223,17 @@ def fields(type_name):
             'task': texts(), 'seed': counts(UINT64), 'hide_arm': st.booleans()}),
         'tap_msgs/srv/SetGoal': st.fixed_dictionaries({'objects': objects() | likely_objects()}),
         'tap_msgs/srv/StepScene': st.fixed_dictionaries({'num_periods': counts(UINT32)}),
+        'simulation_interfaces/srv/GetEntities': st.fixed_dictionaries({'filters': filters()}),
+        'simulation_interfaces/srv/GetEntityState': st.fixed_dictionaries({'entity': entities()}),
+        'simulation_interfaces/srv/SetEntityState': st.fixed_dictionaries({
+            'entity': entities(), 'state': entity_states()}),
+        'simulation_interfaces/srv/StepSimulation': st.fixed_dictionaries({
+            'steps': counts(UINT64)}),
+        'simulation_interfaces/srv/ResetSimulation': st.fixed_dictionaries({
+            'scope': st.sampled_from((0, 1, 2, 4, UINT8)) | counts(UINT8)}),
+        'simulation_interfaces/srv/SetSimulationState': st.fixed_dictionaries({
+            'state': st.fixed_dictionaries({  # but quitting
+                'state': st.sampled_from((0, 1, 2, 4, 5, UINT8))})}),
         'std_srvs/srv/SetBool': st.fixed_dictionaries({'data': st.booleans()}),
         ACTION: st.fixed_dictionaries({
             **request, 'step_budget': amounts, 'goal_image': few(images(), {}),
