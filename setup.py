@@ -26,6 +26,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/config', glob('config/*.yaml')),
+        (f'share/{NAME}/config/layouts', glob('config/layouts/*')),
         (f'share/{NAME}/launch', glob('launch/*.launch.py')),
     ],
     install_requires=['setuptools'],

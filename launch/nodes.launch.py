@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Start simulation, predictor, planner and, if asked for, recorder, robot masks and explorer.
+Start simulation, predictor, planner and, if asked for, recorder, robot masks, explorer and rviz2.
 
 Parameters come from config/tap_ros.yaml of the package or from params_file; for a real camera and
 arm start with sim:=false.
@@ -42,6 +42,9 @@ def generate_launch_description():
             'explorer', default_value='false', choices=['true', 'false'],
             description='Serve a page for browsers at http://127.0.0.1:8000/.'),
         DeclareLaunchArgument(
+            'rviz', default_value='false', choices=['true', 'false'],
+            description='Start rviz2 (if it is installed) with config/layouts/tap_ros.rviz.'),
+        DeclareLaunchArgument(
             'use_sim_time', default_value=LaunchConfiguration('sim'), choices=['true', 'false'],
             description='All but the simulation take the time from /clock.'),
         start('sim_node', {'lock_step': typed('lock_step', bool)},
@@ -52,6 +55,12 @@ def generate_launch_description():
               condition=IfCondition(NotEqualsSubstitution(record, ''))),
         start('robot_mask_node', condition=IfCondition(LaunchConfiguration('mask'))),
         start('explorer_node', condition=IfCondition(LaunchConfiguration('explorer'))),
+        Node(
+            package='rviz2', executable='rviz2', output='screen',
+            arguments=['-d', PathJoinSubstitution(
+                [FindPackageShare('tap_ros'), 'config', 'layouts', 'tap_ros.rviz'])],
+            parameters=[{'use_sim_time': typed('use_sim_time', bool)}],
+            condition=IfCondition(LaunchConfiguration('rviz'))),
     ])
 
 

@@ -35,6 +35,7 @@ TYPES = {
     'subgoal': 'tap_msgs/msg/Subgoal',
     'subgoal/image': 'sensor_msgs/msg/Image',
     'subgoal/overlay': 'sensor_msgs/msg/Image',
+    'plan/distance': 'std_msgs/msg/Float64',
     **dict.fromkeys(CARDS, CARD_TYPE)}
 LATCHED = ('goal/image', 'goal/robot_mask', 'goal/objects', 'subgoal', 'subgoal/image',
            'subgoal/overlay', *CARDS)
@@ -209,9 +210,16 @@ class RecorderNode(Node):
                 self._subscribe(topic, type_name, QoSProfile(
                     depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE,
                     durability=DurabilityPolicy.TRANSIENT_LOCAL
-                    if name.lstrip('/') in LATCHED else DurabilityPolicy.VOLATILE))
+                    if name.lstrip('/') in LATCHED or self._is_latched(topic)
+                    else DurabilityPolicy.VOLATILE))
             except ConfigError as error:
                 self.get_logger().error(f'{escaped(topic)} is not recorded: {escaped(error)}')
+
+    def _is_latched(self, topic: str) -> bool:
+        """Tell whether all who publish a topic keep messages for late joiners."""
+        publishers = self.get_publishers_info_by_topic(topic)
+        return {publisher.qos_profile.durability for publisher in publishers} == {
+            DurabilityPolicy.TRANSIENT_LOCAL}
 
     def _subscribe(self, topic: str, type_name: str, qos: QoSProfile) -> None:
         def on_message(data: bytes, info: dict[str, Any]) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from sensor_msgs.msg import Image
+from std_msgs.msg import Float64
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused, ObjectStates
 from tap_msgs.srv import PredictSubgoal
@@ -101,6 +102,7 @@ class VisualMpcNode(ManagedNode):
         self._predictor = Liveness(self, 'predictor_node', callback_group=group)
         self._markers = self.create_publisher(MarkerArray, 'plan/markers', STREAM)
         self._overlay = self.create_publisher(Image, 'plan/overlay', STREAM)
+        self._distance = self.create_publisher(Float64, 'plan/distance', STREAM)
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
             goal_callback=self._on_goal, cancel_callback=self._on_cancel)
@@ -248,6 +250,7 @@ class VisualMpcNode(ManagedNode):
             if isinstance(answer, End):
                 if answer.outcome == 'aborted':
                     raise PlanningError(answer.message)
+                self._distance.publish(Float64(data=reach.distance))
                 result.success, result.message = answer.outcome == 'reached', answer.message
                 return
             if isinstance(answer, Aim):
@@ -261,6 +264,7 @@ class VisualMpcNode(ManagedNode):
                            time.monotonic())
                 result.steps = reach.steps
                 self._diagnostics.took(answer.plan.planning_ms, 'plan')
+                self._distance.publish(Float64(data=reach.distance))
                 self._show(answer, targets[answer.stage])
                 handle.publish_feedback(ReachGoal.Feedback(
                     step=reach.steps, stage=stage_name(answer.stage, len(targets) - 1),

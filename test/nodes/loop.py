@@ -18,6 +18,7 @@ from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, JointState
 from sim_bridge.simulator import Simulator
+from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
@@ -53,6 +54,9 @@ class Loop:
         self.twists = []
         node.create_subscription(
             TwistStamped, 'arm/delta_twist_cmds', self.twists.append, STREAM)
+        self.distances = []
+        node.create_subscription(
+            Float64, 'plan/distance', lambda m: self.distances.append(m.data), STREAM)
 
     def start(self, name, remaps=(), **parameters):
         self.processes[name] = NodeProcess(
@@ -67,6 +71,7 @@ class Loop:
         for topic in (self.objects, self.joints, self.goal_image, self.goal_objects):
             topic.wait(patience, lambda m: m.header.stamp == image.header.stamp)
         self.twists.clear()
+        self.distances.clear()
 
     @contextmanager
     def set(self, name, **parameters):

@@ -24,6 +24,7 @@ from tap_ros.nodes.predictor_node import OVERLAY_SCALE
 from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
 from tap_ros.pictures import OBJECT_COLOURS
 from tap_ros.planning.plan_picture import CHOSEN
+from tap_ros.recording.attachments import read_attachments
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 from visualization_msgs.msg import MarkerArray
@@ -124,6 +125,12 @@ def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
     assert result.expected_distance == pytest.approx(
         np.linalg.norm(pixels - goals, axis=1).mean(), abs=1e-3)
     assert loop.stopped()
+    for _ in range(100):  # the last may come after the result
+        if len(loop.distances) > budget:
+            break
+        threading.Event().wait(0.05)
+    assert len(loop.distances) == budget + 1 and loop.distances[-1] == result.expected_distance
+    assert loop.distances[0] > loop.distances[-1]
 
 
 def test_plans_are_drawn_for_whoever_listens(loop, client):
@@ -198,8 +205,12 @@ def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
                     stream, validate_crcs=True).iter_messages())
     for topic in ('/camera/image_raw', '/camera/camera_info', '/objects', '/joint_states',
                   '/clock', '/goal/image', '/goal/objects', '/episode', '/gripper/command',
-                  '/arm/delta_twist_cmds', '/subgoal', '/subgoal/image', '/subgoal/overlay'):
+                  '/arm/delta_twist_cmds', '/subgoal', '/subgoal/image', '/subgoal/overlay',
+                  '/plan/distance'):
         assert counts[topic] > 0
+    attached = [each.name for path in bag.glob('*.mcap') for each in read_attachments(path)]
+    assert {'goal.png', 'predictor_node_model_card.md', 'visual_mpc_node_model_card.md'} == set(
+        attached)
     episodes = list(iter_episodes(bag))
     whole, cut_short = episodes[-2:]
     assert (whole.task, whole.seed, len(whole.frames)) == ('push2', 7, 3)

@@ -165,16 +165,24 @@ def test_goal_pictures_and_model_cards_are_attached(client, record, tmp_path):
 
 def test_topics_of_any_type_can_be_recorded(client, record, tmp_path):
     joints = client.create_publisher(JointState, 'elsewhere/joints', STREAM)
-    process = record(topics='[elsewhere/joints]', compression='none', mount_x=0.25,
-                     fixed_opening=0.5).wait_for('ready')
+    robot = client.create_publisher(String, 'robot_description', LATCHED)
+    robot.publish(String(data='<robot/>'))  # before the recorder is there
+    process = record(topics='[elsewhere/joints,robot_description]', compression='none',
+                     mount_x=0.25, fixed_opening=0.5).wait_for('ready')
     wait_for_subscriber(joints)
     joints.publish(JointState(name=['a'], position=[1.5]))
     arrived(joints)
+    arrived(robot)
+    path, = (tmp_path / 'bag').glob('*.mcap')
+    size_when_written(path, 1000)
     finish(client)
     assert process.end() == 0, process.text
-    (topic, kind, message), = read(tmp_path / 'bag')
-    assert (topic, kind) == ('/elsewhere/joints', 'sensor_msgs/msg/JointState')
+    found = {topic: (kind, message) for topic, kind, message in read(tmp_path / 'bag')}
+    assert sorted(found) == ['/elsewhere/joints', '/robot_description']
+    kind, message = found['/elsewhere/joints']
+    assert kind == 'sensor_msgs/msg/JointState'
     assert message.name == ['a'] and message.position.tolist() == [1.5]
+    assert found['/robot_description'][1].data == '<robot/>'
     stood = ur10e.SIMULATED
     assert read_mount(tmp_path / 'bag') == ArmMount(
         ur10e.Mount((0.25, *stood.position[1:]), stood.yaw, stood.tool), 0.5)

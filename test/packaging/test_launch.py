@@ -25,7 +25,23 @@ def described(name):
 
 def test_nodes_launch_starts_each_executable_once():
     nodes = [e for e in described('nodes.launch.py') if isinstance(e, launch_ros.Node)]
-    assert sorted(node.node_executable for node in nodes) == sorted(NODE_MODULES)
+    ours = [node.node_executable for node in nodes if node.node_package == 'tap_ros']
+    assert sorted(ours) == sorted(NODE_MODULES)
+
+
+def test_rviz_is_started_only_if_asked_for_and_with_a_file_that_is_there():
+    context = pytest.importorskip('launch').LaunchContext()
+    entities = described('nodes.launch.py')
+    argument, = [e for e in entities
+                 if isinstance(e, launch.DeclareLaunchArgument) and e.name == 'rviz']
+    assert argument.default_value[0].text == 'false'
+    rviz, = [e for e in entities
+             if isinstance(e, launch_ros.Node) and e.node_package == 'rviz2']
+    for value in ('true', 'false'):
+        context.launch_configurations['rviz'] = value
+        assert rviz.condition.evaluate(context) == (value == 'true')
+    path = Path(*[part.text for part in rviz.cmd[2][0].substitutions[1:]])
+    assert (FOLDER.parent / path).is_file()
 
 
 def test_demo_launch_ends_with_its_driver():

@@ -92,7 +92,7 @@ def test_every_executable_has_its_main(node):
 
 def test_launch_files_and_parameters_are_installed():
     share = Path(get_package_share_directory('tap_ros'))
-    for pattern in ('config/*.yaml', 'launch/*.launch.py'):
+    for pattern in ('config/*.yaml', 'config/layouts/*', 'launch/*.launch.py'):
         here = {path.name for path in ROOT.glob(pattern)}
         assert here and here <= {path.name for path in share.glob(pattern)}
 

@@ -1,0 +1,195 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The layouts of viewers show topics that running nodes publish, by panels that viewers have."""
+
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.util import find_spec
+import json
+from pathlib import Path
+import time
+
+from processes import NodeProcess
+import pytest
+from rclpy.qos import DurabilityPolicy
+import yaml
+
+FOLDER = Path(__file__).parents[2] / 'config' / 'layouts'
+IMAGE, CAMERA_INFO = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
+MARKERS, TEXT = 'visualization_msgs/msg/MarkerArray', 'std_msgs/msg/String'
+DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
+
+# What the 3D panel of Lichtblick 1.28.1 draws, by packages/suite-base/src/panels/ThreeDeeRender.
+DRAWN = (IMAGE, CAMERA_INFO, MARKERS, TEXT)
+# Panels of it, by packages/suite-base/src/panels/index.ts; Foxglove calls them the same.
+PANELS = {'3D', 'Image', 'Plot', 'DiagnosticSummary', 'CallService'}
+# Of rviz 14.1 (Jazzy), by rviz_default_plugins/plugins_description.xml, and by panel_factory.cpp.
+DISPLAYS = {'Grid': None, 'TF': None, 'RobotModel': TEXT, 'MarkerArray': MARKERS,
+            'CameraInfo': CAMERA_INFO, 'Image': IMAGE}
+TOOLS = {'Interact', 'MoveCamera', 'Select', 'FocusCamera', 'Measure'}
+RVIZ_PANELS = {'rviz_common/Displays', 'rviz_common/Views', 'rviz_common/Time'}
+# Widgets of rqt's plugins, by their plugin.xml and .ui files.
+PLUGINS = {'rqt_image_view/ImageView': 'ImageViewWidget', 'rqt_plot/Plot': 'DataPlotWidget',
+           'rqt_runtime_monitor/RuntimeMonitor': 'RuntimeMonitorWidget',
+           'rqt_service_caller/ServiceCaller': 'ServiceCallerWidget'}
+
+
+@pytest.fixture(scope='module')
+def nodes(tmp_path_factory):
+    """Start the nodes whose topics are shown."""
+    folder = tmp_path_factory.mktemp('layouts')
+    started = []
+    try:
+        for name, parameters in (('sim_node', {'observer': 'true', 'lock_step': 'true'}),
+                                 ('predictor_node', {}), ('visual_mpc_node', {})):
+            started.append(NodeProcess(name, folder / f'{name}.log', parameters))
+        for process in started:
+            process.wait_for('ready', 120)
+        yield
+    finally:
+        for process in started:
+            process.kill()
+
+
+def found(ask, missing, give_up_after=200):
+    """Return what is asked for as a dict, once it has all names."""
+    for _ in range(give_up_after):
+        answer = dict(ask())
+        if missing <= set(answer):
+            return answer
+        time.sleep(0.1)
+    raise AssertionError(f'nobody offers {sorted(missing - set(answer))}')
+
+
+def numbers(path, separator, topics):
+    """Check that a path through a message ends at a number."""
+    topic = max((t for t in topics if path.startswith(t + separator)), key=len)
+    package, kind, name = topics[topic][0].split('/')
+    fields = getattr(import_module(f'{package}.{kind}'), name).get_fields_and_field_types()
+    assert fields[path[len(topic) + 1:]] == 'double'
+
+
+def leaves(tree):
+    if isinstance(tree, str):
+        yield tree
+    else:
+        assert tree['direction'] in ('row', 'column') and 0 < tree['splitPercentage'] < 100
+        yield from leaves(tree['first'])
+        yield from leaves(tree['second'])
+
+
+def foxglove():
+    return json.loads((FOLDER / 'tap_ros.json').read_text())
+
+
+def rviz():
+    return yaml.safe_load((FOLDER / 'tap_ros.rviz').read_text())
+
+
+def value(setting):
+    """Return a value of a perspective, as qt_gui reads it."""
+    assert setting['type'] == 'repr'
+    return yaml.safe_load(setting['repr'])
+
+
+def rqt() -> tuple[dict, dict]:
+    """Return the running plugins, and the settings of each instance."""
+    groups = json.loads((FOLDER / 'tap_ros.perspective').read_text())['groups']
+    manager = groups['pluginmanager']
+    settings = {name: {key: value(v) for key, v in group['groups']['plugin']['keys'].items()}
+                for name, group in manager['groups'].items()}
+    return value(manager['keys']['running-plugins']), settings
+
+
+def displayed() -> Iterator[dict]:
+    """Yield rviz's displays that show a topic."""
+    for display in rviz()['Visualization Manager']['Displays']:
+        if 'Topic' in display or 'Description Topic' in display:
+            yield display
+
+
+def test_foxglove_shows_topics_of_the_nodes(nodes, client):
+    panels = foxglove()['configById']
+    images = [c['imageMode']['imageTopic'] for name, c in panels.items() if name[:6] == 'Image!']
+    assert len(set(images)) == len(images) == 6
+    drawn = [topic for c in panels.values() for topic in c.get('topics', ())]
+    drawn += [c['cameraInfoTopic'] for panel in panels.values()
+              for c in panel.get('topics', {}).values() if 'cameraInfoTopic' in c]
+    plotted = [p['value'] for c in panels.values() for p in c.get('paths', ())]
+    health = panels['DiagnosticSummary!all']['topicToRender']
+    topics = found(client.get_topic_names_and_types, {*images, *drawn, health})
+    assert {topics[topic][0] for topic in images} == {IMAGE}
+    assert {topics[topic][0] for topic in drawn} <= set(DRAWN)
+    assert topics[health] == [DIAGNOSTICS] and topics['/plan/markers'] == [MARKERS]
+    for path in plotted:
+        if not path.isdigit():  # a line at a height
+            numbers(path, '.', topics)
+    call = panels['CallService!predict']
+    services = found(client.get_service_names_and_types, {call['serviceName']})
+    assert services[call['serviceName']] == ['tap_msgs/srv/PredictSubgoal']
+    assert json.loads(call['requestPayload']) == {}
+
+
+def test_foxglove_accepts_the_file_and_has_its_panels():
+    layout = foxglove()
+    assert all(isinstance(layout[key], dict)
+               for key in ('configById', 'globalVariables', 'playbackConfig', 'userNodes'))
+    assert isinstance(layout['playbackConfig']['speed'], int)
+    assert sorted(leaves(layout['layout'])) == sorted(layout['configById'])
+    assert {name.split('!')[0] for name in layout['configById']} == PANELS
+
+
+def test_rviz_shows_topics_of_the_nodes_as_they_are_offered(nodes, client):
+    wanted = {}
+    for display in displayed():
+        topic = display.get('Topic') or display['Description Topic']
+        wanted[topic['Value']] = DISPLAYS[display['Class'].split('/')[1]], topic
+    topics = found(client.get_topic_names_and_types, set(wanted))
+    for name, (kind, topic) in wanted.items():
+        assert topics[name] == [kind]
+        info, = client.get_publishers_info_by_topic(name)
+        latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        assert topic['Durability Policy'] == ('Transient Local' if latched else 'Volatile'), name
+        assert topic['Reliability Policy'] == 'Reliable'
+    if find_spec('tf2_msgs'):
+        assert topics['/tf'] == ['tf2_msgs/msg/TFMessage']
+
+
+def test_rviz_has_the_displays_and_a_place_for_each_picture():
+    config = rviz()
+    manager = config['Visualization Manager']
+    classes = [display['Class'] for display in manager['Displays']]
+    assert {f'rviz_default_plugins/{name}' for name in DISPLAYS} == set(classes)
+    assert {tool['Class'] for tool in manager['Tools']} == {
+        f'rviz_default_plugins/{name}' for name in TOOLS}
+    assert {panel['Class'] for panel in config['Panels']} == RVIZ_PANELS
+    assert manager['Views']['Current']['Class'] == 'rviz_default_plugins/Orbit'
+    assert manager['Global Options']['Fixed Frame'] == 'world'
+    docks = bytes.fromhex(config['Window Geometry']['QMainWindow State'])
+    for display in displayed():
+        if display['Class'].endswith('/Image'):
+            assert display['Name'].encode('utf-16-be') in docks
+
+
+def test_rqt_shows_topics_of_the_nodes(nodes, client):
+    running, settings = rqt()
+    images = [s['topic'] for s in settings.values() if 'topic' in s]
+    assert len(set(images)) == len(images) == len(running['rqt_image_view/ImageView'])
+    topics = found(client.get_topic_names_and_types, {*images, '/plan/distance', '/diagnostics'})
+    assert {topics[topic][0] for topic in images} == {IMAGE}
+    numbers(settings['plugin__rqt_plot__Plot__1']['topics'], '/', topics)
+    service = settings['plugin__rqt_service_caller__ServiceCaller__1']['current_service_name']
+    assert found(client.get_service_names_and_types, {service})
+
+
+def test_rqt_has_the_plugins_and_a_place_for_each():
+    running, settings = rqt()
+    assert set(running) == set(PLUGINS)
+    instances = [(name, serial) for name, serials in running.items() for serial in serials]
+    names = {f'{name.replace("/", "__")}__{serial}': name for name, serial in instances}
+    assert {name.removeprefix('plugin__') for name in settings} <= set(names)
+    window = json.loads((FOLDER / 'tap_ros.perspective').read_text())['groups']['mainwindow']
+    text = window['keys']['state']['repr(QByteArray.hex)']
+    docks = bytes.fromhex(text.removeprefix("QtCore.QByteArray(b'").removesuffix("')"))
+    for name, plugin in names.items():
+        assert f'{name}__{PLUGINS[plugin]}'.encode('utf-16-be') in docks
