@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import json
 
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED
-from experiments.paper.runs import paper_runs, PaperRun, SCALES, SINGLE
+from experiments.paper.runs import LONG, paper_runs, PaperRun, SCALES, SINGLE
 import pytest
 from tap_ros.errors import ConfigError
 
@@ -91,13 +91,31 @@ def test_names_are_unique_and_the_first_seed_comes_first():
 
 def test_rows_of_a_task_and_mode_differ_in_the_method_and_network_only():
     free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'progress_margin', 'kl_weight',
-            'seed', 'detach_recursion', 'decoder', 'skips', 'match_temperature', 'pretrain_steps'}
+            'seed', 'detach_recursion', 'decoder', 'skips', 'match_temperature', 'pretrain_steps',
+            'initial_weights'}
     for scale in SCALES:
         settings = {}
         for run in paper_runs(scale):
             values = {name: value for name, value in asdict(run.config('b', 'r')).items()
                       if name not in free}
+            if run.variant.endswith('+long'):
+                values['steps'] /= LONG
             assert settings.setdefault((run.task, run.mode), values) == values
+
+
+def test_the_order_begins_with_what_the_same_method_has_from_push2():
+    runs = paper_runs('small')
+    begun = {run.name: run.beginning for run in runs if run.beginning}
+    assert len(begun) == 6
+    for run in runs:
+        if run.name not in begun:
+            assert run.config('b', 'r').initial_weights == ''
+            continue
+        first = begun[run.name]
+        assert first.name == run.name.replace(run.task, 'push2')
+        assert first in runs[:runs.index(run)], 'it is trained before'
+        assert run.config('b', 'r').initial_weights == (
+            f'r/small/{first.name}/predictor.safetensors')
 
 
 def test_full_has_the_papers_length():
