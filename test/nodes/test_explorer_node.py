@@ -32,6 +32,7 @@ class Explored:
 
     def __init__(self, node, folder):
         self.node, self.folder, self.processes = node, folder, {}
+        self.started = []
         self.start('sim_node', lock_step='true', task='push2', seed=SEED)
         self.start('predictor_node')
         self.start('visual_mpc_node')
@@ -44,6 +45,7 @@ class Explored:
 
     def start(self, name, **parameters):
         self.processes[name] = NodeProcess(name, self.folder / f'{name}.log', parameters)
+        self.started.append(self.processes[name])
 
     def statuses(self):
         """Return a list that gets the newest status of the newest goal, again and again."""
@@ -70,7 +72,7 @@ def explored(tmp_path_factory):
         try:
             yield explored
         finally:
-            for process in explored.processes.values():
+            for process in explored.started:
                 process.kill()
 
 
