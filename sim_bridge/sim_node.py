@@ -308,9 +308,13 @@ class SimNode(Node):
 
     def wait_period(self) -> None:
         """Let one control period pass in which the arm stands still."""
-        if self.state is RunState.STOPPED:
-            self.state = RunState.PAUSED  # as it is no longer at its start
+        self._leave_start()
         self._step(np.zeros(3))
+
+    def _leave_start(self) -> None:
+        """Note that the first scene is no longer at its start, which is what stopped says."""
+        if self.state is RunState.STOPPED:
+            self.state = RunState.PAUSED
 
     def restart(self) -> None:
         """Start the first scene again, as when the node was started."""
@@ -323,6 +327,7 @@ class SimNode(Node):
     def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike) -> None:
         """Put an object elsewhere (see Simulator.put_object) and publish what is seen then."""
         self._sim.put_object(name, pose, velocity)
+        self._leave_start()
         self._stamp_ns += 1  # pictures are told apart by their stamps
         self._publish(self._sim.observe())
 
@@ -343,6 +348,7 @@ class SimNode(Node):
         if sim is not self._sim:
             self._sim.close()
         self._sim, self._hide_arm = sim, hide_arm
+        self._leave_start()
         self._opening, self._twist = 0.0, None
         self._stamp_ns += PERIOD_NS
         self._reset_ns = self._stamp_ns

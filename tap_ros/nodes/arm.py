@@ -58,6 +58,8 @@ class Arm:
     def begin(self, goal: object) -> None:
         """Let a goal, any object, move the arm; nothing else may from now on."""
         with self._lock:
+            if self._closed:
+                return
             self._goal, self._topics = goal, ()
             self._moved_at = -math.inf
             self._ticked_at, self._stood_s = now_awake(), 0.0
@@ -106,7 +108,7 @@ class Arm:
             if self._stood_s:
                 raise PlanningError(f'the planner stood still for {self._stood_s:.1f} s; what it '
                                     'sees may be old. Send the goal again')
-            if self._goal is not goal or self._silent(topics, now):
+            if self._closed or self._goal is not goal or self._silent(topics, now):
                 return False
             self._topics, self._moved_at = tuple(topics), now
             self._gripper.publish(Float64(data=float(np.clip(action[3], 0, 1))))
@@ -115,9 +117,9 @@ class Arm:
 
     def close(self, seconds: float) -> None:
         """Stop the arm for good; wait until that has left, at most so many seconds."""
-        self.end()
         with self._lock:
-            self._closed = True
+            self._closed, self._goal = True, None
+            self._stop()
             self._lock.notify()
         self._thread.join(seconds)
         self._twist.wait_for_all_acked(Duration(seconds=seconds))

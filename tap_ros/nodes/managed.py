@@ -51,7 +51,8 @@ class ManagedNode(LifecycleNode):
         self.active = False
         self._failure: Exception | None = None  # of the transition that was tried last
         self._starting = False  # by itself: a failure is raised, and logged by who starts nodes
-        self._loaded: Any = None  # for parameters that are about to change
+        self._loaded: tuple[Any, str] | None = None  # for parameters that are about to change
+        self._card = ''  # what the weights are
         self._cards = self.create_publisher(String, '~/model_card', LATCHED)
         # First, as rclpy calls the newest callback first: what others refuse is not loaded.
         self.add_on_set_parameters_callback(self._before_set)
@@ -83,8 +84,8 @@ class ManagedNode(LifecycleNode):
         """Say what the node works with, for the log."""
 
     @abstractmethod
-    def files(self) -> list[Path]:
-        """Return the files of the weights."""
+    def files(self, changed: Mapping[str, Any]) -> list[Path]:
+        """Return the files of the weights; changed: as for load."""
 
     def resume(self) -> None:
         """
@@ -134,15 +135,16 @@ class ManagedNode(LifecycleNode):
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the weights."""
-        return self._try('configure', lambda: self.use(self.load({})))
+        return self._try('configure', lambda: self._use(self._load({})))
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to work."""
         def begin() -> None:
+            ready = f'ready: {self.described()}'
+            self._cards.publish(String(data=self._card))
             self.resume()
-            self.active = True
-            self._cards.publish(String(data=describe_weights(self.files())))
-            self.get_logger().info(f'ready: {self.described()}')
+            self.active = True  # last: nothing may fail after it
+            self.get_logger().info(ready)
 
         return self._try('activate', begin)
 
@@ -163,11 +165,23 @@ class ManagedNode(LifecycleNode):
 
     def _stop(self) -> None:
         """Do nothing more; what `pause` raises is logged, and the node is inactive anyway."""
+        if not self.active:
+            return
         self.active = False
         try:
             self.pause()
         except Exception as error:
             self._log(error, 'deactivate')
+
+    def _load(self, changed: Mapping[str, Any]) -> tuple[Any, str]:
+        """Load weights; return them and what they are, which a file may not be for long."""
+        card = describe_weights(self.files(changed))
+        return self.load(changed), card
+
+    def _use(self, loaded: tuple[Any, str]) -> None:
+        """Go on with what _load returned."""
+        self.use(loaded[0])
+        self._card = loaded[1]
 
     def _try(self, transition: str, do: Callable[[], object]) -> TransitionCallbackReturn:
         """Do what a transition does; when it fails, the node stays in the state that it has."""
@@ -223,7 +237,7 @@ class ManagedNode(LifecycleNode):
                 f'{listing(changed)} cannot be changed while the node is active; deactivate it '
                 f'first: ros2 lifecycle set {self.get_fully_qualified_name()} deactivate'))
         try:
-            self._loaded = self.load(changed)
+            self._loaded = self._load(changed)
         except TapError as error:
             return SetParametersResult(successful=False, reason=str(error))
         except Exception as error:
@@ -236,5 +250,5 @@ class ManagedNode(LifecycleNode):
         """Use what was tried."""
         if self._loaded is not None:
             loaded, self._loaded = self._loaded, None
-            self.use(loaded)
+            self._use(loaded)
             self.get_logger().info(f'loaded: {self.described()}')

@@ -99,8 +99,7 @@ class PredictorNode(ManagedNode):
 
     def load(self, changed: Mapping[str, Any]) -> tuple['RequestQueue[Task, Found]', Predictors]:
         """Load weights; return what answers with them."""
-        weights, forward = (
-            changed.get(name, self.params[name]) for name in ('weights', 'forward_weights'))
+        weights, forward = self._names(changed)
         predictors: Predictors = {}
 
         def prepare() -> Callable[[list[Task]], list[Found]]:
@@ -124,7 +123,7 @@ class PredictorNode(ManagedNode):
     def unload(self) -> None:
         """Let the weights go, once the batch in progress has ended."""
         if self._queue is not None:
-            self._queue.close(CLOSE_TIMEOUT)
+            self._queue.close(CLOSE_TIMEOUT, 'the weights are no longer in use; ask again')
         self._queue = None
         self._predictors.clear()
 
@@ -132,15 +131,15 @@ class PredictorNode(ManagedNode):
         """Name the modes, the sizes of pictures, the device and the files."""
         sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
                  for mode, predictor in self._predictors.items()]
-        return f'{", ".join(sizes)}, {self.params["device"]}, {", ".join(self._names())}'
+        return ', '.join([*sizes, self.params['device'], *filter(None, self._names({}))])
 
-    def files(self) -> list[Path]:
+    def files(self, changed: Mapping[str, Any]) -> list[Path]:
         """Return the files of the weights."""
-        return [find_predictor(name) for name in self._names()]
+        return [find_predictor(name) for name in self._names(changed) if name]
 
-    def _names(self) -> list[str]:
-        """Return the weights as the parameters name them."""
-        return [self.params[name] for name in self.reloaded if self.params[name]]
+    def _names(self, changed: Mapping[str, Any]) -> list[str]:
+        """Return the weights as the parameters name them, '' for forward ones that are none."""
+        return [changed.get(name, self.params[name]) for name in self.reloaded]
 
     # In the executor: what comes, and what people see
 

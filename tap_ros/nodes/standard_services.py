@@ -59,7 +59,9 @@ class StandardServices:
 
     def _on_get_features(self, _: Any, response: Any) -> None:
         response.features = SimulatorFeatures(
-            features=[getattr(SimulatorFeatures, name) for name in FEATURES], custom_info=INFO)
+            features=[getattr(SimulatorFeatures, name) for name in FEATURES
+                      if hasattr(SimulatorFeatures, name)],  # earlier versions lack some
+            custom_info=INFO)
 
     def _on_reset(self, request: Any, response: Any) -> None:
         if request.scope in (ResetSimulation.Request.SCOPE_DEFAULT,

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from tap_ros.planning.visual_mpc import VisualMPC
     from tap_ros.prediction.predictor import Subgoal
 
+ENDING = 'the node is ending'
 STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
 
 
@@ -111,13 +112,14 @@ class VisualMpcNode(ManagedNode):
     def close(self) -> None:
         """End the goal in progress, and see that the command to stop has left."""
         self.active = False
-        self._end_goal('the node is ending')
+        self._end_goal(ENDING)
         self._arm.close(1.0)
 
     # Weights
 
     def load(self, changed: Mapping[str, Any]) -> 'VisualMPC':
         """Load weights; return what plans with them."""
+        self._check_idle()
         return load_planner(self.params, changed.get('weights', self.params['weights']))
 
     def use(self, loaded: 'VisualMPC') -> None:
@@ -129,6 +131,7 @@ class VisualMpcNode(ManagedNode):
 
     def unload(self) -> None:
         """Let the weights go."""
+        self._check_idle()
         with suppress(AttributeError):  # where there are none
             del self._mpc
 
@@ -136,15 +139,21 @@ class VisualMpcNode(ManagedNode):
         """Name the device and the file."""
         return f'{self.params["device"]}, {self.params["weights"]}'
 
-    def files(self) -> list[Path]:
+    def files(self, changed: Mapping[str, Any]) -> list[Path]:
         """Return the file of the weights."""
-        return [Path(self.params['weights'])]
+        return [Path(changed.get('weights', self.params['weights']))]
 
     def resume(self) -> None:
         """Serve goals again, once the last one has ended."""
-        if self._busy.locked():
-            raise PlanningError('the last goal has not ended yet; activate the node again')
+        self._check_idle()
+        if self._halt == ENDING:
+            raise PlanningError(ENDING)
         self._halt = ''
+
+    def _check_idle(self) -> None:
+        """Raise PlanningError while the last goal has not ended: a plan may take its time."""
+        if self._busy.locked():
+            raise PlanningError('the last goal has not ended yet; try again')
 
     def pause(self) -> None:
         """Stop the arm at once, and let the goal in progress end."""
@@ -196,6 +205,7 @@ class VisualMpcNode(ManagedNode):
             return result
         try:
             self._arm.begin(handle)
+            self._go_on(handle)
             self._reach(handle, time.monotonic(), result)
             handle.succeed()
         except Cancelled as error:

@@ -46,6 +46,7 @@ class RequestQueue(Generic[Request, Answer]):
         self._waiting: deque[tuple[Request, Callable[[Answer | Exception], object]]] = deque()
         self._changed = threading.Condition()
         self._ending = False
+        self._reason = ''  # why
         prepared: Future[None] = Future()
         self._thread = threading.Thread(
             target=self._run, args=(prepare, prepared), name=THREAD_NAME, daemon=True)
@@ -75,26 +76,28 @@ class RequestQueue(Generic[Request, Answer]):
         """
         with self._changed:
             if self._ending:
-                raise Busy('busy: the node is ending; ask again when it is back')
+                raise Busy(f'busy: {self._reason}')
             if len(self._waiting) >= self._max_waiting:
                 raise Busy(f'busy: {len(self._waiting)} requests are waiting, which is the most '
                            'that may; ask again')
             self._waiting.append((request, answer))
             self._changed.notify()
 
-    def close(self, timeout_s: float) -> None:
+    def close(self, timeout_s: float,
+              reason: str = 'the node is ending; ask again when it is back') -> None:
         """
         Answer what still waits with Busy, and end the thread after its batch.
 
         :param timeout_s: most seconds to wait for that batch.
+        :param reason: what those are told who wait or come later.
         """
         with self._changed:
-            self._ending = True
+            self._ending, self._reason = True, reason
             left = list(self._waiting)
             self._waiting.clear()
             self._changed.notify()
         for _, answer in left:
-            answer(Busy('busy: the node is ending; ask again when it is back'))
+            answer(Busy(f'busy: {reason}'))
         self._thread.join(timeout_s)
 
     def _run(self, prepare: Callable[[], Callable[[list[Request]], Iterable[Answer]]],

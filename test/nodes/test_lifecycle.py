@@ -13,8 +13,11 @@ import pytest
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from std_msgs.msg import String
 from tap_msgs.action import ReachGoal
-from tap_ros.nodes.clients import call, send_goal, wait_for_result
+from tap_ros.learning.weights import stored_digest
+from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
+from tap_ros.nodes.topics import LATCHED
 from tap_ros.weights import FORWARD_MODEL
 from test_predictor_node import pictures, Service, weights_file, WITH_GOAL
 
@@ -119,6 +122,20 @@ def test_weights_change_while_a_predictor_is_inactive_alone(predictor, tmp_path)
     assert str(other) in service.process.text.splitlines()[-1]
     assert service.process.end() == 0
     assert 'Traceback' not in service.process.text
+
+
+def test_the_card_is_that_of_the_weights_in_use_and_not_of_a_newer_file(predictor, tmp_path):
+    service, managed = predictor(autostart='false')
+    service.process.wait_for('waiting', 120)
+    assert managed.to(CONFIGURE)
+    plain = tmp_path / 'plain.safetensors'
+    digest = stored_digest(plain)
+    weights_file(plain, latent_size=8)
+    assert stored_digest(plain) != digest
+    assert managed.to(ACTIVATE)
+    card = Newest(service.node, String, '/managed/predictor_node/model_card', LATCHED)
+    assert digest in card.wait(20).data
+    assert service.process.end() == 0, 'it ends well while it is active'
 
 
 def test_a_planner_that_is_deactivated_stops_the_arm(loop):
