@@ -318,7 +318,9 @@ class SimNode(Node):
 
     def restart(self) -> None:
         """Start the first scene again, as when the node was started."""
+        state = self.state
         self._reset(self.params['task'], self.params['seed'], False)
+        self.state = state  # stopped stays stopped: it is the first scene
 
     def repeat(self) -> None:
         """Start the present scene again."""

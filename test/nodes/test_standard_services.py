@@ -373,6 +373,15 @@ def test_states_are_those_of_the_own_services_too(rig):
     assert rig.set_state(PAUSED) == OK and rig.set_state(STOPPED) == OK
     assert call(rig.own['step'], StepScene.Request(), 20).success
     assert rig.state() == PAUSED, 'no longer at its start'
+    assert rig.set_state(STOPPED) == OK
+    assert rig.code('reset_simulation') == OK and rig.state() == STOPPED
+    assert call(rig.own['reset'], ResetScene.Request(seed=SEED + 1), 20).success
+    assert rig.state() == PAUSED, 'another scene'
+    assert rig.set_state(STOPPED) == OK
+    state = rig.ask('get_entity_state', entity='object_0').state
+    state.pose.position.z += 0.05
+    assert rig.code('set_entity_state', entity='object_0', state=state) == OK
+    assert rig.state() == PAUSED, 'another place'
     for state in (SimulationState.STATE_NO_WORLD, SimulationState.STATE_LOADING_WORLD, 200):
         assert rig.set_state(state) == UNSUPPORTED
     assert rig.state() == PAUSED
