@@ -83,6 +83,10 @@ def test_objects_of_another_moment_are_no_goal(camera):
     objects = node.create_publisher(ObjectStates, 'objects', STREAM)
     goal_image = Newest(node, Image, 'goal/image', LATCHED)
     url = page_address(explorer).replace('http', 'ws').replace('/?', '/socket?')
+    deadline = time.monotonic() + 30
+    while not all(each.get_subscription_count() for each in (pictures, objects)):
+        assert time.monotonic() < deadline  # a picture without any objects would be a goal
+        time.sleep(0.1)
     with connect(url, open_timeout=10) as browser:
         text, deadline, stamp = '', time.monotonic() + 30, 0
         while 'no objects have the stamp' not in text:
