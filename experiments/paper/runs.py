@@ -65,14 +65,15 @@ VARIANTS = {
     '+skips+margin': {**_OURS, 'margin': 3},
     '+skips+edge': {**_OURS, 'progress_margin': 0.0},
     '+skips+annealed': {**_OURS, 'match_temperature': 1.0},
-    # Not begun with the weights of push2.
+    # Of the tasks in FINE_TUNED, from fresh weights.
     '+skips+scratch': _OURS,
     '+skips+long': _OURS,
 }
 LONG = 2  # times the steps, of '+long'
-# Few episodes, in which both objects stand close together: they begin with the weights that the
-# same method has from push2.
-FINE_TUNED = ('order2', 'order3')
+# Few episodes, in which the objects stand close together: from fresh weights, or those of a short
+# training, predictions copy the start. All methods begin with the same shipped weights.
+FINE_TUNED = {'order2': 'push2', 'order3': 'push3'}
+_FINE_TUNED = {'goal_picture': 'mixed', 'start_crop': 0.3}  # as those were trained
 
 
 def label(method, variant='', recursion=1):
@@ -140,10 +141,10 @@ class PaperRun:
 
     @property
     def beginning(self):
-        """The PaperRun with whose weights it begins, None for fresh ones."""
-        if self.task not in FINE_TUNED or self.variant != OURS:
-            return None
-        return replace(self, task='push2')
+        """Name of the shipped weights that it begins with, '' for fresh ones."""
+        # Shipped networks have the width of 'small'.
+        fresh = self.scale != 'small' or self.variant != OURS
+        return '' if fresh else FINE_TUNED.get(self.task, '')
 
     @property
     def shifted(self):
@@ -178,14 +179,13 @@ class PaperRun:
             settings |= _RECURSION
         if not SCALES[self.scale].steps and settings.get('decoder') != 'shared':
             settings['pretrain_steps'] = self._steps_of(PRETRAIN_EPOCHS)
-        if self.beginning:
-            settings['initial_weights'] = str(
-                self.beginning.folder(runs) / 'predictor.safetensors')
+        if self.task in FINE_TUNED:
+            settings |= _FINE_TUNED
         return TrainingConfig(
             recordings=(str(Path(recordings) / self.task),), out=str(self.folder(runs)),
             mode=self.mode, method=self.method, new_pixels=self.new_pixels, seed=self.seed,
             test_fraction=held_out_share(self.num_episodes), recursion=self.recursion,
-            steps=self.num_steps, **settings)
+            steps=self.num_steps, initial_weights=self.beginning, **settings)
 
     def folder(self, runs):
         """Return the Path of this run's folder in the folder of all runs."""

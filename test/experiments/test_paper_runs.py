@@ -4,11 +4,13 @@
 
 from dataclasses import asdict, replace
 import json
+from pathlib import Path
 
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED
-from experiments.paper.runs import LONG, paper_runs, PaperRun, SCALES, SINGLE
+from experiments.paper.runs import FINE_TUNED, LONG, paper_runs, PaperRun, SCALES, SINGLE
 import pytest
 from tap_ros.errors import ConfigError
+from tap_ros.weights import find_predictor
 
 EVERY = [run for scale in SCALES for run in paper_runs(scale)]
 MAIN = {'fix-wo-gan', 'min-wo-gan', 'genmin-wo-gan', 'genmin-wo-gan+progress'}
@@ -50,7 +52,8 @@ def test_every_run_can_be_trained_as_its_name_says():
     for run in EVERY:
         config = run.config('bags', 'runs/paper')
         assert config.chosen.name == run.method and config.mode == run.mode
-        assert config.seed == run.seed and config.goal_picture == 'last'
+        assert config.seed == run.seed
+        assert config.goal_picture == ('mixed' if run.task in FINE_TUNED else 'last')
         assert config.outer_power == 1
         assert config.recordings == (f'bags/{run.task}',)
         assert config.out == f'runs/paper/{run.scale}/{run.name}'
@@ -103,19 +106,16 @@ def test_rows_of_a_task_and_mode_differ_in_the_method_and_network_only():
             assert settings.setdefault((run.task, run.mode), values) == values
 
 
-def test_the_order_begins_with_what_the_same_method_has_from_push2():
-    runs = paper_runs('small')
-    begun = {run.name: run.beginning for run in runs if run.beginning}
+def test_the_order_begins_with_the_same_shipped_weights_for_all_methods():
+    begun = {run.name: run.config('b', 'r').initial_weights for run in paper_runs('small')}
+    begun = {name: weights for name, weights in begun.items() if weights}
     assert len(begun) == 6
-    for run in runs:
-        if run.name not in begun:
-            assert run.config('b', 'r').initial_weights == ''
-            continue
-        first = begun[run.name]
-        assert first.name == run.name.replace(run.task, 'push2')
-        assert first in runs[:runs.index(run)], 'it is trained before'
-        assert run.config('b', 'r').initial_weights == (
-            f'r/small/{first.name}/predictor.safetensors')
+    for name, weights in begun.items():
+        task = name.split('-')[0]
+        assert weights == {'order2': 'push2', 'order3': 'push3'}[task]
+        # The training reads them before its first step.
+        assert Path(find_predictor(weights)).is_file()
+    assert not any(run.config('b', 'r').initial_weights for run in paper_runs('full'))
 
 
 def test_full_has_the_papers_length():
