@@ -15,9 +15,16 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from tap_msgs.action import ReachGoal
+from tap_msgs.srv import PredictSubgoal
 from tap_ros.learning.weights import stored_digest
-from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
-from tap_ros.nodes.topics import LATCHED
+from tap_ros.nodes.clients import (
+    call,
+    Newest,
+    send_goal,
+    wait_for_future,
+    wait_for_result,
+)
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS
 from tap_ros.weights import FORWARD_MODEL
 from test_predictor_node import pictures, Service, weights_file, WITH_GOAL
 
@@ -124,6 +131,28 @@ def test_weights_change_while_a_predictor_is_inactive_alone(predictor, tmp_path)
     assert 'Traceback' not in service.process.text
 
 
+def test_who_waits_for_a_subgoal_is_answered_when_the_predictor_is_deactivated(predictor):
+    service, managed = predictor()
+    service.process.wait_for('ready', 120)
+    assert service.client.wait_for_service(30)
+    client = service.node.create_client(
+        PredictSubgoal, '/managed/predict_subgoal', qos_profile=SERVICE_QOS)
+    assert client.wait_for_service(30)
+    request = PredictSubgoal.Request(recursion_depth=8, **WITH_GOAL)
+    waiting = [client.call_async(request) for _ in range(40)]
+    assert wait_for_future(waiting[0], 60)
+    assert managed.to(DEACTIVATE)
+    assert all(wait_for_future(future, 60) for future in waiting)
+    refused = [future.result().message for future in waiting if not future.result().success]
+    assert waiting[0].result().success
+    assert all('activate it' in message for message in refused)
+    assert managed.to(ACTIVATE)
+    service.answer(**WITH_GOAL)
+    assert managed.to(DEACTIVATE)
+    assert service.process.end() == 0, 'it ends well while it is inactive'
+    assert 'Traceback' not in service.process.text
+
+
 def test_the_card_is_that_of_the_weights_in_use_and_not_of_a_newer_file(predictor, tmp_path):
     service, managed = predictor(autostart='false')
     service.process.wait_for('waiting', 120)
@@ -161,3 +190,21 @@ def test_a_planner_that_is_deactivated_stops_the_arm(loop):
     status, result = loop.reach(mode='direct', step_budget=2)
     assert status == GoalStatus.STATUS_SUCCEEDED and result.steps == 2, result.message
     assert 'Traceback' not in loop.processes['visual_mpc_node'].text
+
+
+def test_a_planner_that_is_shut_down_stops_the_arm_for_good(loop):
+    managed = Managed(loop.node, 'visual_mpc_node')
+    loop.reset()
+    moving = threading.Event()
+    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
+                       lambda feedback: moving.set())
+    assert moving.wait(120)
+    assert managed.to(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    status, result = wait_for_result(handle, 30)
+    assert status == GoalStatus.STATUS_ABORTED and 'deactivated' in result.message
+    assert loop.stopped()
+    count = len(loop.moves())
+    status, result = loop.reach(mode='direct', step_budget=1)
+    assert status == GoalStatus.STATUS_ABORTED and 'start it again' in result.message
+    assert loop.stopped() and len(loop.moves()) == count
+    assert loop.processes['visual_mpc_node'].end() == 0
