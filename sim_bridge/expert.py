@@ -21,10 +21,11 @@ import mujoco.rollout
 import numpy as np
 from sim_bridge.episode_run import carry_out, EpisodeRun
 from sim_bridge.grasp_expert import GraspConfig, run_grasp_episode
+from sim_bridge.pick_and_place import STACK_CONFIG
 from sim_bridge.push_order import find_order
 from sim_bridge.pushes import Moment, Push, push_actions, PushRollouts
 from sim_bridge.simulator import Simulator
-from sim_bridge.stack_expert import run_stack_episode, STACK_CONFIG
+from sim_bridge.stack_expert import run_stack_episode
 from sim_bridge.tasks import Task
 from sim_bridge.timing import draw_share, MORE_FRAMES, timed_plans
 from tap_ros.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW

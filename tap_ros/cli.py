@@ -39,6 +39,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'forward': ('score a forward model on recordings', 'tap_ros.evaluation.forward'),
         'planning': ('plan scenes and score where the objects end (Table 2)',
                      'experiments.planning.command'),
+        'stacking': ('stack objects via predicted subgoals and score the towers',
+                     'experiments.stacking.command'),
         'faults': ('inject faults into real nodes and files', 'experiments.faults.nodes.command'),
     }),
     'predict': ('predict subgoals from picture files', 'tap_ros.prediction.predict_command'),

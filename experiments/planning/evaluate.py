@@ -69,12 +69,7 @@ def make_jobs(args):
     planner = with_preset(args.preset)
     if args.plan_samples or args.plan_iterations or args.replan_every:
         planner = changed(planner, args.plan_samples, args.plan_iterations, args.replan_every)
-    weights = {'shipped': '{task}'}
-    for text in args.predictor:
-        name, found, file = text.partition('=')
-        if not found:
-            raise ConfigError(f'--predictor {text}: expected NAME=FILE')
-        weights[name] = file
+    named = named_weights(args.predictor)
     defaults = {'switch': args.switch, 'recursion': args.recursion, 'samples': args.samples,
                 'tracking': args.tracking}
     methods = list(dict.fromkeys(parse_method(text, **defaults) for text in args.methods))
@@ -83,19 +78,50 @@ def make_jobs(args):
         for method in methods:
             file = ''
             if method.predicted:
-                run = RUNS.get(method.base, method.base)
-                file = weights.get(method.base, TRAINED.replace('{name}', run))
-                file = str(find_predictor(file.replace('{task}', task)))
-                if not Path(file).is_file():
-                    raise ConfigError(
-                        f'method {method.name!r}: no weights {file}; train them with `python -m '
-                        f'tap_ros paper --only "{task}-bidirectional-{run}-warp-s0"`, '
-                        f'name them with --predictor {method.base}=FILE, or leave the method out '
-                        'with --methods')
+                file = find_weights(method, task, named, RUNS, TRAINED)
             jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
                             args.step_budget, args.preset, _command(args, task, method),
                             args.look))
     return jobs
+
+
+def named_weights(texts):
+    """
+    Read --predictor.
+
+    :param texts: NAME=FILE each.
+    :return: dict from names, also 'shipped', to files, with {task} for the task.
+    :raises ConfigError: for what is none.
+    """
+    weights = {'shipped': '{task}'}
+    for text in texts:
+        name, found, file = text.partition('=')
+        if not found:
+            raise ConfigError(f'--predictor {text}: expected NAME=FILE')
+        weights[name] = file
+    return weights
+
+
+def find_weights(method, task, named, runs, trained):
+    """
+    Find the weights of a method that predicts.
+
+    :param method: with a base and a name.
+    :param task: name.
+    :param named: of named_weights.
+    :param runs: what the command paper calls predictors that have a shorter name here.
+    :param trained: where it leaves them, with {task} and {name}.
+    :return: str, a file that is there.
+    :raises ConfigError: where there is none.
+    """
+    usual = trained.replace('{name}', runs.get(method.base, method.base))
+    file = str(find_predictor(named.get(method.base, usual).replace('{task}', task)))
+    if not Path(file).is_file():
+        raise ConfigError(
+            f'method {method.name!r}: no weights {file}; train them with `python -m tap_ros paper '
+            f'--only "{Path(usual.replace("{task}", task)).parent.name}"`, name them with '
+            f'--predictor {method.base}=FILE, or leave the method out with --methods')
+    return file
 
 
 def changed(planner, samples, iterations, replan_every):

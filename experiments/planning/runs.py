@@ -49,6 +49,11 @@ class Job:
         """Return the step budget."""
         return self.budget or step_budget(get_task(self.task).num_objects)
 
+    @property
+    def about(self):
+        """Return as a dict what is stored beside the settings and changes no result."""
+        return {'command': self.command}
+
     def settings(self):
         """Return as a dict all that changes results; weights by what is in them."""
         planner = asdict(self.method.planner(self.planner))
@@ -85,7 +90,7 @@ class ResultFile:
 
     def __init__(self, folder, job):
         self.path = Path(folder) / f'{job.task}-{job.method.file_name}.json'
-        self.settings, self.scenes, self._command = job.settings(), {}, job.command
+        self.settings, self.scenes, self._about = job.settings(), {}, job.about
         if self.path.exists():
             stored, self.scenes = read_results(self.path)
             changed = [k for k in self.settings if stored.get(k) != self.settings[k]]
@@ -98,8 +103,7 @@ class ResultFile:
         """Keep the result of one scene, a dict with its seed; the file is replaced at once."""
         self.scenes[scene['seed']] = scene
         lines = [json.dumps(self.scenes[seed]) for seed in sorted(self.scenes)]
-        settings = self.settings | {'command': self._command}
-        text = json.dumps(settings) + ',\n"scenes": [\n ' + ',\n '.join(lines)
+        text = json.dumps(self.settings | self._about) + ',\n"scenes": [\n ' + ',\n '.join(lines)
         write_atomically(self.path, '{"settings": ' + text + '\n]}\n')
 
 
@@ -132,13 +136,14 @@ def known(stored, names):
             for name, value in stored.items() if name in names}
 
 
-def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True):
+def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True, run=None):
     """
     Run all jobs on all scenes, and go on where an interrupted evaluation stopped.
 
     :param jobs: list of Job; seeds: of the scenes.
     :param folder: of the result files.
     :param engine: Engine; each scene is planned in one thread.
+    :param run: function of a job and a seed that gives what run_scene does; None: that.
     :return: list of ResultFile, one for each job.
     :raises ConfigError: for result files that are damaged or made with other settings.
     """
@@ -146,7 +151,7 @@ def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True):
     # scene by scene, so that what was run so far can be compared
     todo = [(i, seed) for seed in seeds for i, file in enumerate(files)
             if seed not in file.scenes]
-    tasks = {Task(f'{jobs[i].task}, {jobs[i].method.name}, scene {seed}', run_scene,
+    tasks = {Task(f'{jobs[i].task}, {jobs[i].method.name}, scene {seed}', run or run_scene,
                   (jobs[i], seed)): i for i, seed in todo}
     with tqdm(total=len(todo), desc='scenes x methods', disable=not progress) as bar:
         for task, get in run_tasks(tasks, engine):

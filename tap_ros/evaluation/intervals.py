@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far a mean over episodes can be trusted: percentile bootstrap intervals of 95%."""
+"""How far a mean over episodes can be trusted: intervals of 95%, by bootstrap or of Wilson."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -69,6 +69,22 @@ def mean_interval(values: ArrayLike, **options: int) -> Interval:
     :return: Interval.
     """
     return bootstrap(lambda values: values.mean(-1), np.asarray(values, float), **options)
+
+
+def share_interval(successes: ArrayLike) -> Interval:
+    """
+    Estimate in which share of episodes something holds, by Wilson's interval.
+
+    Where it holds in all or in none, a bootstrap would say that this is certain.
+
+    :param successes: (N,) of 0 and 1, at least one.
+    :return: Interval, 0 to 1.
+    """
+    from scipy import stats
+
+    values = np.asarray(successes, float)
+    found = stats.binomtest(round(values.sum()), len(values)).proportion_ci(method='wilson')
+    return Interval(float(values.mean()), float(found.low), float(found.high))
 
 
 def gain_interval(errors: ArrayLike, baseline: ArrayLike, **options: int) -> Interval:

@@ -4,7 +4,12 @@
 
 import numpy as np
 import pytest
-from tap_ros.evaluation.intervals import bootstrap, gain_interval, mean_interval
+from tap_ros.evaluation.intervals import (
+    bootstrap,
+    gain_interval,
+    mean_interval,
+    share_interval,
+)
 
 
 def test_an_interval_of_equal_values_is_a_point():
@@ -25,6 +30,14 @@ def test_gains_are_paired():
     assert gain_interval(0.75 * baseline, baseline) == pytest.approx((0.25, 0.25, 0.25))
     _, low, high = gain_interval(0.75 * baseline[::-1], baseline)
     assert high - low > 0.1
+
+
+def test_shares_have_wilsons_interval_also_at_both_ends():
+    z = 1.959964
+    assert share_interval([1] * 10) == pytest.approx((1, 10 / (10 + z ** 2), 1), abs=1e-6)
+    assert share_interval([0] * 10) == pytest.approx((0, 0, z ** 2 / (10 + z ** 2)), abs=1e-6)
+    value, low, high = share_interval([1, 0] * 200)
+    assert value == 0.5 and high - low == pytest.approx(2 * z * 0.025, rel=0.02)
 
 
 def test_the_seed_decides():

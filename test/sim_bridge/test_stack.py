@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of stacking: towers stand by themselves, and episodes end with the release."""
 
+import mujoco.rollout
 import numpy as np
 import pytest
 from sim_bridge.collect import make_episode
 from sim_bridge.expert import run_episode
+from sim_bridge.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
 from sim_bridge.scene import HALF_HEIGHT
 from sim_bridge.simulator import Simulator
 from sim_bridge.stack_tasks import BLOCK_RANGE, BLOCK_SEPARATION, HAND_MARGIN, is_tower, levels
@@ -91,6 +93,30 @@ def test_a_recorded_goal_shows_the_tower_with_the_arm_elsewhere(simulator, episo
     episode = make_episode(simulator, observations, actions, outcome)
     np.testing.assert_allclose(episode.goal_poses, observations[-1].object_poses, atol=1e-6)
     assert (episode.goal_frame != observations[-1].image).any()
+
+
+@pytest.mark.parametrize('place', [(0.0, 0.0), (0.1, -0.1), None])
+def test_a_block_is_put_down_without_slipping_in_the_fingers(place):
+    simulator = Simulator('stack2')
+    try:
+        simulator.reset(4)
+        mover = PickAndPlace(simulator, np.random.default_rng(1), STACK_CONFIG,
+                             mujoco.rollout.Rollout(nthread=0))
+        base = simulator.object_poses()[0, :3]
+        below = base if place is None else on_table(np.array(place))
+        held = []  # m, how high the block hangs in the fingers after each plan
+        for plan in mover.move(1, lambda: below):
+            for action in plan:
+                seen = simulator.step(action)
+            held.append(seen.object_poses[1, 2] - seen.gripper[2])
+        assert abs(held[-2] - held[-4]) < 0.003  # before the release, and after the lift
+        for action in [[0, 0, 0.12, 1], [0, 0, 0, 1]]:
+            simulator.step(action)
+        poses = simulator.object_poses()[:, :3]
+        np.testing.assert_allclose(poses[1], below + [0, 0, 2 * HALF_HEIGHT], atol=0.005)
+        np.testing.assert_allclose(poses[0], base, atol=0.002)
+    finally:
+        simulator.close()
 
 
 @pytest.mark.parametrize('offset', [[0.03, 0, 0], [0, -0.03, 0], [0, 0, 0.02], [0, 0, -0.02]])

@@ -1,0 +1,147 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+One scene: pictures are brought about one after the other, by picking up and placing objects.
+
+The executor is the simulator's own: it knows where the objects are and finds each grasp in the
+true physics. A picture says which object goes where.
+"""
+
+from dataclasses import dataclass, field
+
+from experiments.planning.episode import View
+from experiments.stacking.reading import Move, PictureReader, read_moves
+import mujoco.rollout
+import numpy as np
+from sim_bridge.expert import run_episode as run_expert
+from sim_bridge.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
+from tap_ros.contract import LIFTED, SUCCESS_DISTANCE
+from tap_ros.errors import ConfigError
+from tap_ros.learning.robot_mask import trained_robot_mask
+
+OVER = 0.045  # m; an object whose place is nearer to another one, from above, is put on that
+ARRIVED = 0.01  # m from its last place, then an object of the expert's is where it goes
+SETTLE_STEPS = 3  # control periods with the arm risen, then it counts where things are
+
+
+@dataclass
+class Stage:
+    """One picture that was brought about."""
+
+    picture: np.ndarray  # uint8 (H, W, 3)
+    pixels: np.ndarray  # (K, 2), what was read from it; NaN: not seen
+    moves: list  # Move, in the order in which they were made
+
+
+@dataclass
+class StackedEpisode:
+    """What happened in one run."""
+
+    start: object  # Observation
+    goal: object  # Observation
+    distances: np.ndarray  # (K,) m to the goals at the end, ground truth
+    success: bool
+    first_right: bool  # the first move was that of the object that has to be first, to its place
+    stages: list = field(default_factory=list)  # Stage
+    frames: list = field(default_factory=list)  # uint8 (H, W, 3), one a control period
+
+    @property
+    def moves(self):
+        """Return all moves in the order in which they were made."""
+        return [move for stage in self.stages for move in stage.moves]
+
+
+def run_episode(simulator, method, seed, predictor=None):
+    """
+    Bring the pictures of a method about in one scene.
+
+    :param simulator: Simulator of a task in which something is put somewhere; reset here.
+    :param method: methods.Method.
+    :param seed: of the scene, of the order of moves where the method has none, and of the arm.
+    :param predictor: SubgoalPredictor, for methods that predict.
+    :return: StackedEpisode.
+    :raises ConfigError: when the predictor is missing, or weights need robot masks that the look
+        has not.
+    """
+    if method.predicted and predictor is None:
+        raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
+    shown = _expert_subgoals(simulator, seed) if method.base == 'true_subgoals' else []
+    start = simulator.reset(seed)
+    goal, reader = simulator.goal(), PictureReader(simulator, start)
+    if method.predicted:
+        shown = _predict(predictor, method, start, goal, seed)
+    pictures = [] if method.base == 'nothing' else [*shown, goal.image]
+    # The same order for all methods that know none, so that they are compared scene by scene.
+    stream = simulator.task.stream
+    order = np.random.default_rng([seed, stream, 2]).permutation(simulator.task.num_objects)
+    mover = PickAndPlace(simulator, np.random.default_rng([seed, stream, 3]), STACK_CONFIG,
+                         mujoco.rollout.Rollout(nthread=0))
+    stages, frames = [], [start.image]
+    for picture in pictures:
+        poses = simulator.object_poses()[:, :3]
+        pixels = reader.read(picture, simulator.camera.project(poses))
+        moves = read_moves(pixels, poses, simulator.camera)
+        if method.base == 'true_places':
+            places = simulator.scene.goal_poses[:, :2]
+            moves = [Move(k, tuple(places[k].tolist())) for k in simulator.scene.order]
+        elif method.base == 'oracle_order':
+            moves.sort(key=lambda move: [*simulator.scene.order, move.object].index(move.object))
+        elif method.base != 'lowest_first':
+            moves.sort(key=lambda move: order.tolist().index(move.object))
+        for move in moves:
+            frames += _make(simulator, mover, move)
+        stages.append(Stage(picture, pixels, moves))
+    distances = simulator.distances()
+    success = simulator.outcome() == 'success' and bool((distances < SUCCESS_DISTANCE).all())
+    run = StackedEpisode(start, goal, distances, success, False, stages, frames)
+    run.first_right = bool(run.moves) and _is_first(run.moves[0], simulator.scene)
+    return run
+
+
+def _make(simulator, mover, move):
+    """Make a move, rise and wait until all is at rest; return the pictures meanwhile."""
+    frames = []
+    for plan in mover.move(move.object, lambda: what_is_below(simulator.object_poses(), move)):
+        frames += [simulator.step(action).image for action in plan]
+    rise = [[0, 0, max(LIFTED - simulator.target[2], 0), 1]]
+    return frames + [simulator.step(action).image
+                     for action in rise + [[0, 0, 0, 1]] * SETTLE_STEPS]
+
+
+def what_is_below(poses, move):
+    """
+    Say on what an object comes to stand.
+
+    :param poses: (K, 3 or more) m, where the objects are.
+    :param move: Move.
+    :return: (3,) m, the origin of the highest other object at the place, see also on_table.
+    """
+    place = np.array(move.place)
+    others = np.delete(poses[:, :3], move.object, axis=0)
+    under = others[np.linalg.norm(others[:, :2] - place, axis=1) < OVER]
+    return under[under[:, 2].argmax()] if len(under) else on_table(place)
+
+
+def _is_first(move, scene):
+    """Say whether a move brings the object that has to be first to its place."""
+    k = scene.order[0]
+    gap = np.linalg.norm(scene.goal_poses[k, :2] - move.place)
+    return bool(move.object == k and gap < SUCCESS_DISTANCE)
+
+
+def _expert_subgoals(simulator, seed):
+    """Return the frame of each object in which the expert has brought it to its place."""
+    observations, *_ = run_expert(simulator, seed)
+    places = np.array([seen.object_poses[:, :3] for seen in observations])  # (T, K, 3)
+    there = np.linalg.norm(places - places[-1], axis=-1) < ARRIVED
+    # argmax: the first one.
+    return [observations[there[:, k].argmax()].image for k in simulator.scene.order]
+
+
+def _predict(predictor, method, start, goal, seed):
+    """Return the pictures of the predicted subgoals, the earliest first."""
+    robot_mask, share = trained_robot_mask(predictor.training)
+    view = View(robot_mask if share else 'none')
+    subgoals = predictor.predict(view.see(start).image, view.fill(goal).image,
+                                 recursion_depth=method.recursion, seed=seed)
+    return [subgoal.image for subgoal in subgoals]
