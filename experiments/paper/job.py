@@ -122,6 +122,7 @@ def score(run, config, weights, places):
     from tap_ros.learning.split import split_episodes
     from tap_ros.prediction.predictor import load_network
     from tap_ros.recording.cache import open_recordings
+    from tap_ros.weights import find_predictor
 
     network, about = load_network(weights, pick_device(config.device))
     store = open_recordings(list(config.recordings), progress=False)
@@ -158,7 +159,7 @@ def score(run, config, weights, places):
                  'held_out': len(held_out),
                  'shifted': {name: recording_hash(places.recording(name))
                              for name in run.shifted},
-                 **({'initial_weights': file_hash(config.initial_weights)}
+                 **({'initial_weights': file_hash(find_predictor(config.initial_weights))}
                     if config.initial_weights else {}),
                  'command': '; '.join(filter(None, (collect_command(
                      places.recording(task)) for task in (run.task, *run.shifted))))},

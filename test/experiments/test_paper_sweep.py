@@ -17,6 +17,7 @@ from experiments.paper import sweep as sweep_module
 from experiments.paper.job import BUSY, DONE, perform, UNFINISHED
 from experiments.paper.places import (
     collect_command,
+    file_hash,
     is_collected,
     Places,
     recording_hash,
@@ -34,6 +35,7 @@ from tap_ros.files import locked
 from tap_ros.learning.split import split_episodes
 from tap_ros.options import parse
 from tap_ros.recording.cache import open_recordings
+from tap_ros.weights import find_predictor
 
 ROOT = Path(__file__).parents[2]
 SEEDS = (122, 142, *range(4), 6, 8)  # the first two are held out
@@ -42,11 +44,11 @@ RUN = PaperRun('push2', 'bidirectional', 'genmin-wo-gan', new_pixels=False, epis
                steps=2)
 
 
-def write_squares(folder, seeds):
+def write_squares(folder, seeds, size=16):
     """Write episodes of two squares that move one after the other."""
     start = [np.random.default_rng(seed).uniform(3, 7, (2, 2)) for seed in seeds]
     write_bag(folder, [
-        move_squares(at, at + 5, length=7, size=16, half=1, seed=seed, task=folder.name)
+        move_squares(at, at + 5, length=7, size=size, half=1, seed=seed, task=folder.name)
         for at, seed in zip(start, seeds)])
 
 
@@ -101,6 +103,18 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places, small):
     assert len(scores['bottleneck_at']) == held_out
     assert result['training']['steps'] == 2 and result['config']['method'] == RUN.method
     assert result['name'] == RUN.name and RUN.name in result['command']
+
+
+def test_a_run_that_begins_with_shipped_weights_tells_which(tmp_path, monkeypatch):
+    monkeypatch.setitem(SCALES, 'small', replace(SCALES['small'], settings={
+        'base_width': 16, 'batch_size': 4, 'threads': 1}))
+    write_squares(tmp_path / 'bags' / 'order2', SEEDS, size=64)
+    places = Places(*(str(tmp_path / name) for name in ('bags', 'runs', 'results')))
+    run = replace(RUN, task='order2', variant='+skips')
+    assert perform(run, places) == DONE
+    found = json.loads(places.result(run).read_text())
+    assert found['config']['initial_weights'] == 'push2'
+    assert found['data']['initial_weights'] == file_hash(find_predictor('push2'))
 
 
 def test_samples_and_forward_prediction_are_scored(places, small):
