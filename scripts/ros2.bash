@@ -44,11 +44,7 @@ get() {
     git clone --quiet --depth 1 --branch "$tag" "https://github.com/$repository" "$target.git"
     from=$target.git
   fi
-  if [ ! -e "$from" ]; then
-    echo "$from is not there; ROS2_SOURCES must hold the repository $name"
-    return 1
-  fi
-  if git -C "$from" rev-parse --quiet --verify "$tag^{commit}"; then
+  if git -C "$from" rev-parse --quiet --verify "$tag^{commit}" >/dev/null; then
     git -C "$from" archive "$tag" "$@" | tar x -C "$target"
   else
     for folder in "$@"; do cp -r "$from/$folder" "$target/"; done
@@ -71,6 +67,14 @@ build() {
     --cmake-args -DBUILD_TESTING=OFF -DPython3_EXECUTABLE="$(command -v python)"
 }
 
+# What is there stays when there is nothing to replace it with.
+for entry in "${repositories[@]}"; do
+  read -r name _ <<<"${entry#*/}"
+  if [ -n "$ROS2_SOURCES" ] && [ ! -e "$ROS2_SOURCES/$name" ]; then
+    echo "$ROS2_SOURCES/$name is not there; ROS2_SOURCES must hold the repository ${entry%% *}"
+    exit 1
+  fi
+done
 rm -rf ros2
 mkdir -p ros2/src
 . scripts/environment.bash

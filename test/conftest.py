@@ -8,13 +8,19 @@ Modules beside this file (made_episodes, lively) can be imported by every test.
 
 import os
 
+from hypothesis import HealthCheck, settings
 import pytest
 
-# Nodes and clients of these tests talk among themselves only.
+# Nodes and clients of these tests talk among themselves only, whatever domain is set: two workers
+# in one would hear each other.
 os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 if 'PYTEST_XDIST_WORKER' in os.environ:  # workers share the cores
     os.environ.setdefault('OMP_NUM_THREADS', '1')
+# How fast examples come says nothing, as other tests run beside these.
+settings.register_profile(
+    'tap_ros', deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile('tap_ros')
 
 
 @pytest.hookimpl(optionalhook=True)  # of xdist

@@ -17,7 +17,7 @@ import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import Image
-from tap_msgs.msg import Episode, ObjectStates
+from tap_msgs.msg import Episode, ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.errors import TapError
@@ -33,7 +33,7 @@ from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.subgoal_messages import decode_subgoals
+from tap_ros.nodes.subgoal_messages import decode_subgoal, decode_subgoals
 from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
 from tap_ros.pictures import grid, overlay, png_bytes
@@ -86,7 +86,7 @@ class ExplorerNode(Node):
         self._heard = [
             self._hear(kind, topic, 'camera', STREAM),
             self._hear(Image, 'goal/image', 'goal', LATCHED),
-            self._hear(Image, 'subgoal/overlay', 'subgoal', LATCHED),
+            self._hear(Subgoal, 'subgoal', 'subgoal', LATCHED),
             self._hear(ObjectStates, 'objects', 'objects', STREAM),
             self._hear(ObjectStates, 'goal/objects', 'goal_objects', LATCHED),
             Heard(self, Episode, 'episode', self._on_episode, STREAM),
@@ -232,7 +232,10 @@ class ExplorerNode(Node):
             # The first subgoal of an answer comes by topic, too.
             if kind in changed and not (
                     kind == 'subgoal' and newest[kind][0].header.stamp == self._sheet_stamp):
-                self._show_picture(kind, newest[kind][0])
+                try:
+                    self._show_picture(kind, _picture_of(newest[kind][0], kind))
+                except TapError as error:
+                    self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
         now = time.monotonic()
         ages = {kind: now - came for kind, (_, came) in newest.items()}
         running = self._calls.running
@@ -271,12 +274,7 @@ class ExplorerNode(Node):
         return {each: ((place.x, place.y, place.z), tuple(pixel.tolist()))
                 for each, place, pixel in zip(names, places, pixels)}
 
-    def _show_picture(self, kind: str, message: Any) -> None:
-        try:
-            image = decode_image(message, kind)
-        except TapError as error:
-            self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
-            return
+    def _show_picture(self, kind: str, image: np.ndarray) -> None:
         height, width = image.shape[:2]
         self._sizes[kind] = width, height
         share = LARGEST / max(width, height)
@@ -299,6 +297,15 @@ def _listed(objects: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
             ) -> list[dict[str, Any]]:
     return [{'name': name, 'u': round(u, 2), 'v': round(v, 2)}
             for name, (_, (u, v)) in objects.items()]
+
+
+def _picture_of(message: Any, kind: str) -> np.ndarray:
+    """Return what is shown of a message: uint8 (H, W, 3); of a Subgoal with its maps."""
+    if not isinstance(message, Subgoal):
+        return decode_image(message, kind)
+    one = decode_subgoal(
+        message, message.object_names, (message.image.height, message.image.width))
+    return overlay(one.image, one.object_maps)
 
 
 def _silence(age: float | None) -> str:

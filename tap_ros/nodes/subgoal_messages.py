@@ -57,13 +57,21 @@ def decode_subgoals(response: 'PredictSubgoal.Response', names: Sequence[str],
         raise PlanningError(
             f'predict_subgoal: {count} subgoals, {len(response.sample)} entries of sample and '
             f'{len(response.level)} of level; expected one or more, and as many of each')
-    return [_decode(message, names, size, sample, level) for message, sample, level in zip(
-        response.subgoals, response.sample, response.level)]
+    return [decode_subgoal(message, names, size, sample, level)
+            for message, sample, level in zip(
+                response.subgoals, response.sample, response.level)]
 
 
-def _decode(message: SubgoalMessage, names: Sequence[str], size: Sequence[int], sample: int,
-            level: int) -> Subgoal:
-    """Turn one tap_msgs/Subgoal into a Subgoal."""
+def decode_subgoal(message: SubgoalMessage, names: Sequence[str], size: Sequence[int],
+                   sample: int = 0, level: int = 1) -> Subgoal:
+    """
+    Turn one tap_msgs/Subgoal into a Subgoal; names, size and errors are as above.
+
+    :param message: tap_msgs/Subgoal.
+    :param sample: which sample it belongs to, from 0.
+    :param level: level of recursion, from 1.
+    :return: prediction.predictor.Subgoal.
+    """
     found = tuple(message.object_names)
     if not len(found) == len(message.object_maps) == len(message.expected_pixels):
         raise PlanningError(

@@ -14,10 +14,12 @@ from action_msgs.msg import GoalStatus, GoalStatusArray
 import numpy as np
 from processes import Client, NodeProcess, page_address
 import pytest
-from tap_msgs.msg import ObjectStates
+from tap_msgs.msg import ObjectStates, Subgoal
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.nodes.clients import Newest
+from tap_ros.nodes.subgoal_messages import decode_subgoal
 from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.pictures import overlay
 from websockets.sync.client import connect
 
 BROWSER = next(filter(None, map(shutil.which, (
@@ -39,6 +41,7 @@ class Explored:
         self.start('explorer_node', port=0)
         self.objects = Newest(node, ObjectStates, 'objects', STREAM)
         self.goals = Newest(node, ObjectStates, 'goal/objects', LATCHED)
+        self.subgoal = Newest(node, Subgoal, 'subgoal', LATCHED)
         for process in self.processes.values():
             process.wait_for('ready')
         self.url = page_address(self.processes['explorer_node'])
@@ -176,6 +179,29 @@ def test_a_second_browser_sees_the_same(explored, browser):
             seen = [each.evaluate(f'document.getElementById("{kind}").toDataURL()')
                     for each in (page, other)]
             assert seen[0] == seen[1] and len(seen[0]) > 1000
+
+
+@needs_browser
+def test_the_subgoal_shown_is_the_predicted_picture_with_its_maps(explored, browser):
+    with opened(browser, explored.url) as page:
+        reset(page)
+        stamp = explored.objects.wait(10).header.stamp
+        page.click('#predict')
+        message = explored.subgoal.wait(60, lambda message: message.header.stamp == stamp)
+        one = decode_subgoal(message, message.object_names, (64, 64))
+        expected = overlay(one.image, one.object_maps)
+        assert np.abs(expected.astype(int) - one.image).max() > 50, 'the maps are seen'
+
+        page.wait_for_function('pictures.subgoal')
+
+        def shown():
+            values = page.evaluate("""() => {
+                const context = new OffscreenCanvas(64, 64).getContext('2d');
+                context.drawImage(pictures.subgoal, 0, 0);
+                return Array.from(context.getImageData(0, 0, 64, 64).data);
+            }""")
+            return np.reshape(values, (64, 64, 4))[..., :3]
+        wait_until(lambda: np.array_equal(shown(), expected))
 
 
 @needs_browser
