@@ -10,6 +10,7 @@ work, and the rate of a large matrix product says what the machine can do.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+import json
 import os
 from pathlib import Path
 import platform
@@ -61,7 +62,8 @@ class Options:
     :param clients: how many ask the predictor node at once.
     :param repeats: how often each time is taken; the median counts.
     :param seconds: how long the clients ask.
-    :param write: also write docs/results/growth.json, growth.md and docs/images/growth.png.
+    :param write: also write docs/results/growth.json, growth.md and docs/images/growth.png; parts
+        that are not measured stay there as they are.
     """
 
     parts: tuple[Part, ...] = tuple(AXES)
@@ -91,6 +93,10 @@ def run(args):
     print(make_table(rows).to_string(index=False))
     if args.write:
         folder = Path('docs/results')
+        if (folder / ROWS).exists():
+            rows += [row for row in json.loads((folder / ROWS).read_text())
+                     if row['part'] not in args.parts]
+        rows.sort(key=lambda row: list(AXES).index(row['part']))
         write_rows(folder / ROWS, rows)
         write_atomically(folder / PAGE, make_page(rows))
         write_atomically(folder / PICTURE, draw(rows))
@@ -130,7 +136,8 @@ def draw(rows):
             axis.plot(sizes, ms[0] * sizes / sizes[0], color='#b0b0b0', linewidth=0.8,
                       linestyle='--', zorder=0)
         axis.set(xscale='log', yscale='log')
-        axis.set_xticks(ticks := sorted(set(here['size'])), [f'{tick:g}' for tick in ticks])
+        axis.set_xticks(ticks := sorted(set(here['size'])), [f'{tick:g}' for tick in ticks],
+                        fontsize=6)
         axis.minorticks_off()
         axis.set_xlabel(AXES[part], fontsize=8)
         axis.legend(fontsize=6, frameon=False, loc='upper left')
@@ -157,8 +164,9 @@ def _episodes(args) -> Iterator[Row]:
             yield {'size': count, 'work': 'collect', 'ms': _time(
                 collect, bag, CollectConfig(episodes=count), Engine(workers=1), False)}
             for work in ('decode into the cache', 'open again'):
+                # A cache of its own: in the user's the same episodes may be from last time.
                 yield {'size': count, 'work': work, 'ms': _time(
-                    partial(open_recordings, progress=False), [bag])}
+                    partial(open_recordings, progress=False), [bag], f'{folder}/cache')}
 
 
 def _objects(args) -> Iterator[Row]:

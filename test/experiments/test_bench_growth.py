@@ -2,11 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The benchmark of growth: what it measures, and what its page says."""
 
+import json
+from pathlib import Path
+
 import cv2
 from experiments.bench import growth
 import numpy as np
 import pytest
 
+RESULTS = Path(__file__).parents[2] / 'docs' / 'results'
 ROWS = [{'part': 'samples', 'size': size, 'work': 'plan', 'ms': ms}
         for size, ms in ((64, 200.0), (128, 300.0))] + [
             {'part': 'sizes', 'size': 64, 'work': 'draw a picture', 'ms': 2.5}]
@@ -28,3 +32,19 @@ def test_the_page_tells_each_time_beside_that_of_the_least_work():
     assert '| sizes | 64 | draw a picture | 2.5 ms | 1.00 |' in page
     picture = cv2.imdecode(np.frombuffer(growth.draw(ROWS), np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] > 2 * picture.shape[0], 'a panel for each of two parts'
+
+
+@pytest.mark.slow
+def test_decoding_is_measured_where_nothing_was_decoded_before():
+    args = growth.Options(episodes=(2, 2))
+    times = [(row['work'], row['ms']) for row in growth._episodes(args)]
+    decoded = [ms for work, ms in times if work == 'decode into the cache']
+    again = [ms for work, ms in times if work == 'open again']
+    assert min(decoded) > max(again), 'the second time, too'
+
+
+def test_the_page_and_its_numbers_are_of_the_same_measurement():
+    rows = json.loads((RESULTS / growth.ROWS).read_text())
+    assert {row['part'] for row in rows} == set(growth.AXES)
+    table = (RESULTS / growth.PAGE).read_text()
+    assert str(growth.make_page(rows)).split('| grows')[1] == table.split('| grows')[1]
