@@ -58,8 +58,11 @@ class Started:
 
 @pytest.fixture
 def domain():
-    """Return a domain beside that of the tests, where the nodes have their names to themselves."""
-    return (int(os.environ.get('ROS_DOMAIN_ID', 0)) + 50) % 100 + 1
+    """Yield a domain beside that of the tests, where the nodes have their names to themselves."""
+    number = (int(os.environ.get('ROS_DOMAIN_ID', 0)) + 50) % 100 + 1
+    yield number
+    subprocess.run(['ros2', 'daemon', 'stop'], capture_output=True, timeout=60,
+                   env=os.environ | {'ROS_DOMAIN_ID': str(number)})
 
 
 def call(line, folder, domain):
