@@ -214,6 +214,8 @@ class ExplorerNode(Node):
 
     def _show(self) -> None:
         """Bring the board up to date."""
+        # Before the log: how a run ended is told first, so that who sees no run sees how it ended.
+        running = self._calls.running
         with self._lock:
             newest = dict(self._newest)
             changed = self._changed if self._board.watched else self._changed - {
@@ -238,7 +240,6 @@ class ExplorerNode(Node):
                     self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
         now = time.monotonic()
         ages = {kind: now - came for kind, (_, came) in newest.items()}
-        running = self._calls.running
         movable = self._calls.movable
         self._board.put('state', json.dumps({
             'kind': 'state', 'task': self._task, 'tasks': list(EPISODE_FRAMES),
