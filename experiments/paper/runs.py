@@ -70,8 +70,8 @@ VARIANTS = {
     '+skips+long': _OURS,
 }
 LONG = 2  # times the steps, of '+long'
-# Few episodes, in which the objects stand close together: from fresh weights, or those of a short
-# training, predictions copy the start. All methods begin with the same shipped weights.
+# Few episodes, in which the objects stand close together: from fresh weights genmin copied the
+# start. All methods begin with the same shipped weights.
 FINE_TUNED = {'order2': 'push2', 'order3': 'push3'}
 _FINE_TUNED = {'goal_picture': 'mixed', 'start_crop': 0.3}  # as those were trained
 

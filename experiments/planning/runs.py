@@ -193,9 +193,9 @@ def plan_scene(job, seed):
     :return: list of PlannedEpisodes, one or, each object alone, K; final distances (K,) metres.
     """
     torch.set_num_threads(1)  # with more, the predictor's last digits differ
-    simulator, predictor = _simulator(job.task, job.look), None
+    simulator, predictor = load_simulator(job.task, job.look), None
     if job.predictor:
-        predictor = _predictor(job.predictor, job.device)
+        predictor = load_predictor(job.predictor, job.device)
     subsets = [None]
     if job.method.base == 'one_object':
         subsets = [[k] for k in range(simulator.task.num_objects)]
@@ -210,12 +210,14 @@ def plan_scene(job, seed):
 
 
 @lru_cache
-def _simulator(task, look):
+def load_simulator(task, look):
+    """Return the Simulator of a task and a look, made once in a process."""
     return Simulator(task, look=look)
 
 
 @lru_cache
-def _predictor(path, device):
+def load_predictor(path, device):
+    """Return the SubgoalPredictor of a file, loaded once in a process."""
     return SubgoalPredictor.load(path, device)
 
 

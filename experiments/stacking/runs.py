@@ -4,17 +4,14 @@
 
 from dataclasses import dataclass
 from datetime import date
-from functools import lru_cache
 import os
 import platform
 import time
 
-from experiments.planning.runs import digest
+from experiments.planning.runs import digest, load_predictor, load_simulator
 from experiments.stacking.episode import run_episode
 from experiments.stacking.methods import Method
 from sim_bridge.looks import DEFAULT_LOOK
-from sim_bridge.simulator import Simulator
-from tap_ros.prediction.predictor import SubgoalPredictor
 import torch
 
 
@@ -64,15 +61,5 @@ def run_scene(job, seed):
 def make_episode(job, seed):
     """Run a job on one scene; return the StackedEpisode."""
     torch.set_num_threads(1)  # with more, the predictor's last digits differ
-    predictor = _predictor(job.predictor, job.device) if job.predictor else None
-    return run_episode(_simulator(job.task, job.look), job.method, seed, predictor)
-
-
-@lru_cache
-def _simulator(task, look):
-    return Simulator(task, look=look)
-
-
-@lru_cache
-def _predictor(path, device):
-    return SubgoalPredictor.load(path, device)
+    predictor = load_predictor(job.predictor, job.device) if job.predictor else None
+    return run_episode(load_simulator(job.task, job.look), job.method, seed, predictor)

@@ -152,9 +152,9 @@ class ExplorerNode(Node):
         names = tuple(first.object_names)
         subgoals = decode_subgoals(
             response, names, (first.image.height, first.image.width))[:MAX_SHOWN]
-        panels = [overlay(one.image, one.object_maps) for one in subgoals]
         self._sheet_stamp = None
-        if len(panels) > 1:
+        if len(subgoals) > 1:
+            panels = [overlay(one.image, one.object_maps) for one in subgoals]
             panels += [np.full_like(panels[0], 255)] * (-len(panels) % min(COLUMNS, len(panels)))
             width = min(COLUMNS, len(panels))
             sheet = grid([panels[i:i + width] for i in range(0, len(panels), width)])

@@ -167,13 +167,19 @@ def test_the_card_is_that_of_the_weights_in_use_and_not_of_a_newer_file(predicto
     assert service.process.end() == 0, 'it ends well while it is active'
 
 
-def test_a_planner_that_is_deactivated_stops_the_arm(loop):
-    managed = Managed(loop.node, 'visual_mpc_node')
-    loop.reset()
+def begin_to_move(loop):
+    """Send a goal and return its handle once the arm moves."""
     moving = threading.Event()
     handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
                        lambda feedback: moving.set())
     assert moving.wait(120)
+    return handle
+
+
+def test_a_planner_that_is_deactivated_stops_the_arm(loop):
+    managed = Managed(loop.node, 'visual_mpc_node')
+    loop.reset()
+    handle = begin_to_move(loop)
     assert managed.to(DEACTIVATE)
     status, result = wait_for_result(handle, 30)
     assert status == GoalStatus.STATUS_ABORTED and 'deactivated' in result.message
@@ -195,10 +201,7 @@ def test_a_planner_that_is_deactivated_stops_the_arm(loop):
 def test_a_planner_that_is_shut_down_stops_the_arm_for_good(loop):
     managed = Managed(loop.node, 'visual_mpc_node')
     loop.reset()
-    moving = threading.Event()
-    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30,
-                       lambda feedback: moving.set())
-    assert moving.wait(120)
+    handle = begin_to_move(loop)
     assert managed.to(Transition.TRANSITION_ACTIVE_SHUTDOWN)
     status, result = wait_for_result(handle, 30)
     assert status == GoalStatus.STATUS_ABORTED and 'deactivated' in result.message
