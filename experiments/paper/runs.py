@@ -239,6 +239,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
         mode='forward', variant=OURS)
     # Best of 100.
     add(['pick_place', 'push2', 'grasp'], ['genmin-vae'], variant=OURS)
+    add(['push2', 'pick_place'], ['genmin-vae+progress'], variant=OURS)
     # Table 1 with the paper's network.
     add(SINGLE, ['fix', 'genmin', 'min', 'genmin-wo-gan', 'genmin-vae-gan'])
     # Three objects, and stacking.

@@ -9,7 +9,9 @@ import shlex
 from experiments.pages import interval, render
 import numpy as np
 import pandas as pd
+from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.evaluation.prediction import evaluate, write_pictures
+from tap_ros.evaluation.samples import SAMPLES, score_samples
 from tap_ros.evaluation.shown import SHOWN
 from tap_ros.files import write_atomically
 from tap_ros.learning.weights import load_weights, save_weights
@@ -45,12 +47,15 @@ def ship(recipe, bags, runs, out):
     network, _ = load_network(file)
     store = open_recordings([str(recipe.fresh(bags))], progress=False)
     episodes = np.arange(len(store))
-    goals = ['last frame']
-    if not np.array_equal(store[0].goal_frame, store[0].frames[-1]):
+    forward = config['num_context'] == 1
+    goals = ['none' if forward else 'last frame']
+    if not forward and not np.array_equal(store[0].goal_frame, store[0].frames[-1]):
         goals.append('arm elsewhere')
     scores = {goal: evaluate(network, store, episodes, goal_picture=_option(goal))
               for goal in goals}
-    good = found(scores['last frame']['prediction'])
+    first = scores[goals[0]]['prediction']
+    samples = sample_facts(network, store, episodes) if network.config.latent_size else None
+    good = found(first)
     shown = [*np.flatnonzero(good)[:PICTURED], *np.flatnonzero(~good)[:PICTURED]]
     write_pictures(file.with_suffix('.png'), network, store, shown, 'last')
     card = file.with_suffix('.md')
@@ -60,8 +65,8 @@ def ship(recipe, bags, runs, out):
         'weights/templates/card.md.j2', file=file.name, name=recipe.name, task=recipe.task,
         collect=collect, again=again, train=train, earlier=recipe.earlier,
         run=json.loads((run / 'run.json').read_text()), method=about['settings']['method'],
-        fresh=len(store), pushing=np.isfinite(scores['last frame']['prediction'].bottleneck).any(),
-        metrics=headline(scores['last frame']['prediction']),
+        fresh=len(store), pushing=np.isfinite(first.bottleneck).any(), forward=forward,
+        goal=goals[0], metrics=headline(first), samples=samples,
         scores=tabulate(scores), succeed=int(good[shown].sum()),
         fail=int((~good[shown]).sum())))
     return card
@@ -78,6 +83,24 @@ def headline(scores):
     names = ('min_l1', _BOTTLENECKS if _BOTTLENECKS in known else 'shows_both')
     return [(name, titles[name][0], round(known[name].value, titles[name][1]))
             for name in names if name in known]
+
+
+def sample_facts(network, store, episodes):
+    """
+    Measure 100 samples of each episode, goal picture the last frame.
+
+    :param network: Predictor with z.
+    :param store: the EpisodeStore.
+    :param episodes: indices of episodes.
+    :return: dict of texts for the card: their number, the best one's error with its interval, and
+        how much they differ: in px where positions are known, and in the pixels near objects.
+    """
+    samples = score_samples(network, store, episodes)
+    least = mean_interval(samples.min_l1)
+    placed = samples.spread_px[np.isfinite(samples.spread_px)]
+    return {'count': SAMPLES, 'placed': f'{placed.mean():.1f}' if len(placed) else '',
+            'near': f'{np.nanmean(samples.spread_near):.4f}',
+            'best': f'{least.value:.4f} ({least.low:.4f} to {least.high:.4f})'}
 
 
 def found(scores):
@@ -116,4 +139,4 @@ def tabulate(scores):
 
 def _option(goal):
     """Return what `evaluate prediction --goal-picture` calls it."""
-    return 'last' if goal == 'last frame' else 'recorded'
+    return 'recorded' if goal == 'arm elsewhere' else 'last'

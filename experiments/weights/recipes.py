@@ -63,6 +63,11 @@ class Recipe:
 _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0.5 '
             '--start-crop 0.3 --batch-size 24 --decoder shared --skips --goal-picture mixed')
 
+
+def _with_z(options):
+    return options.replace('-wo-gan', '-vae') + ' --kl-weight 1e-5'
+
+
 RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push2', 'push2', {
         'push2': '--episodes 2000', 'push2_random': '--episodes 3500 --appearance random'},
@@ -78,4 +83,12 @@ RECIPES = {recipe.name: recipe for recipe in (
     Recipe('grasp', 'grasp', {'grasp': '--episodes 3000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', {'pick_place': '--episodes 3000'},
            f'{_GRIPPING} --steps 10000'),
+    # Samples differ little with the default kl_weight of 1e-4.
+    Recipe('push2_vae', 'push2', {'push2': '--episodes 2000'},
+           f'{_with_z(_PUSHING)} --steps 4000'),
+    Recipe('pick_place_vae', 'pick_place', {'pick_place': '--episodes 3000'},
+           f'{_with_z(_GRIPPING)} --steps 4000'),
+    Recipe('grasp_forward', 'grasp', {'grasp': '--episodes 3000'},
+           _GRIPPING.replace('genmin-wo-gan+progress', 'genmin4-wo-gan')
+           + ' --mode forward --steps 4000'),
 )}

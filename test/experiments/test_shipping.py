@@ -41,7 +41,8 @@ def test_weights_are_made_from_nothing_and_their_card_says_how(places, capfd):
                         for path in (file, source))
     assert np.abs(shipped.image.astype(int) - trained.image).max() <= 1
     card = file.with_suffix('.md').read_text()
-    for text in ('python -m tap_ros collect --task grasp --episodes 30 --out bags/grasp',
+    for text in ('a subgoal picture',
+                 'python -m tap_ros collect --task grasp --episodes 30 --out bags/grasp',
                  'python -m tap_ros collect --task grasp --episodes 3 --seed 900000',
                  '--episodes 2 --appearance lighter_table --out bags/light',
                  'python -m tap_ros train --recordings bags/grasp bags/light', '--steps 2',
@@ -52,6 +53,20 @@ def test_weights_are_made_from_nothing_and_their_card_says_how(places, capfd):
     before = source.stat().st_mtime_ns
     assert command.run(options) == 0  # nothing is collected or trained twice
     assert source.stat().st_mtime_ns == before
+
+
+def test_a_card_says_what_samples_are_worth_and_that_no_goal_is_given(
+        places, monkeypatch, capfd):
+    monkeypatch.setitem(RECIPES, TINY.name, replace(
+        TINY, task='push2', collections={'push2': '--episodes 30'},
+        train='--method genmin-vae --mode forward --steps 2 --batch-size 2 --base-width 4'))
+    assert command.run(command.Options(only=(TINY.name,), **places)) == 0
+    card = Path(places['out'], 'predictor_tiny.md').read_text()
+    for text in ('a later picture from a start picture alone', 'forward_weights:=tiny',
+                 'The best of 100 samples', 'Samples place an object', 'prediction (z = 0)',
+                 'goal picture none', '| none | copy-start |'):
+        assert text in card, text
+    assert 'arm elsewhere' not in card and 'copy-goal' not in card
 
 
 def test_the_list_is_of_commands_that_exist(places, capsys):
