@@ -9,10 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.appearance import Appearance
-from sim_bridge.scene import ARM_GEOM_GROUP, CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
+from sim_bridge.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.errors import SceneError
-
-MAX_SCENE_GEOMS = 200
 
 
 @dataclass(frozen=True)
@@ -91,11 +89,11 @@ class Camera:
 
 @dataclass(frozen=True)
 class View:
-    """One picture, and where the robot is in it if that is known."""
+    """One picture, and where the robot is in it."""
 
     picture: np.ndarray  # uint8 (H, W, 3) rgb
-    robot_mask: np.ndarray | None = None  # uint8 (H, W), values as in contract.py
-    arm_joints: np.ndarray | None = None  # (6,) rad, of the UR10e; in a studio
+    robot_mask: np.ndarray  # uint8 (H, W), values as in contract.py
+    arm_joints: np.ndarray  # (6,) rad, of the UR10e
 
 
 class OpenGL:
@@ -150,44 +148,3 @@ class OpenGL:
         self._gl.make_current()  # else another context's objects would be freed
         self._context.free()
         self._gl.free()
-
-
-class Renderer:
-    """
-    Renders models that share the visual settings of scene.py with one OpenGL context.
-
-    :param model: mujoco.MjModel, the first of them.
-    :param image_size: of the square picture, in pixels.
-    :raises SceneError: when nothing can be rendered.
-    """
-
-    def __init__(self, model: mujoco.MjModel, image_size: int) -> None:
-        self._gl = OpenGL(model, image_size, image_size)
-        self._show, self._hide = mujoco.MjvOption(), mujoco.MjvOption()
-        self._hide.geomgroup[ARM_GEOM_GROUP] = 0
-        self.use(model)
-
-    def use(self, model: mujoco.MjModel) -> None:
-        """Render this model from now on."""
-        self._model = model
-        self._scene = mujoco.MjvScene(model, MAX_SCENE_GEOMS)
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = 0
-
-    def render(self, data: mujoco.MjData, hide_arm: bool = False) -> View:
-        """
-        Render one picture.
-
-        :param data: mujoco.MjData, after mj_forward.
-        :param hide_arm: leave the arm out of the picture.
-        :return: View with the picture alone.
-        """
-        mujoco.mjv_updateScene(
-            self._model, data, self._hide if hide_arm else self._show, None, self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL, self._scene)
-        return View(self._gl.draw(self._scene))
-
-    def close(self) -> None:
-        """Free the context."""
-        self._gl.close()

@@ -255,7 +255,6 @@ def make_episode(simulator: Simulator, observations: Sequence[Observation], acti
     goal = observations[-1]
     if simulator.task.kind in ('push', 'stack'):
         goal = simulator.photograph(goal.object_poses)
-    masks = [o.robot_mask for o in observations if o.robot_mask is not None]
     return Episode(
         frames=np.stack([o.image for o in observations]),
         stamps=np.array([o.stamp_ns + start_ns for o in observations], np.int64),
@@ -266,4 +265,4 @@ def make_episode(simulator: Simulator, observations: Sequence[Observation], acti
         object_poses=np.stack([o.object_poses for o in observations]),
         goal_frame=goal.image, goal_pixels=goal.object_pixels, goal_poses=goal.object_poses,
         task=simulator.task.name, seed=simulator.scene.seed, outcome=outcome,
-        robot_masks=np.stack(masks) if masks else None, goal_mask=goal.robot_mask)
+        robot_masks=np.stack([o.robot_mask for o in observations]), goal_mask=goal.robot_mask)

@@ -9,11 +9,8 @@ from sim_bridge.scene import (
     CAMERA_FOVY,
     CAMERA_POSITION,
     CAMERA_TILT,
-    GRIP_FOVY,
-    GRIP_TILT,
     GRIPPER,
     Hand,
-    NARROW,
     PUSHER,
 )
 from tap_ros.errors import SceneError
@@ -24,7 +21,6 @@ class Look:
     """
     One look.
 
-    :param studio: table, light and shadows of studio.py, and a UR10e; else flat colours.
     :param arm: the camera's pictures show the whole UR10e; else the hand alone.
     :param push_hand: Hand of tasks that push.
     :param grip_hand: Hand of tasks with a grasp.
@@ -33,13 +29,12 @@ class Look:
     :param grip_spread: factor of the ranges in which objects to be gripped lie.
     """
 
-    studio: bool
     arm: bool
     push_hand: Hand
     grip_hand: Hand
     push_camera: tuple[float, float, tuple[float, float, float]]  # tilt, fovy, position
     grip_camera: tuple[float, float, tuple[float, float, float]]
-    grip_spread: float = 1.0
+    grip_spread: float
 
     def camera(self, gripping: bool, width: int, height: int) -> Camera:
         """Return the camera of a kind of task."""
@@ -59,10 +54,8 @@ _TABLE = (CAMERA_TILT, CAMERA_FOVY, CAMERA_POSITION)  # all of the table
 _TABLE_AND_ARM = (0.84, 33.5, (0.0, -1.36, 1.33))
 _NEAR = (0.73, 18.5, CAMERA_POSITION)
 LOOKS = {
-    'plain': Look(
-        False, False, NARROW, NARROW, _TABLE, (GRIP_TILT, GRIP_FOVY, CAMERA_POSITION)),
-    'hand': Look(True, False, PUSHER, GRIPPER, _TABLE, _NEAR, 0.65),
-    'ur10e': Look(True, True, PUSHER, GRIPPER, _TABLE_AND_ARM, _NEAR, 0.65),
+    'hand': Look(False, PUSHER, GRIPPER, _TABLE, _NEAR, 0.65),
+    'ur10e': Look(True, PUSHER, GRIPPER, _TABLE_AND_ARM, _NEAR, 0.65),
 }
 DEFAULT_LOOK = 'hand'
 # From the side, at a person's height: for films.

@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A random tabletop with a Cartesian gripper, one to n objects and one camera, as a MuJoCo model.
+A random tabletop with a Cartesian gripper and one to n objects, as a MuJoCo model of the physics.
 
 The scene follows the cartgripper world of the paper's data: slide joints, objects made of boxes in
 L or T form, random colours. Ours differ in three ways: bars and discs are added to the shapes, the
@@ -29,24 +29,21 @@ ARM_GEOM_GROUP = 1  # so that the renderer can leave the arm out of a picture
 CAMERA_POSITION = (0.0, -1.1, 1.3)
 CAMERA_TILT = 0.68  # rad from straight down
 CAMERA_FOVY = 34.0  # degrees
-GRIP_TILT = 0.73  # for tasks with a grasp the view is narrower, as the objects are thin,
-GRIP_FOVY = 27.0  # and higher, so that the lifted arm is in it
 
 
 @dataclass(frozen=True)
 class Hand:
     """Half sizes (x, y, z) of a finger and of the palm in m, and their colours (r, g, b)."""
 
-    finger: tuple[float, float, float] = (0.01, 0.02, 0.06)
-    palm: tuple[float, float, float] = (0.03, 0.03, 0.02)
-    finger_colour: tuple[float, float, float] = (1, 1, 1)
-    palm_colour: tuple[float, float, float] = (0.55, 0.55, 0.58)
+    finger: tuple[float, float, float]
+    palm: tuple[float, float, float]
+    finger_colour: tuple[float, float, float] = (0.93, 0.93, 0.91)
+    palm_colour: tuple[float, float, float] = (0.25, 0.26, 0.28)
 
 
-NARROW = Hand()
 # Closed, it is as wide along x as along y: objects do not slip off sideways.
-PUSHER = Hand((0.017, 0.035, 0.06), (0.04, 0.04, 0.02), (0.93, 0.93, 0.91), (0.25, 0.26, 0.28))
-GRIPPER = Hand((0.01, 0.02, 0.06), (0.045, 0.035, 0.02), (0.93, 0.93, 0.91), (0.25, 0.26, 0.28))
+PUSHER = Hand((0.017, 0.035, 0.06), (0.04, 0.04, 0.02))
+GRIPPER = Hand((0.01, 0.02, 0.06), (0.045, 0.035, 0.02))
 
 
 @dataclass(frozen=True)
@@ -98,8 +95,8 @@ def object_names(count: int) -> tuple[str, ...]:
     return tuple(f'object_{i}' for i in range(count))
 
 
-def build_scene(shapes: Sequence[ObjectShape], image_size: int = 64,
-                gripping: bool = False, hand: Hand = NARROW) -> mujoco.MjModel:
+def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False,
+                hand: Hand = PUSHER) -> mujoco.MjModel:
     """
     Compile the MuJoCo model of a table with a gripper and the given objects.
 
@@ -107,9 +104,7 @@ def build_scene(shapes: Sequence[ObjectShape], image_size: int = 64,
     joint for each object. Controls: targets of gripper x, y, z and of the two fingers, in metres.
 
     :param shapes: sequence of ObjectShape.
-    :param image_size: pixels of the square off-screen picture.
-    :param gripping: let friction hold what the fingers grip, and look from nearer; pushing does
-        without, for speed.
+    :param gripping: let friction hold what the fingers grip; pushing does without, for speed.
     :param hand: Hand.
     :return: mujoco.MjModel.
     """
@@ -123,31 +118,14 @@ def build_scene(shapes: Sequence[ObjectShape], image_size: int = 64,
         # Soft friction lets what is held creep down: solve for no slip.
         spec.option.noslip_iterations = 5
         spec.option.iterations, spec.option.ls_iterations = 50, 20
-    # Shadows and multi-sampling are most of the cost of a small picture on a CPU.
-    spec.visual.quality.shadowsize = 0
-    spec.visual.quality.offsamples = 0
-    spec.visual.global_.offwidth = image_size
-    spec.visual.global_.offheight = image_size
-    spec.visual.headlight.ambient = [0.55, 0.55, 0.55]
-    spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
-    spec.visual.headlight.specular = [0, 0, 0]
     world = spec.worldbody
     world.add_geom(
         name='table', type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1],
-        rgba=[0.26, 0.21, 0.18, 1], friction=[1, 0.01, 0.0002])
-    _add_camera(world, *(GRIP_TILT, GRIP_FOVY) if gripping else (CAMERA_TILT, CAMERA_FOVY))
+        friction=[1, 0.01, 0.0002])
     _add_gripper(spec, world, hand, GRIP if gripping else {'friction': [1, 0.01, 0.0002]})
     for name, shape in zip(object_names(len(shapes)), shapes):
         _add_object(world, name, shape)
     return spec.compile()
-
-
-def _add_camera(world: mujoco.MjsBody, tilt: float, fovy: float) -> None:
-    """Add the one camera, looking from the front down onto the table."""
-    half = tilt / 2
-    world.add_camera(
-        name='camera', pos=list(CAMERA_POSITION), quat=[np.cos(half), np.sin(half), 0, 0],
-        fovy=fovy)
 
 
 def _add_gripper(spec: mujoco.MjSpec, world: mujoco.MjsBody, hand: Hand,

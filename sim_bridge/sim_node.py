@@ -130,14 +130,11 @@ class SimNode(Node):
         self._streams = {
             topic: self.create_publisher(kind, topic, STREAM) for topic, kind in {
                 'clock': ClockMessage, 'joint_states': JointState, 'objects': ObjectStates,
-                'camera/camera_info': CameraInfo, 'camera/image_raw': Image}.items()}
-        self._goal_mask = None
-        if self._sim.look.studio:
-            self._streams['camera/robot_mask'] = self.create_publisher(
-                Image, 'camera/robot_mask', STREAM)
-            self._goal_mask = self.create_publisher(Image, 'goal/robot_mask', LATCHED)
-            self._description = self.create_publisher(String, 'robot_description', LATCHED)
-            self._description.publish(String(data=robot_description()))
+                'camera/camera_info': CameraInfo, 'camera/robot_mask': Image,
+                'camera/image_raw': Image}.items()}
+        self._goal_mask = self.create_publisher(Image, 'goal/robot_mask', LATCHED)
+        self._description = self.create_publisher(String, 'robot_description', LATCHED)
+        self._description.publish(String(data=robot_description()))
         if self.params['observer']:
             self._streams['observer/image_raw'] = self.create_publisher(
                 Image, 'observer/image_raw', STREAM)
@@ -390,22 +387,18 @@ class SimNode(Node):
             'objects': encode_observed(observation, stamp),
             'camera/camera_info': encode_camera_info(
                 camera.K, (camera.height, camera.width), stamp, CAMERA_FRAME),
-            'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME)}
-        if observation.robot_mask is not None:
-            self._newest['camera/robot_mask'] = encode_mask(
-                observation.robot_mask, stamp, CAMERA_FRAME)
+            'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME),
+            'camera/robot_mask': encode_mask(observation.robot_mask, stamp, CAMERA_FRAME)}
         if self.params['observer']:
             self._newest['observer/image_raw'] = encode_image(
                 self._sim.observer_picture(), stamp, OBSERVER_FRAME)
-        if observation.arm_joints is not None:
-            self._transforms.moving(arm_transforms(observation.arm_joints), stamp)
+        self._transforms.moving(arm_transforms(observation.arm_joints), stamp)
         self._send_newest()
 
     def _publish_fixed_transforms(self) -> None:
         """Tell where the cameras and the foot of the arm are in this scene."""
-        fixed = [camera_transform(self._sim.camera, CAMERA_FRAME)]
-        if self._sim.look.studio:
-            fixed += [camera_transform(OBSERVER, OBSERVER_FRAME), *fixed_arm_transforms()]
+        fixed = [camera_transform(self._sim.camera, CAMERA_FRAME),
+                 camera_transform(OBSERVER, OBSERVER_FRAME), *fixed_arm_transforms()]
         self._transforms.fixed(fixed, to_stamp(self._stamp_ns))
 
     def _send_newest(self) -> None:
@@ -420,8 +413,7 @@ class SimNode(Node):
         stamp = to_stamp(self._goal_ns)
         self._goal_objects.publish(encode_observed(goal, stamp))
         self._goal_image.publish(encode_image(goal.image, stamp, CAMERA_FRAME))
-        if self._goal_mask is not None and goal.robot_mask is not None:
-            self._goal_mask.publish(encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
+        self._goal_mask.publish(encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
 
     def _publish_episode(self, event: int, outcome: str) -> None:
         scene = self._sim.scene
@@ -441,11 +433,10 @@ def declare_parameters(node: Node) -> Parameters:
                        low=16, high=1024)
     parameters.declare(
         'look', DEFAULT_LOOK,
-        "What the camera's pictures show: the whole UR10e at a wooden table, its hand alone, or "
-        'plain colours.',
+        "What the camera's pictures show: the whole UR10e at a wooden table, or its hand alone.",
         choices=list(LOOKS))
     parameters.declare(
-        'appearance', 'usual', 'Table, light and camera of looks with a table; random: drawn from '
+        'appearance', 'usual', 'Table, light and camera; random: drawn from '
         'the seed of each scene.', choices=list(CHOICES))
     parameters.declare(
         'observer', False, 'Publish observer/image_raw, a view from the side for people.')

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.appearance import choose_appearance, USUAL
-from sim_bridge.camera import Renderer
 from sim_bridge.entities import check_free, check_pose, check_velocity
 from sim_bridge.grasping import grasp_place
 from sim_bridge.looks import DEFAULT_LOOK, get_look, OBSERVER
@@ -57,8 +56,8 @@ class Observation:
     object_names: tuple[str, ...]
     object_pixels: np.ndarray  # (K, 2) float32 (u, v) of the object origins
     object_poses: np.ndarray  # (K, 7) float64: x, y, z in m, quaternion x, y, z, w
-    robot_mask: np.ndarray | None = None  # (H, W) uint8, values as in contract.py; in a studio
-    arm_joints: np.ndarray | None = None  # (6,) float64 rad, of the UR10e; in a studio
+    robot_mask: np.ndarray  # (H, W) uint8, values as in contract.py
+    arm_joints: np.ndarray  # (6,) float64 rad, of the UR10e
 
 
 def clip_action(action: ArrayLike) -> np.ndarray:
@@ -110,8 +109,7 @@ class Simulator:
     :param task: name of a task, see tasks.TASKS.
     :param image_size: pixels of the square picture.
     :param look: name of a look, see looks.LOOKS.
-    :param appearance: name of an appearance, see appearance.CHOICES; others than 'usual' need a
-        look with a studio.
+    :param appearance: name of an appearance, see appearance.CHOICES.
     :raises SceneError: for an unknown task, look or appearance, a bad size, or when nothing can be
         rendered.
     """
@@ -121,12 +119,11 @@ class Simulator:
         self.task, self.look = get_task(task), get_look(look)
         if not 16 <= image_size <= 1024:
             raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')
-        if choose_appearance(appearance, 0) != USUAL and not self.look.studio:
-            raise SceneError(f'appearance {appearance!r} needs a look with a studio, not {look!r}')
+        choose_appearance(appearance, 0)  # refuses what there is not
         self._appearance = appearance
         self._usual_camera = self.look.camera(self.task.gripping, image_size, image_size)
         self.camera = self._usual_camera
-        self._renderer: Renderer | Studio | None = None
+        self._renderer: Studio | None = None
         self._observer: Studio | None = None
         self._worn = USUAL  # the appearance of the present scene
 
@@ -141,7 +138,7 @@ class Simulator:
         gripping = self.task.gripping
         self.scene = sample_scene(self.task, seed, self.look.spread(gripping))
         self.model = build_scene(
-            self.scene.shapes, self.camera.height, gripping, self.look.hand(gripping))
+            self.scene.shapes, gripping, self.look.hand(gripping))
         self.data = mujoco.MjData(self.model)
         self._prepare_camera()
         self.target = np.append(self.scene.gripper_start, 0.0)
@@ -268,9 +265,8 @@ class Simulator:
     def _ramp(self, action: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the servo targets of an action (SUBSTEPS, 5) and the last one (4,)."""
         controls, targets = ramp_controls(self.target, clip_action(action)[None])
-        if self.look.studio:
-            ur10e.check_motion(
-                ur10e.joints_at(self.target), ur10e.joints_at(targets[0]), CONTROL_PERIOD)
+        ur10e.check_motion(
+            ur10e.joints_at(self.target), ur10e.joints_at(targets[0]), CONTROL_PERIOD)
         return controls, targets[0]
 
     def observe(self, hide_arm: bool = False) -> Observation:
@@ -290,13 +286,7 @@ class Simulator:
             object_poses=poses, robot_mask=view.robot_mask, arm_joints=view.arm_joints)
 
     def observer_picture(self) -> np.ndarray:
-        """
-        Take a picture from the side, for people: uint8 (360, 480, 3) rgb.
-
-        :raises SceneError: for looks without a studio.
-        """
-        if not self.look.studio:
-            raise SceneError("observer: this look has no view from the side; choose 'ur10e'")
+        """Take a picture from the side, for people: uint8 (360, 480, 3) rgb."""
         if self._observer is None:
             self._observer = Studio(OBSERVER, arm=True)
         self._observer.dress(replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
@@ -357,14 +347,8 @@ class Simulator:
 
     def _prepare_camera(self) -> None:
         """Let the camera see the scene, as it looks with its seed."""
-        if not self.look.studio:
-            if self._renderer is None:
-                self._renderer = Renderer(self.model, self.camera.height)
-            self._renderer.use(self.model)
-            return
         if self._renderer is None:
             self._renderer = Studio(self._usual_camera, self.look.arm)
-        assert isinstance(self._renderer, Studio)
         self._worn = choose_appearance(self._appearance, self.scene.seed)
         self._renderer.dress(self._worn)
         self._renderer.use(self.model)

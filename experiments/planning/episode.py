@@ -61,8 +61,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     :param reached: px, mean over objects; nearer than this is there. 0: never.
     :param objects: indices of the objects that are planned for; None: all.
     :return: PlannedEpisode.
-    :raises ConfigError: when the predictor is missing, or weights need robot masks that the look
-        has not.
+    :raises ConfigError: when the predictor is missing.
     """
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
@@ -120,9 +119,6 @@ class View:
     def _filled(self, observation, fill):
         if self._robot_mask == 'none':
             return observation
-        if observation.robot_mask is None:
-            raise ConfigError(f'weights trained with robot_mask {self._robot_mask} need pictures '
-                              'with robot masks; choose a look that has them, hand or ur10e')
         return replace(observation, image=fill(observation.image, observation.robot_mask))
 
 
@@ -186,7 +182,6 @@ def true_configuration(simulator, picture, seen, goal):
 def as_recording(run, task, seed, outcome):
     """Return a PlannedEpisode as the Episode of a recording."""
     seen, goal = run.observations, run.goal
-    masked = goal.robot_mask is not None
 
     def stack(name, dtype):
         return np.array([getattr(o, name) for o in seen], dtype)
@@ -199,5 +194,5 @@ def as_recording(run, task, seed, outcome):
         object_poses=stack('object_poses', np.float64), goal_frame=goal.image,
         goal_pixels=np.asarray(goal.object_pixels, np.float32),
         goal_poses=np.asarray(goal.object_poses, np.float64), task=task, seed=seed,
-        outcome=outcome, robot_masks=stack('robot_mask', np.uint8) if masked else None,
+        outcome=outcome, robot_masks=stack('robot_mask', np.uint8),
         goal_mask=goal.robot_mask)

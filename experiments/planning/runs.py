@@ -26,7 +26,6 @@ from tap_ros.prediction.predictor import SubgoalPredictor
 import torch
 from tqdm import tqdm
 
-FIRST_LOOK = 'plain'  # of results that tell none
 SPEED_ONLY = ('batch_size', 'threads')  # settings of the planner that change no result
 
 
@@ -121,7 +120,7 @@ def read_results(path):
         scenes = {scene['seed']: scene for scene in stored['scenes']}
         for scene in scenes.values():
             float(scene['final_cm']), list(scene['objects_cm']), int(scene['steps'])
-        settings = {'look': FIRST_LOOK} | stored['settings']
+        settings = dict(stored['settings'])
         if 'planner' in settings:
             settings['planner'] = known(settings['planner'], asdict(VisualMPCConfig()))
         return settings, scenes

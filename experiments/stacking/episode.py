@@ -60,8 +60,7 @@ def run_episode(simulator, method, seed, predictor=None):
     :param seed: of the scene, of the order of moves where the method has none, and of the arm.
     :param predictor: SubgoalPredictor, for methods that predict.
     :return: StackedEpisode.
-    :raises ConfigError: when the predictor is missing, or weights need robot masks that the look
-        has not.
+    :raises ConfigError: when the predictor is missing.
     """
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')

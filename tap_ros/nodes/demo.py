@@ -28,7 +28,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 from sim_bridge.expert import run_episode
-from sim_bridge.looks import DEFAULT_LOOK, get_look, LOOKS, OBSERVER
+from sim_bridge.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import get_task, TASKS
 from tap_msgs.action import ReachGoal
@@ -274,8 +274,7 @@ def film_expert(task: str, seed: int, look: str) -> list[np.ndarray]:
 def start_nodes(processes: NodeProcesses, folder: Path, task: str, look: str) -> None:
     """Start simulator, predictor, recorder and, for tasks that push, the planner."""
     processes.start('recorder_node', folder=folder / 'recording' / task)
-    processes.start('sim_node', lock_step=True, task=task, look=look,
-                    observer=get_look(look).studio)
+    processes.start('sim_node', lock_step=True, task=task, look=look, observer=True)
     processes.start('predictor_node', weights=task if task in PREDICTORS else DEFAULT_PREDICTOR)
     if not get_task(task).gripping:
         processes.start('visual_mpc_node')

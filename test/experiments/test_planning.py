@@ -154,15 +154,6 @@ def test_networks_are_shown_what_nodes_would_show(studio, mpc, predictor, robot_
     check_episode(as_recording(run, 'push2', 5, 'failure'))
 
 
-def test_weights_that_need_masks_are_refused_where_a_look_has_none(mpc):
-    simulator = Simulator('push2', look='plain')
-    model = copy.copy(mpc.model)
-    model.config = replace(model.config, robot_mask='all')
-    with pytest.raises(ConfigError, match='hand or ur10e'):
-        run_episode(simulator, VisualMPC(model, SMALL), DIRECT, 3, 5)
-    simulator.close()
-
-
 def test_one_object_alone_is_planned_for_alone(simulator, mpc):
     run = run_episode(simulator, mpc, parse_method('one_object'), 2, 5, objects=[1])
     assert len(run.targets) == 1 and len(run.targets[0].pixels) == 1

@@ -48,8 +48,8 @@ def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path, shape
 
 
 def test_without_a_robot_there_is_no_mask_and_the_reason(tmp_path):
-    sim = NodeProcess(
-        'sim_node', tmp_path / 'sim.txt', {'lock_step': 'true', 'look': 'plain'})
+    sim = NodeProcess('sim_node', tmp_path / 'sim.txt', {'lock_step': 'true'}, [
+        '-r robot_description:=elsewhere', '-r joint_states:=elsewhere_too'])
     node = NodeProcess('robot_mask_node', tmp_path / 'mask.txt', CAMERA, OWN_TOPIC)
     own = NodeProcess('robot_mask_node', tmp_path / 'own.txt', CAMERA | {'urdf': 'ur10e'},
                       [*OWN_TOPIC, '-r __node:=other'])

@@ -25,7 +25,7 @@ NAMES = ('object_0', 'object_1', 'object_2')
 
 @pytest.fixture(scope='module')
 def simulator():
-    simulator = Simulator('push2', look='plain')
+    simulator = Simulator('push2')
     yield simulator
     simulator.close()
 
