@@ -19,7 +19,8 @@ DEFAULT_METHODS = ('nothing', 'direct', 'direct:twice', 'fix', 'genmin', 'genmin
                    'shipped', 'oracle_order', 'true_subgoal', 'true_model')
 # What the command paper calls the predictors that these methods stand for.
 RUNS = {'fix': 'fix-wo-gan+skips', 'genmin': 'genmin-wo-gan+skips',
-        'genmin+progress': 'genmin-wo-gan+progress+skips'}
+        'genmin+progress': 'genmin-wo-gan+progress+skips',
+        'genmin+relative': 'genmin-wo-gan+relative+skips'}
 TRAINED = 'runs/paper/small/{task}-bidirectional-{name}-warp-s0/predictor.safetensors'
 
 
@@ -30,11 +31,11 @@ class Options:
 
     :param tasks: what is planned.
     :param methods: nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped
-        for the shipped predictor; fix, genmin (over time) and genmin+progress for those that the
-        command paper trained with our network and without GAN, or the name of another one; with
-        options behind colons: half, recursion<n>, samples<n>, carried, true_maps, true_model,
-        twice, more_search, paper (its search whatever --preset says), plain_cost, every<n>, for
-        example genmin:half:carried.
+        for the shipped predictor; fix, genmin (over time), genmin+progress and genmin+relative
+        for those that the command paper trained with our network and without GAN, or the name of
+        another one; with options behind colons: half, recursion<n>, samples<n>, carried,
+        true_maps, true_model, twice, more_search, paper (its search whatever --preset says),
+        plain_cost, every<n>, for example genmin:half:carried.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
     :param look: of the world, see sim_bridge.looks; pictures are filled behind the robot as the

@@ -18,7 +18,7 @@ PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward mod
          'search': 'the search', 'cost': 'its cost', 'tracking': 'object pixels',
          'switch': 'when to go on', 'recursion': 'number of subgoals',
          'samples': 'number of samples', 'replan_every': 'how often to plan'}
-FIRST = ('nothing', 'direct', 'fix', 'genmin', 'genmin+progress', 'shipped')
+FIRST = ('nothing', 'direct', 'fix', 'genmin', 'genmin+progress', 'genmin+relative', 'shipped')
 
 _interval = partial(interval, digits=1, form='{}{} [{}, {}]')
 

@@ -63,7 +63,7 @@ def ship(recipe, bags, runs, out):
                               for words in recipe.commands('bags', 'runs/weights'))
     write_atomically(card, render(
         'weights/templates/card.md.j2', file=file.name, name=recipe.name, task=recipe.task,
-        collect=collect, again=again, train=train, earlier=recipe.earlier,
+        collect=collect, again=again, train=train,
         run=json.loads((run / 'run.json').read_text()), method=about['settings']['method'],
         fresh=len(store), pushing=np.isfinite(first.bottleneck).any(), forward=forward,
         goal=goals[0], metrics=headline(first), samples=samples,

@@ -11,8 +11,6 @@ from typing import Annotated
 
 from experiments.weights.card import ship
 from experiments.weights.recipes import RECIPES
-from tap_ros.errors import ConfigError
-from tap_ros.files import write_atomically
 from tap_ros.options import Flag, Folder, one_of
 
 
@@ -46,10 +44,6 @@ def run(args):
     """
     for name in args.only or RECIPES:
         recipe = RECIPES[name]
-        if recipe.earlier:
-            print(f'git show {recipe.earlier} > {recipe.initial(args.runs)}', flush=True)
-            if not args.list:
-                _take_earlier(recipe, args.runs)
         for words in recipe.commands(args.bags, args.runs):
             if words[0] == 'train':
                 words = [*words, '--threads', str(args.threads)]
@@ -62,18 +56,3 @@ def run(args):
             Path(args.out).mkdir(parents=True, exist_ok=True)
             print(ship(recipe, args.bags, args.runs, args.out), flush=True)
     return 0
-
-
-def _take_earlier(recipe, runs):
-    """
-    Take the weights that a training begins with out of the history.
-
-    :raises ConfigError: where there is no history.
-    """
-    found = subprocess.run(['git', '-C', str(Path(__file__).parent), 'show', recipe.earlier],
-                           capture_output=True)
-    if found.returncode:
-        raise ConfigError(f'{recipe.earlier}: git does not have it here '
-                          f'({found.stderr.decode(errors="replace").strip()}); clone the whole '
-                          'repository')
-    write_atomically(recipe.initial(runs), found.stdout)

@@ -22,23 +22,16 @@ class Recipe:
     :param task: of its scenes.
     :param collections: options of `collect` beside the task, by names of folders.
     :param train: options of `train` beside recordings and folder.
-    :param earlier: shipped weights of a commit that the training begins with: 'COMMIT:FILE'.
     """
 
     name: str
     task: str
     collections: dict[str, str]
     train: str
-    earlier: str = ''
 
     def fresh(self, folder: str | Path) -> Path:
         """Return the folder of the recording of scenes that it never saw."""
         return Path(folder, f'fresh_{self.task}')
-
-    def initial(self, runs: str | Path) -> Path:
-        """Return where the weights of an earlier commit are put."""
-        commit, file = self.earlier.split(':')
-        return Path(runs, f'{commit}_{Path(file).name}')
 
     def commands(self, bags: str | Path, runs: str | Path) -> list[list[str]]:
         """
@@ -55,8 +48,7 @@ class Recipe:
             [*collect, '--episodes', str(FRESH_EPISODES), '--seed', str(FRESH_SEED),
              '--out', str(self.fresh(bags))],
             ['train', '--recordings', *folders, '--out', str(Path(runs, self.name)),
-             *shlex.split(self.train),
-             *(['--initial-weights', str(self.initial(runs))] if self.earlier else [])]]
+             *shlex.split(self.train)]]
 
 
 # With the arm elsewhere in half of the goal pictures, one decoder learns faster than three.
@@ -72,10 +64,10 @@ RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push2', 'push2', {
         'push2': '--episodes 2000', 'push2_random': '--episodes 3500 --appearance random'},
         f'{_PUSHING} --steps 10000'),
-    # Does not come out as shipped: recordings are others now, see docs/training.md.
-    Recipe('order2', 'order2', {'order2': '--episodes 600'}, f'{_PUSHING} --steps 2500',
-           '3c12a9d:tap_ros/weights/predictor_push2.safetensors'),
-    # Begins with the push2 that is installed, not with the one made just before.
+    # These begin with the push2 that is installed, not with the one made just before.
+    Recipe('order2', 'order2', {'order2': '--episodes 700'},
+           '--method genmin-wo-gan+relative --outer-power 1 --start-crop 0.3 --batch-size 24 '
+           '--decoder shared --skips --goal-picture mixed --initial-weights push2 --steps 2500'),
     Recipe('push3', 'push3', {'push3': '--episodes 600'},
            f'{_PUSHING} --initial-weights push2 --steps 3000'),
     Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),

@@ -11,7 +11,6 @@ from experiments.weights.recipes import Recipe, RECIPES
 import numpy as np
 import pytest
 from tap_ros.cli import main
-from tap_ros.errors import ConfigError
 from tap_ros.evaluation.prediction import EpisodeScores
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import PREDICTORS
@@ -72,9 +71,6 @@ def test_a_card_says_what_samples_are_worth_and_that_no_goal_is_given(
 def test_the_list_is_of_commands_that_exist(places, capsys):
     assert command.run(command.Options(list=True, **places)) == 0
     lines = capsys.readouterr().out.splitlines()
-    taken = [line for line in lines if line.startswith('git show ')]
-    assert len(taken) == sum(bool(recipe.earlier) for recipe in RECIPES.values()) > 0
-    lines = [line for line in lines if line not in taken]
     assert len(lines) == sum(2 + len(recipe.collections) for recipe in RECIPES.values())
     assert not Path(places['runs']).exists()
     for line in lines:
@@ -82,20 +78,6 @@ def test_the_list_is_of_commands_that_exist(places, capsys):
         with pytest.raises(SystemExit) as ended:
             main([*words, '--help'])
         assert ended.value.code == 0
-
-
-def test_a_training_may_begin_with_weights_of_an_earlier_commit(places, monkeypatch, capfd):
-    earlier = replace(TINY, earlier='HEAD:tap_ros/weights/predictor_grasp.safetensors',
-                      train=RECIPES['grasp'].train + ' --steps 1 --batch-size 2')
-    monkeypatch.setitem(RECIPES, TINY.name, earlier)
-    assert command.run(command.Options(only=(TINY.name,), **places)) == 0
-    card = Path(places['out'], 'predictor_tiny.md').read_text()
-    assert '--initial-weights' in card and f'(`git show {earlier.earlier}`)' in card
-    gone = replace(earlier, earlier='HEAD:never.safetensors')
-    monkeypatch.setitem(RECIPES, TINY.name, gone)
-    with pytest.raises(ConfigError, match='HEAD:never.safetensors: git does not have it here'):
-        command.run(command.Options(only=(TINY.name,), **places))
-    assert not gone.initial(places['runs']).exists()
 
 
 def test_a_step_that_fails_ends_it(places, monkeypatch, capfd):
