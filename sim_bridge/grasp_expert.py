@@ -16,6 +16,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from sim_bridge.episode_run import carry_out, EpisodeRun
+from sim_bridge.looks import GRIP_SPREAD
 from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, Simulator
 from tap_ros.contract import CLEAR, MOVE_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW
 
@@ -161,7 +162,7 @@ class GraspExpert:
         path += [below] * hold
         closed = len(path) - 1
         path += [below, leave]
-        wiggle, reach = self._config.wiggle, RANGE * simulator.look.spread(True)
+        wiggle, reach = self._config.wiggle, RANGE * GRIP_SPREAD
         while len(path) <= steps_left:
             path.append(path[-1] + rng.normal(0, [wiggle, wiggle, wiggle / 3]))
             path[-1] = np.clip(path[-1], [-reach, -reach, CLEAR], [reach, reach, 0.14])

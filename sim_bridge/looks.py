@@ -1,18 +1,11 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The looks of the world: what is drawn around the physics, which hand it has, and the cameras."""
+"""The looks of the world: what is drawn around the physics, and the cameras."""
 
 from dataclasses import dataclass
 
 from sim_bridge.camera import Camera
-from sim_bridge.scene import (
-    CAMERA_FOVY,
-    CAMERA_POSITION,
-    CAMERA_TILT,
-    GRIPPER,
-    Hand,
-    PUSHER,
-)
+from sim_bridge.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.errors import SceneError
 
 
@@ -21,41 +14,28 @@ class Look:
     """
     One look.
 
+    Hands and objects are the same in all of them, and so is the camera of tasks with a grasp.
+
     :param arm: the camera's pictures show the whole UR10e; else the hand alone.
-    :param push_hand: Hand of tasks that push.
-    :param grip_hand: Hand of tasks with a grasp.
     :param push_camera: what Camera is given for tasks that push.
-    :param grip_camera: likewise, with a grasp.
-    :param grip_spread: factor of the ranges in which objects to be gripped lie.
     """
 
     arm: bool
-    push_hand: Hand
-    grip_hand: Hand
     push_camera: tuple[float, float, tuple[float, float, float]]  # tilt, fovy, position
-    grip_camera: tuple[float, float, tuple[float, float, float]]
-    grip_spread: float
 
     def camera(self, gripping: bool, width: int, height: int) -> Camera:
         """Return the camera of a kind of task."""
-        tilt, fovy, position = self.grip_camera if gripping else self.push_camera
+        tilt, fovy, position = _NEAR if gripping else self.push_camera
         return Camera(width, height, tilt, fovy, position)
-
-    def hand(self, gripping: bool) -> Hand:
-        """Return the hand of a kind of task."""
-        return self.grip_hand if gripping else self.push_hand
-
-    def spread(self, gripping: bool) -> float:
-        """Return the factor of the ranges in which objects lie."""
-        return self.grip_spread if gripping else 1.0
 
 
 _TABLE = (CAMERA_TILT, CAMERA_FOVY, CAMERA_POSITION)  # all of the table
 _TABLE_AND_ARM = (0.84, 33.5, (0.0, -1.36, 1.33))
 _NEAR = (0.73, 18.5, CAMERA_POSITION)
+GRIP_SPREAD = 0.65  # of the ranges in which objects to be gripped lie: that camera sees less
 LOOKS = {
-    'hand': Look(False, PUSHER, GRIPPER, _TABLE, _NEAR, 0.65),
-    'ur10e': Look(True, PUSHER, GRIPPER, _TABLE_AND_ARM, _NEAR, 0.65),
+    'hand': Look(False, _TABLE),
+    'ur10e': Look(True, _TABLE_AND_ARM),
 }
 DEFAULT_LOOK = 'hand'
 # From the side, at a person's height: for films.

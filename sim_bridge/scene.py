@@ -24,6 +24,7 @@ FINGER_CLEARANCE = 0.006  # m between fingertips and table at z = 0
 FINGER_GAP = 0.001  # m, half the gap between closed fingers
 FINGER_TRAVEL = 0.04  # m each finger moves from closed (0) to open (1)
 TIMESTEP = 0.0125  # s; a control period is a whole number of these, see simulator.py
+SLIDE = {'friction': [1, 0.01, 0.0002]}
 GRIP = {'friction': [2, 0.02, 0.0002], 'condim': 4}  # rubber: what is held does not turn either
 ARM_GEOM_GROUP = 1  # so that the renderer can leave the arm out of a picture
 CAMERA_POSITION = (0.0, -1.1, 1.3)
@@ -95,8 +96,7 @@ def object_names(count: int) -> tuple[str, ...]:
     return tuple(f'object_{i}' for i in range(count))
 
 
-def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False,
-                hand: Hand = PUSHER) -> mujoco.MjModel:
+def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False) -> mujoco.MjModel:
     """
     Compile the MuJoCo model of a table with a gripper and the given objects.
 
@@ -104,8 +104,8 @@ def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False,
     joint for each object. Controls: targets of gripper x, y, z and of the two fingers, in metres.
 
     :param shapes: sequence of ObjectShape.
-    :param gripping: let friction hold what the fingers grip; pushing does without, for speed.
-    :param hand: Hand.
+    :param gripping: take the hand that grips, and let friction hold what is in it; pushing does
+        without, for speed.
     :return: mujoco.MjModel.
     """
     spec = mujoco.MjSpec()
@@ -122,7 +122,7 @@ def build_scene(shapes: Sequence[ObjectShape], gripping: bool = False,
     world.add_geom(
         name='table', type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1],
         friction=[1, 0.01, 0.0002])
-    _add_gripper(spec, world, hand, GRIP if gripping else {'friction': [1, 0.01, 0.0002]})
+    _add_gripper(spec, world, *(GRIPPER, GRIP) if gripping else (PUSHER, SLIDE))
     for name, shape in zip(object_names(len(shapes)), shapes):
         _add_object(world, name, shape)
     return spec.compile()
@@ -176,8 +176,7 @@ def _add_object(world: mujoco.MjsBody, name: str, shape: ObjectShape) -> None:
             zip(shape.half_sizes, shape.centres, shape.colours)):
         disc = shape.kind == 'disc'
         # With rolling friction (condim 6), else a disc that is tipped onto its rim rolls away.
-        rolling = {'condim': 6, 'friction': [1, 0.01, 0.005]} if disc else {
-            'friction': [1, 0.01, 0.0002]}
+        rolling = {'condim': 6, 'friction': [1, 0.01, 0.005]} if disc else SLIDE
         body.add_geom(
             name=f'{name}_part_{i}', pos=[*centre, 0],
             type=mujoco.mjtGeom.mjGEOM_CYLINDER if disc else mujoco.mjtGeom.mjGEOM_BOX,

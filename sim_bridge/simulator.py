@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from sim_bridge.appearance import choose_appearance, USUAL
 from sim_bridge.entities import check_free, check_pose, check_velocity
 from sim_bridge.grasping import grasp_place
-from sim_bridge.looks import DEFAULT_LOOK, get_look, OBSERVER
+from sim_bridge.looks import DEFAULT_LOOK, get_look, GRIP_SPREAD, OBSERVER
 from sim_bridge.moved_goal import check_apart, check_places
 from sim_bridge.places import gripper_away_from
 from sim_bridge.scene import (
@@ -136,9 +136,8 @@ class Simulator:
         :raises SceneError: for a bad seed.
         """
         gripping = self.task.gripping
-        self.scene = sample_scene(self.task, seed, self.look.spread(gripping))
-        self.model = build_scene(
-            self.scene.shapes, gripping, self.look.hand(gripping))
+        self.scene = sample_scene(self.task, seed, GRIP_SPREAD if gripping else 1.0)
+        self.model = build_scene(self.scene.shapes, gripping)
         self.data = mujoco.MjData(self.model)
         self._prepare_camera()
         self.target = np.append(self.scene.gripper_start, 0.0)

@@ -246,7 +246,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(SINGLE, ['fix', 'genmin', 'min', 'genmin-wo-gan', 'genmin-vae-gan'])
     # Three objects, and stacking.
     add(['stack2', 'push3'], l1_rows, variant=OURS)
-    add(['push3'], l1_rows[:3], variant=OURS, new_pixels=False)
+    add(['push3'], relative + l1_rows[:3], variant=OURS, new_pixels=False)
     # What the parts of genmin+progress are worth.
     add(['push2'], ['genmin-wo-gan+progress', 'genmin-wo-gan', 'fix-wo-gan'], new_pixels=False)
     add(['push2'], ['genmin+progress', 'genmin'], variant=OURS, new_pixels=False)

@@ -16,7 +16,7 @@ from tyro import conf
 
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 DEFAULT_METHODS = ('nothing', 'direct', 'direct:twice', 'fix', 'genmin', 'genmin+progress',
-                   'shipped', 'oracle_order', 'true_subgoal', 'true_model')
+                   'genmin+relative', 'shipped', 'oracle_order', 'true_subgoal', 'true_model')
 # What the command paper calls the predictors that these methods stand for.
 RUNS = {'fix': 'fix-wo-gan+skips', 'genmin': 'genmin-wo-gan+skips',
         'genmin+progress': 'genmin-wo-gan+progress+skips',

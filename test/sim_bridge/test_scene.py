@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 from sim_bridge.grasping import GRASP_YAW
-from sim_bridge.looks import LOOKS
+from sim_bridge.looks import GRIP_SPREAD, LOOKS
 from sim_bridge.places import GOAL_DISTANCE, GOAL_YAW_RANGE, OBJECT_RANGE
 from sim_bridge.scene import build_scene, random_shape
 from sim_bridge.simulator import Simulator
@@ -62,8 +62,8 @@ def test_scenes_with_a_grasp_obey_their_rules(task):
 
 @pytest.mark.parametrize('look', LOOKS)
 def test_the_gripper_and_its_object_stay_in_the_picture(look):
-    camera, spread = LOOKS[look].camera(True, 64, 64), LOOKS[look].spread(True)
-    reach, top = spread * GRASP_REACH_RANGE, WORKSPACE_HIGH[2] + 0.02
+    camera = LOOKS[look].camera(True, 64, 64)
+    reach, top = GRIP_SPREAD * GRASP_REACH_RANGE, WORKSPACE_HIGH[2] + 0.02
     corners = np.array([
         [x, y, z] for x in (-reach, reach) for y in (-reach, reach) for z in (0.03, top)])
     pixels = camera.project(corners)
