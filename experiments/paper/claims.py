@@ -110,7 +110,8 @@ def _forward(rows):
 
 def _recursion(rows):
     for method, how in ((_PROGRESS, 'trained on r = 1'),
-                        (f'{_PROGRESS}-r2', 'trained as Eq. 3 says')):
+                        (f'{_PROGRESS}-r2', 'trained as Eq. 3 says'),
+                        (f'{_PROGRESS}+pieces', 'trained on pieces of episodes')):
         about = {'task': 'pick_place', 'mode': 'bidirectional', 'method': method,
                  'new_pixels': True}
         place = find(rows, metric='place', **about)

@@ -37,7 +37,7 @@ from tap_ros.prediction.losses import CHANGED
 
 # May differ between the methods of a scale, see runs.py.
 SETTINGS = ('decoder', 'skips', 'margin', 'progress_margin', 'match_temperature', 'colour',
-            'brightness', 'learning_rate', 'gan_weight', 'kl_weight', 'recursion',
+            'brightness', 'min_crop', 'learning_rate', 'gan_weight', 'kl_weight', 'recursion',
             'detach_recursion', 'pretrain_steps')
 GRIDS = {  # what follows <task>-<mode>[-warp] in the name of a picture
     '': 'inputs, each method, and the true frame that matches best',

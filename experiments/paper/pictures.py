@@ -12,8 +12,9 @@ from pathlib import Path
 import re
 
 from experiments.paper.figures import COLOURS, family, file_name
-from experiments.paper.names import method_order
+from experiments.paper.names import method_order, variant_of
 from experiments.paper.published import TITLES
+from experiments.paper.runs import OURS
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
@@ -185,6 +186,8 @@ def _methods(task, mode, shown, store, episodes, goal_picture):
     ours = next((one for one in chosen if family(one.method) == 'ours'), None)
     matches = []
     for one in shown:
+        if variant_of(one.method) not in ('', OURS):
+            continue  # too many to see
         image = _predict(one, episodes, context).image
         _append(rows, to_uint8(image))
         headings.append(_coloured(one.method))
@@ -241,7 +244,8 @@ def _parts(task, mode, shown, store, episodes, goal_picture):
 @torch.inference_mode()
 def _recursion(task, mode, shown, store, episodes, goal_picture):
     """Show predictions with the prediction before as the goal (Fig. 7)."""
-    chosen = _contrast(shown) + [one for one in shown if re.search(r'-r\d+$', one.method)]
+    chosen = _contrast(shown) + [
+        one for one in shown if re.search(r'-r\d+$|\+pieces$', one.method)]
     if mode != 'bidirectional' or not chosen:
         return None
     batch, context = _gather(store, episodes, mode, goal_picture)

@@ -65,6 +65,16 @@ VARIANTS = {
     '+skips+margin': {**_OURS, 'margin': 3},
     '+skips+edge': {**_OURS, 'progress_margin': 0.0},
     '+skips+annealed': {**_OURS, 'match_temperature': 1.0},
+    # Inputs and targets of random pieces of episodes: a piece that ends at the place is what
+    # recursion asks of.
+    '+skips+pieces': {**_OURS, 'min_crop': 0.3},
+    # With next to no price on z.
+    '+skips+free': {**_OURS, 'kl_weight': 1e-7},
+    # Tried where genmin+progress finds few bottlenecks.
+    '+skips+window0.65': {**_OURS, 'progress_margin': 0.65},
+    '+skips+window0.8': {**_OURS, 'progress_margin': 0.8},
+    '+skips+window0.85': {**_OURS, 'progress_margin': 0.85},
+    '+skips+slow': {**_OURS, 'learning_rate': 3e-4},
     # Of the tasks in FINE_TUNED, from fresh weights.
     '+skips+scratch': _OURS,
     '+skips+long': _OURS,
@@ -143,7 +153,7 @@ class PaperRun:
     def beginning(self):
         """Name of the shipped weights that it begins with, '' for fresh ones."""
         # Shipped networks have the width of 'small'.
-        fresh = self.scale != 'small' or self.variant != OURS
+        fresh = self.scale != 'small' or self.variant in ('', '+skips+scratch')
         return '' if fresh else FINE_TUNED.get(self.task, '')
 
     @property
@@ -230,6 +240,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(['push2'], relative, variant=OURS)
     # Fig. 7, trained as Eq. 3 says.
     add(['pick_place'], l1_rows[:1], variant=OURS, recursion=2)
+    add(['pick_place'], l1_rows[:1], variant='+skips+pieces')
     # When the bottleneck happens.
     add(TIMED, relative + ['genmin-wo-gan+progress', 'fix-wo-gan', 'genmin-wo-gan',
                            'fix0.25-wo-gan', 'fix0.75-wo-gan'], variant=OURS, new_pixels=False)
@@ -241,7 +252,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
         mode='forward', variant=OURS)
     # Best of 100.
     add(['pick_place', 'push2', 'grasp'], ['genmin-vae'], variant=OURS)
-    add(['push2'], ['genmin-vae+relative'], variant=OURS)
+    add(['push2'], ['genmin-vae+relative'], variant='+skips+free', new_pixels=False)
     # Table 1 with the paper's network.
     add(SINGLE, ['fix', 'genmin', 'min', 'genmin-wo-gan', 'genmin-vae-gan'])
     # Three objects, and stacking.
@@ -254,5 +265,10 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
         new_pixels=False)
     add(['push2'], ['genmin-wo-gan'], variant='+skips+margin', new_pixels=False)
     add(['push2'], ['genmin-wo-gan+progress'], variant='+skips+edge', new_pixels=False)
+    # What was tried.
+    for task, tried in (('order2', ('window0.65', 'window0.85', 'annealed', 'slow')),
+                        ('push2_late', ('window0.8',))):
+        for variant in tried:
+            add([task], l1_rows[:1], variant=f'+skips+{variant}', new_pixels=False)
     return [replace(run, seed=seed) for seed in seeds or MAIN_SEEDS for run, main in rows
             if seeds or main or not seed]
