@@ -33,9 +33,9 @@ class Options:
     :param methods: nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped
         for the shipped predictor; fix, genmin (over time), genmin+progress and genmin+relative
         for those that the command paper trained with our network and without GAN, or the name of
-        another one; with options behind colons: half, recursion<n>, samples<n>, carried,
-        true_maps, true_model, twice, more_search, paper (its search whatever --preset says),
-        plain_cost, every<n>, for example genmin:half:carried.
+        another one; with options behind colons: half, recursion<n>, rounds<n>, samples<n>,
+        carried, true_maps, true_model, twice, more_search, paper (its search whatever --preset
+        says), plain_cost, every<n>, for example genmin:half:carried.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
     :param look: of the world, see sim_bridge.looks; pictures are filled behind the robot as the

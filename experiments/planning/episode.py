@@ -74,14 +74,19 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     follower = mpc.model if method.tracking == 'carried' else None
     if method.model == 'true':
         mpc = VisualMPC(TrueModel(mpc.model, simulator, objects), mpc.config)
-    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, follower, objects=objects),
-                  seed)
+    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, follower, objects=objects,
+                                   rounds=method.rounds), seed)
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
     tracked = []
     while method.base != 'nothing':
         shown = as_seen(view.see(seen))
         answer = reach.step(shown)
-        if isinstance(answer, Aim):
+        while isinstance(answer, Aim):
+            if reach.aimed:
+                seen = replace(seen, object_pixels=answer.seen.pixels)
+                targets, found = make_targets(
+                    simulator, mpc, method, seen, goal, predictor, seed)
+                subgoals += found
             reach.head_for(targets)
             answer = reach.step(shown)
         tracked.append(reach.pixels)
@@ -95,7 +100,8 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
         times.append(answer.plan.planning_ms)
     return PlannedEpisode(
         np.array(distances), observations, np.array(actions).reshape(-1, 4), np.array(times),
-        goal, targets, reach.switches, np.array(tracked or [start.object_pixels]), subgoals)
+        goal, reach.targets or targets, reach.switches,
+        np.array(tracked or [start.object_pixels]), subgoals)
 
 
 class View:
@@ -130,7 +136,7 @@ def as_seen(observation):
 
 def make_targets(simulator, mpc, method, seen, goal, predictor, seed):
     """
-    Decide what is planned to, at the start of an episode.
+    Decide what is planned to from what is seen, at the start of each round.
 
     :return: list of Target, the goal last, and the list of the Subgoals that were predicted.
     """

@@ -18,12 +18,12 @@ BASES = ('nothing', 'direct', 'one_object', 'oracle_order', 'true_subgoal')
 BOUNDS = ('one_object', 'oracle_order', 'true_subgoal', 'true_model')
 OPTIONS = {  # option: (field, value; None: the number behind it)
     'half': ('switch', 'half'), 'reached': ('switch', 'reached'),
-    'recursion': ('recursion', None), 'samples': ('samples', None),
+    'recursion': ('recursion', None), 'rounds': ('rounds', None), 'samples': ('samples', None),
     'carried': ('tracking', 'carried'), 'true_maps': ('maps', 'true'),
     'true_model': ('model', 'true'), 'more_search': ('search', 'more'),
     'twice': ('search', 'twice'), 'paper': ('search', 'paper'), 'plain_cost': ('cost', 'plain'),
     'every': ('replan_every', None)}
-SUBGOALS_ONLY = ('switch', 'recursion', 'samples', 'maps')
+SUBGOALS_ONLY = ('switch', 'recursion', 'rounds', 'samples', 'maps')
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Method:
     :param base: one of BASES, or the name of a predictor.
     :param switch: 'reached' or 'half', see planning.hierarchy.Itinerary.
     :param recursion: subgoals in a row.
+    :param rounds: how often subgoals are predicted, see planning.reach.ReachConfig.
     :param samples: subgoals to choose from by the planner's own cost.
     :param maps: 'predicted'; 'true': where the objects are in that true configuration (some at
         their goals, the others at their starts) whose picture is nearest to the predicted one.
@@ -51,6 +52,7 @@ class Method:
     base: str
     switch: str = 'reached'
     recursion: int = 1
+    rounds: int = 1
     samples: int = 1
     maps: str = 'predicted'
     tracking: str = 'ground_truth'
@@ -135,14 +137,15 @@ def parse_method(text, **defaults):
         values[field] = value or int(number)
     unused = []
     if base in BASES:
-        unused = [f for f in SUBGOALS_ONLY if base != 'true_subgoal' or f in ('samples', 'maps')]
+        unused = [f for f in SUBGOALS_ONLY if base != 'true_subgoal' or f in (
+            'rounds', 'samples', 'maps')]
     if base in ('oracle_order',):
         unused.remove('switch')
     if base == 'nothing':
         unused = [f for f in DEFAULTS if f != 'base']
     method = Method(**(values | {field: DEFAULTS[field] for field in unused}))
-    if min(method.recursion, method.samples) < 1:
-        raise ConfigError(f'method {text!r}: recursion and samples are at least 1')
+    if min(method.recursion, method.rounds, method.samples) < 1:
+        raise ConfigError(f'method {text!r}: recursion, rounds and samples are at least 1')
     if method.samples > 1 and method.model == 'true':
         raise ConfigError(f'method {text!r}: the simulator cannot start from a predicted picture, '
                           'so samples cannot be chosen by it; leave out one of the two')

@@ -17,6 +17,7 @@ TITLES = {'push2': 'Two objects', 'push3': 'Three objects',
 PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward model',
          'search': 'the search', 'cost': 'its cost', 'tracking': 'object pixels',
          'switch': 'when to go on', 'recursion': 'number of subgoals',
+         'rounds': 'how often to predict',
          'samples': 'number of samples', 'replan_every': 'how often to plan'}
 FIRST = ('nothing', 'direct', 'fix', 'genmin', 'genmin+progress', 'genmin+relative', 'shipped')
 

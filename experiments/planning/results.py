@@ -104,9 +104,9 @@ def partners(method, names):
     :param method: Method.
     :param names: of all methods that there are results of.
     :return: list of (what is compared, name of the other): 'direct' and 'fix' with the same
-        planner (fix with the same switch and recursion, too), direct with twice the samples; for
-        each option the method without
-        it, under the name of Method's field; for true_subgoal every predictor, as 'subgoal'.
+        planner (fix with the same switch, recursion and rounds, too), direct with twice the
+        samples; for each option the method without it, under the name of Method's field; for
+        true_subgoal every predictor, as 'subgoal'.
     """
     if method.base == 'nothing':
         return []
@@ -130,8 +130,9 @@ def _how(name, settings):
     method, planner = parse_method(name), settings['planner']
     return {
         'look': settings['look'], 'tracking': settings['object_pixels'], 'switch': method.switch,
-        'recursion': method.recursion, 'samples': method.samples, 'maps': method.maps,
-        'model': method.model, 'cost': method.cost, 'step_budget': settings['step_budget'],
+        'recursion': method.recursion, 'rounds': method.rounds, 'samples': method.samples,
+        'maps': method.maps, 'model': method.model, 'cost': method.cost,
+        'step_budget': settings['step_budget'],
         'planner_samples': planner['search']['num_samples'],
         'planner_iterations': planner['search']['num_iterations'],
         'replan_every': planner['replan_every'], 'preset': settings['preset'],

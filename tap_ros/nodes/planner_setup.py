@@ -73,6 +73,9 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('switch', 'reached', 'When to go on from a subgoal: when it is reached, '
                        'or its share of the budget spent; or at its share (half), as the paper '
                        'does.', choices=SWITCHES, read_only=False)
+    parameters.declare('subgoal_rounds', 1, 'How often a goal in subgoal mode asks for subgoals: '
+                       'again, from what is seen then, when those of a round are passed.',
+                       low=1, high=16, read_only=False)
     parameters.declare('tracking', 'ground_truth', 'Where the objects are: as objects says at '
                        'every picture (ground_truth), or there only at first, then carried by '
                        'the forward model and found again in the pictures.', choices=TRACKING,

@@ -243,7 +243,6 @@ class VisualMpcNode(ManagedNode):
         self._sight.begin(accepted)
         self._refusals.clear()
         config = self._config(request)
-        targets: list[Target] = []
         reach = Reach(self._mpc, config, request.seed, accepted)
         while True:
             self._go_on(handle)
@@ -264,8 +263,8 @@ class VisualMpcNode(ManagedNode):
                 result.success, result.message = answer.outcome == 'reached', answer.message
                 return
             if isinstance(answer, Aim):
-                targets = self._aim(handle, mode, answer.seen, config.limits)
-                reach.head_for(targets, time.monotonic())
+                reach.head_for(self._aim(handle, mode, answer.seen, config.limits),
+                               time.monotonic())
                 continue
             # Before sending: the picture that answers may come at once.
             newest_ns = self._sight.newest_stamp()
@@ -275,9 +274,9 @@ class VisualMpcNode(ManagedNode):
                 result.steps = reach.steps
                 self._diagnostics.took(answer.plan.planning_ms, 'plan')
                 self._distance.publish(Float64(data=reach.distance))
-                self._show(answer, targets[answer.stage])
+                self._show(answer, reach.targets[answer.stage])
                 handle.publish_feedback(ReachGoal.Feedback(
-                    step=reach.steps, stage=stage_name(answer.stage, len(targets) - 1),
+                    step=reach.steps, stage=stage_name(answer.stage, len(reach.targets) - 1),
                     expected_distance=float(answer.plan.expected_distance),
                     planning_ms=float(answer.plan.planning_ms)))
             else:
@@ -300,7 +299,8 @@ class VisualMpcNode(ManagedNode):
         follower = self._model if params['tracking'] == 'carried' else None
         limits = Limits(params['max_step_xy'], params['max_step_z'])
         return ReachConfig(request.step_budget, params['switch'], params['goal_tolerance'],
-                           follower, limits, params['max_age'], params['image_timeout'])
+                           follower, limits, params['max_age'], params['image_timeout'],
+                           rounds=params['subgoal_rounds'])
 
     def _is_cancelled(self, handle: 'ServerGoalHandle') -> bool:
         return self._cancelled is handle or handle.is_cancel_requested

@@ -8,7 +8,7 @@ visual_mpc_node and the evaluation both drive it, so that they act alike:
     reach = Reach(mpc, ReachConfig(step_budget=40), seed)
     while not isinstance(answer := reach.step(seen), End):
         if isinstance(answer, Aim):
-            reach.head_for(targets)          # decided from what is seen now
+            reach.head_for(targets)          # decided from answer.seen
         elif isinstance(answer, Command):
             seen = carry_out(answer.plan.action)
             reach.sent()
@@ -17,7 +17,7 @@ visual_mpc_node and the evaluation both drive it, so that they act alike:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
@@ -59,6 +59,8 @@ class ReachConfig:
     :param max_age: s; nothing is planned from what was received longer ago.
     :param timeout: s without a command, planning apart, after which the goal ends.
     :param objects: indices of the objects that are planned for; None: all.
+    :param rounds: how often to ask where to go, at least 1: again when the subgoals of a round are
+        passed, and not after the last round.
     """
 
     step_budget: int = 0
@@ -69,13 +71,14 @@ class ReachConfig:
     max_age: float = float('inf')
     timeout: float = float('inf')
     objects: tuple[int, ...] | None = None
+    rounds: int = 1
 
 
 @dataclass(frozen=True)
 class Aim:
     """Decide from `seen` what to go to, and say so by Reach.head_for."""
 
-    seen: Seen
+    seen: Seen  # where objects are followed, `pixels` is where they are now
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ class Command:
     """Carry out plan.action, and say so by Reach.sent; what is not carried out is planned anew."""
 
     plan: Plan
-    stage: int  # index of the target; the last one is the goal
+    stage: int  # index into Reach.targets
     seen: Seen  # what it answers
 
 
@@ -102,8 +105,20 @@ class End:
     message: str
 
 
-# What a plan changes: the planner's Memory, Itinerary.switches, ObjectTracker.memory.
-_Kept = tuple[Memory, list[int], tuple[np.ndarray, np.ndarray] | None]
+@dataclass(frozen=True)
+class _Round:
+    """The targets of one answer to an Aim."""
+
+    number: int  # from 1
+    earlier: tuple[Target, ...]  # subgoals passed in the rounds before
+    switches: tuple[int, ...]  # steps at which those ended
+    first_step: int
+    targets: tuple[Target, ...]
+    itinerary: Itinerary
+
+
+# What a plan changes: the planner's Memory, the round, Itinerary.switches, ObjectTracker.memory.
+_Kept = tuple[Memory, _Round, list[int], tuple[np.ndarray, np.ndarray] | None]
 
 
 class Reach:
@@ -127,8 +142,7 @@ class Reach:
     def __init__(self, mpc: VisualMPC, config: ReachConfig, seed: int = 0,
                  now: float = 0.0) -> None:
         self._mpc, self._config, self._seed = mpc, config, seed
-        self._targets: list[Target] | None = None
-        self._itinerary: Itinerary | None = None
+        self._round: _Round | None = None
         self._tracker: ObjectTracker | None = None
         self._tabulated: tuple[Target, Goal] | None = None
         self._first: Seen | None = None
@@ -146,12 +160,20 @@ class Reach:
     @property
     def aimed(self) -> bool:
         """Tell whether head_for has been called."""
-        return self._targets is not None
+        return self._round is not None
+
+    @property
+    def targets(self) -> list[Target]:
+        """Return the subgoals of all rounds so far, then the goal; empty before head_for."""
+        return [*self._round.earlier, *self._round.targets] if self._round else []
 
     @property
     def switches(self) -> list[int]:
         """Return the steps at which the targets after the first one began."""
-        return self._itinerary.switches if self._itinerary else []
+        if self._round is None:
+            return []
+        first = self._round.first_step
+        return [*self._round.switches, *(first + step for step in self._round.itinerary.switches)]
 
     def step(self, seen: Seen | None, now: float = 0.0,
              lacking: str = '') -> Aim | Command | Wait | End:
@@ -185,7 +207,7 @@ class Reach:
         if self._planned is not None and self._planned.seen.stamp_ns == seen.stamp_ns:
             return self._planned
         self._first = self._first or seen
-        return Aim(seen) if self._targets is None else self._plan(seen)
+        return Aim(seen) if self._round is None else self._plan(seen)
 
     def interrupted(self, seen: Seen | None) -> End | None:
         """
@@ -201,21 +223,31 @@ class Reach:
 
     def head_for(self, targets: Sequence[Target], now: float = 0.0) -> None:
         """
-        Say what to go to.
+        Say what to go to; what is left of the step budget is for these targets.
 
         :param targets: list of hierarchy.Target, the last one is the goal.
         :param now: deciding may have taken time, which does not count as silence.
         """
-        config = self._config
-        self._targets = list(targets)
+        config, before = self._config, self._round
         self._budget = config.step_budget or step_budget(len(targets[-1].pixels))
-        self._itinerary = Itinerary(targets, self._budget, config.switch, config.reached)
-        if config.follower is not None:
+        itinerary = Itinerary(
+            targets, self._budget - self.steps, config.switch, config.reached)
+        if before is None:
+            self._round = _Round(1, (), (), 0, tuple(targets), itinerary)
+        else:
+            self._round = _Round(
+                before.number + 1, (*before.earlier, *before.targets[:-1]),
+                tuple(self.switches), self.steps, tuple(targets), itinerary)
+        if config.follower is not None and self._tracker is None:
             first = self._first
             assert first is not None and first.pixels is not None, 'an Aim comes first'
             self._tracker = ObjectTracker(
                 config.follower, first.image, first.gripper, first.pixels)
-        self._kept, self._sent_at = self._memory(Memory(self._seed)), now
+        kept = self._memory(Memory(self._seed))
+        # In a later round the tracker has seen the picture of the Aim, which is yet to be planned
+        # from: it goes back to the picture before.
+        self._kept = (*kept[:3], self._kept[3]) if self._kept else kept
+        self._sent_at = now
 
     def sent(self, after_ns: int | None = None, now: float = 0.0) -> None:
         """
@@ -263,25 +295,28 @@ class Reach:
             return f'what was seen is {age:.1f} s old' + (f': {lacking}' if lacking else '')
         return ''
 
-    def _plan(self, seen: Seen) -> Command | End:
+    def _plan(self, seen: Seen) -> Aim | Command | End:
         """Plan the next command from a new picture."""
-        config, itinerary = self._config, self._itinerary
-        assert self._targets is not None and itinerary is not None and self._kept is not None
-        memory = self._recall(self._kept)
+        config = self._config
+        assert self._first is not None and self._kept is not None
+        memory, current = self._recall(self._kept)
         self.pixels = pixels = self._find_objects(seen)
         chosen = pixels if config.objects is None else pixels[list(config.objects)]
-        self.distance = self._targets[-1].distance(chosen)
+        self.distance = current.targets[-1].distance(chosen)
         if self.distance <= config.reached:
             return End('reached', f'{self.distance:.1f} px from the goal, reached')
         if self.steps >= self._budget:
             return End('spent', f'{self.distance:.1f} px from the goal, '
                                 f'step budget of {self._budget} spent')
-        target = itinerary.target(self.steps, chosen)
+        target = current.itinerary.target(self.steps - current.first_step, chosen)
+        if (target is current.targets[-1] and len(current.targets) > 1
+                and current.number < config.rounds):
+            return Aim(replace(seen, names=self._first.names, pixels=pixels))
         limit = np.array(seen.image.shape[1::-1]) - 1
         goal = self._goal(target, np.clip(chosen, 0, limit))
         plan = self._mpc.plan(
             Scene(seen.image, seen.gripper, chosen), goal, memory, config.limits)
-        return Command(plan, len(itinerary.switches), seen)
+        return Command(plan, len(self.switches), seen)
 
     def _goal(self, target: Target, pixels: np.ndarray) -> Goal:
         """Return the planner's Goal for a target, tabulated once unless objects are free."""
@@ -303,17 +338,17 @@ class Reach:
 
     def _memory(self, planned: Memory) -> _Kept:
         """Return all that a plan changes: the planner's Memory, and what is set back."""
-        return (planned, list(self.switches),
+        assert self._round is not None
+        return (planned, self._round, list(self._round.itinerary.switches),
                 None if self._tracker is None else self._tracker.memory)
 
-    def _recall(self, memory: _Kept) -> Memory:
-        """Set back what a plan has changed; return the planner's Memory."""
-        planned, switches, tracked = memory
-        if self._itinerary is not None:
-            self._itinerary.switches = list(switches)
+    def _recall(self, memory: _Kept) -> tuple[Memory, _Round]:
+        """Set back what a plan has changed; return the planner's Memory and the round."""
+        planned, self._round, switches, tracked = memory
+        self._round.itinerary.switches = list(switches)
         if self._tracker is not None and tracked is not None:
             self._tracker.memory = tracked
-        return planned
+        return planned, self._round
 
 
 def scene_change(first: Seen, seen: Seen) -> str:

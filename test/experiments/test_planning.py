@@ -79,6 +79,29 @@ def test_recursion_gives_one_subgoal_more_and_all_share_the_budget(simulator, mp
     assert run.switches == [1, 2] and len(run.subgoals) == 2 and len(run.targets) == 3
 
 
+def test_rounds_predict_again_from_what_is_seen_when_a_subgoal_is_passed(
+        simulator, mpc, predictor):
+    asked = []
+
+    class Asked:
+        training = predictor.training
+
+        def predict(self, start, goal, start_pixels, *args, **options):
+            asked.append((start, start_pixels))
+            return predictor.predict(start, goal, start_pixels, *args, **options)
+
+    run = run_episode(simulator, mpc, parse_method('shipped:rounds2:half'), 4, 5, Asked())
+    assert run.switches == [2, 3] and len(run.actions) == 4
+    assert len(run.subgoals) == 2 and len(run.targets) == 3
+    np.testing.assert_array_equal(run.targets[-1].pixels, run.goal.object_pixels)
+    for (image, pixels), step in zip(asked, (0, 2), strict=True):
+        np.testing.assert_array_equal(image, run.frames[step])
+        np.testing.assert_array_equal(pixels, run.observations[step].object_pixels)
+    once = run_episode(simulator, mpc, parse_method('shipped:half'), 4, 5, predictor)
+    np.testing.assert_array_equal(run.actions[:2], once.actions[:2])
+    assert (run.actions[2] != once.actions[2]).any()
+
+
 def test_a_missing_predictor_is_named(simulator, mpc):
     with pytest.raises(ConfigError, match='predictor'):
         run_episode(simulator, mpc, SHIPPED, 4, seed=5)
@@ -225,7 +248,7 @@ def test_objects_can_be_followed_by_pictures_while_the_simulator_plans(simulator
     *BASES, 'genmin', 'true_model', 'genmin:half', 'fix0.25:recursion2:samples8:carried',
     'genmin+relative:true_maps', 'genmin:true_model:more_search', 'direct:every3',
     'fix:paper', 'true_subgoal:plain_cost',
-    'true_subgoal:half:recursion2'])
+    'true_subgoal:half:recursion2', 'genmin:rounds3:carried'])
 def test_the_name_of_a_method_reads_as_that_method(text):
     method = parse_method(text)
     assert parse_method(method.name) == method
@@ -241,7 +264,7 @@ def test_options_that_a_method_has_no_use_for_change_nothing():
 
 @pytest.mark.parametrize('text', [
     'genmin:often', 'genmin:half2', 'genmin:recursion', 'genmin:recursion0', 'a b',
-    'genmin:samples4:true_model'])
+    'genmin:rounds0', 'genmin:samples4:true_model'])
 def test_impossible_methods_are_named(text):
     with pytest.raises(ConfigError, match=text):
         parse_method(text)

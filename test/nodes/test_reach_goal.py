@@ -53,6 +53,13 @@ def test_the_nodes_go_through_a_chain_as_one_process_does(loop):
     assert stages[-1] == 'goal' and run.switches[-1] > 0
 
 
+def test_the_nodes_predict_again_as_one_process_does(loop):
+    with loop.set('visual_mpc_node', subgoal_rounds=2, switch='half'):
+        run, stages = acts_like(loop, 'shipped:rounds2:half', DEFAULT_PREDICTOR, step_budget=4)
+    assert run.switches == [2, 3] and len(run.subgoals) == 2
+    assert stages == ['subgoal', 'subgoal', 'subgoal 2 of 2', 'goal']
+
+
 def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
     network = lively_network(image_size=64, latent_size=8)
     weights = tmp_path / 'sampling.safetensors'

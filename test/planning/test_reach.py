@@ -251,6 +251,71 @@ def test_a_command_says_which_target_it_is_for(mpc):
     assert reach.switches == [stages.index(1)]
 
 
+def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
+    first, second = Target(START + 2), Target(START + 4)
+    reach = Reach(mpc, ReachConfig(10, rounds=2), 3)
+    reach.step(look(0))
+    reach.head_for([first, GOAL])
+    act(reach, 0)
+    aim = reach.step(look(1, first.pixels))
+    assert isinstance(aim, Aim) and aim.seen.pixels is first.pixels and reach.steps == 1
+    assert isinstance(reach.step(look(1, first.pixels)), Aim)  # until it is told
+    reach.head_for([second, GOAL])
+    for t, pixels, stage in ((1, first.pixels, 1), (2, second.pixels, 2), (3, START, 2)):
+        command = reach.step(look(t, pixels))
+        assert isinstance(command, Command) and command.stage == stage  # no third round
+        reach.sent()
+    assert reach.targets == [first, second, GOAL] and reach.switches == [1, 2]
+
+
+def test_the_rounds_share_the_budget(mpc):
+    reach = Reach(mpc, ReachConfig(8, switch='half', rounds=2), 3)
+    reach.step(look(0))
+    asked = []
+    for t in range(9):
+        answer = reach.step(look(t))
+        if isinstance(answer, Aim):
+            asked.append(t)
+            reach.head_for([Target(START + 2), GOAL])
+            answer = reach.step(look(t))
+        if t < 8:
+            reach.sent()
+    assert asked == [0, 4] and reach.switches == [4, 6]
+    assert isinstance(answer, End) and answer.outcome == 'spent'
+
+
+def test_a_command_refused_before_a_round_leads_to_that_round_again(mpc):
+    reach = Reach(mpc, ReachConfig(10, rounds=2), 3)
+    reach.step(look(0))
+    reach.head_for([Target(START + 2), GOAL])
+    act(reach, 0)
+    act(reach, 1)
+    assert isinstance(reach.step(look(2, START + 2)), Aim)
+    reach.head_for([Target(START + 4), GOAL])
+    assert reach.refused(2 * SECOND, 'it answers an old image') and reach.steps == 1
+    # Without its effect the first subgoal is yet to be reached.
+    assert reach.step(look(3)).stage == 0 and len(reach.targets) == 2
+    assert isinstance(reach.step(look(4, START + 2)), Aim)
+
+
+def test_a_followed_object_is_followed_once_a_picture_in_every_round(mpc, model):
+    def followed(rounds):
+        reach = Reach(mpc, ReachConfig(10, switch='half', follower=model, rounds=rounds), 3)
+        reach.step(look(0))
+        found = []
+        for t in range(8):
+            answer = reach.step(look(t, None if t else START))
+            if isinstance(answer, Aim):
+                assert answer.seen.names == ('a', 'b')
+                assert t == 0 or answer.seen.pixels is reach.pixels
+                reach.head_for([Target(START + 2), GOAL])
+                answer = reach.step(look(t, None if t else START))
+            found.append(reach.pixels)
+            reach.sent()
+        return found
+    np.testing.assert_array_equal(followed(1)[:6], followed(2)[:6])
+
+
 def test_what_is_too_old_says_what_else_is_lacking(mpc):
     reach = begun(mpc)
     old = look(1, received=-9.0)
