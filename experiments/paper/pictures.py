@@ -53,7 +53,8 @@ def write_grids(folder, runs, weights, recordings='bags'):
     """
     Write the grids of every task of Table 1 and mode of one scale.
 
-    A picture that is there stays where not all the weights are at hand that it could show.
+    A picture that is there stays where weights of a method that it should show are not at hand.
+    Of several seeds the first one at hand is shown.
 
     :param folder: to write PNG files to.
     :param runs: dicts as results.load_runs returns them, of one scale.
@@ -64,25 +65,28 @@ def write_grids(folder, runs, weights, recordings='bags'):
     settings = sorted({(run['task'], run['mode'], run['new_pixels']) for run in runs
                        if run['task'] in TITLES})
     for task, mode, new_pixels in settings:
-        same = [run for run in runs if (run['task'], run['mode'], run['new_pixels']) == (
-            task, mode, new_pixels)]
-        chosen = {}
-        for run in sorted(same, key=lambda run: run['seed'], reverse=True):
-            chosen[run['method']] = run
-        paths = {method: Path(weights) / run['name'] / 'predictor.safetensors'
-                 for method, run in chosen.items()}
-        at_hand = [m for m in sorted(paths, key=method_order) if paths[m].exists()]
-        episodes = at_hand and _held_out(chosen[at_hand[0]], recordings)
-        if not at_hand or episodes is None:
+        same = sorted((run for run in runs if (run['task'], run['mode'], run['new_pixels']) == (
+            task, mode, new_pixels)), key=lambda run: (method_order(run['method']), run['seed']))
+        paths = {}
+        for run in same:
+            path = Path(weights) / run['name'] / 'predictor.safetensors'
+            if path.exists():
+                paths.setdefault(run['method'], path)
+        episodes = paths and _held_out(same[0], recordings)
+        if not paths or episodes is None:
             continue
-        shown = [Shown(method, load_network(paths[method])[0]) for method in at_hand]
+        networks = {method: Shown(method, load_network(path)[0])
+                    for method, path in paths.items()}
         variant = '' if new_pixels else '-warp'
         title = f'{TITLES[task]}, {mode}' + ('' if new_pixels else ', no new pixels')
-        for name, make in GRIDS.items():
-            sheet = make(task, mode, shown, *episodes)
-            path = Path(folder) / file_name(f'{task}-{mode}{variant}{name}', chosen[
-                at_hand[0]]['scale'])
-            if sheet is not None and (len(at_hand) == len(paths) or not path.exists()):
+        for name, (choose, make) in GRIDS.items():
+            path = Path(folder) / file_name(f'{task}-{mode}{variant}{name}', same[0]['scale'])
+            chosen = choose(list(dict.fromkeys(run['method'] for run in same)))
+            if not networks.keys() >= set(chosen):
+                chosen = [] if path.exists() else choose(list(networks))
+            sheet = chosen and make(
+                task, mode, [networks[method] for method in chosen], *episodes)
+            if sheet:
                 write_atomically(path, png_bytes(draw(title, *sheet)))
 
 
@@ -181,17 +185,15 @@ def _methods(task, mode, shown, store, episodes, goal_picture):
     """Show inputs, the output of each method, and matches of genmin and ours (Figs. 5, 6)."""
     batch, context = _gather(store, episodes, mode, goal_picture)
     headings, rows = _inputs(batch)
-    chosen = _contrast(shown)
-    matched = next((one for one in chosen if family(one.method) == 'genmin'), None)
-    ours = next((one for one in chosen if family(one.method) == 'ours'), None)
+    chosen = _contrast([one.method for one in shown])
+    matched = next((method for method in chosen if family(method) == 'genmin'), None)
+    ours = next((method for method in chosen if family(method) == 'ours'), None)
     matches = []
     for one in shown:
-        if variant_of(one.method) not in ('', OURS):
-            continue  # too many to see
         image = _predict(one, episodes, context).image
         _append(rows, to_uint8(image))
         headings.append(_coloured(one.method))
-        if one is matched or one is ours:
+        if one.method in (matched, ours):
             errors = l1_errors(image[:, None], batch.targets.movedim(-1, 2))[:, 0]
             match = match_step(errors, batch.valid)
             matches.append((one, batch.targets.numpy()[np.arange(len(match)), match]))
@@ -201,31 +203,45 @@ def _methods(task, mode, shown, store, episodes, goal_picture):
     return [headings], rows
 
 
-def _preferred(shown, names):
-    """Return the first of the names that is shown, else None."""
-    at_hand = {one.method: one for one in shown}
-    return next((at_hand[name] for name in names if name in at_hand), None)
+def _main_methods(methods):
+    """Leave out variants, which are too many to see."""
+    return [method for method in methods if variant_of(method) in ('', OURS)]
 
 
-def _contrast(shown):
-    """Choose fix, genmin and a form of ours that finds bottlenecks, those that are at hand."""
+def _preferred(methods, names):
+    """Return the first of the names that is among the methods, else None."""
+    return next((name for name in names if name in methods), None)
+
+
+def _contrast(methods):
+    """Choose fix, genmin and a form of ours that finds bottlenecks, those that there are."""
     ends = ('-wo-gan+skips', '+skips', '-wo-gan', '')
-    found = [_preferred(shown, [f'{stem}{end}' for end in ends for stem in stems])
+    found = [_preferred(methods, [f'{stem}{end}' for end in ends for stem in stems])
              for stems in (('fix', 'fix0.50'), ('genmin', 'genmin4'))]
-    found.append(_preferred(shown, ('genmin-wo-gan+progress+skips', 'genmin-wo-gan+progress')))
-    return [one for one in found if one is not None]
+    found.append(_preferred(methods, ('genmin-wo-gan+progress+skips', 'genmin-wo-gan+progress')))
+    return [method for method in found if method is not None]
+
+
+def _recursive(methods):
+    """Choose those of _contrast and those that were trained for recursion."""
+    return _contrast(methods) + [
+        method for method in methods if re.search(r'-r\d+$|\+pieces$', method)]
+
+
+def _sampling(methods):
+    """Choose a method with z, of our network if there is one."""
+    return [method for method in methods if '-vae' in method][-1:]
 
 
 @torch.inference_mode()
 def _parts(task, mode, shown, store, episodes, goal_picture):
     """Show what pushing predictions are blended from (Figs. 9, 15): masked warps, new pixels."""
-    chosen = _contrast(shown)
-    if not task.startswith('push') or mode != 'bidirectional' or not chosen:
+    if not task.startswith('push') or mode != 'bidirectional':
         return None
     batch, context = _gather(store, episodes, mode, goal_picture)
     headings, rows = _inputs(batch)
     above = [('', None, len(headings))]
-    for one in chosen:
+    for one in shown:
         prediction = _predict(one, episodes, context)
         parts = [*warp(context, prediction.flow).unbind(1)]
         if prediction.new_pixels is not None:
@@ -244,14 +260,12 @@ def _parts(task, mode, shown, store, episodes, goal_picture):
 @torch.inference_mode()
 def _recursion(task, mode, shown, store, episodes, goal_picture):
     """Show predictions with the prediction before as the goal (Fig. 7)."""
-    chosen = _contrast(shown) + [
-        one for one in shown if re.search(r'-r\d+$|\+pieces$', one.method)]
-    if mode != 'bidirectional' or not chosen:
+    if mode != 'bidirectional':
         return None
     batch, context = _gather(store, episodes, mode, goal_picture)
     headings, rows = _inputs(batch)
     above = [('', None, len(headings))]
-    for one in chosen:
+    for one in shown:
         first = _predict(one, episodes, context).image
         following = torch.stack([context[:, 0], first.clamp(-1, 1)], 1)
         second = _predict(one, episodes, following).image
@@ -265,10 +279,7 @@ def _recursion(task, mode, shown, store, episodes, goal_picture):
 @torch.inference_mode()
 def _samples(task, mode, shown, store, episodes, goal_picture):
     """Show samples of the VAE for one start and goal (Figs. 9, 16)."""
-    chosen = [one for one in shown if one.network.config.latent_size]
-    chosen = _preferred(chosen, [one.method for one in reversed(chosen)])
-    if chosen is None:
-        return None
+    chosen, = shown
     batch, context = _gather(store, episodes, mode, goal_picture)
     headings, rows = _inputs(batch)
     for n in range(SAMPLES):
@@ -278,4 +289,6 @@ def _samples(task, mode, shown, store, episodes, goal_picture):
     return [above, headings], rows
 
 
-GRIDS = {'': _methods, '-masks': _parts, '-recursion': _recursion, '-samples': _samples}
+GRIDS = {  # end of the file name -> (which methods of those that there are, how they are shown)
+    '': (_main_methods, _methods), '-masks': (_contrast, _parts),
+    '-recursion': (_recursive, _recursion), '-samples': (_sampling, _samples)}

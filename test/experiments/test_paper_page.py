@@ -5,7 +5,6 @@
 from dataclasses import asdict
 from pathlib import Path
 import re
-from types import SimpleNamespace
 
 import cv2
 from experiments.paper.pictures import _contrast, draw, write_grids
@@ -188,9 +187,8 @@ def test_grids_show_each_method_that_has_weights(tmp_path):
 
 def test_masks_show_a_form_of_ours_that_finds_bottlenecks():
     def chosen(task, mode, new_pixels):
-        return [one.method for one in _contrast([
-            SimpleNamespace(method=run.label) for run in paper_runs('small')
-            if (run.task, run.mode, run.new_pixels) == (task, mode, new_pixels)])]
+        return _contrast([run.label for run in paper_runs('small')
+                          if (run.task, run.mode, run.new_pixels) == (task, mode, new_pixels)])
 
     for task in ('grasp', 'pick_place', 'push2', 'push3', 'stack2'):
         assert chosen(task, 'bidirectional', True) == [FIX, GENMIN, OURS]
@@ -212,6 +210,26 @@ def test_a_picture_that_shows_more_is_not_replaced(tmp_path):
     weights_for(tmp_path / 'weights', runs[1])
     write_grids(tmp_path, runs, tmp_path / 'weights')
     assert there.read_bytes() != b'of both'
+
+
+def test_a_picture_needs_only_the_weights_that_it_shows_of_whichever_seed(tmp_path):
+    pieces = f'{OURS}+pieces'
+    runs = [made_run(method, scores(0.02), seed=seed)
+            for method in (FIX, GENMIN, OURS, pieces, 'min-wo-gan+skips') for seed in (0, 1)]
+    data_hash = open_recordings([str(SAMPLE)]).data_hash
+    names = ('', '-masks', '-recursion')
+    there = [tmp_path / f'push2-bidirectional{name}.png' for name in names]
+    for path in there:
+        path.write_bytes(b'before')
+    for run in runs:
+        run['config'] = {'recordings': [str(SAMPLE)], 'test_fraction': 0.5}
+        run['data'] = run['data'] | {'hash': data_hash}
+        if run['seed'] == 1 and not run['method'].startswith('min'):
+            weights_for(tmp_path / 'weights', run)
+    write_grids(tmp_path, runs, tmp_path / 'weights')
+    # The first would show min, too.
+    assert [path.read_bytes() == b'before' for path in there] == [True, False, False]
+    assert (cv2.imread(str(there[2])).shape[1] + 2) // 130 == 2 + 2 * 4
 
 
 def test_headings_stand_above_the_panels():
