@@ -37,8 +37,8 @@ from tap_ros.prediction.losses import CHANGED
 
 # May differ between the methods of a scale, see runs.py.
 SETTINGS = ('decoder', 'skips', 'margin', 'progress_margin', 'match_temperature', 'colour',
-            'brightness', 'min_crop', 'learning_rate', 'gan_weight', 'kl_weight', 'recursion',
-            'detach_recursion', 'pretrain_steps')
+            'brightness', 'min_crop', 'learning_rate', 'gan_weight', 'kl_weight', 'free_nats',
+            'recursion', 'detach_recursion', 'pretrain_steps')
 GRIDS = {  # what follows <task>-<mode>[-warp] in the name of a picture
     '': 'inputs, each method, and the true frame that matches best',
     '-masks': 'what the output is blended from: warped inputs under their masks, and new pixels',

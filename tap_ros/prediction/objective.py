@@ -150,7 +150,8 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
             mean, log_variance = networks.recognition(
                 augmentation.apply(video) if augmentation else video)
         z = sample_latent(mean, log_variance, draws.posterior[:, 0])
-        parts['kl'] = config.kl_weight * kl_divergence(mean, log_variance).mean()
+        nats = kl_divergence(mean, log_variance).mean()
+        parts['kl'] = config.kl_weight * (nats - config.free_nats).clamp(min=0)
     with autocast():
         prediction = networks.predictor(context, z)
     measured = targets.measured(context)

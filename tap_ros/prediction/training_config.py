@@ -87,6 +87,9 @@ class ObjectiveSettings:
         paper: with it, see objective.py.
     :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
     :param kl_weight: of the KL divergence beside it.
+    :param free_nats: so much KL divergence costs nothing, in the mean over the batch; 0, the
+        paper: all of it costs. Else z says nothing: at first the predictor does not heed it, so
+        that only its price is learnt ("free bits", arXiv:1606.04934).
     :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
         B, slow: choose a small num_targets).
     """
@@ -103,13 +106,14 @@ class ObjectiveSettings:
     detach_recursion: bool = False
     gan_weight: float = 5e-5
     kl_weight: float = 1e-4
+    free_nats: float = 0.0
     posterior: Posterior = 'video'
 
     def __post_init__(self) -> None:
         """Refuse a loss that there is not."""
         _check_choice(self, mode=Mode, posterior=Posterior)
         _check_least(self, 1, 'recursion')
-        _check_least(self, 0, 'changed_weight', 'gan_weight', 'kl_weight')
+        _check_least(self, 0, 'changed_weight', 'gan_weight', 'kl_weight', 'free_nats')
         _check_range(self, bell_edge=(1e-6, 1), progress_margin=(0, 0.95), outer_power=(0.1, 1),
                      match_temperature=(0, 1e6), match_share=(1e-6, 1))
         method = self.chosen
@@ -132,6 +136,10 @@ class ObjectiveSettings:
                 not method.vae or method.gan or self.recursion > 1):
             raise ConfigError("posterior: 'frame' goes with a -vae method without GAN and without "
                               'recursion')
+        if self.free_nats and self.posterior == 'frame':
+            raise ConfigError("free_nats: it goes with posterior 'video'")
+        if self.free_nats and not method.vae:
+            raise ConfigError(f'free_nats: it goes with a -vae method, got method {method.name}')
 
     @cached_property
     def chosen(self) -> Method:

@@ -285,6 +285,16 @@ def test_eq_9_is_the_divergence_and_the_least_error_at_a_sample_of_the_posterior
         (0.01 * mean ** 2 / 2 + least).mean().item(), rel=1e-4)
 
 
+def test_free_nats_cost_nothing():
+    batch = replace(make_batch(B=4), video=make_batch(B=4, seed=7).targets)
+    nats = (to_float(batch.video).mean((1, 2, 3, 4)) ** 2 / 2).mean().item()
+    for free, price in ((0.0, nats), (nats / 4, 0.75 * nats), (2 * nats, 0.0)):
+        config = replace(CONFIG, method='min-vae', kl_weight=0.01, free_nats=free)
+        outcome = predictor_loss(Networks(Shade(), Brightness(6)), batch, None, config,
+                                 still_draws(batch))
+        assert outcome.parts['kl'].item() == pytest.approx(0.01 * price, rel=1e-4)
+
+
 def test_appendix_b_is_the_minimum_over_the_whole_loss():
     batch = make_batch(B=2, T=5)
     shades = torch.tensor([[250, 30, 128, 30, 250], [250, 140, 30, 250, 100]], dtype=torch.uint8)

@@ -286,7 +286,9 @@ def test_learning_rate_rises_and_falls():
     {'method': 'min+relative'}, {'method': 'genmin+progress', 'mode': 'forward'},
     {'recursion': 2, 'method': 'fix'}, {'progress_margin': 0.5, 'method': 'genmin'},
     {'posterior': 'frame', 'method': 'genmin-vae-gan'},
-    {'posterior': 'frame', 'method': 'genmin-wo-gan'}, {'gan_weight': -1.0}])
+    {'posterior': 'frame', 'method': 'genmin-wo-gan'}, {'gan_weight': -1.0},
+    {'free_nats': -1.0, 'method': 'genmin-vae'}, {'free_nats': 1.0, 'method': 'genmin'},
+    {'free_nats': 1.0, 'posterior': 'frame', 'method': 'genmin-vae'}])
 def test_settings_that_make_no_sense_are_refused_by_name(values):
     with pytest.raises(ConfigError, match=next(iter(values))):
         TrainingConfig(**{'recordings': ('bag',), 'out': 'out', **values})
