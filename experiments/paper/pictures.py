@@ -72,7 +72,7 @@ def write_grids(folder, runs, weights, recordings='bags'):
             path = Path(weights) / run['name'] / 'predictor.safetensors'
             if path.exists():
                 paths.setdefault(run['method'], path)
-        episodes = paths and _held_out(same[0], recordings)
+        episodes = paths and _held_out(same, recordings)
         if not paths or episodes is None:
             continue
         networks = {method: Shown(method, load_network(path)[0])
@@ -90,8 +90,9 @@ def write_grids(folder, runs, weights, recordings='bags'):
                 write_atomically(path, png_bytes(draw(title, *sheet)))
 
 
-def _held_out(run, recordings):
+def _held_out(runs, recordings):
     """Return (store, indices of the first held-out episodes, goal picture), or None."""
+    run = runs[0]
     own = run['config'].get('recordings', ())
     paths = [path for path in own if Path(path).exists()]
     paths = paths or [Path(recordings) / run['task']]
@@ -100,7 +101,7 @@ def _held_out(run, recordings):
     store = open_recordings(paths)
     _, held_out = split_episodes(store, run['config'].get('test_fraction', TEST_FRACTION))
     # Of other recordings the pictures would not be those that the scores are of.
-    if not len(held_out) or store.data_hash != run['data']['hash']:
+    if not len(held_out) or store.data_hash not in {run['data']['hash'] for run in runs}:
         return None
     return store, held_out[:EPISODES], run['evaluation'].get('goal_picture', 'last')
 

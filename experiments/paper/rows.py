@@ -36,14 +36,12 @@ class Group:
     :param key: dict of task, mode, method, scale and, where something was trained, new_pixels.
     :param scores: dict of float arrays (S, N), a row for each run; NaN where undefined.
     :param command: makes the runs.
-    :param data_hash: of the recordings.
     :param of: for the best of 100, the method that was sampled from.
     """
 
     key: dict
     scores: dict
     command: str
-    data_hash: str
     of: str = ''
 
 
@@ -103,7 +101,7 @@ def _group(key, runs, part, of=''):
                 [[level[name] for level in run['evaluation']['recursion']] for run in runs],
                 float).swapaxes(1, 2)  # S, N, levels
     command = ' && '.join(run['command'] for run in runs)
-    return Group(key, scores, command, runs[0]['data']['hash'], of)
+    return Group(key, scores, command, of)
 
 
 def make_rows(groups):
@@ -225,9 +223,8 @@ def find_baseline(group, groups):
     for variant in dict.fromkeys((variant_of(name), network_of(name))):
         for method in names:
             for other in groups:
-                if (other.key == {**group.key, 'new_pixels': group.key.get('new_pixels', True),
-                                  'method': method + variant}
-                        and other.data_hash == group.data_hash):
+                if other.key == {**group.key, 'new_pixels': group.key.get('new_pixels', True),
+                                 'method': method + variant}:
                     return other
     return None
 
@@ -267,8 +264,8 @@ def _equal_gain_rows(groups):
         name, mode = group.key['method'], group.key['mode']
         if name in COPIES or name.startswith('fix') or 'match_step' not in group.scores:
             continue
-        same = [other for other in groups if other.data_hash == group.data_hash
-                and all(other.key[part] == group.key[part] for part in ('task', 'mode', 'scale'))
+        same = [other for other in groups
+                if all(other.key[part] == group.key[part] for part in ('task', 'mode', 'scale'))
                 and other.key.get('new_pixels') in (None, group.key['new_pixels'])]
         fixed = [[other for other in same if re.fullmatch(
             r'fix[\d.]*(-wo-gan)?' + re.escape(variant), other.key['method'])]

@@ -32,7 +32,7 @@ def scores(l1, at=0.5, frames=40, bottleneck=None, mass=None, seed=0):
 
 
 def made_run(method, prediction, task='push2', mode='bidirectional', new_pixels=True, seed=0,
-             data_hash='d', **evaluation):
+             **evaluation):
     """Invent a run; `evaluation` has more parts than prediction."""
     name = f'{task}-{mode}-{method}{"" if new_pixels else "-warp"}-s{seed}'
     copies = {'copy-start': scores(0.003, 0.03)}
@@ -42,7 +42,7 @@ def made_run(method, prediction, task='push2', mode='bidirectional', new_pixels=
         'name': name, 'task': task, 'mode': mode, 'method': method, 'new_pixels': new_pixels,
         'seed': seed, 'scale': 'small', 'command': f'make {name}',
         'config': {'recordings': ['nowhere'], 'batch_size': 32, 'base_width': 16},
-        'data': {'hash': data_hash, 'episodes': 800, 'held_out': len(prediction['min_l1']),
+        'data': {'hash': 'd', 'episodes': 800, 'held_out': len(prediction['min_l1']),
                  'command': 'collect it'},
         'training': {'steps': 3000, 'seconds': 600.0, 'machine': 'a machine', 'torch': '2',
                      'python': '3'},

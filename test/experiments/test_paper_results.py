@@ -265,7 +265,19 @@ def test_methods_stand_in_the_order_of_the_paper():
 
 def test_numbers_of_other_recordings_are_left_out():
     runs = [made_run('fix', scores(0.02)), made_run('min', scores(0.02)),
-            made_run('genmin', scores(0.01), data_hash='other')]
+            made_run('genmin', scores(0.01)), made_run('genmin4', scores(0.01), mode='forward')]
+    runs[1]['data']['hash'] = 'of another machine'
+    runs[2]['evaluation']['copy-start']['min_l1'][7] += 1e-5  # another episode
+    kept, left_out = on_same_recordings(runs)
+    assert [run['method'] for run in kept] == ['fix', 'min', 'genmin4']
+    assert [run['method'] for run in left_out] == ['genmin']
+
+
+def test_numbers_of_other_looks_are_left_out():
+    looks = [{'light': {'copy-goal': scores(error), 'prediction': scores(0.02)}}
+             for error in (0.003, 0.003, 0.004)]
+    runs = [made_run(method, scores(0.02), shifted=shifted)
+            for method, shifted in zip(('fix', 'min', 'genmin'), looks)]
     kept, left_out = on_same_recordings(runs)
     assert [run['method'] for run in kept] == ['fix', 'min']
     assert [run['method'] for run in left_out] == ['genmin']
