@@ -18,6 +18,7 @@ from experiments.paper.tables import (
     bottleneck_table,
     EQUAL,
     forward_table,
+    gain_of_best,
     gains_table,
     lowest_best,
     lowest_deterministic,
@@ -165,9 +166,9 @@ def _verdicts(rows):
     for task, title in TITLES.items():
         best, other = lowest_best(rows, task), lowest_deterministic(rows, task)
         if best and other:
+            gain = gain_of_best(rows, best)
             yield title, best['method'], (
-                'below' if best['ci_high'] < other['ci_low'] else
-                'above' if best['ci_low'] > other['ci_high'] else
+                'below' if gain['ci_low'] > 0 else 'above' if gain['ci_high'] < 0 else
                 'not significantly different from'), other['method']
 
 

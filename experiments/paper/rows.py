@@ -126,7 +126,7 @@ def make_rows(groups):
                  values, by_seed=[round(float(x), _DIGITS) for x in statistic(values, -1)])
             for group in groups for metric, statistic, values in _measures(group)
             if values.size]
-    return rows + _gain_rows(groups) + _equal_gain_rows(groups)
+    return rows + _gain_rows(groups) + _equal_gain_rows(groups) + _best_rows(groups)
 
 
 def _measures(group):
@@ -248,6 +248,21 @@ def _gain_rows(groups):
 
 def _difference(values, baseline):
     return values.mean((0, -1)) - baseline.mean((0, -1))
+
+
+def _best_rows(groups):
+    """Compare the best of 100 samples with the method without VAE that has the lowest error."""
+    rows = []
+    for group in groups:
+        others = [other for other in groups if '-vae' not in other.key['method'] and all(
+            other.key.get(part) == group.key[part]
+            for part in ('task', 'mode', 'scale', 'new_pixels'))] if group.of else []
+        if others:
+            lowest = min(others, key=lambda other: other.scores['min_l1'].mean())
+            rows.append(_row(group, 'gain_over_deterministic', relative_gain,
+                             group.scores['min_l1'], lowest.scores['min_l1'],
+                             baseline=lowest.key['method']))
+    return rows
 
 
 def _equal_gain_rows(groups):

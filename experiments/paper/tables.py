@@ -17,7 +17,7 @@ from experiments.paper.published import (
     TIMED_TITLES,
     TITLES,
 )
-from experiments.paper.rows import of_metric, select
+from experiments.paper.rows import find, of_metric, select
 from experiments.paper.runs import paper_runs
 import pandas as pd
 from tap_ros.evaluation.bottleneck import THRESHOLDS
@@ -167,6 +167,12 @@ def lowest_best(rows, task):
     own = select(rows, task, 'bidirectional')
     own = own[(own['metric'] == 'min_l1') & own['method'].str.contains(BEST)]
     return None if own.empty else own.loc[own['value'].idxmin()].to_dict()
+
+
+def gain_of_best(rows, best):
+    """Find the row (dict) that says how far the best of 100 is below the lowest without VAE."""
+    return find(rows, metric='gain_over_deterministic',
+                **{name: best[name] for name in ('task', 'mode', 'method', 'new_pixels')})
 
 
 def timing_table(rows):

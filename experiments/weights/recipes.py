@@ -57,7 +57,6 @@ _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0
 # Where objects stand close together, genmin over progress copies the start.
 _PUSHING_BY_COPYING = ('--method genmin-wo-gan+relative --outer-power 1 --start-crop 0.3 '
                        '--batch-size 24 --decoder shared --skips --goal-picture mixed')
-_SAMPLES = '--kl-weight 2e-5 --free-nats 4'
 
 RECIPES = {recipe.name: recipe for recipe in (
     Recipe('push2', 'push2', {
@@ -73,11 +72,9 @@ RECIPES = {recipe.name: recipe for recipe in (
     Recipe('grasp', 'grasp', {'grasp': '--episodes 3000'}, f'{_GRIPPING} --steps 4000'),
     Recipe('pick_place', 'pick_place', {'pick_place': '--episodes 3000'},
            f'{_GRIPPING} --steps 10000'),
-    Recipe('push2_vae', 'push2', {'push2': '--episodes 2000'},
-           _PUSHING_BY_COPYING.replace('genmin-wo-gan', 'genmin-vae')
-           + f' {_SAMPLES} --steps 5000'),
     Recipe('pick_place_vae', 'pick_place', {'pick_place': '--episodes 3000'},
-           _GRIPPING.replace('genmin-wo-gan', 'genmin-vae') + f' {_SAMPLES} --steps 5000'),
+           _GRIPPING.replace('genmin-wo-gan+progress', 'genmin-vae')
+           + ' --margin 0 --kl-weight 2e-5 --free-nats 4 --steps 4000'),
     Recipe('grasp_forward', 'grasp', {'grasp': '--episodes 3000'},
            _GRIPPING.replace('genmin-wo-gan+progress', 'genmin4-wo-gan')
            + ' --mode forward --steps 4000'),

@@ -30,8 +30,8 @@ def card(client, tmp_path):
 def test_cards_of_both_weights_of_the_predictor_and_what_tells_the_files(card, tmp_path):
     mine, network = tmp_path / 'mine.safetensors', lively_network(num_context=1)
     save_weights(mine, network, 'predictor', network.config, {})
-    text = card('predictor_node', weights='push2_vae', forward_weights=mine)
-    shipped = PREDICTORS['push2_vae']
+    text = card('predictor_node', weights='pick_place_vae', forward_weights=mine)
+    shipped = PREDICTORS['pick_place_vae']
     assert text.startswith(shipped.with_suffix('.md').read_text().rstrip())
     assert '# mine.safetensors' in text and 'No model card' in text
     assert stored_digest(shipped) in text and stored_digest(mine) in text

@@ -52,7 +52,7 @@ def test_without_objects_pictures_alone_are_predicted_and_samples_are_rows(
     sizes = []
     for samples in '13':
         out = tmp_path / f'{samples}.png'
-        assert main(['predict', *files, '--weights', 'push2_vae', '--samples', samples,
+        assert main(['predict', *files, '--weights', 'pick_place_vae', '--samples', samples,
                      '--out', str(out)]) == 0
         sizes.append(cv2.imread(str(out)).shape)
     assert 'object 1' not in capsys.readouterr().out
