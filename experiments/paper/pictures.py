@@ -230,8 +230,9 @@ def _recursive(methods):
 
 
 def _sampling(methods):
-    """Choose a method with z, of our network if there is one."""
-    return [method for method in methods if '-vae' in method][-1:]
+    """Choose a method with z, of our network and over time if there is one."""
+    drawn = [method for method in methods if '-vae' in method]
+    return [_preferred(drawn, [f'genmin-vae{OURS}', *reversed(drawn)])] if drawn else []
 
 
 @torch.inference_mode()

@@ -88,8 +88,8 @@ class ObjectiveSettings:
     :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
     :param kl_weight: of the KL divergence beside it.
     :param free_nats: so much KL divergence costs nothing, in the mean over the batch; 0, the
-        paper: all of it costs. Else z says nothing: at first the predictor does not heed it, so
-        that only its price is learnt ("free bits", arXiv:1606.04934).
+        paper: all of it costs. Else z may say nothing: at first the predictor does not heed it,
+        so that its price alone is learnt ("free bits", arXiv:1606.04934).
     :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
         B, slow: choose a small num_targets).
     """
