@@ -75,17 +75,16 @@ def write_grids(folder, runs, weights, recordings='bags'):
         episodes = paths and _held_out(same, recordings)
         if not paths or episodes is None:
             continue
-        networks = {method: Shown(method, load_network(path)[0])
-                    for method, path in paths.items()}
         variant = '' if new_pixels else '-warp'
         title = f'{TITLES[task]}, {mode}' + ('' if new_pixels else ', no new pixels')
         for name, (choose, make) in GRIDS.items():
             path = Path(folder) / file_name(f'{task}-{mode}{variant}{name}', same[0]['scale'])
             chosen = choose(list(dict.fromkeys(run['method'] for run in same)))
-            if not networks.keys() >= set(chosen):
-                chosen = [] if path.exists() else choose(list(networks))
+            if not paths.keys() >= set(chosen):
+                chosen = [] if path.exists() else choose(list(paths))
             sheet = chosen and make(
-                task, mode, [networks[method] for method in chosen], *episodes)
+                task, mode, [Shown(method, load_network(paths[method])[0]) for method in chosen],
+                *episodes)
             if sheet:
                 write_atomically(path, png_bytes(draw(title, *sheet)))
 
@@ -205,8 +204,9 @@ def _methods(task, mode, shown, store, episodes, goal_picture):
 
 
 def _main_methods(methods):
-    """Leave out variants, which are too many to see."""
-    return [method for method in methods if variant_of(method) in ('', OURS)]
+    """Leave out variants and what was trained for recursion, which are too many to see."""
+    return [method for method in methods
+            if variant_of(method) in ('', OURS) and not re.search(r'-r\d+$', method)]
 
 
 def _preferred(methods, names):
@@ -224,9 +224,9 @@ def _contrast(methods):
 
 
 def _recursive(methods):
-    """Choose those of _contrast and those that were trained for recursion."""
-    return _contrast(methods) + [
-        method for method in methods if re.search(r'-r\d+$|\+pieces$', method)]
+    """Choose those that were trained for recursion; without any, those of _contrast."""
+    return [method for method in methods
+            if re.search(r'-r\d+$|\+pieces$', method)] or _contrast(methods)
 
 
 def _sampling(methods):

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from experiments.paper import figures
+from experiments.paper.names import COPIES
 from experiments.paper.page import make_page
 from experiments.paper.pictures import write_grids
 from experiments.paper.rows import as_frame, group_runs, make_rows
@@ -47,8 +48,8 @@ def on_same_recordings(runs):
     """
     Leave out runs that were scored on other episodes than most of their task, mode and scale.
 
-    Numbers of different held-out episodes must not stand in one table. What copying the start
-    picture costs in each tells them apart; the hash of a recording also depends on the last digits
+    Numbers of different held-out episodes must not stand in one table. What copying an
+    input costs in each tells them apart; the hash of a recording also depends on the last digits
     of joint positions, in which machines differ.
 
     :param runs: of load_runs.
@@ -59,7 +60,7 @@ def on_same_recordings(runs):
 
     def data(run):
         scores = run['evaluation']
-        return (tuple(scores['copy-start']['min_l1']),
+        return (*(tuple(scores[copy]['min_l1']) for copy in COPIES if copy in scores),
                 *(tuple(other['copy-goal']['min_l1'])
                   for _, other in sorted(scores.get('shifted', {}).items())))
     counts = {}

@@ -65,8 +65,7 @@ VARIANTS = {
     '+skips+margin': {**_OURS, 'margin': 3},
     '+skips+edge': {**_OURS, 'progress_margin': 0.0},
     '+skips+annealed': {**_OURS, 'match_temperature': 1.0},
-    # Inputs and targets of random pieces of episodes: a piece that ends at the place is what
-    # recursion asks of.
+    # Recursion asks for what comes before the place, and a piece that ends there shows it.
     '+skips+pieces': {**_OURS, 'min_crop': 0.3},
     # The VAE as in the paper.
     '+skips+priced': {**_OURS, 'free_nats': 0.0, 'kl_weight': 1e-5},

@@ -64,7 +64,7 @@ def find_state(run, places, hashes=None):
     :param run: PaperRun.
     :param places: Places.
     :param hashes: of data_hashes. Where the recording is not at hand a run that was done elsewhere
-        is taken as it is.
+        is taken as it is; where one with another hash is, it is not done with that recording.
     :return: State.
     """
     recorded = (hashes or {}).get(run.task)

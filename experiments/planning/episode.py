@@ -9,6 +9,7 @@ same.
 
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 from experiments.planning.true_model import TrueModel
 import numpy as np
@@ -66,8 +67,9 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     start = seen = simulator.reset(seed)
-    goal, view = simulator.goal(), View(mpc.model.config.robot_mask)
-    targets, subgoals = make_targets(simulator, mpc, method, seen, goal, predictor, seed)
+    goal, learned = simulator.goal(), mpc
+    view, asked = View(mpc.model.config.robot_mask), View(_mask_of(method, predictor))
+    targets, subgoals = [Target(goal.object_pixels)], []
     if objects is not None:
         objects = tuple(objects)
         targets = [Target(goal.object_pixels[list(objects)])]
@@ -79,16 +81,17 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
     tracked = []
     while method.base != 'nothing':
-        shown = as_seen(view.see(seen))
-        answer = reach.step(shown)
+        shown, start_picture = view.see(seen), asked.see(seen).image
+        answer = reach.step(as_seen(shown))
         while isinstance(answer, Aim):
-            if reach.aimed:
-                seen = replace(seen, object_pixels=answer.seen.pixels)
+            if objects is None:
+                pictures = Pictures(start_picture, asked.fill(goal).image, shown.image)
                 targets, found = make_targets(
-                    simulator, mpc, method, seen, goal, predictor, seed)
+                    simulator, learned, method, replace(seen, object_pixels=answer.seen.pixels),
+                    goal, predictor, seed, pictures)
                 subgoals += found
             reach.head_for(targets)
-            answer = reach.step(shown)
+            answer = reach.step(as_seen(shown))
         tracked.append(reach.pixels)
         if isinstance(answer, End):
             break
@@ -134,24 +137,37 @@ def as_seen(observation):
                 observation.object_pixels, observation.stamp_ns)
 
 
-def make_targets(simulator, mpc, method, seen, goal, predictor, seed):
+def _mask_of(method, predictor):
+    """Return what robot_mask the pictures for the predictor are filled with."""
+    robot_mask, share = trained_robot_mask(predictor.training) if method.predicted else ('none', 0)
+    return robot_mask if share else 'none'
+
+
+class Pictures(NamedTuple):
+    """What networks see of an episode now, uint8 (H, W, 3), filled as each was trained."""
+
+    start: np.ndarray  # for the predictor
+    goal: np.ndarray  # for the predictor
+    planned_from: np.ndarray  # for the planner's model
+
+
+def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=None):
     """
     Decide what is planned to from what is seen, at the start of each round.
 
+    :param mpc: VisualMPC with the learned model, which chooses among samples.
+    :param seen: Observation of now; goal: of the goal.
+    :param pictures: Pictures, for methods that predict.
     :return: list of Target, the goal last, and the list of the Subgoals that were predicted.
     """
     start, end = seen.object_pixels, goal.object_pixels
     last = Target(end)
     if method.predicted:
-        robot_mask, share = trained_robot_mask(predictor.training)
-        view = View(robot_mask if share else 'none')
-        before, after = view.see(seen).image, view.fill(goal).image
         found = predictor.predict(
-            before, after, start, end, num_samples=method.samples,
+            pictures.start, pictures.goal, start, end, num_samples=method.samples,
             recursion_depth=method.recursion, seed=seed)
-        shown = View(mpc.model.config.robot_mask).see(seen)
         subgoals = choose_sample(
-            mpc, Scene(shown.image, seen.gripper, start), end, found, seed)
+            mpc, Scene(pictures.planned_from, seen.gripper, start), end, found, seed)
         if method.maps == 'true':
             return [*(Target(true_configuration(simulator, s.image, seen, goal))
                       for s in subgoals), last], subgoals

@@ -60,7 +60,7 @@ class ReachConfig:
     :param timeout: s without a command, planning apart, after which the goal ends.
     :param objects: indices of the objects that are planned for; None: all.
     :param rounds: how often to ask where to go, at least 1: again when the subgoals of a round are
-        passed, and not after the last round.
+        passed and a command was sent since it began, and not after the last round.
     """
 
     step_budget: int = 0
@@ -310,7 +310,7 @@ class Reach:
                                 f'step budget of {self._budget} spent')
         target = current.itinerary.target(self.steps - current.first_step, chosen)
         if (target is current.targets[-1] and len(current.targets) > 1
-                and current.number < config.rounds):
+                and current.number < config.rounds and self.steps > current.first_step):
             return Aim(replace(seen, names=self._first.names, pixels=pixels))
         limit = np.array(seen.image.shape[1::-1]) - 1
         goal = self._goal(target, np.clip(chosen, 0, limit))

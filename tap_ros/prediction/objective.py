@@ -96,6 +96,7 @@ class Outcome:
     :param prediction: Prediction.
     :param parts: dict of the terms of the loss, scalars without gradient.
     :param judged: what the discriminators learn from, or None (see discriminators_loss).
+    :param nats: KL divergence of z, mean over the batch, without gradient; None without z.
     """
 
     loss: torch.Tensor
@@ -103,6 +104,7 @@ class Outcome:
     prediction: Prediction
     parts: dict[str, torch.Tensor]
     judged: dict[str, Any] | None = None
+    nats: torch.Tensor | None = None
 
 
 def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation | None,
@@ -138,7 +140,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
     context = to_float(batch.context)  # B, C, 3, H, W
     context = augmentation.apply(context) if augmentation else context
     parts: dict[str, torch.Tensor] = {}
-    z = None
+    z = nats = None
     if networks.recognition is not None:
         assert draws is not None, 'z is drawn'
         if config.posterior == 'frame':
@@ -170,7 +172,8 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
             networks, prediction, targets, context, measured, match, parts['error'], config, z,
             autocast, selection)
     return Outcome(total(parts.values()), match, prediction,
-                   {name: value.detach() for name, value in parts.items()}, judged)
+                   {name: value.detach() for name, value in parts.items()}, judged,
+                   None if nats is None else nats.detach())
 
 
 def _judge(networks: Networks, prediction: Prediction, z: torch.Tensor | None, targets: Targets,
@@ -277,17 +280,18 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
             mean, log_variance = networks.recognition(torch.cat([context, frame[:, None]], 1))
             prediction = networks.predictor(
                 context, sample_latent(mean, log_variance, draws.posterior[:, t]))
-        divergences.append(config.kl_weight * kl_divergence(mean, log_variance))
+        divergences.append(kl_divergence(mean, log_variance))
         errors.append(targets.outer_l1(prediction.image, step, measured))
         predictions.append(prediction)
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
-    whole = (divergences + errors).detach()
+    whole = (config.kl_weight * divergences + errors).detach()
     match = targets.choose(selection(
         whole, lambda: targets.errors(measured), batch, config), batch.valid)
-    parts = {'kl': fixed_time_loss(divergences, match),
+    nats = fixed_time_loss(divergences, match)
+    parts = {'kl': config.kl_weight * nats,
              'error': fixed_time_loss(outer_error(errors, config), match)}
     return Outcome(total(parts.values()), match, _choose(predictions, match),
-                   {name: value.detach() for name, value in parts.items()})
+                   {name: value.detach() for name, value in parts.items()}, nats=nats.detach())
 
 
 def _choose(predictions: Sequence[Prediction], match: torch.Tensor) -> Prediction:

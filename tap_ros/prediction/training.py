@@ -286,7 +286,8 @@ def _values(outcome: Outcome, batch: Batch, processes: Processes) -> dict[str, f
     fraction = batch.times.gather(1, outcome.match[:, None]) / batch.end
     values = {'loss': outcome.loss, 'match_fraction': fraction.mean(),
               'match_fraction_square': fraction.square().mean(),
-              **{f'loss_{name}': value for name, value in outcome.parts.items()}}
+              **{f'loss_{name}': value for name, value in outcome.parts.items()},
+              **({} if outcome.nats is None else {'nats': outcome.nats})}
     means = processes.mean(torch.stack([value.detach().float() for value in values.values()]))
     shown: dict[str, float] = dict(zip(values, means.tolist()))
     variance = shown.pop('match_fraction_square') - shown['match_fraction'] ** 2

@@ -234,7 +234,7 @@ def test_a_picture_needs_only_the_weights_that_it_shows_of_whichever_seed(tmp_pa
     write_grids(tmp_path, runs, tmp_path / 'weights')
     # The first would show min, too.
     assert [path.read_bytes() == b'before' for path in there] == [True, False, False]
-    assert (cv2.imread(str(there[2])).shape[1] + 2) // 130 == 2 + 2 * 4
+    assert (cv2.imread(str(there[2])).shape[1] + 2) // 130 == 2 + 2
 
 
 def test_headings_stand_above_the_panels():

@@ -177,6 +177,19 @@ def test_networks_are_shown_what_nodes_would_show(studio, mpc, predictor, robot_
     check_episode(as_recording(run, 'push2', 5, 'failure'))
 
 
+def test_in_a_later_round_the_predictor_is_shown_what_was_seen_behind_the_robot(
+        studio, mpc, predictor):
+    witness = Witness(predictor, 'all', 1)
+    run = run_episode(studio, mpc, parse_method('shipped:rounds2:half'), 4, 5, witness)
+    view = FreeView('all')
+    seen = [view.update(seen.image, seen.robot_mask) for seen in run.observations[:3]]
+    np.testing.assert_array_equal(witness.shown[2], seen[2])
+    np.testing.assert_array_equal(
+        witness.shown[3], view.fill(run.goal.image, run.goal.robot_mask))
+    first = run.observations[2]
+    assert (witness.shown[2] != FreeView('all').update(first.image, first.robot_mask)).any()
+
+
 def test_one_object_alone_is_planned_for_alone(simulator, mpc):
     run = run_episode(simulator, mpc, parse_method('one_object'), 2, 5, objects=[1])
     assert len(run.targets) == 1 and len(run.targets[0].pixels) == 1
@@ -235,6 +248,13 @@ def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):
     planner = VisualMPC(mpc.model, method.planner(SMALL))
     runs = [run_episode(simulator, planner, method, 2, 5) for _ in range(2)]
     np.testing.assert_array_equal(runs[0].actions, runs[1].actions)
+
+
+def test_subgoals_are_predicted_again_while_the_simulator_plans(simulator, mpc, predictor):
+    method = parse_method('shipped:rounds2:half:true_model')
+    planner = VisualMPC(mpc.model, method.planner(SMALL))
+    run = run_episode(simulator, planner, method, 4, 5, predictor)
+    assert len(run.subgoals) == 2 and len(run.actions) == 4
 
 
 def test_objects_can_be_followed_by_pictures_while_the_simulator_plans(simulator, mpc):

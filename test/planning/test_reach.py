@@ -268,6 +268,21 @@ def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
     assert reach.targets == [first, second, GOAL] and reach.switches == [1, 2]
 
 
+def test_between_two_rounds_a_command_is_sent(mpc):
+    for switch, budget in (('reached', 10), ('half', 3)):
+        reach, asked = Reach(mpc, ReachConfig(budget, switch=switch, rounds=9), 3), []
+        for t in range(budget):
+            answer = reach.step(look(t))
+            while isinstance(answer, Aim):
+                asked.append(t)
+                # Passed at once: it is where the objects are, or no step is left for it.
+                reach.head_for([Target(START), GOAL])
+                answer = reach.step(look(t))
+            assert isinstance(answer, Command)
+            reach.sent()
+        assert len(asked) == len(set(asked)) > 1
+
+
 def test_the_rounds_share_the_budget(mpc):
     reach = Reach(mpc, ReachConfig(8, switch='half', rounds=2), 3)
     reach.step(look(0))

@@ -293,6 +293,7 @@ def test_free_nats_cost_nothing():
         outcome = predictor_loss(Networks(Shade(), Brightness(6)), batch, None, config,
                                  still_draws(batch))
         assert outcome.parts['kl'].item() == pytest.approx(0.01 * price, rel=1e-4)
+        assert outcome.nats.item() == pytest.approx(nats, rel=1e-4)
 
 
 def test_appendix_b_is_the_minimum_over_the_whole_loss():
