@@ -87,9 +87,9 @@ class ObjectiveSettings:
         paper: with it, see objective.py.
     :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
     :param kl_weight: of the KL divergence beside it.
-    :param free_nats: KL divergence up to this, in the mean over the batch, costs nothing; 0, the
-        paper: all of it costs, and z may be ignored (posterior collapse). As free bits
-        (arXiv:1606.04934), of the whole z.
+    :param free_nats: KL divergence up to this, in the mean over a process's part of the batch,
+        costs nothing; 0, the paper: all of it costs, and z may be ignored (posterior collapse). As
+        free bits (arXiv:1606.04934), of the whole z.
     :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
         B, slow: choose a small num_targets).
     """

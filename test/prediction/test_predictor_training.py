@@ -145,7 +145,8 @@ def test_two_processes_learn_what_one_does_from_the_whole_batch(config, tmp_path
         assert len(values[0]) == 3
         assert values[1][0] == pytest.approx(values[0][0], rel=1e-3, abs=1e-6), tag
         # Adam makes much of the last digits of small gradients.
-        assert values[1] == pytest.approx(values[0], rel=1e-2, abs=1e-6), tag
+        least = 1e-3 if tag == 'train/nats' else 1e-6
+        assert values[1] == pytest.approx(values[0], rel=1e-2, abs=least), tag
 
 
 def test_a_batch_that_cannot_be_divided_is_refused():
