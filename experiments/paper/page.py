@@ -54,7 +54,7 @@ def make_page(rows, runs, left_out, scales, pictures, findings=''):
 
     :param rows: of rows.as_frame.
     :param runs: dicts of the runs that the rows are from.
-    :param left_out: dicts of finished runs that were scored on other recordings.
+    :param left_out: dicts of finished runs that were scored on other episodes.
     :param scales: in the order wanted.
     :param pictures: file names beside the page.
     :param findings: Markdown that a person wrote.

@@ -44,7 +44,7 @@ def load_runs(folder):
     return runs
 
 
-def on_same_recordings(runs):
+def on_same_episodes(runs):
     """
     Leave out runs that were scored on other episodes than most of their task, mode and scale.
 
@@ -87,7 +87,7 @@ def write_results(folder='docs/results', runs='runs/paper', recordings='bags', p
     if not loaded:
         raise ConfigError(f'{folder / "runs"}: there are no finished runs; make some with '
                           'python -m tap_ros paper')
-    kept, left_out = on_same_recordings(loaded)
+    kept, left_out = on_same_episodes(loaded)
     groups = group_runs(kept)
     rows = make_rows(groups)
     write_rows(folder / 'prediction.json', told_apart(rows))

@@ -67,7 +67,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
     if method.predicted and predictor is None:
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     start = seen = simulator.reset(seed)
-    goal, learned = simulator.goal(), mpc
+    goal = simulator.goal()
     view, asked = View(mpc.model.config.robot_mask), View(_mask_of(method, predictor))
     targets, subgoals = [Target(goal.object_pixels)], []
     if objects is not None:
@@ -87,7 +87,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
             if objects is None:
                 pictures = Pictures(start_picture, asked.fill(goal).image, shown.image)
                 targets, found = make_targets(
-                    simulator, learned, method, replace(seen, object_pixels=answer.seen.pixels),
+                    simulator, mpc, method, replace(seen, object_pixels=answer.seen.pixels),
                     goal, predictor, seed, pictures)
                 subgoals += found
             reach.head_for(targets)
@@ -155,7 +155,7 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=N
     """
     Decide what is planned to from what is seen, at the start of each round.
 
-    :param mpc: VisualMPC with the learned model, which chooses among samples.
+    :param mpc: VisualMPC, which chooses among samples.
     :param seen: Observation of now; goal: of the goal.
     :param pictures: Pictures, for methods that predict.
     :return: list of Target, the goal last, and the list of the Subgoals that were predicted.

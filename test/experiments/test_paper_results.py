@@ -7,7 +7,7 @@ import json
 from experiments.paper.names import best_of_name, method_order, network_of, short_name
 from experiments.paper.results import (
     load_runs,
-    on_same_recordings,
+    on_same_episodes,
     told_apart,
     write_results,
 )
@@ -268,7 +268,7 @@ def test_numbers_of_other_recordings_are_left_out():
             made_run('genmin', scores(0.01)), made_run('genmin4', scores(0.01), mode='forward')]
     runs[1]['data']['hash'] = 'of another machine'
     runs[2]['evaluation']['copy-start']['min_l1'][7] += 1e-5  # another episode
-    kept, left_out = on_same_recordings(runs)
+    kept, left_out = on_same_episodes(runs)
     assert [run['method'] for run in kept] == ['fix', 'min', 'genmin4']
     assert [run['method'] for run in left_out] == ['genmin']
 
@@ -278,7 +278,7 @@ def test_numbers_of_other_looks_are_left_out():
              for error in (0.003, 0.003, 0.004)]
     runs = [made_run(method, scores(0.02), shifted=shifted)
             for method, shifted in zip(('fix', 'min', 'genmin'), looks)]
-    kept, left_out = on_same_recordings(runs)
+    kept, left_out = on_same_episodes(runs)
     assert [run['method'] for run in kept] == ['fix', 'min']
     assert [run['method'] for run in left_out] == ['genmin']
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from experiments.bench.engine import make_page as make_engine_page
 from experiments.paper.page import make_page as make_prediction_page
-from experiments.paper.results import load_runs, on_same_recordings, told_apart
+from experiments.paper.results import load_runs, on_same_episodes, told_apart
 from experiments.paper.rows import as_frame, group_runs, make_rows
 from experiments.planning import results as planning
 from experiments.planning.evaluate import find_films
@@ -29,7 +29,7 @@ def rows_of(name):
 
 
 def test_numbers_of_predictions_are_made_from_the_scores():
-    runs, left_out = on_same_recordings(load_runs(RESULTS / 'runs'))
+    runs, left_out = on_same_episodes(load_runs(RESULTS / 'runs'))
     assert not left_out
     # One task: all take ten times as long.
     made = told_apart(make_rows(group_runs([run for run in runs if run['task'] == 'pick_place'])))
@@ -38,7 +38,7 @@ def test_numbers_of_predictions_are_made_from_the_scores():
 
 
 def test_the_page_about_predictions_is_made_from_the_numbers():
-    runs, left_out = on_same_recordings(load_runs(RESULTS / 'runs'))
+    runs, left_out = on_same_episodes(load_runs(RESULTS / 'runs'))
     rows = as_frame([{**row, 'metric': row['metric'].removesuffix('_warp_only')}
                      for row in rows_of('prediction.json')])
     pictures = sorted(path.name for path in RESULTS.glob('*.png'))
