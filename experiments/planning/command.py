@@ -20,7 +20,10 @@ DEFAULT_METHODS = ('nothing', 'direct', 'direct:twice', 'fix', 'genmin', 'genmin
 # What the command paper calls the predictors that these methods stand for.
 RUNS = {'fix': 'fix-wo-gan+skips', 'genmin': 'genmin-wo-gan+skips',
         'genmin+progress': 'genmin-wo-gan+progress+skips',
-        'genmin+relative': 'genmin-wo-gan+relative+skips'}
+        'genmin+relative': 'genmin-wo-gan+relative+skips',
+        'genmin+relative+pieces': 'genmin-wo-gan+relative+skips+pieces',
+        'genmin+relative+scratch': 'genmin-wo-gan+relative+skips+scratch',
+        'fix+scratch': 'fix-wo-gan+skips+scratch'}
 TRAINED = 'runs/paper/small/{task}-bidirectional-{name}-warp-s0/predictor.safetensors'
 
 

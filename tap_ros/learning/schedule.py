@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What changes over a training: the learning rate, and the temperature of the match."""
+"""What changes over a training: learning rate, temperature of the match, price of z."""
 
 import math
 
@@ -31,3 +31,15 @@ def match_temperature(step: int, steps: int, highest: float, share: float) -> fl
     :return: the temperature.
     """
     return highest * max(0.0, 1 - step / (share * steps))
+
+
+def kl_share(step: int, steps: int, warmup: float) -> float:
+    """
+    Compute which share of its weight the KL divergence has at a step: a linear rise to 1.
+
+    :param step: from 0 on.
+    :param steps: length of the training.
+    :param warmup: share of the training that the rise takes; 0: the share is 1 from the start.
+    :return: the share, 0 to 1.
+    """
+    return min(1.0, step / (warmup * steps)) if warmup else 1.0

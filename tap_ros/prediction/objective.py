@@ -110,7 +110,8 @@ class Outcome:
 def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation | None,
                    config: ObjectiveSettings, draws: Draws | None = None,
                    autocast: Autocast = contextlib.nullcontext,
-                   selection: Selection = selection_errors, temperature: float = 0.0) -> Outcome:
+                   selection: Selection = selection_errors, temperature: float = 0.0,
+                   kl_share: float = 1.0) -> Outcome:
     """
     Compute the predictor's training loss of a batch.
 
@@ -134,9 +135,11 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
     :param autocast: makes the context manager to run the networks in.
     :param selection: function as selection.selection_errors: any preference.
     :param temperature: of the match at this step, see losses.match_step.
+    :param kl_share: of the weight of the KL divergence at this step, see schedule.kl_share.
     :return: Outcome.
     """
     targets = Targets(batch, augmentation, config, temperature, draws.match if draws else None)
+    kl_weight = kl_share * config.kl_weight
     context = to_float(batch.context)  # B, C, 3, H, W
     context = augmentation.apply(context) if augmentation else context
     parts: dict[str, torch.Tensor] = {}
@@ -145,7 +148,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
         assert draws is not None, 'z is drawn'
         if config.posterior == 'frame':
             return _frame_posterior_loss(
-                networks, targets, context, config, draws, autocast, selection)
+                networks, targets, context, config, draws, autocast, selection, kl_weight)
         assert batch.video is not None, 'see Sampling.video_frames'
         video = to_float(batch.video)
         with autocast():
@@ -153,7 +156,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
                 augmentation.apply(video) if augmentation else video)
         z = sample_latent(mean, log_variance, draws.posterior[:, 0])
         nats = kl_divergence(mean, log_variance).mean()
-        parts['kl'] = config.kl_weight * (nats - config.free_nats).clamp(min=0)
+        parts['kl'] = kl_weight * (nats - config.free_nats).clamp(min=0)
     with autocast():
         prediction = networks.predictor(context, z)
     measured = targets.measured(context)
@@ -259,7 +262,7 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
 
 def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.Tensor,
                           config: ObjectiveSettings, draws: Draws, autocast: Autocast,
-                          selection: Selection) -> Outcome:
+                          selection: Selection, kl_weight: float) -> Outcome:
     """
     Compute the alternative of appendix B: the minimum over time of the whole CVAE loss.
 
@@ -284,11 +287,11 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
         errors.append(targets.outer_l1(prediction.image, step, measured))
         predictions.append(prediction)
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
-    whole = (config.kl_weight * divergences + errors).detach()
+    whole = (kl_weight * divergences + errors).detach()
     match = targets.choose(selection(
         whole, lambda: targets.errors(measured), batch, config), batch.valid)
     nats = fixed_time_loss(divergences, match)
-    parts = {'kl': config.kl_weight * nats,
+    parts = {'kl': kl_weight * nats,
              'error': fixed_time_loss(outer_error(errors, config), match)}
     return Outcome(total(parts.values()), match, _choose(predictions, match),
                    {name: value.detach() for name, value in parts.items()}, nats=nats.detach())

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recognition network q_phi(z | X) of the time-agnostic CVAE (section 3.4, Eq. 9)."""
 
+import math
+
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.networks import encoder, initialise, PredictorConfig
 import torch
@@ -21,10 +23,12 @@ class Recognition(nn.Module):
 
     :param config: PredictorConfig of the predictor that takes z.
     :param num_images: how many pictures it takes.
+    :param initial_std: standard deviation of z that it begins with.
     :raises ConfigError: if that predictor has no z.
     """
 
-    def __init__(self, config: PredictorConfig, num_images: int) -> None:
+    def __init__(self, config: PredictorConfig, num_images: int,
+                 initial_std: float = 1.0) -> None:
         super().__init__()
         if config.latent_size < 1:
             raise ConfigError('latent_size: a recognition network needs at least 1, got '
@@ -35,6 +39,8 @@ class Recognition(nn.Module):
             nn.Conv2d(widths[-1], widths[-1], 3, padding=1), nn.ReLU(),
             nn.Conv2d(widths[-1], 2 * config.latent_size, 4))
         self.apply(initialise)
+        with torch.no_grad():
+            self.head[-1].get_parameter('bias')[config.latent_size:] = 2 * math.log(initial_std)
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """

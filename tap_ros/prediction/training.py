@@ -22,7 +22,7 @@ from tap_ros.learning.filled import fill, Filled, with_masks
 from tap_ros.learning.frames import Frames, MappedFrames, ResidentFrames
 from tap_ros.learning.parallel import joined, Processes, share_batch_norm
 from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
-from tap_ros.learning.schedule import learning_rate, match_temperature
+from tap_ros.learning.schedule import kl_share, learning_rate, match_temperature
 from tap_ros.learning.split import split_episodes, warn_if_none
 from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.augmentation import Augmentation
@@ -209,7 +209,8 @@ def _step(state: TrainingState[Predictor], networks: Networks, batch: Batch,
     temperature = match_temperature(
         state.step, config.steps, config.match_temperature, config.match_share)
     outcome = predictor_loss(
-        networks, batch, augmentation, config, draws, autocast, temperature=temperature)
+        networks, batch, augmentation, config, draws, autocast, temperature=temperature,
+        kl_share=kl_share(state.step, config.steps, config.kl_warmup))
     state.optimizers[0].zero_grad()
     outcome.loss.backward()
     processes.average_gradients(state.optimizers[0].param_groups[0]['params'])
@@ -237,7 +238,7 @@ def _helpers(config: TrainingConfig, shape: PredictorConfig,
     if method.vae:
         images = (config.video_frames if config.posterior == 'video'
                   else shape.num_context + 1)
-        helpers['recognition'] = Recognition(shape, images)
+        helpers['recognition'] = Recognition(shape, images, config.posterior_std)
     if method.gan:
         helpers['discriminator'] = Discriminator(shape, longest - 1)
         if method.vae:

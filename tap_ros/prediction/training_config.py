@@ -90,6 +90,10 @@ class ObjectiveSettings:
     :param free_nats: KL divergence up to this, in the mean over a process's part of the batch,
         costs nothing; 0, the paper: all of it costs, and z may be ignored (posterior collapse). As
         free bits (arXiv:1606.04934), of the whole z.
+    :param kl_warmup: share of the training over which the weight of the KL divergence rises from
+        0, so that z is of use before it costs something (arXiv:1602.02282); 0, the paper: never.
+    :param posterior_std: standard deviation of z that the recognition network begins with; one
+        well below 1 is little noise, which the predictor need not learn to ignore first.
     :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
         B, slow: choose a small num_targets).
     """
@@ -107,6 +111,8 @@ class ObjectiveSettings:
     gan_weight: float = 5e-5
     kl_weight: float = 1e-4
     free_nats: float = 0.0
+    kl_warmup: float = 0.0
+    posterior_std: float = 1.0
     posterior: Posterior = 'video'
 
     def __post_init__(self) -> None:
@@ -115,7 +121,8 @@ class ObjectiveSettings:
         _check_least(self, 1, 'recursion')
         _check_least(self, 0, 'changed_weight', 'gan_weight', 'kl_weight', 'free_nats')
         _check_range(self, bell_edge=(1e-6, 1), progress_margin=(0, 0.95), outer_power=(0.1, 1),
-                     match_temperature=(0, 1e6), match_share=(1e-6, 1))
+                     match_temperature=(0, 1e6), match_share=(1e-6, 1),
+                     kl_warmup=(0, 1), posterior_std=(0.01, 1))
         method = self.chosen
         if method.beta is not None and not self.forward:
             raise ConfigError(f'method: {method.name} has the linear preference of forward '
@@ -138,8 +145,9 @@ class ObjectiveSettings:
                               'recursion')
         if self.free_nats and self.posterior == 'frame':
             raise ConfigError("free_nats: it goes with posterior 'video'")
-        if self.free_nats and not method.vae:
-            raise ConfigError(f'free_nats: it goes with a -vae method, got method {method.name}')
+        for name in ('free_nats', 'kl_warmup', 'posterior_std'):
+            if getattr(self, name) != getattr(ObjectiveSettings, name) and not method.vae:
+                raise ConfigError(f'{name}: it goes with a -vae method, got method {method.name}')
 
     @cached_property
     def chosen(self) -> Method:

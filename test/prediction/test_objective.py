@@ -296,6 +296,18 @@ def test_free_nats_cost_nothing():
         assert outcome.nats.item() == pytest.approx(nats, rel=1e-4)
 
 
+@pytest.mark.parametrize('posterior', ['video', 'frame'])
+def test_a_share_of_the_weight_is_a_share_of_the_price(posterior):
+    batch = replace(make_batch(B=4), video=make_batch(B=4, seed=7).targets)
+    config = replace(CONFIG, method='min-vae', posterior=posterior, kl_weight=0.01)
+    whole, none, quarter = (
+        predictor_loss(Networks(Shade(), Brightness(6 if posterior == 'video' else 1)), batch,
+                       None, replace(config, kl_weight=weight), still_draws(batch), kl_share=share)
+        for weight, share in ((0.01, 1.0), (0.01, 0.0), (0.04, 0.25)))
+    assert whole.parts['kl'] > 0 and none.parts['kl'] == 0
+    assert quarter.loss.item() == pytest.approx(whole.loss.item(), rel=1e-6)
+
+
 def test_appendix_b_is_the_minimum_over_the_whole_loss():
     batch = make_batch(B=2, T=5)
     shades = torch.tensor([[250, 30, 128, 30, 250], [250, 140, 30, 250, 100]], dtype=torch.uint8)

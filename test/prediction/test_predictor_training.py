@@ -18,7 +18,7 @@ from tap_ros.files import only_writer
 from tap_ros.images import to_float
 from tap_ros.learning import devices
 from tap_ros.learning.parallel import Processes
-from tap_ros.learning.schedule import learning_rate
+from tap_ros.learning.schedule import kl_share, learning_rate
 from tap_ros.learning.weights import load_tensors, load_weights, save_tensors
 from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
@@ -50,6 +50,7 @@ def weights(config):
     {'method': 'genmin4', 'mode': 'forward', 'recursion': 2},
     {'decoder': 'shared', 'skips': True, 'recursion': 2, 'detach_recursion': True,
      'match_temperature': 1.0, 'match_share': 1.0},
+    {'method': 'genmin-vae', 'kl_warmup': 1.0, 'posterior_std': 0.1},
     {'method': 'genmin-vae', 'posterior': 'frame', 'num_targets': 2}])
 def test_two_steps_and_two_more_equal_four(config, tmp_path, values):
     config = replace(config, **values)
@@ -280,6 +281,12 @@ def test_learning_rate_rises_and_falls():
     assert all(a >= b for a, b in zip(rates[10:], rates[11:]))
 
 
+def test_the_price_of_z_rises():
+    shares = [kl_share(step, 100, 0.5) for step in range(100)]
+    assert shares[0] == 0 and shares[25] == 0.5 and shares[50:] == [1] * 50
+    assert kl_share(0, 100, 0.0) == 1
+
+
 @pytest.mark.parametrize('values', [
     {'recordings': ()}, {'method': 'max'}, {'outer_power': 2.0}, {'mode': 'sideways'},
     {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
@@ -289,6 +296,8 @@ def test_learning_rate_rises_and_falls():
     {'posterior': 'frame', 'method': 'genmin-vae-gan'},
     {'posterior': 'frame', 'method': 'genmin-wo-gan'}, {'gan_weight': -1.0},
     {'free_nats': -1.0, 'method': 'genmin-vae'}, {'free_nats': 1.0, 'method': 'genmin'},
+    {'kl_warmup': 1.5, 'method': 'genmin-vae'}, {'kl_warmup': 0.5, 'method': 'genmin'},
+    {'posterior_std': 0.0, 'method': 'genmin-vae'}, {'posterior_std': 0.1, 'method': 'genmin'},
     {'free_nats': 1.0, 'posterior': 'frame', 'method': 'genmin-vae'}])
 def test_settings_that_make_no_sense_are_refused_by_name(values):
     with pytest.raises(ConfigError, match=next(iter(values))):

@@ -58,6 +58,12 @@ def test_it_begins_near_the_prior():
     assert (kl_divergence(mean, log_variance) < 1).all()
 
 
+@pytest.mark.parametrize('std', [1.0, 0.1])
+def test_its_first_spread_is_chosen(std):
+    _, log_variance = Recognition(SMALL, 6, std)(draw(4, 6, 3, 64, 64).tanh())
+    assert (log_variance / 2).exp().allclose(torch.tensor(std), rtol=0.2)
+
+
 def test_every_picture_matters():
     network, video = Recognition(SMALL, 6), draw(2, 6, 3, 64, 64).tanh().requires_grad_()
     mean, log_variance = network(video)

@@ -196,6 +196,18 @@ def test_terms_of_the_loss_have_their_weights(trained, option, method, term, fac
     assert values[1] == pytest.approx(factor * values[0], rel=1e-3)
 
 
+def test_z_costs_nothing_at_first_and_has_the_spread_asked_for(trained):
+    found = {}
+    for name, options in (('usual', {}), ('rising', {'kl_warmup': 1.0}),
+                          ('narrow', {'posterior_std': 0.1})):
+        trained(method='genmin-vae', **options, **STILL)
+        found[name] = [dict(curve(trained.config.out, part))[1] for part in ('loss_kl', 'nats')]
+    assert found['usual'][0] > 0 and found['rising'][0] == 0
+    assert found['rising'][1] == pytest.approx(found['usual'][1])
+    # of each of the 32 numbers of z: (0.01 - 1 - log 0.01) / 2
+    assert found['narrow'][1] - found['usual'][1] == pytest.approx(32 * 1.81, rel=0.05)
+
+
 def losses(trained, **options):
     trained(**options)
     return dict(curve(trained.config.out, 'loss'))[1]
