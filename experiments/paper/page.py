@@ -10,7 +10,7 @@ from experiments.pages import render
 from experiments.paper.claims import claims_table
 from experiments.paper.figures import file_name
 from experiments.paper.names import method_order
-from experiments.paper.published import TIMED_TITLES, TITLES
+from experiments.paper.published import ORDER_TITLES, TIMED_TITLES, TITLES
 from experiments.paper.rows import BESIDE, find, PICK, PLACE
 from experiments.paper.runs import paper_runs
 from experiments.paper.tables import (
@@ -35,11 +35,13 @@ from tap_ros.evaluation.bottleneck import MIN_MOTION
 from tap_ros.evaluation.samples import NEAR
 from tap_ros.evaluation.shown import SHOWN
 from tap_ros.prediction.losses import CHANGED
+from tap_ros.prediction.training_config import DEFAULTS
 
 # May differ between the methods of a scale, see runs.py.
 SETTINGS = ('decoder', 'skips', 'margin', 'progress_margin', 'match_temperature', 'colour',
-            'brightness', 'min_crop', 'learning_rate', 'gan_weight', 'kl_weight', 'free_nats',
-            'recursion', 'detach_recursion', 'pretrain_steps')
+            'brightness', 'goal_picture', 'start_crop', 'min_crop', 'initial_weights',
+            'gan_weight', 'kl_weight', 'free_nats', 'kl_warmup', 'posterior_std', 'recursion',
+            'detach_recursion', 'pretrain_steps')
 GRIDS = {  # what follows <task>-<mode>[-warp] in the name of a picture
     '': 'inputs, each method, and the true frame that matches best',
     '-masks': 'what the output is blended from: warped inputs under their masks, and new pixels',
@@ -91,8 +93,8 @@ def _of_scale(scale, rows, runs, pictures, scales):
         'forward_gains': rows[(rows['metric'] == 'gain_over_fix_at_match_step')
                               & (rows['mode'] == 'forward')],
         'counted': copied['bottleneck_frequency_2px'], 'all': copied['min_l1'],
-        'bottlenecks': [(title, bottleneck_table(rows, task)) for task, title in TITLES.items()
-                        if task == 'push2' or find(
+        'bottlenecks': [(title, bottleneck_table(rows, task))
+                        for task, title in (TITLES | ORDER_TITLES).items() if task == 'push2' or find(
                             rows, task=task, metric='bottleneck_frequency_2px')],
         'best': best_table(rows), 'verdicts': list(_verdicts(rows)),
         'plots': {name: file if file in pictures else '' for name, file in plots.items()},
@@ -122,14 +124,15 @@ def _settings(runs):
     lines = []
     timed = {task: f'{TITLES["push2"]}, {when}' for task, when in TIMED_TITLES.items()}
     frames = EPISODE_FRAMES | dict.fromkeys(timed, EPISODE_FRAMES['push2'] + MORE_FRAMES)
-    for task, title in (TITLES | timed).items():
+    for task, title in (TITLES | timed | ORDER_TITLES).items():
         own = [run for run in runs if run['task'] == task]
         if own:
             data, config = own[0]['data'], own[0]['config']
+            hashes = dict.fromkeys(run['data']['hash'][:8] for run in own)
             steps = sorted({run['training']['steps'] for run in own})
             lines.append({
                 'task': title, 'frames': frames[task], 'trained on': data['episodes'],
-                'held out': data['held_out'], 'data': f'`{data["hash"][:8]}`',
+                'held out': data['held_out'], 'data': ' '.join(f'`{name}`' for name in hashes),
                 'steps': ' to '.join(map(str, dict.fromkeys((steps[0], steps[-1])))),
                 'batch': config.get('batch_size'), 'base width': config.get('base_width'),
                 'runs': len(own), 'minutes of training':
@@ -141,15 +144,25 @@ def _differences(runs):
     """Tabulate the settings, beside the method's own, that are not the same in all runs."""
     lines = []
     for setting in SETTINGS:
-        methods = {}
+        values = {}  # value -> method -> tasks
         for run in runs:
-            methods.setdefault(run['config'].get(setting), set()).add(run['method'])
-        if len(methods) > 1:
-            usual, *others = sorted(methods, key=lambda value: (-len(methods[value]), str(value)))
-            lines += [(f'`{setting}`', f'{usual}', 'all others'), *(
-                ('', f'{value}', ', '.join(sorted(methods[value], key=method_order)))
+            value = run['config'].get(setting, DEFAULTS.get(setting))
+            values.setdefault(value, {}).setdefault(run['method'], set()).add(run['task'])
+        if len(values) > 1:
+            usual, *others = sorted(values, key=lambda value: (
+                -sum(map(len, values[value].values())), str(value)))
+            lines += [(f'`{setting}`', str(usual) or 'none', 'all others'), *(
+                ('', str(value), '; '.join(_of_methods(values[value])))
                 for value in others)]
-    return pd.DataFrame(lines, columns=['setting', 'value', 'methods'])
+    return pd.DataFrame(lines, columns=['setting', 'value', 'of'])
+
+
+def _of_methods(tasks):
+    """Name methods (a dict of each one's set of tasks), those of the same tasks together."""
+    together = {}
+    for method in sorted(tasks, key=method_order):
+        together.setdefault(tuple(sorted(tasks[method])), []).append(method)
+    return [f'{", ".join(names)}: {", ".join(methods)}' for names, methods in together.items()]
 
 
 def _table_1_settings(rows, scale):

@@ -28,10 +28,10 @@ NOT_RUN = '*not run*'
 EQUAL = 0.10
 
 
-def _methods_of(own, task, mode, new_pixels):
+def _methods_of(rows, task, mode, new_pixels):
     """List, in order, the methods of a setting and those that complete results have."""
-    names = {*own['method'], *(
-        run.label for scale in own['scale'].unique() for run in paper_runs(scale)
+    names = {*select(rows, task, mode, new_pixels)['method'], *(
+        run.label for scale in rows['scale'].unique() for run in paper_runs(scale)
         if (run.task, run.mode, run.new_pixels) == (task, mode, new_pixels))}
     return sorted((name for name in names if BEST not in name), key=method_order)
 
@@ -46,7 +46,7 @@ def _match_steps(own, methods):
 def scores_table(rows, task, mode, new_pixels=True):
     """Show errors and match-steps of a task beside the paper's (Table 1)."""
     own = select(rows, task, mode, new_pixels)
-    methods = _methods_of(own, task, mode, new_pixels)
+    methods = _methods_of(rows, task, mode, new_pixels)
     error, changed, beside = (of_metric(own, metric, methods) for metric in (
         'min_l1', 'changed_l1', 'match_beside_input'))
     table = pd.DataFrame({
@@ -97,7 +97,7 @@ def gains_table(rows, new_pixels=True):
 def forward_table(rows, task='grasp'):
     """Show the numbers of the forward scatter (Fig. 4), and gains at the same match-step."""
     own = select(rows, task, 'forward')
-    methods = _methods_of(own, task, 'forward', True)
+    methods = _methods_of(rows, task, 'forward', True)
     theirs = pd.DataFrame.from_dict(FORWARD_GRASP if task == 'grasp' else {}, 'index',
                                     columns=['step', 'l1']).reindex(map(short_name, methods))
     theirs.index = methods
@@ -113,7 +113,7 @@ def forward_table(rows, task='grasp'):
 def bottleneck_table(rows, task):
     """Show the bottleneck frequency at every threshold in percent, and the median score."""
     own = select(rows, task, 'bidirectional', new_pixels=False)
-    methods = _methods_of(own, task, 'bidirectional', False)
+    methods = _methods_of(rows, task, 'bidirectional', False)
     table = pd.DataFrame({f'{n} px': number(of_metric(
         own, f'bottleneck_frequency_{n}px', methods)['value'], 0, 100) for n in THRESHOLDS})
     table['2 px'] = '**' + table['2 px'] + '**'
@@ -135,7 +135,7 @@ def best_table(rows):
     for task, title in TITLES.items():
         for new_pixels in (True, False):
             own = select(rows, task, 'bidirectional', new_pixels)
-            drawn = [method for method in _methods_of(own, task, 'bidirectional', new_pixels)
+            drawn = [method for method in _methods_of(rows, task, 'bidirectional', new_pixels)
                      if '-vae' in method]
             best = [best_of_name(method) for method in drawn]
             lowest = lowest_deterministic(rows, task, new_pixels)
@@ -180,13 +180,14 @@ def timing_table(rows):
     parts = []
     for task, title in TIMED_TITLES.items():
         own = select(rows, task, 'bidirectional', new_pixels=False)
-        methods = sorted({name for name in own['method'] if name not in COPIES},
-                         key=method_order)
+        methods = [name for name in _methods_of(rows, task, 'bidirectional', False)
+                   if name not in COPIES]
         at, found, target = (of_metric(own, metric, methods) for metric in (
             'bottleneck_at', 'bottleneck_frequency_2px', 'target_bottleneck_frequency_2px'))
         parts.append(pd.DataFrame({
             'the bottleneck comes': title, 'at, share of the episode': number(at['value'], 2),
-            'method': methods, 'bottlenecks at 2 px, %': interval(found, 0, 100),
+            'method': methods,
+            'bottlenecks at 2 px, %': interval(found, 0, 100).fillna(NOT_RUN),
             'no object left out, %': interval(
                 of_metric(own, 'visible_bottleneck_frequency_2px', methods), 0, 100),
             'the true frame at that time, %': number(target['value'], 0, 100),
@@ -228,11 +229,11 @@ def recursion_table(rows):
 def parts_table(rows, task='push2'):
     """Show what each part of genmin+progress is worth: bottlenecks with and without it."""
     own = select(rows, task, 'bidirectional', new_pixels=False)
-    own = own[own['method'].str.startswith('genmin')]
-    methods = sorted(set(own['method']), key=method_order)
+    methods = [name for name in _methods_of(rows, task, 'bidirectional', False)
+               if name.startswith('genmin')]
     return pd.DataFrame({
         'method': methods, 'bottlenecks at 2 px, %': interval(
-            of_metric(own, 'bottleneck_frequency_2px', methods), 0, 100).array,
+            of_metric(own, 'bottleneck_frequency_2px', methods), 0, 100).fillna(NOT_RUN).array,
         'match, share of the episode': number(
             of_metric(own, 'match_fraction', methods)['value'], 2).array,
         'beside an input, %': number(

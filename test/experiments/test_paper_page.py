@@ -138,7 +138,7 @@ def test_settings_that_differ_are_named(tmp_path):
     plain, ours = made_run('genmin', scores(0.02)), made_run('genmin+progress', scores(0.01))
     plain['config']['margin'], ours['config']['margin'] = 0, 3
     page = page_of(tmp_path, plain, ours)
-    assert '| `margin` | 0 | all others |\n|  | 3 | genmin+progress |' in page
+    assert '| `margin` | 0 | all others |\n|  | 3 | push2: genmin+progress |' in page
     assert '`learning_rate`' not in page
 
 
