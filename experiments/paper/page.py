@@ -94,7 +94,8 @@ def _of_scale(scale, rows, runs, pictures, scales):
                               & (rows['mode'] == 'forward')],
         'counted': copied['bottleneck_frequency_2px'], 'all': copied['min_l1'],
         'bottlenecks': [(title, bottleneck_table(rows, task))
-                        for task, title in (TITLES | ORDER_TITLES).items() if task == 'push2' or find(
+                        for task, title in (TITLES | ORDER_TITLES).items()
+                        if task == 'push2' or find(
                             rows, task=task, metric='bottleneck_frequency_2px')],
         'best': best_table(rows), 'verdicts': list(_verdicts(rows)),
         'plots': {name: file if file in pictures else '' for name, file in plots.items()},

@@ -35,11 +35,14 @@ def match_temperature(step: int, steps: int, highest: float, share: float) -> fl
 
 def kl_share(step: int, steps: int, warmup: float) -> float:
     """
-    Compute which share of its weight the KL divergence has at a step: a linear rise to 1.
+    Compute which share of its weight the KL divergence has at a step: 0, a linear rise, then 1.
+
+    Adam scales gradients, so that a price however small shuts z off before it is of use.
 
     :param step: from 0 on.
     :param steps: length of the training.
-    :param warmup: share of the training that the rise takes; 0: the share is 1 from the start.
+    :param warmup: share of the training in which it is 0, and over which it then rises; 0: the
+        share is 1 from the start.
     :return: the share, 0 to 1.
     """
-    return min(1.0, step / (warmup * steps)) if warmup else 1.0
+    return min(1.0, max(0.0, step / (warmup * steps) - 1)) if warmup else 1.0

@@ -90,8 +90,9 @@ class ObjectiveSettings:
     :param free_nats: KL divergence up to this, in the mean over a process's part of the batch,
         costs nothing; 0, the paper: all of it costs, and z may be ignored (posterior collapse). As
         free bits (arXiv:1606.04934), of the whole z.
-    :param kl_warmup: share of the training over which the weight of the KL divergence rises from
-        0, so that z is of use before it costs something (arXiv:1602.02282); 0, the paper: never.
+    :param kl_warmup: share of the training in which the KL divergence costs nothing, and over
+        which its weight then rises, so that z is of use before it has a price (as in
+        arXiv:1602.02282); 0, the paper: never.
     :param posterior_std: standard deviation of z that the recognition network begins with; one
         well below 1 is little noise, which the predictor need not learn to ignore first.
     :param posterior: z is inferred from the whole 'video' (Eq. 9), or from each 'frame' (appendix
@@ -122,7 +123,7 @@ class ObjectiveSettings:
         _check_least(self, 0, 'changed_weight', 'gan_weight', 'kl_weight', 'free_nats')
         _check_range(self, bell_edge=(1e-6, 1), progress_margin=(0, 0.95), outer_power=(0.1, 1),
                      match_temperature=(0, 1e6), match_share=(1e-6, 1),
-                     kl_warmup=(0, 1), posterior_std=(0.01, 1))
+                     kl_warmup=(0, 0.5), posterior_std=(0.01, 1))
         method = self.chosen
         if method.beta is not None and not self.forward:
             raise ConfigError(f'method: {method.name} has the linear preference of forward '

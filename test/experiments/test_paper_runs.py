@@ -95,7 +95,8 @@ def test_names_are_unique_and_the_first_seed_comes_first():
 def test_rows_of_a_task_and_mode_differ_in_the_method_and_network_only():
     free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'progress_margin', 'kl_weight',
             'free_nats', 'kl_warmup', 'posterior_std', 'seed', 'detach_recursion', 'decoder',
-            'skips', 'match_temperature', 'pretrain_steps', 'initial_weights', 'min_crop'}
+            'skips', 'match_temperature', 'colour', 'brightness', 'pretrain_steps',
+            'initial_weights', 'min_crop'}
     for scale in SCALES:
         settings = {}
         for run in paper_runs(scale):
