@@ -105,7 +105,7 @@ def test_the_best_of_100_is_a_claim_about_intervals(tmp_path):
         tmp_path / 'c', made_run('genmin', scores(0.01), task='pick_place'),
         made_run('genmin-vae', scores(0.02), task='pick_place', best_of_100=scores(0.0095)))
     assert claim(less, start)[3].endswith('; 5% (5% to 5%) below')
-    assert claim(less, start)[4] == 'yes'
+    assert claim(less, start)[4] == 'paired only'
 
 
 def test_recursion_is_a_claim_about_the_place(tmp_path):
