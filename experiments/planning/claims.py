@@ -6,7 +6,8 @@ from experiments.paper.published import TABLE_2
 import pandas as pd
 
 OURS = 'shipped'
-UNSHIPPED = {'order3': 'genmin+relative'}  # has no shipped weights: what stands in their place
+# Three objects in order have two bottlenecks, so subgoals are predicted twice.
+ROUNDS = {'order3': 'shipped:rounds2'}
 MOST_CM = {'push2': 2.5, 'push3': 3.0}  # via the subgoal
 POINTS = 0.2  # of success, more than direct and than fix
 _OBJECTS = {'push2': 'two objects', 'push3': 'three objects',
@@ -42,7 +43,7 @@ def claims_table(rows):
             _met(less and less['ci_high'] < 0)))
     for task in ('order2', 'order3'):
         for other, name in (('direct', 'direct'), ('fix', 'via the subgoal of `fix`')):
-            more = find(task, UNSHIPPED.get(task, OURS), 'success_5cm_difference', other)
+            more = find(task, ROUNDS.get(task, OURS), 'success_5cm_difference', other)
             lines.append((
                 f'success via the subgoal minus {name}, {_OBJECTS[task]}', '',
                 f'at least {100 * POINTS:.0f} points, interval above 0',

@@ -22,6 +22,8 @@ RUNS = {'fix': 'fix-wo-gan+skips', 'genmin': 'genmin-wo-gan+skips',
         'genmin+progress': 'genmin-wo-gan+progress+skips',
         'genmin+relative': 'genmin-wo-gan+relative+skips',
         'genmin+relative+pieces': 'genmin-wo-gan+relative+skips+pieces',
+        'genmin+relative+rounds': 'genmin-wo-gan+relative+skips+rounds',
+        'fix+rounds': 'fix-wo-gan+skips+rounds',
         'genmin+relative+scratch': 'genmin-wo-gan+relative+skips+scratch',
         'fix+scratch': 'fix-wo-gan+skips+scratch'}
 TRAINED = 'runs/paper/small/{task}-bidirectional-{name}-warp-s0/predictor.safetensors'

@@ -12,6 +12,7 @@ from scipy.stats import sem
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.evaluation.intervals import mean_interval
 
+FIXED = ('fix', 'fix+rounds')  # fixed-time prediction: the first of which there are results
 # Results are compared where these settings agree; what an option changes is not among them.
 SAME = ('look', 'step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
 
@@ -104,7 +105,7 @@ def partners(method, names):
     :param method: Method.
     :param names: of all methods that there are results of.
     :return: list of (what is compared, name of the other): 'direct' and 'fix' with the same
-        planner (fix with the same switch, recursion and rounds, too), direct with twice the
+        planner (fix, see FIXED, with the same switch, recursion and rounds, too), direct with twice the
         samples; for each option the method without it, under the name of Method's field; for
         true_subgoal every predictor, as 'subgoal'.
     """
@@ -112,8 +113,9 @@ def partners(method, names):
         return []
     plain = {field: DEFAULTS[field] for field in SUBGOALS_ONLY}
     once = {field: DEFAULTS[field] for field in ('samples', 'maps')}
+    fixed = [replace(method, base=base, **once) for base in FIXED]
     found = [('direct', replace(method, base='direct', **plain)),
-             ('fix', replace(method, base='fix', **once))]
+             *[('fix', fix) for fix in fixed if fix.name in names and method not in fixed][:1]]
     if method.search == 'preset' and method.base != 'direct':
         found.append(('direct, twice', replace(method, base='direct', search='twice', **plain)))
     found += [(field, replace(method, **{field: default})) for field, default in DEFAULTS.items()

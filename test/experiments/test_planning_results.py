@@ -126,6 +126,9 @@ def test_methods_are_compared_in_the_same_planner():
     assert partners(parse_method('true_subgoal'), names)[2:] == [
         ('subgoal', 'fix'), ('subgoal', 'genmin')]
     assert compared('nothing') == {}
+    names |= {'fix+rounds', 'fix+rounds:rounds2', 'shipped:rounds2', 'shipped'}
+    assert compared('shipped:rounds2')['fix'] == 'fix+rounds:rounds2'
+    assert compared('shipped')['fix'] == 'fix' and 'fix' not in compared('fix+rounds')
     names.add('direct:twice')
     assert compared('genmin')['direct, twice'] == 'direct:twice'
     assert compared('direct:twice') == {'search': 'direct'}
@@ -162,6 +165,9 @@ def test_claims_follow_the_numbers():
     page = make_page(ordered, {})
     more = cells('success via the subgoal minus direct, two, one on')
     assert more[3].startswith('+33 points (') and more[4] == 'no', 'the interval begins at 0'
+    twice = [{**row, 'task': 'order3', 'method': row['method'].replace(
+        'shipped', 'shipped:rounds2')} for row in rows]
+    assert '+33 points (' in make_page(twice, {})
 
 
 def test_the_page_shows_the_papers_numbers_beside_ours():
