@@ -39,7 +39,7 @@ from tap_ros.prediction.training_config import DEFAULTS
 
 # May differ between the methods of a scale, see runs.py.
 SETTINGS = ('decoder', 'skips', 'margin', 'progress_margin', 'match_temperature', 'colour',
-            'brightness', 'goal_picture', 'start_crop', 'min_crop', 'initial_weights',
+            'goal_picture', 'start_crop', 'min_crop', 'initial_weights',
             'gan_weight', 'kl_weight', 'free_nats', 'kl_warmup', 'posterior_std', 'recursion',
             'detach_recursion', 'pretrain_steps')
 GRIDS = {  # what follows <task>-<mode>[-warp] in the name of a picture
@@ -143,7 +143,9 @@ def _settings(runs):
 
 def _differences(runs):
     """Tabulate the settings, beside the method's own, that are not the same in all runs."""
-    lines = []
+    lines, every = [], {}  # task -> its methods
+    for run in runs:
+        every.setdefault(run['task'], set()).add(run['method'])
     for setting in SETTINGS:
         values = {}  # value -> method -> tasks
         for run in runs:
@@ -153,17 +155,26 @@ def _differences(runs):
             usual, *others = sorted(values, key=lambda value: (
                 -sum(map(len, values[value].values())), str(value)))
             lines += [(f'`{setting}`', str(usual) or 'none', 'all others'), *(
-                ('', str(value), '; '.join(_of_methods(values[value])))
+                ('', str(value), '; '.join(_of_methods(values[value], every)))
                 for value in others)]
     return pd.DataFrame(lines, columns=['setting', 'value', 'of'])
 
 
-def _of_methods(tasks):
-    """Name methods (a dict of each one's set of tasks), those of the same tasks together."""
+def _of_methods(tasks, every):
+    """
+    Name methods, those of the same tasks together.
+
+    :param tasks: dict of the set of tasks of each method.
+    :param every: dict of the set of all methods of each task.
+    """
+    whole = [task for task, methods in every.items()
+             if methods == {method for method in tasks if task in tasks[method]}]
     together = {}
     for method in sorted(tasks, key=method_order):
-        together.setdefault(tuple(sorted(tasks[method])), []).append(method)
-    return [f'{", ".join(names)}: {", ".join(methods)}' for names, methods in together.items()]
+        together.setdefault(tuple(sorted(tasks[method] - set(whole))), []).append(method)
+    return [f'all of {task}' for task in sorted(whole)] + [
+        f'{", ".join(names)}: {", ".join(methods)}'
+        for names, methods in together.items() if names]
 
 
 def _table_1_settings(rows, scale):

@@ -105,9 +105,9 @@ def partners(method, names):
     :param method: Method.
     :param names: of all methods that there are results of.
     :return: list of (what is compared, name of the other): 'direct' and 'fix' with the same
-        planner (fix, see FIXED, with the same switch, recursion and rounds, too), direct with twice the
-        samples; for each option the method without it, under the name of Method's field; for
-        true_subgoal every predictor, as 'subgoal'.
+        planner (fix, see FIXED, with the same switch, recursion and rounds, too), direct with
+        twice the samples; for each option the method without it, under the name of Method's
+        field; for true_subgoal every predictor, as 'subgoal'.
     """
     if method.base == 'nothing':
         return []

@@ -137,7 +137,13 @@ def test_fig_4_is_a_claim_about_six_betas(tmp_path):
 def test_settings_that_differ_are_named(tmp_path):
     plain, ours = made_run('genmin', scores(0.02)), made_run('genmin+progress', scores(0.01))
     plain['config']['margin'], ours['config']['margin'] = 0, 3
-    page = page_of(tmp_path, plain, ours)
+    others = [made_run(method, scores(0.02), task='grasp') for method in ('fix', 'min', 'genmin')]
+    for run in (plain, ours):
+        run['config']['colour'] = True
+    for run in others:
+        run['config'] |= {'margin': 0, 'colour': False}
+    page = page_of(tmp_path, plain, ours, *others)
+    assert '| `colour` | False | all others |\n|  | True | all of push2 |' in page
     assert '| `margin` | 0 | all others |\n|  | 3 | push2: genmin+progress |' in page
     assert '`learning_rate`' not in page
 
