@@ -39,7 +39,7 @@ from tap_ros.prediction.training_config import DEFAULTS
 
 # May differ between the methods of a scale, see runs.py.
 SETTINGS = ('decoder', 'skips', 'margin', 'progress_margin', 'match_temperature', 'colour',
-            'goal_picture', 'start_crop', 'min_crop', 'initial_weights',
+            'brightness', 'goal_picture', 'start_crop', 'min_crop', 'initial_weights',
             'gan_weight', 'kl_weight', 'free_nats', 'kl_warmup', 'posterior_std', 'recursion',
             'detach_recursion', 'pretrain_steps')
 GRIDS = {  # what follows <task>-<mode>[-warp] in the name of a picture
@@ -155,7 +155,7 @@ def _differences(runs):
             usual, *others = sorted(values, key=lambda value: (
                 -sum(map(len, values[value].values())), str(value)))
             lines += [(f'`{setting}`', str(usual) or 'none', 'all others'), *(
-                ('', str(value), '; '.join(_of_methods(values[value], every)))
+                ('', str(value) or 'none', '; '.join(_of_methods(values[value], every)))
                 for value in others)]
     return pd.DataFrame(lines, columns=['setting', 'value', 'of'])
 

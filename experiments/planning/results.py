@@ -12,7 +12,6 @@ from scipy.stats import sem
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.evaluation.intervals import mean_interval
 
-FIXED = ('fix', 'fix+rounds')  # fixed-time prediction: the first of which there are results
 # Results are compared where these settings agree; what an option changes is not among them.
 SAME = ('look', 'step_budget', 'reached_px', 'preset', 'forward_weights', 'device', 'precision')
 
@@ -105,17 +104,19 @@ def partners(method, names):
     :param method: Method.
     :param names: of all methods that there are results of.
     :return: list of (what is compared, name of the other): 'direct' and 'fix' with the same
-        planner (fix, see FIXED, with the same switch, recursion and rounds, too), direct with
-        twice the samples; for each option the method without it, under the name of Method's
-        field; for true_subgoal every predictor, as 'subgoal'.
+        planner (fix with the same switch, recursion and rounds, too, and trained likewise where
+        there are results of that, see _fixed_time), direct with twice the samples; for each
+        option the method without it, under the name of Method's field; for true_subgoal every
+        predictor, as 'subgoal'.
     """
     if method.base == 'nothing':
         return []
     plain = {field: DEFAULTS[field] for field in SUBGOALS_ONLY}
     once = {field: DEFAULTS[field] for field in ('samples', 'maps')}
-    fixed = [replace(method, base=base, **once) for base in FIXED]
-    found = [('direct', replace(method, base='direct', **plain)),
-             *[('fix', fix) for fix in fixed if fix.name in names and method not in fixed][:1]]
+    found = [('direct', replace(method, base='direct', **plain))]
+    if not method.base.startswith('fix'):
+        fixed = [replace(method, base=base, **once) for base in _fixed_time(method)]
+        found += [('fix', fix) for fix in fixed if fix.name in names][:1]
     if method.search == 'preset' and method.base != 'direct':
         found.append(('direct, twice', replace(method, base='direct', search='twice', **plain)))
     found += [(field, replace(method, **{field: default})) for field, default in DEFAULTS.items()
@@ -125,6 +126,14 @@ def partners(method, names):
         found += [('subgoal', replace(method, base=base)) for base in sorted(predictors)]
     return [(what, other.name) for what, other in found
             if other.name in names and other != method]
+
+
+def _fixed_time(method):
+    """Name the predictors of fixed-time prediction that a method is compared with, best first."""
+    trained = [f'fix{end}' for end in ('+rounds', '+scratch') if method.base.endswith(end)]
+    if method.base == 'shipped' and method.rounds > 1:
+        trained.append('fix+rounds')
+    return [*trained, 'fix']
 
 
 def _how(name, settings):

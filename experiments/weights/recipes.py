@@ -55,7 +55,7 @@ class Recipe:
 _PUSHING = ('--method genmin-wo-gan+progress --outer-power 1 --progress-margin 0.5 '
             '--start-crop 0.3 --batch-size 24 --decoder shared --skips --goal-picture mixed')
 # Where objects stand close together, genmin over progress copies the start.
-_PUSHING_BY_COPYING = ('--method genmin-wo-gan+relative --outer-power 1 --start-crop 0.3 '
+_PUSHING_BY_COPYING = ('--method genmin-wo-gan+relative --outer-power 1 --start-crop {} '
                        '--batch-size 24 --decoder shared --skips --goal-picture mixed')
 
 RECIPES = {recipe.name: recipe for recipe in (
@@ -64,11 +64,10 @@ RECIPES = {recipe.name: recipe for recipe in (
         f'{_PUSHING} --steps 10000'),
     # These begin with the push2 that is installed, not with the one made just before.
     Recipe('order2', 'order2', {'order2': '--episodes 700'},
-           f'{_PUSHING_BY_COPYING} --initial-weights push2 --steps 2500'),
+           f'{_PUSHING_BY_COPYING.format(0.3)} --initial-weights push2 --steps 2500'),
     # Begins anywhere in the first 0.6: a second subgoal is predicted from where the first one was.
     Recipe('order3', 'order3', {'order3': '--episodes 700'},
-           _PUSHING_BY_COPYING.replace('--start-crop 0.3', '--start-crop 0.6')
-           + ' --initial-weights push3 --steps 4000'),
+           f'{_PUSHING_BY_COPYING.format(0.6)} --initial-weights push3 --steps 4000'),
     Recipe('push3', 'push3', {'push3': '--episodes 600'},
            f'{_PUSHING} --initial-weights push2 --steps 3000'),
     Recipe('stack2', 'stack2', {'stack2': '--episodes 1000'}, f'{_GRIPPING} --steps 4000'),

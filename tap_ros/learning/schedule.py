@@ -37,7 +37,7 @@ def kl_share(step: int, steps: int, warmup: float) -> float:
     """
     Compute which share of its weight the KL divergence has at a step: 0, a linear rise, then 1.
 
-    Adam scales gradients, so that a price however small shuts z off before it is of use.
+    Adam scales gradients, so that even a small price can shut z off before it is of use.
 
     :param step: from 0 on.
     :param steps: length of the training.

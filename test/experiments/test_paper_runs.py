@@ -8,9 +8,14 @@ from pathlib import Path
 
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED
 from experiments.paper.runs import FINE_TUNED, LONG, paper_runs, PaperRun, SCALES, SINGLE
+from experiments.weights.recipes import RECIPES
 import pytest
 from tap_ros.errors import ConfigError
+from tap_ros.learning.checkpoints import FREE
+from tap_ros.prediction.training_config import DEFAULTS
 from tap_ros.weights import find_predictor
+
+ROOT = Path(__file__).parents[2]
 
 EVERY = [run for scale in SCALES for run in paper_runs(scale)]
 MAIN = {'fix-wo-gan', 'min-wo-gan', 'genmin-wo-gan', 'genmin-wo-gan+progress'}
@@ -95,15 +100,40 @@ def test_names_are_unique_and_the_first_seed_comes_first():
 def test_rows_of_a_task_and_mode_differ_in_the_method_and_network_only():
     free = {'method', 'out', 'new_pixels', 'recursion', 'margin', 'progress_margin', 'kl_weight',
             'free_nats', 'kl_warmup', 'posterior_std', 'seed', 'detach_recursion', 'decoder',
-            'skips', 'match_temperature', 'colour', 'brightness', 'pretrain_steps',
-            'initial_weights', 'min_crop', 'start_crop'}
+            'skips', 'match_temperature', 'pretrain_steps', 'initial_weights', 'min_crop'}
+    others = {'+skips+uncoloured': ('colour', 'brightness'),
+              '+skips+narrow': ('colour', 'brightness'), '+skips+rounds': ('start_crop',)}
     for scale in SCALES:
         settings = {}
         for run in paper_runs(scale):
             values = {name: value for name, value in asdict(run.config('b', 'r')).items()
                       if name not in free}
             values['steps'] /= LONG.get(run.variant, 1)
-            assert settings.setdefault((run.task, run.mode), values) == values
+            first = settings.setdefault((run.task, run.mode), values)
+            changed = {name for name in values if values[name] != first[name]}
+            assert changed == set(others.get(run.variant, ()))
+
+
+def test_order3_is_begun_late_as_long_as_the_shipped_weights():
+    runs = [run for run in paper_runs('small') if run.variant == '+skips+rounds']
+    assert {run.method for run in runs} == {'fix-wo-gan', 'genmin-wo-gan+relative'}
+    recipe = RECIPES['order3'].train.split()
+    for config in (run.config('b', 'r') for run in runs):
+        assert (config.start_crop, config.steps, config.initial_weights) == (0.6, 4000, 'push3')
+        for option in ('start_crop', 'steps', 'initial_weights'):
+            at = recipe.index('--' + option.replace('_', '-'))
+            assert recipe[at + 1] == str(getattr(config, option))
+
+
+def test_finished_runs_have_the_settings_of_today():
+    runs = {(run.scale, run.name): run for run in EVERY}
+    files = sorted(ROOT.glob('docs/results/runs/*/*.json'))
+    assert files
+    for path in files:
+        stored = json.loads(path.read_text())
+        config = asdict(runs[path.parent.name, path.stem].config('bags', 'runs'))
+        for name in config.keys() - {*FREE, 'precision'}:
+            assert stored['config'].get(name, DEFAULTS[name]) == config[name], (path.stem, name)
 
 
 def test_the_order_begins_with_the_same_shipped_weights_for_all_methods():

@@ -126,9 +126,12 @@ def test_methods_are_compared_in_the_same_planner():
     assert partners(parse_method('true_subgoal'), names)[2:] == [
         ('subgoal', 'fix'), ('subgoal', 'genmin')]
     assert compared('nothing') == {}
-    names |= {'fix+rounds', 'fix+rounds:rounds2', 'shipped:rounds2', 'shipped'}
+    names |= {'fix:rounds2', 'shipped:rounds2', 'shipped', 'fix+scratch'}
+    assert compared('shipped:rounds2')['fix'] == 'fix:rounds2'
+    names |= {'fix+rounds', 'fix+rounds:rounds2'}
     assert compared('shipped:rounds2')['fix'] == 'fix+rounds:rounds2'
     assert compared('shipped')['fix'] == 'fix' and 'fix' not in compared('fix+rounds')
+    assert compared('genmin+relative+scratch')['fix'] == 'fix+scratch'
     names.add('direct:twice')
     assert compared('genmin')['direct, twice'] == 'direct:twice'
     assert compared('direct:twice') == {'search': 'direct'}
@@ -167,7 +170,10 @@ def test_claims_follow_the_numbers():
     assert more[3].startswith('+33 points (') and more[4] == 'no', 'the interval begins at 0'
     twice = [{**row, 'task': 'order3', 'method': row['method'].replace(
         'shipped', 'shipped:rounds2')} for row in rows]
-    assert '+33 points (' in make_page(twice, {})
+    page = make_page(twice, {})
+    assert cells('success via the subgoal minus direct, three')[3].startswith('+33 points (')
+    page = make_page([{**row, 'task': 'order3'} for row in rows], {})
+    assert cells('success via the subgoal minus direct, three')[4] == '*not run*'
 
 
 def test_the_page_shows_the_papers_numbers_beside_ours():
