@@ -21,7 +21,6 @@ DEFAULT_METHODS = ('nothing', 'direct', 'direct:twice', 'fix', 'genmin', 'genmin
 RUNS = {'fix': 'fix-wo-gan+skips', 'genmin': 'genmin-wo-gan+skips',
         'genmin+progress': 'genmin-wo-gan+progress+skips',
         'genmin+relative': 'genmin-wo-gan+relative+skips',
-        'genmin+relative+pieces': 'genmin-wo-gan+relative+skips+pieces',
         'genmin+relative+rounds': 'genmin-wo-gan+relative+skips+rounds',
         'fix+rounds': 'fix-wo-gan+skips+rounds',
         'genmin+relative+scratch': 'genmin-wo-gan+relative+skips+scratch',

@@ -5,15 +5,13 @@
 from functools import partial
 
 from experiments.pages import interval, number, render
-from experiments.paper.published import PLANNING_BOUNDS, TABLE_2
+from experiments.paper.published import ORDER_TITLES, PLANNING_BOUNDS, TABLE_2
 from experiments.planning.claims import claims_table
 from experiments.planning.methods import BOUNDS
 import pandas as pd
 from tap_ros.planning.forward_scores import MOVED_PIXELS
 
-TITLES = {'push2': 'Two objects', 'push3': 'Three objects',
-          'order2': 'Two objects, one on the goal of the other',
-          'order3': 'Three objects, two on goals of others'}
+TITLES = {'push2': 'Two objects', 'push3': 'Three objects', **ORDER_TITLES}
 PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward model',
          'search': 'the search', 'cost': 'its cost', 'tracking': 'object pixels',
          'switch': 'when to go on', 'recursion': 'number of subgoals',
