@@ -4,7 +4,7 @@
 
 import re
 
-from experiments.paper.runs import OURS, VARIANTS
+from experiments.paper.runs import LONG, OURS, VARIANTS
 from tap_ros.prediction.methods import parse_method
 
 COPIES = ('copy-start', 'copy-goal')
@@ -31,6 +31,11 @@ def variant_of(method):
     """Return which of runs.VARIANTS a method's name stands for; '' for the method as it is."""
     name = re.sub(r'-r\d+$', '', method)
     return max((variant for variant in VARIANTS if name.endswith(variant)), key=len)
+
+
+def trained_as_long(method):
+    """Return whether a method was trained for the usual number of steps."""
+    return variant_of(method) not in LONG
 
 
 def network_of(method):

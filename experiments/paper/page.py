@@ -11,6 +11,7 @@ from experiments.paper.claims import claims_table
 from experiments.paper.figures import file_name
 from experiments.paper.names import method_order
 from experiments.paper.published import ORDER_TITLES, TIMED_TITLES, TITLES
+from experiments.paper.recordings import RECORDINGS
 from experiments.paper.rows import BESIDE, find, PICK, PLACE
 from experiments.paper.runs import paper_runs
 from experiments.paper.tables import (
@@ -124,7 +125,9 @@ def _settings(runs):
     """Tabulate what was run, on what, and how long."""
     lines = []
     timed = {task: f'{TITLES["push2"]}, {when}' for task, when in TIMED_TITLES.items()}
-    frames = EPISODE_FRAMES | dict.fromkeys(timed, EPISODE_FRAMES['push2'] + MORE_FRAMES)
+    frames = EPISODE_FRAMES | {
+        name: EPISODE_FRAMES[RECORDINGS[name].task] + MORE_FRAMES
+        for name in (*timed, 'order2_late')}
     for task, title in (TITLES | timed | ORDER_TITLES).items():
         own = [run for run in runs if run['task'] == task]
         if own:

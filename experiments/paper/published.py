@@ -10,6 +10,7 @@ others than ours: only how its methods stand to each other carries over.
 TITLES = {'grasp': 'Grasping', 'pick_place': 'Pick-and-place', 'push2': 'Pushing two objects',
           'push3': 'Pushing three objects', 'stack2': 'Stacking two blocks'}
 ORDER_TITLES = {'order2': 'Two objects, one on the goal of the other',
+                'order2_late': 'Two objects, one on the goal of the other, late',
                 'order3': 'Three objects, two on goals of others'}
 # Of recordings whose bottleneck comes at another time, and of other looks of pushing.
 TIMED_TITLES = {'push2_early': 'early', 'push2_middle': 'in the middle', 'push2_late': 'late',

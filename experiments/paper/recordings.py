@@ -47,6 +47,7 @@ RECORDINGS = {
     'stack2': _recording('stack2', 1000, 20000),
     'order2': _recording('order2', 700, 20000),
     'order3': _recording('order3', 700, 20000),
+    'order2_late': _recording('order2', 700, 20000, timing='late'),
     **{f'push2_{timing}': _recording('push2', 700, 20000, timing=timing) for timing in TIMINGS},
     **{name: _recording('push2', HELD_OUT, 1000, seed=UNSEEN,
                         appearance=name.removeprefix('push2_')) for name in SHIFTED},

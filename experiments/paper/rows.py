@@ -10,7 +10,14 @@ are averaged, episode by episode; by_seed tells how far trainings differ.
 from dataclasses import dataclass
 import re
 
-from experiments.paper.names import BEST, best_of_name, COPIES, network_of, variant_of
+from experiments.paper.names import (
+    BEST,
+    best_of_name,
+    COPIES,
+    network_of,
+    trained_as_long,
+    variant_of,
+)
 import numpy as np
 import pandas as pd
 from tap_ros.evaluation.bottleneck import THRESHOLDS, VISIBLE
@@ -251,12 +258,13 @@ def _difference(values, baseline):
 
 
 def _best_rows(groups):
-    """Compare the best of 100 samples with the method without VAE that has the lowest error."""
+    """Compare the best of 100 samples with the lowest method without VAE, at equal steps."""
     rows = []
     for group in groups:
-        others = [other for other in groups if '-vae' not in other.key['method'] and all(
-            other.key.get(part) == group.key[part]
-            for part in ('task', 'mode', 'scale', 'new_pixels'))] if group.of else []
+        others = [other for other in groups if '-vae' not in other.key['method']
+                  and trained_as_long(other.key['method']) and all(
+                      other.key.get(part) == group.key[part]
+                      for part in ('task', 'mode', 'scale', 'new_pixels'))] if group.of else []
         if others:
             lowest = min(others, key=lambda other: other.scores['min_l1'].mean())
             rows.append(_row(group, 'gain_over_deterministic', relative_gain,

@@ -69,9 +69,11 @@ VARIANTS = {
     '+skips+pieces': {**_OURS, 'min_crop': 0.3},
     # The VAE as in the paper.
     '+skips+priced': {**_OURS, 'free_nats': 0.0, 'kl_weight': 1e-5},
-    # Tried in pushing, where pictures lack the hand: in its own colours, and with a z that costs
-    # nothing at first.
+    # Tried in pushing, where pictures lack the hand: in its own colours, for longer, with more
+    # weight on what changes, and with a z that costs nothing at first.
     '+skips+uncoloured': {**_OURS, 'colour': False, 'brightness': 0.0},
+    '+skips+uncoloured+long': {**_OURS, 'colour': False, 'brightness': 0.0},
+    '+skips+weighted': {**_OURS, 'colour': False, 'brightness': 0.0, 'changed_weight': 4.0},
     '+skips+narrow': {**_OURS, 'colour': False, 'brightness': 0.0, 'kl_warmup': 0.4,
                       'posterior_std': 0.1},
     # Of the tasks in FINE_TUNED, from fresh weights.
@@ -80,10 +82,10 @@ VARIANTS = {
     # For subgoals that are predicted again from where the first one was reached.
     '+skips+rounds': {**_OURS, 'start_crop': 0.6},
 }
-LONG = {'+skips+long': 2, '+skips+rounds': 1.6}  # times the steps
+LONG = {'+skips+long': 2, '+skips+rounds': 1.6, '+skips+uncoloured+long': 3.2}  # times the steps
 # Few episodes, in which the objects stand close together: from fresh weights genmin copied the
 # start. All methods begin with the same shipped weights.
-FINE_TUNED = {'order2': 'push2', 'order3': 'push3'}
+FINE_TUNED = {'order2': 'push2', 'order3': 'push3', 'order2_late': 'push2'}
 _FINE_TUNED = {'goal_picture': 'mixed', 'start_crop': 0.3}  # as those were trained
 
 
@@ -238,6 +240,8 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(['order2'], relative + l1_rows[:2], variant='+skips+scratch', new_pixels=False)
     add(['order3'], relative, variant='+skips+pieces', new_pixels=False)
     add(['order3'], relative + ['fix-wo-gan'], variant='+skips+rounds', new_pixels=False)
+    for variant in (OURS, '+skips+rounds'):
+        add(['order2_late'], relative + ['fix-wo-gan'], variant=variant, new_pixels=False)
     # Table 1 with our network.
     add(SINGLE, l1_rows, variant=OURS, main=True)
     add(['push2'], relative, variant=OURS)
@@ -258,6 +262,8 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(['pick_place'], ['genmin-vae+progress'], variant=OURS)
     add(['pick_place', 'push2'], ['genmin-vae'], variant='+skips+priced')
     add(['push2'], relative, variant='+skips+uncoloured')
+    add(['push2'], ['genmin-wo-gan'], variant='+skips+uncoloured+long')
+    add(['push2'], ['genmin-wo-gan'], variant='+skips+weighted')
     add(['push2'], ['genmin-vae'], variant='+skips+narrow')
     add(['push2'], ['genmin-vae+relative'], variant=OURS, new_pixels=False)
     # Table 1 with the paper's network.

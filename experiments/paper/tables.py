@@ -7,7 +7,14 @@ Their rows are those of rows.as_frame, of one scale.
 """
 
 from experiments.pages import interval, number
-from experiments.paper.names import BEST, best_of_name, COPIES, method_order, short_name
+from experiments.paper.names import (
+    BEST,
+    best_of_name,
+    COPIES,
+    method_order,
+    short_name,
+    trained_as_long,
+)
 from experiments.paper.published import (
     BOTTLENECK_2PX,
     FORWARD_GRASP,
@@ -155,10 +162,14 @@ def best_table(rows):
 
 
 def lowest_deterministic(rows, task, new_pixels=True):
-    """Find the row (dict) of the trained method without VAE with the lowest error, or None."""
+    """
+    Find the trained method without VAE that has the lowest error.
+
+    :return: its row as a dict, or None. Methods that were trained for longer do not count.
+    """
     own = select(rows, task, 'bidirectional', new_pixels)
     own = own[(own['metric'] == 'min_l1') & ~own['method'].str.contains('-vae')
-              & ~own['method'].isin(COPIES)]
+              & ~own['method'].isin(COPIES) & own['method'].map(trained_as_long).astype(bool)]
     return None if own.empty else own.loc[own['value'].idxmin()].to_dict()
 
 

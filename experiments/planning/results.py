@@ -130,7 +130,8 @@ def partners(method, names):
 
 def _fixed_time(method):
     """Name the predictors of fixed-time prediction that a method is compared with, best first."""
-    trained = [f'fix{end}' for end in ('+rounds', '+scratch') if method.base.endswith(end)]
+    trained = [f'fix{end}' for end in ('+rounds', '+scratch', '+late')
+               if method.base.endswith(end)]
     if method.base == 'shipped' and method.rounds > 1:
         trained.append('fix+rounds')
     return [*trained, 'fix']

@@ -106,6 +106,11 @@ def test_the_best_of_100_is_a_claim_about_intervals(tmp_path):
         made_run('genmin-vae', scores(0.02), task='pick_place', best_of_100=scores(0.0095)))
     assert claim(less, start)[3].endswith('; 5% (5% to 5%) below')
     assert claim(less, start)[4] == 'paired only'
+    longer = page_of(  # was trained for more steps than the samples' method
+        tmp_path / 'd', made_run('genmin', scores(0.01), task='pick_place'),
+        made_run('genmin-wo-gan+skips+long', scores(0.0001), task='pick_place'),
+        made_run('genmin-vae', scores(0.02), task='pick_place', best_of_100=scores(0.0095)))
+    assert claim(longer, start) == claim(less, start)
 
 
 def test_recursion_is_a_claim_about_the_place(tmp_path):

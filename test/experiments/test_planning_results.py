@@ -126,12 +126,13 @@ def test_methods_are_compared_in_the_same_planner():
     assert partners(parse_method('true_subgoal'), names)[2:] == [
         ('subgoal', 'fix'), ('subgoal', 'genmin')]
     assert compared('nothing') == {}
-    names |= {'fix:rounds2', 'shipped:rounds2', 'shipped', 'fix+scratch'}
+    names |= {'fix:rounds2', 'shipped:rounds2', 'shipped', 'fix+scratch', 'fix+late'}
     assert compared('shipped:rounds2')['fix'] == 'fix:rounds2'
     names |= {'fix+rounds', 'fix+rounds:rounds2'}
     assert compared('shipped:rounds2')['fix'] == 'fix+rounds:rounds2'
     assert compared('shipped')['fix'] == 'fix' and 'fix' not in compared('fix+rounds')
     assert compared('genmin+relative+scratch')['fix'] == 'fix+scratch'
+    assert compared('genmin+relative+late')['fix'] == 'fix+late'
     names.add('direct:twice')
     assert compared('genmin')['direct, twice'] == 'direct:twice'
     assert compared('direct:twice') == {'search': 'direct'}
