@@ -126,8 +126,8 @@ def _settings(runs):
     lines = []
     timed = {task: f'{TITLES["push2"]}, {when}' for task, when in TIMED_TITLES.items()}
     frames = EPISODE_FRAMES | {
-        name: EPISODE_FRAMES[RECORDINGS[name].task] + MORE_FRAMES
-        for name in (*timed, 'order2_late')}
+        name: EPISODE_FRAMES[recording.task] + MORE_FRAMES
+        for name, recording in RECORDINGS.items() if 'timing' in recording.options}
     for task, title in (TITLES | timed | ORDER_TITLES).items():
         own = [run for run in runs if run['task'] == task]
         if own:

@@ -129,12 +129,11 @@ def partners(method, names):
 
 
 def _fixed_time(method):
-    """Name the predictors of fixed-time prediction that a method is compared with, best first."""
-    trained = [f'fix{end}' for end in ('+rounds', '+scratch', '+late')
-               if method.base.endswith(end)]
+    """Name the predictors of fixed time that a method is compared with: trained likewise, any."""
+    likewise = method.base.rpartition('+')[2]
     if method.base == 'shipped' and method.rounds > 1:
-        trained.append('fix+rounds')
-    return [*trained, 'fix']
+        likewise = 'rounds'
+    return [f'fix+{likewise}', 'fix']
 
 
 def _how(name, settings):

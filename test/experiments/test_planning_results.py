@@ -169,6 +169,11 @@ def test_claims_follow_the_numbers():
     page = make_page(ordered, {})
     more = cells('success via the subgoal minus direct, two, one on')
     assert more[3].startswith('+33 points (') and more[4] == 'no', 'the interval begins at 0'
+    late = make_rows(dict([stored('fix+late', [9.0, 4.0, 9.0]),
+                           stored('genmin+relative+late', [2.0, 2.0, 3.0])]))
+    page = make_page([{**row, 'task': 'order2'} for row in late], {})
+    assert cells('success via the subgoal minus via the subgoal of `fix`, both trained')[
+        3].startswith('+67 points (')
     twice = [{**row, 'task': 'order3', 'method': row['method'].replace(
         'shipped', 'shipped:rounds2')} for row in rows]
     page = make_page(twice, {})
