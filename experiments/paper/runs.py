@@ -76,6 +76,10 @@ VARIANTS = {
     '+skips+weighted': {**_OURS, 'colour': False, 'brightness': 0.0, 'changed_weight': 4.0},
     '+skips+narrow': {**_OURS, 'colour': False, 'brightness': 0.0, 'kl_warmup': 0.4,
                       'posterior_std': 0.1},
+    # The same with the VAE of appendix B: z is inferred from the frame that it is to show.
+    '+skips+frame': {**_OURS, 'colour': False, 'brightness': 0.0, 'kl_warmup': 0.4,
+                     'posterior_std': 0.1, 'free_nats': 0.0, 'kl_weight': 1e-5,
+                     'posterior': 'frame', 'num_targets': 3},
     # Of the tasks in FINE_TUNED, from fresh weights.
     '+skips+scratch': _OURS,
     '+skips+long': _OURS,
@@ -265,6 +269,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(['push2'], ['genmin-wo-gan'], variant='+skips+uncoloured+long')
     add(['push2'], ['genmin-wo-gan'], variant='+skips+weighted')
     add(['push2'], ['genmin-vae'], variant='+skips+narrow')
+    add(['push2'], ['genmin-vae'], variant='+skips+frame')
     add(['push2'], ['genmin-vae+relative'], variant=OURS, new_pixels=False)
     # Table 1 with the paper's network.
     add(SINGLE, ['fix', 'genmin', 'min', 'genmin-wo-gan', 'genmin-vae-gan'])

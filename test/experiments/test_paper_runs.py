@@ -104,6 +104,7 @@ def test_rows_of_a_task_and_mode_differ_in_the_method_and_network_only():
     colours = 'colour', 'brightness'
     others = {'+skips+uncoloured': colours, '+skips+uncoloured+long': colours,
               '+skips+narrow': colours, '+skips+weighted': (*colours, 'changed_weight'),
+              '+skips+frame': (*colours, 'posterior', 'num_targets'),
               '+skips+rounds': ('start_crop',)}
     for scale in SCALES:
         settings = {}
