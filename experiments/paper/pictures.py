@@ -232,7 +232,8 @@ def _recursive(methods):
 def _sampling(methods):
     """Choose a method with z, of our network and over time if there is one."""
     drawn = [method for method in methods if '-vae' in method]
-    return [_preferred(drawn, [f'genmin-vae{OURS}', *reversed(drawn)])] if drawn else []
+    wanted = [f'genmin-vae{OURS}+frame', f'genmin-vae{OURS}', *reversed(drawn)]
+    return [_preferred(drawn, wanted)] if drawn else []
 
 
 @torch.inference_mode()

@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 
 import cv2
-from experiments.paper.pictures import _contrast, draw, write_grids
+from experiments.paper.pictures import _contrast, _sampling, draw, write_grids
 from experiments.paper.results import write_results
 from experiments.paper.runs import paper_runs
 from made_runs import made_run, save_runs, scores
@@ -210,6 +210,13 @@ def test_masks_show_a_form_of_ours_that_finds_bottlenecks():
         assert chosen(task, 'bidirectional', True) == [FIX, GENMIN, OURS]
     assert chosen('push2', 'bidirectional', False) == [FIX, GENMIN, OURS]
     assert chosen('grasp', 'forward', True) == ['fix0.50-wo-gan+skips', 'genmin4-wo-gan+skips']
+
+
+def test_samples_are_of_the_form_whose_samples_differ_most():
+    usual, frame = 'genmin-vae+skips', 'genmin-vae+skips+frame'
+    assert _sampling([FIX, 'genmin-vae-gan', frame, usual]) == [frame]
+    assert _sampling([FIX, 'genmin-vae-gan', usual, 'genmin-vae+skips+priced']) == [usual]
+    assert _sampling([FIX]) == []
 
 
 def test_a_picture_that_shows_more_is_not_replaced(tmp_path):
