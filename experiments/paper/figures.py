@@ -3,6 +3,7 @@
 """The plots: forward scatter (Fig. 4), gains over fix, bottleneck curve, match-steps."""
 
 import io
+from textwrap import fill
 
 from experiments.paper.names import COPIES, method_order, short_name, variant_of
 from experiments.paper.published import (
@@ -290,10 +291,10 @@ def gains(rows):
         if task in GAINS and 'genmin' in methods:
             axis.plot(100 * GAINS[task], methods.index('genmin'), 'D', color=COLOURS['genmin'],
                       markerfacecolor='none', markersize=7, markeredgewidth=1.3)
-        axis.set_title(TITLES[task], fontsize=10, loc='left', color=_INK)
+        axis.set_title(fill(TITLES[task], 14), fontsize=10, loc='left', color=_INK)
         axis.set_yticks(range(len(methods)), methods)
         axis.set_ylim(len(methods) - 0.4, -0.6)
-        axis.set_xlabel('error below fix, %', fontsize=9, color=_INK)
+        axis.set_xlabel('error below\nfix, %', fontsize=9, color=_INK)
         axis.grid(color='#f0f0f0')
     for label, method in zip(axes[0, 0].get_yticklabels(), methods):
         label.set_color(COLOURS[family(method)])

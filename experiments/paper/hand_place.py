@@ -15,6 +15,7 @@ is beside it is wrong twice, where it is painted and where it is left out.
 
 from dataclasses import dataclass
 import json
+import shlex
 import sys
 
 import numpy as np
@@ -190,7 +191,8 @@ def main():
         rows = [{'recording': bag} | measure(open_recordings(bag), args.held_out, args.seed)
                 for bag in args.bags]
         write_atomically(args.out, json.dumps(
-            {'seed': args.seed, 'held_out': args.held_out, 'recordings': rows}, indent=1) + '\n')
+            {'command': shlex.join(['python', '-m', 'experiments.paper.hand_place', *sys.argv[1:]]),
+             'seed': args.seed, 'held_out': args.held_out, 'recordings': rows}, indent=1) + '\n')
     except TapError as error:
         sys.exit(f'error: {error}')
     for row in rows:
