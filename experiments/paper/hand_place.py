@@ -190,9 +190,10 @@ def main():
                      (__doc__ or '').strip())
         rows = [{'recording': bag} | measure(open_recordings(bag), args.held_out, args.seed)
                 for bag in args.bags]
+        command = shlex.join(['python', '-m', 'experiments.paper.hand_place', *sys.argv[1:]])
         write_atomically(args.out, json.dumps(
-            {'command': shlex.join(['python', '-m', 'experiments.paper.hand_place', *sys.argv[1:]]),
-             'seed': args.seed, 'held_out': args.held_out, 'recordings': rows}, indent=1) + '\n')
+            {'command': command, 'seed': args.seed, 'held_out': args.held_out,
+             'recordings': rows}, indent=1) + '\n')
     except TapError as error:
         sys.exit(f'error: {error}')
     for row in rows:

@@ -79,9 +79,10 @@ def write_grids(folder, runs, weights, recordings='bags'):
         title = f'{TITLES[task]}, {mode}' + ('' if new_pixels else ', no new pixels')
         for name, (choose, make) in GRIDS.items():
             path = Path(folder) / file_name(f'{task}-{mode}{variant}{name}', same[0]['scale'])
-            chosen = choose(list(dict.fromkeys(run['method'] for run in same)))
+            chosen = choose(same)
             if not paths.keys() >= set(chosen):
-                chosen = [] if path.exists() else choose(list(paths))
+                chosen = [] if path.exists() else choose(
+                    [run for run in same if run['method'] in paths])
             sheet = chosen and make(
                 task, mode, [Shown(method, load_network(paths[method])[0]) for method in chosen],
                 *episodes)
@@ -229,11 +230,18 @@ def _recursive(methods):
             if re.search(r'-r\d+$|\+pieces$', method)] or _contrast(methods)
 
 
-def _sampling(methods):
-    """Choose a method with z, of our network and over time if there is one."""
-    drawn = [method for method in methods if '-vae' in method]
-    wanted = [f'genmin-vae{OURS}+frame', f'genmin-vae{OURS}', *reversed(drawn)]
-    return [_preferred(drawn, wanted)] if drawn else []
+def _sampling(runs):
+    """Choose the method with z whose best of 100 samples has the lowest error."""
+    def error(run):
+        return np.mean(run['evaluation'].get('best_of_100', {}).get('min_l1', np.inf))
+
+    drawn = [run for run in runs if '-vae' in run['method']]
+    return [min(drawn, key=error)['method']] if drawn else []
+
+
+def _by_name(choose):
+    """Make what chooses among names of methods choose among runs."""
+    return lambda runs: choose(list(dict.fromkeys(run['method'] for run in runs)))
 
 
 @torch.inference_mode()
@@ -292,6 +300,6 @@ def _samples(task, mode, shown, store, episodes, goal_picture):
     return [above, headings], rows
 
 
-GRIDS = {  # end of the file name -> (which methods of those that there are, how they are shown)
-    '': (_main_methods, _methods), '-masks': (_contrast, _parts),
-    '-recursion': (_recursive, _recursion), '-samples': (_sampling, _samples)}
+GRIDS = {  # end of the file name -> (which methods of which runs, how they are shown)
+    '': (_by_name(_main_methods), _methods), '-masks': (_by_name(_contrast), _parts),
+    '-recursion': (_by_name(_recursive), _recursion), '-samples': (_sampling, _samples)}

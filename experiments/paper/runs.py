@@ -268,7 +268,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(['push2'], relative, variant='+skips+uncoloured')
     add(['push2'], ['genmin-wo-gan'], variant='+skips+uncoloured+long')
     add(['push2'], ['genmin-wo-gan'], variant='+skips+weighted')
-    add(['push2'], ['genmin-vae'], variant='+skips+narrow')
+    add(['push2', 'pick_place'], ['genmin-vae'], variant='+skips+narrow')
     add(['push2', 'pick_place'], ['genmin-vae'], variant='+skips+frame')
     add(['push2'], ['genmin-vae+relative'], variant=OURS, new_pixels=False)
     # Table 1 with the paper's network.

@@ -212,11 +212,15 @@ def test_masks_show_a_form_of_ours_that_finds_bottlenecks():
     assert chosen('grasp', 'forward', True) == ['fix0.50-wo-gan+skips', 'genmin4-wo-gan+skips']
 
 
-def test_samples_are_of_the_form_whose_samples_differ_most():
-    usual, frame = 'genmin-vae+skips', 'genmin-vae+skips+frame'
-    assert _sampling([FIX, 'genmin-vae-gan', frame, usual]) == [frame]
-    assert _sampling([FIX, 'genmin-vae-gan', usual, 'genmin-vae+skips+priced']) == [usual]
-    assert _sampling([FIX]) == []
+def test_samples_are_of_the_method_whose_best_is_lowest():
+    runs = [{'method': method, 'evaluation': evaluation} for method, evaluation in (
+        (FIX, {}), ('genmin-vae-gan', {}),
+        ('genmin-vae+skips', {'best_of_100': {'min_l1': [0.01, 0.03]}}),
+        ('genmin-vae+skips+frame', {'best_of_100': {'min_l1': [0.018, 0.018]}}))]
+    assert _sampling(runs) == ['genmin-vae+skips+frame']
+    assert _sampling(runs[:3]) == ['genmin-vae+skips']
+    assert _sampling(runs[:2]) == ['genmin-vae-gan']
+    assert _sampling(runs[:1]) == []
 
 
 def test_a_picture_that_shows_more_is_not_replaced(tmp_path):
