@@ -51,7 +51,7 @@ _PROGRESS = {'margin': 3}
 _PROGRESS_PUSHING = {'progress_margin': 0.5}
 # A hand on an object is told by its colour; other colours teach that it has none.
 _GRIPPING = {'colour': False, 'brightness': 0.0}
-# Without free nats samples hardly differ.
+# Without free nats samples of pick-and-place hardly differ.
 _VAE = {'kl_weight': 2e-5, 'free_nats': 4.0}
 # Else the loss of level 2 bends the picture of level 1, which serves it as an input.
 _RECURSION = {'detach_recursion': True}
