@@ -9,8 +9,8 @@ frames: its loss is the least distance over these frames, as genmin's is the lea
 predictor of pictures is told less. In pushing the bottleneck is where one object is home and the
 other one untouched, in gripping where the hand closes around an object at its start.
 
-A hand in a picture lowers its l1 error only where more than half of it covers the true one: what
-is beside it is wrong twice, where it is painted and where it is left out.
+By its area, a painted hand lowers the l1 error only where it covers more than half of the true
+one: what is beside it is wrong twice, where it is painted and where it is left out.
 """
 
 from dataclasses import dataclass
@@ -24,6 +24,7 @@ from sim_bridge.tasks import TASKS
 from tap_ros.errors import TapError
 from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.files import write_atomically
+from tap_ros.learning.split import split_episodes
 from tap_ros.options import Bags, File, parse
 from tap_ros.recording.cache import open_recordings
 import torch
@@ -32,6 +33,7 @@ from tyro import conf
 
 UNTOUCHED, HOME = 0.01, 0.02  # m
 FAR = 100.0  # m, where a hand is that is not there
+LEAST = 10  # episodes
 STEPS, BATCH, WIDTH, RATE, DECAY = 1000, 128, 128, 1e-3, 1e-2
 
 
@@ -41,7 +43,7 @@ class Options:
     Options of `python -m experiments.paper.hand_place`.
 
     :param bags: recordings, a row each; of one task each, with object positions.
-    :param held_out: share of the episodes, the last ones, that it is tested on.
+    :param held_out: share of the episodes that it is tested on.
     :param seed: of the network.
     :param out: the file of results.
     """
@@ -147,35 +149,46 @@ def measure(store, held_out, seed=0):
     Measure how near to the hand the predicted places are.
 
     :param store: EpisodeStore of one task.
-    :param held_out: share of the episodes that it is tested on.
+    :param held_out: share of the episodes that it is tested on, see split.split_episodes.
     :param seed: of the network.
     :return: dict of results.
-    :raises TapError: with fewer than ten episodes that show the bottleneck on either side.
+    :raises TapError: for another task or several, and with fewer than ten episodes that show the
+        bottleneck on either side.
     """
-    known, hands, first = [], [], round(len(store) * (1 - held_out))
-    tested = []
-    for i in range(len(store)):
-        found = bottleneck_hands(store[i])
-        if found is not None:
-            known.append(known_places(store[i], found[0]))
-            hands.append(torch.from_numpy(found[1]))
-            tested.append(i >= first)
-    tested = torch.tensor(tested)
-    if min(tested.sum(), (~tested).sum()) < 10:
-        raise TapError(f'{len(known)} episodes show the bottleneck: expected at least 10 to train '
-                       'on and 10 to test on')
-    known = torch.from_numpy(np.stack(known))
-    frames = torch.tensor([float(len(hand)) for hand in hands])
-    hands = nn.utils.rnn.pad_sequence(hands, batch_first=True, padding_value=FAR)
-    places = predict_places(known[~tested], hands[~tested], known[tested], seed)
-    distance = distance_to_nearest(hands[tested], places)
-    palm = (GRIPPER if TASKS[store[0].task].gripping else PUSHER).palm[:2]
-    cover = best_cover(hands[tested], places, palm)
-    return {'task': store[0].task, 'train_episodes': int((~tested).sum()),
-            'test_episodes': len(distance), 'frames_of_the_bottleneck': frames.median().item(),
+    tasks = {store[i].task for i in range(len(store))}
+    if len(tasks) > 1 or not tasks <= set(TASKS):
+        raise TapError(f'a recording has the tasks {sorted(tasks)}: expected one of {list(TASKS)}')
+    trained, tested = ([found for i in part if (found := _seen(store[i])) is not None]
+                       for part in split_episodes(store, held_out))
+    if min(len(trained), len(tested)) < LEAST:
+        raise TapError(f'{len(trained)} and {len(tested)} episodes show the bottleneck: expected '
+                       f'at least {LEAST} to train on and {LEAST} to test on')
+    (known, hands), (asked, there) = map(_stacked, (trained, tested))
+    places = predict_places(known, hands, asked, seed)
+    task, = tasks
+    palm = (GRIPPER if TASKS[task].gripping else PUSHER).palm[:2]
+    cover = best_cover(there, places, palm)
+    return {'task': task, 'train_episodes': len(trained), 'test_episodes': len(tested),
+            'frames_of_the_bottleneck': float(np.median([len(hand) for _, hand in tested])),
             'more_than_half_covered': _interval(lambda x: (x > 0.5).mean(-1), cover),
             'mean_cover': _interval(lambda x: x.mean(-1), cover),
-            'median_distance_m': _interval(lambda x: np.median(x, -1), distance)}
+            'median_distance_m': _interval(
+                lambda x: np.median(x, -1), distance_to_nearest(there, places))}
+
+
+def _seen(episode):
+    """Return what is known of an episode and where the hand is, or None; tensors."""
+    found = bottleneck_hands(episode)
+    if found is None:
+        return None
+    first, hands = found
+    return torch.from_numpy(known_places(episode, first)), torch.from_numpy(hands)
+
+
+def _stacked(episodes):
+    known, hands = zip(*episodes)
+    return torch.stack(known), nn.utils.rnn.pad_sequence(
+        hands, batch_first=True, padding_value=FAR)
 
 
 def _interval(statistic, values):

@@ -14,10 +14,12 @@ from experiments.paper.hand_place import (
     distance_to_nearest,
     FAR,
     known_places,
+    measure,
     predict_places,
 )
 import numpy as np
 import pytest
+from tap_ros.errors import TapError
 from tap_ros.recording.cache import open_recordings
 import torch
 
@@ -92,6 +94,18 @@ def test_a_hand_that_follows_from_the_objects_is_found_and_a_random_one_is_not()
         shares.append((distance_to_nearest(hands[700:], places) < 0.02).float().mean().item())
     assert shares[0] > 0.9
     assert shares[1] < 0.2
+
+
+def test_episodes_without_a_task_are_refused(sample):
+    class Unmarked:
+        def __len__(self):
+            return 3
+
+        def __getitem__(self, i):
+            return replace(sample[i], task='')
+
+    with pytest.raises(TapError, match="tasks \\[''\\]"):
+        measure(Unmarked(), 0.5)
 
 
 @pytest.mark.parametrize('words, expected', [

@@ -100,6 +100,22 @@ def test_the_readme_says_what_was_measured(number, file, form, rows):
     assert table[number].split('|')[3].strip() == form.format(*numbers)
 
 
+def test_the_findings_say_how_much_of_the_hand_is_covered():
+    results = json.loads((ROOT / 'docs' / 'results' / 'hand_place.json').read_text())
+    pushing, stacking = results['recordings']
+    assert (pushing['task'], stacking['task']) == ('push2', 'stack2')
+
+    def share(row, name):
+        return '{:.0f}% ({:.0f} to {:.0f})'.format(
+            *(100 * row[name][key] for key in ('value', 'ci_low', 'ci_high')))
+
+    findings = ' '.join((ROOT / 'docs' / 'results' / 'findings.md').read_text().split())
+    assert f'it covers {share(pushing, "mean_cover")} of the hand' in findings
+    half = share(pushing, 'more_than_half_covered').replace('% (', '% of the episodes (')
+    assert f'more than half in {half}' in findings
+    assert f'in stacking it covers {share(stacking, "mean_cover")}' in findings
+
+
 def test_the_papers_network_gains_what_the_readme_says():
     gains = (measured('prediction.json', **{**GENMIN, **GAIN, 'method': 'genmin'}, task=task)[0]
              for task in ('push2', 'pick_place', 'grasp'))
