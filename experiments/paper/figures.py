@@ -185,8 +185,7 @@ def bottleneck_curve(rows, task='push2', new_pixels=False):
             ends[method] = value[-1]
         axis.set(xlim=(0, 10), ylim=(0, 100), xticks=THRESHOLDS)
         axis.grid(axis='y', color='#f0f0f0')
-        axis.set_xlabel('sum over both objects of the expected distance, px', fontsize=9,
-                        color=_INK)
+        axis.set_xlabel('expected distance, sum of both objects, px', fontsize=9, color=_INK)
         axis.set_title(TITLES[task] + title, fontsize=10, loc='left', color=_INK)
     axes[0, 0].set_ylabel('predictions within so many pixels, %', fontsize=9, color=_INK)
     for method, share in BOTTLENECK_2PX.items() if task == 'push2' else ():
