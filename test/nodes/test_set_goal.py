@@ -122,7 +122,7 @@ def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
     picture = loop.goal_image.wait(1)
     loop.reset()
     drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
-    loop.reach(mode='direct', step_budget=1)  # until then the recorder has heard of the new episode
+    loop.reach(mode='direct', step_budget=1)  # by then the recorder knows of the new episode
     assert call(recorder, SetBool.Request(data=False), 30).success
     episode, following = [e for e in iter_episodes(folder) if e.task]
     assert (episode.seed, len(episode), episode.outcome) == (7, 3, 'failure')
