@@ -12,6 +12,7 @@ from geometry_msgs.msg import Twist, TwistStamped
 import numpy as np
 from numpy.typing import ArrayLike
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
@@ -54,6 +55,7 @@ PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
 MAX_TIMEOUT = 60.0  # s
+LAST_WORDS_S = 1.0  # s that the end of the last episode may take to arrive
 
 
 class SimNode(Node):
@@ -121,9 +123,10 @@ class SimNode(Node):
             f'ready: task {task}, seed {self.params["seed"]}, {mode}')
 
     def close(self) -> None:
-        """End the episode."""
+        """End the episode, and wait a moment for whoever records it."""
         self._end_episode()
         self._sim.close()
+        self._episode.wait_for_all_acked(Duration(seconds=LAST_WORDS_S))
 
     def _create_publishers(self) -> None:
         self._newest: dict[str, Any] = {}  # topic -> the message sent last

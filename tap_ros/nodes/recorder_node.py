@@ -127,6 +127,7 @@ class RecorderNode(Node):
 
     def _finish(self) -> str:
         """End the bag; return what became of it, for people."""
+        self._take_waiting()
         if self._writer is None:
             return self._failure or 'nothing was being recorded'
         writer, self._writer = self._writer, None
@@ -253,6 +254,19 @@ class RecorderNode(Node):
             received = info['received_timestamp'] or time.time_ns()
             self._write(topic, source.type_name, data, received,
                         info['source_timestamp'] or received, qos)
+
+    def _take_waiting(self) -> None:
+        """Record what has arrived and waits for its callback, such as the end of an episode."""
+        try:
+            for subscription in [source.subscription for source in self._sources.values()]:
+                for _ in range(DEPTH):
+                    with subscription.handle:
+                        taken = subscription.handle.take_message(subscription.msg_type, True)
+                    if taken is None:
+                        break
+                    subscription.callback(*taken)
+        except Exception as error:  # the bag is finished all the same
+            self._tell('the last messages were not recorded', error)
 
     def _on_timer(self) -> None:
         try:

@@ -12,14 +12,17 @@ from mcap.reader import make_reader
 import numpy as np
 from processes import NodeProcess
 import pytest
+import rclpy
 from rclpy.duration import Duration
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 from tap_ros import ur10e
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import encode_image
+from tap_ros.nodes.recorder_node import RecorderNode
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.attachments import read_attachments
 from tap_ros.recording.messages import decode
@@ -116,6 +119,23 @@ def test_messages_come_back_as_they_were_sent(client, record, tmp_path):
         == [index / 10 for index in range(10)]
     assert [m.data.tobytes() for topic, _, m in found if topic == '/goal/image'] \
         == [bytes(random_image(1).data)]
+
+
+def test_what_has_arrived_when_it_ends_is_recorded(client, tmp_path):
+    publisher = client.create_publisher(Float64, 'gripper/command', STREAM)
+    rclpy.init(args=['--ros-args', '-p', f'folder:={tmp_path / "bag"}'],
+               signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = RecorderNode()
+        wait_for_subscriber(publisher)
+        for value in range(8):
+            publisher.publish(Float64(data=float(value)))
+        arrived(publisher)
+        assert node.close() == 0  # no callback has run
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
+    assert [message.data for *_, message in read(tmp_path / 'bag')] == list(range(8))
 
 
 def test_a_bag_is_never_overwritten_and_each_one_has_the_goal(client, record, tmp_path):
