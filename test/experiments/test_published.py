@@ -50,6 +50,11 @@ def measured(file, **wanted):
     return [row[name] for name in ('value', 'ci_low', 'ci_high')]
 
 
+def text(*parts):
+    """Return a page of the documentation in one line."""
+    return ' '.join(ROOT.joinpath('docs', *parts).read_text().split())
+
+
 GENMIN, FIX = ({'mode': 'bidirectional', 'method': f'{name}-wo-gan+skips'}
                for name in ('genmin', 'fix'))
 RELATIVE = {**GENMIN, 'method': 'genmin-wo-gan+relative+skips'}
@@ -109,7 +114,7 @@ def test_the_findings_say_how_much_of_the_hand_is_covered():
         return '{:.0f}% ({:.0f} to {:.0f})'.format(
             *(100 * row[name][key] for key in ('value', 'ci_low', 'ci_high')))
 
-    findings = ' '.join((ROOT / 'docs' / 'results' / 'findings.md').read_text().split())
+    findings = text('results', 'findings.md')
     assert f'it covers {share(pushing, "mean_cover")} of the hand' in findings
     half = share(pushing, 'more_than_half_covered').replace('% (', '% of the episodes (')
     assert f'more than half in {half}' in findings
@@ -121,3 +126,54 @@ def test_the_papers_network_gains_what_the_readme_says():
              for task in ('push2', 'pick_place', 'grasp'))
     assert ("With GAN the paper's network gains {:.0%} in pushing, {:.0%} in pick-and-place, "
             '{:.0%} in grasping').format(*gains) in ' '.join(README.split())
+
+
+def test_the_page_on_training_says_what_the_subgoal_gains_in_order():
+    via, direct = (measured('planning.json', **ORDERED, method=method)
+                   for method in ('shipped', 'direct'))
+    gain = measured('planning.json', task='order2', method='shipped',
+                    metric='success_5cm_difference', compares='direct')
+    with_it, without, more = (
+        f'{100 * value:.0f}{{}} ({100 * low:.0f} to {100 * high:.0f})'
+        for value, low, high in (via, direct, gain))
+    assert (with_it.format('% of 100 scenes')
+            + ' via the subgoal that the shipped weights predict, and in '
+            + without.format('%') + ' with `direct`: '
+            + more.format(' points more')) in text('training.md')
+
+
+def test_the_page_on_training_says_what_the_margin_of_progress_changes():
+    edge, usual = (measured('prediction.json', **{
+        **GENMIN, **FOUND, 'task': 'push2', 'method': f'genmin-wo-gan+progress+skips{form}'})[0]
+        for form in ('+edge', ''))
+    assert (f'0.0 finds as many bottlenecks ({edge:.0%} instead of {usual:.0%})'
+            in text('training.md'))
+
+
+def written(file):
+    """Return every value and interval of a file of the results, rounded in all ways, as texts."""
+    intervals = []
+
+    def gather(fields):
+        if fields.get('ci_low') is not None:
+            intervals.append((fields['value'], fields['ci_low'], fields['ci_high']))
+        return fields
+
+    json.loads((ROOT / 'docs' / 'results' / file).read_text(), object_hook=gather)
+    return {
+        tuple(f'{round(factor * bound, digits) + 0.0:.{digits}f}' for bound in bounds)
+        for value, low, high in intervals
+        for sign, bounds in ((1, (value, low, high)), (-1, (value, high, low)))
+        for factor in (sign, 100 * sign) for digits in range(5)}
+
+
+@pytest.mark.parametrize('page, data', [
+    ('findings.md', ['prediction.json', 'hand_place.json']),
+    ('planning_findings.md', ['planning.json']), ('stacking_findings.md', ['stacking.json'])])
+def test_every_interval_in_the_findings_stands_in_the_data(page, data):
+    found = re.findall(
+        r'(-?\d+(?:\.\d+)?)[^()\d]{0,60}\((-?\d+(?:\.\d+)?) to (-?\d+(?:\.\d+)?)[,;)]',
+        text('results', page))
+    assert len(found) > 3
+    missing = set(found) - set().union(*map(written, data))
+    assert not missing
