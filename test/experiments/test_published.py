@@ -32,7 +32,7 @@ def paper_column(page, title):
 
 
 @pytest.mark.parametrize('title, value', [
-    ('bottlenecks at 2 px, pushing without new pixels: `genmin`; `fix`',
+    ('bottlenecks at 2 px, pushing without new pixels, usual recordings: `genmin`; `fix`',
      [100 * published.BOTTLENECK_2PX[method] for method in ('genmin', 'fix')]),
     ('error of `genmin` below `fix`: grasping; pick-and-place',
      [100 * published.GAINS[task] for task in ('grasp', 'pick_place')]),
