@@ -258,7 +258,8 @@ class RecorderNode(Node):
     def _take_waiting(self) -> None:
         """Record what has arrived and waits for its callback, such as the end of an episode."""
         try:
-            for subscription in [source.subscription for source in self._sources.values()]:
+            for source in self._sources.values():
+                subscription = source.subscription
                 for _ in range(DEPTH):
                     with subscription.handle:
                         taken = subscription.handle.take_message(subscription.msg_type, True)

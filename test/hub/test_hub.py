@@ -269,13 +269,13 @@ def test_a_pull_that_is_aborted_leaves_what_was_there(sent, hub, shell):
     Path(shell.folder, NAME).write_bytes(b'mine')
     process = shell.start('pull', REPO, '--out', '.', '--force')
     assert hub.stalled.wait(100)
-    while process.is_alive():  # Python drops an interrupt that comes while a finalizer runs
+    while process.is_alive():  # once in some hundred runs the first interrupt had no effect
         os.kill(process.pid, sent)
         process.join(10)
     code, output, error = shell.end(process)
     assert not output and files(shell.folder) == {NAME: b'mine'}
     if sent == signal.SIGINT:
-        assert (code, error.splitlines()[-1]) == (130, 'interrupted')
+        assert (code, error) == (130, 'interrupted\n')
         assert not any(shell.scratch.iterdir())
 
 
