@@ -39,7 +39,7 @@ class Options:
         for those that the command paper trained with our network and without GAN, or the name of
         another one; with options behind colons: half, recursion<n>, rounds<n>, samples<n>,
         carried, true_maps, true_model, twice, more_search, paper (its search whatever --preset
-        says), plain_cost, every<n>, for example genmin:half:carried.
+        says), plain_cost, every<n>, steps<n>, for example genmin:half:carried.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
     :param look: of the world, see sim_bridge.looks; pictures are filled behind the robot as the
@@ -47,7 +47,7 @@ class Options:
     :param scenes: how many.
     :param seed: of the first scene.
     :param switch: go on from a subgoal when it is reached, or at its share of the budget as in
-        the paper; for all methods, as the next three.
+        the paper; for all methods, as the next three and step_budget.
     :param recursion: subgoals in a row.
     :param samples: subgoals to choose from, for predictors that draw.
     :param tracking: where object pixels come from.

@@ -71,7 +71,7 @@ def make_jobs(args):
         planner = changed(planner, args.plan_samples, args.plan_iterations, args.replan_every)
     named = named_weights(args.predictor)
     defaults = {'switch': args.switch, 'recursion': args.recursion, 'samples': args.samples,
-                'tracking': args.tracking}
+                'tracking': args.tracking, 'step_budget': args.step_budget}
     methods = list(dict.fromkeys(parse_method(text, **defaults) for text in args.methods))
     jobs = []
     for task in args.tasks:
@@ -80,8 +80,7 @@ def make_jobs(args):
             if method.predicted:
                 file = find_weights(method, task, named, RUNS, TRAINED)
             jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
-                            args.step_budget, args.preset, _command(args, task, method),
-                            args.look))
+                            args.preset, _command(args, task, method), args.look))
     return jobs
 
 
@@ -146,8 +145,7 @@ def _command(args, task, method):
              '--scenes', str(args.scenes)]
     for option, usual in (('look', DEFAULT_LOOK), ('seed', FIRST_SCENE), ('preset', 'default'),
                           ('plan_samples', 0), ('plan_iterations', 0), ('replan_every', 0),
-                          ('step_budget', 0), ('forward_weights', str(FORWARD_MODEL)),
-                          ('device', 'cpu')):
+                          ('forward_weights', str(FORWARD_MODEL)), ('device', 'cpu')):
         value = getattr(args, option)
         if value != usual:
             words += ['--' + option.replace('_', '-'), shlex.quote(str(value))]

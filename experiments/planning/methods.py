@@ -22,7 +22,7 @@ OPTIONS = {  # option: (field, value; None: the number behind it)
     'carried': ('tracking', 'carried'), 'true_maps': ('maps', 'true'),
     'true_model': ('model', 'true'), 'more_search': ('search', 'more'),
     'twice': ('search', 'twice'), 'paper': ('search', 'paper'), 'plain_cost': ('cost', 'plain'),
-    'every': ('replan_every', None)}
+    'every': ('replan_every', None), 'steps': ('step_budget', None)}
 SUBGOALS_ONLY = ('switch', 'recursion', 'rounds', 'samples', 'maps')
 
 
@@ -47,6 +47,7 @@ class Method:
     :param cost: 'preset'; 'plain': the sum of distances alone, as in the paper, nothing that
         prefers to bring one object home before the next (VisualMPCConfig.unfinished).
     :param replan_every: see VisualMPCConfig; 0: as the preset has it.
+    :param step_budget: control periods at most; 0: the task's, see contract.step_budget.
     """
 
     base: str
@@ -60,6 +61,7 @@ class Method:
     search: str = 'preset'
     cost: str = 'preset'
     replan_every: int = 0
+    step_budget: int = 0
 
     @property
     def predicted(self):

@@ -9,6 +9,8 @@ from experiments.paper.published import ORDER_TITLES, PLANNING_BOUNDS, TABLE_2
 from experiments.planning.claims import claims_table
 from experiments.planning.methods import BOUNDS
 import pandas as pd
+from sim_bridge.tasks import get_task
+from tap_ros.contract import step_budget
 from tap_ros.planning.forward_scores import MOVED_PIXELS
 
 TITLES = {'push2': 'Two objects', 'push3': 'Three objects', **ORDER_TITLES}
@@ -16,7 +18,8 @@ PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward mod
          'search': 'the search', 'cost': 'its cost', 'tracking': 'object pixels',
          'switch': 'when to go on', 'recursion': 'number of subgoals',
          'rounds': 'how often to predict',
-         'samples': 'number of samples', 'replan_every': 'how often to plan'}
+         'samples': 'number of samples', 'replan_every': 'how often to plan',
+         'step_budget': 'number of steps'}
 FIRST = ('nothing', 'direct', 'fix', 'genmin', 'genmin+progress', 'genmin+relative', 'shipped')
 
 _interval = partial(interval, digits=1, form='{}{} [{}, {}]')
@@ -36,7 +39,7 @@ def make_page(rows, strips, maps=(), findings=''):
     rows = pd.DataFrame([{'compares': None, 'against': None, **row} for row in rows])
     maps = pd.DataFrame(maps)
     tasks = [{
-        'title': TITLES.get(task, task), 'budget': own['step_budget'].iloc[0],
+        'title': TITLES.get(task, task), 'budget': step_budget(get_task(task).num_objects),
         'table': _methods(task, own), 'replaced': _replaced(own),
         'strips': [(method, *strip) for (of, method), strip in strips.items() if of == task],
     } for task, own in rows.groupby('task', sort=False)]

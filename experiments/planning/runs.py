@@ -39,14 +39,13 @@ class Job:
     forward_weights: str
     predictor: str = ''  # weights file; '' when nothing is predicted
     device: str = 'cpu'
-    budget: int = 0  # control periods; 0: the task's
     preset: str = ''  # name of the planner's settings
     command: str = ''  # that makes the numbers again
     look: str = DEFAULT_LOOK  # of the world
 
     def steps(self):
         """Return the step budget."""
-        return self.budget or step_budget(get_task(self.task).num_objects)
+        return self.method.step_budget or step_budget(get_task(self.task).num_objects)
 
     @property
     def about(self):

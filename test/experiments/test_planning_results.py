@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the planning results: resumed, paired, refused when damaged; the whole command."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 import json
 from pathlib import Path
 
@@ -31,19 +31,19 @@ PUBLISHED = Path(__file__).parents[2] / 'docs' / 'results' / 'planning'
 SMALL = VisualMPCConfig(search=CEMConfig(8, 1, 4), proposals=4, batch_size=8, threads=1)
 
 
-def job(name, budget=1):
-    return Job('push2', parse_method(name), SMALL, str(FORWARD_MODEL), budget=budget)
+def job(name, planner=SMALL):
+    return Job('push2', parse_method(name), planner, str(FORWARD_MODEL))
 
 
 def stored(name, finals, first=0):
     scenes = {first + i: {'seed': first + i, 'final_cm': cm, 'objects_cm': [cm, cm],
                           'steps': 40, 'plan_ms': None if name == 'nothing' else 5.0}
               for i, cm in enumerate(finals)}
-    return ('push2', name), (job(name, 40).settings(), scenes)
+    return ('push2', name), (job(name).settings(), scenes)
 
 
 def test_an_evaluation_goes_on_where_it_stopped(tmp_path):
-    jobs = [job('nothing'), job('direct')]
+    jobs = [job('nothing'), job('direct:steps1')]
     first = run_jobs(jobs, [7], tmp_path, progress=False)
     text = first[0].path.read_text()
     first[0].path.write_text(text.replace('"final_cm": 20.0', '"final_cm": 99.0'))
@@ -55,10 +55,9 @@ def test_an_evaluation_goes_on_where_it_stopped(tmp_path):
 
 def test_other_settings_are_refused_and_speed_is_none(tmp_path):
     ResultFile(tmp_path, job('direct')).add(stored('direct', [9.0])[1][1][0])
-    with pytest.raises(ConfigError, match='step_budget'):
-        ResultFile(tmp_path, job('direct', budget=2))
-    faster = Job('push2', parse_method('direct'), VisualMPCConfig(
-        search=SMALL.search, proposals=4, batch_size=3, threads=2), str(FORWARD_MODEL), budget=1)
+    with pytest.raises(ConfigError, match='planner'):
+        ResultFile(tmp_path, job('direct', replace(SMALL, proposals=5)))
+    faster = job('direct', replace(SMALL, batch_size=3, threads=2))
     assert ResultFile(tmp_path, faster).scenes
 
 
@@ -137,6 +136,8 @@ def test_methods_are_compared_in_the_same_planner():
     assert compared('genmin')['direct, twice'] == 'direct:twice'
     assert compared('direct:twice') == {'search': 'direct'}
     assert 'direct, twice' not in {**compared('genmin:half:paper'), **compared('direct')}
+    names |= {'direct:steps60', 'genmin:steps60'}
+    assert compared('genmin:steps60') == {'direct': 'direct:steps60', 'step_budget': 'genmin'}
 
 
 def test_results_of_other_settings_are_not_subtracted():
@@ -145,6 +146,10 @@ def test_results_of_other_settings_are_not_subtracted():
     assert not any('against' in row for row in make_rows(results))
     results['push2', 'direct'][0].update(preset='', planner={**asdict(SMALL), 'clearance': 0.2})
     assert not any('against' in row for row in make_rows(results))
+    results = dict([stored('direct', [9.0]), stored('genmin:steps60', [4.0])])
+    assert not any('against' in row for row in make_rows(results))
+    results = dict([stored('direct', [9.0]), stored('direct:steps60', [4.0])])
+    assert {r['compares'] for r in make_rows(results) if 'against' in r} == {'step_budget'}
     results = dict([stored('genmin', [9.0]), stored('genmin:true_maps', [4.0])])
     assert any('against' in row for row in make_rows(results))
     results['push2', 'genmin'][0]['predictor_weights'] = 'others'
@@ -227,15 +232,17 @@ def test_the_command_leaves_numbers_page_strips_and_recordings(tmp_path, capsys)
              '--plan-iterations', '1']
     assert main(words) == 0
     rows = json.loads((out / 'planning.json').read_text())
-    assert {row['method'] for row in rows} == {'nothing', 'direct', 'shipped:carried'}
-    carried = [row for row in rows if row['method'] == 'shipped:carried']
+    assert {row['method'] for row in rows} == {
+        'nothing', 'direct:steps2', 'shipped:carried:steps2'}
+    carried = [row for row in rows if row['method'] == 'shipped:carried:steps2']
+    assert {row['step_budget'] for row in carried} == {2}
     assert {row['tracking'] for row in carried} == {'carried'}
     assert 'tracking_error_px' in {row['metric'] for row in carried}
-    assert '--methods shipped:carried --scenes 2' in carried[0]['command']
+    assert '--methods shipped:carried:steps2 --scenes 2' in carried[0]['command']
     page = (out / 'planning.md').read_text()
-    assert 'planning/push2-direct.png' in page
-    assert (out / 'planning' / 'push2-direct.png').read_bytes().startswith(b'\x89PNG')
-    recorded = recordings / 'push2-shipped--carried.mcap'
+    assert 'planning/push2-direct--steps2.png' in page
+    assert (out / 'planning' / 'push2-direct--steps2.png').read_bytes().startswith(b'\x89PNG')
+    recorded = recordings / 'push2-shipped--carried--steps2.mcap'
     assert len(list(iter_episodes(recorded))) == 3
     before = recorded.stat().st_mtime_ns
     assert main(words) == 0 and recorded.stat().st_mtime_ns == before  # nothing is run again
