@@ -37,17 +37,18 @@ class Options:
     :param methods: nothing, direct, one_object, oracle_order, true_subgoal, true_model, shipped
         for the shipped predictor; fix, genmin (over time), genmin+progress and genmin+relative
         for those that the command paper trained with our network and without GAN, or the name of
-        another one; with options behind colons: half, recursion<n>, rounds<n>, samples<n>,
-        carried, true_maps, true_model, twice, more_search, paper (its search whatever --preset
-        says), plain_cost, every<n>, steps<n>, for example genmin:half:carried.
+        another one; with options behind colons: half, stalled, recursion<n>, rounds<n>,
+        samples<n>, carried, true_maps, true_model, twice, more_search, paper (its search whatever
+        --preset says), plain_cost, every<n>, steps<n>, for example genmin:half:carried.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
     :param look: of the world, see sim_bridge.looks; pictures are filled behind the robot as the
         weights' training was, by the looks' robot masks.
     :param scenes: how many.
     :param seed: of the first scene.
-    :param switch: go on from a subgoal when it is reached, or at its share of the budget as in
-        the paper; for all methods, as the next three and step_budget.
+    :param switch: go on from a subgoal when it is reached; when nothing moves any more, too; or
+        at its share of the budget as in the paper; for all methods, as the next three and
+        step_budget.
     :param recursion: subgoals in a row.
     :param samples: subgoals to choose from, for predictors that draw.
     :param tracking: where object pixels come from.

@@ -17,7 +17,8 @@ from tap_ros.planning.mpc_config import LARGE, PAPER
 BASES = ('nothing', 'direct', 'one_object', 'oracle_order', 'true_subgoal')
 BOUNDS = ('one_object', 'oracle_order', 'true_subgoal', 'true_model')
 OPTIONS = {  # option: (field, value; None: the number behind it)
-    'half': ('switch', 'half'), 'reached': ('switch', 'reached'),
+    'half': ('switch', 'half'), 'stalled': ('switch', 'stalled'),
+    'reached': ('switch', 'reached'),
     'recursion': ('recursion', None), 'rounds': ('rounds', None), 'samples': ('samples', None),
     'carried': ('tracking', 'carried'), 'true_maps': ('maps', 'true'),
     'true_model': ('model', 'true'), 'more_search': ('search', 'more'),
@@ -32,7 +33,7 @@ class Method:
     A way to plan.
 
     :param base: one of BASES, or the name of a predictor.
-    :param switch: 'reached' or 'half', see planning.hierarchy.Itinerary.
+    :param switch: 'reached', 'stalled' or 'half', see planning.hierarchy.Itinerary.
     :param recursion: subgoals in a row.
     :param rounds: how often subgoals are predicted, see planning.reach.ReachConfig.
     :param samples: subgoals to choose from by the planner's own cost.

@@ -12,6 +12,7 @@ import pandas as pd
 from sim_bridge.tasks import get_task
 from tap_ros.contract import step_budget
 from tap_ros.planning.forward_scores import MOVED_PIXELS
+from tap_ros.planning.mpc_config import STALL
 
 TITLES = {'push2': 'Two objects', 'push3': 'Three objects', **ORDER_TITLES}
 PARTS = {'subgoal': 'the subgoal', 'maps': 'its maps', 'model': 'the forward model',
@@ -45,7 +46,7 @@ def make_page(rows, strips, maps=(), findings=''):
     } for task, own in rows.groupby('task', sort=False)]
     return render('planning/templates/planning.md.j2', tasks=tasks, findings=findings,
                   claims=claims, commands=rows['command'].unique(), map_table=_maps(maps),
-                  moved=MOVED_PIXELS,
+                  moved=MOVED_PIXELS, stall=STALL,
                   map_commands=[] if maps.empty else maps['command'].unique())
 
 

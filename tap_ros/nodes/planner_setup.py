@@ -20,7 +20,7 @@ from tap_ros.nodes.managed import declare_autostart
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.forward_model import ForwardModel
-from tap_ros.planning.mpc_config import PRESETS, SWITCHES, with_preset
+from tap_ros.planning.mpc_config import PRESETS, STALL, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.text import escaped
@@ -71,8 +71,10 @@ def declare_parameters(node: 'Node') -> Parameters:
              'the mean expected distance to its maps is so much above the least possible.')):
         parameters.declare(name, default, description, low=low, high=high, read_only=False)
     parameters.declare('switch', 'reached', 'When to go on from a subgoal: when it is reached, '
-                       'or its share of the budget spent; or at its share (half), as the paper '
-                       'does.', choices=SWITCHES, read_only=False)
+                       'or its share of the budget spent; also when an object has moved and then '
+                       f'none for {STALL} commands (stalled); or at its share (half), as the '
+                       'paper does.',
+                       choices=SWITCHES, read_only=False)
     parameters.declare('subgoal_rounds', 1, 'How often a goal in subgoal mode asks for subgoals: '
                        'again, from what is seen then, when those of a round are passed.',
                        low=1, high=16, read_only=False)

@@ -4,7 +4,8 @@
 Hierarchical planning: one target after another, the goal last (App. F of the paper).
 
 The paper has one subgoal and switches at half the budget ('half'). Switching as soon as the
-subgoal is reached ('reached') wastes no steps; several subgoals share the budget equally.
+subgoal is reached ('reached') wastes no steps, and giving up one to which nothing moves any more
+('stalled') wastes fewer still; several subgoals share the budget equally.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,9 +20,11 @@ from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.expected_distance import distances_to_all_pixels
-from tap_ros.planning.mpc_config import SWITCHES
+from tap_ros.planning.mpc_config import STALL, SWITCHES
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
+
+MOVED = 1.0  # px; an object that is nearer to where it was has not moved
 
 if TYPE_CHECKING:
     from tap_ros.prediction.predictor import Subgoal
@@ -74,6 +77,9 @@ class Target:
         return {'pixels': np.where(self.free[:, None], pixels, self.pixels)}
 
 
+ItineraryMemory = tuple[tuple[int, ...], tuple[int, np.ndarray] | None]
+
+
 class Itinerary:
     """
     Say at every step what to plan to.
@@ -83,7 +89,8 @@ class Itinerary:
     :param targets: list of Target, the last one is the goal.
     :param step_budget: B.
     :param switch: 'half': a target gets its whole share of the budget; 'reached': goes on to the
-        next one as soon as it is reached.
+        next one as soon as it is reached; 'stalled': then, or when an object has moved and
+        none does any more for STALL control periods.
     :param reached: px of Target.distance; nearer than this is there. 0: never.
     :ivar switches: steps at which the second, third ... target began.
     """
@@ -95,6 +102,17 @@ class Itinerary:
         self._targets, self._budget = list(targets), step_budget
         self._switch, self._reached = switch, reached
         self.switches: list[int] = []
+        self._moved: tuple[int, np.ndarray] | None = None  # when an object did last, all places
+
+    @property
+    def memory(self) -> ItineraryMemory:
+        """Return what `target` changes; may be set back."""
+        return tuple(self.switches), self._moved
+
+    @memory.setter
+    def memory(self, memory: ItineraryMemory) -> None:
+        switches, self._moved = memory
+        self.switches = list(switches)
 
     def target(self, step: int, pixels: np.ndarray) -> Target:
         """
@@ -103,15 +121,25 @@ class Itinerary:
         :param step: control periods that have passed.
         :param pixels: (K, 2), where the objects are.
         """
+        if self._moved is None or _farthest(pixels, self._moved[1]) > MOVED:
+            self._moved = step, np.array(pixels)
         while len(self.switches) < len(self._targets) - 1:
             stage = len(self.switches)
             late = step >= (stage + 1) * self._budget // len(self._targets)
-            there = (self._switch == 'reached'
+            there = (self._switch != 'half'
                      and self._targets[stage].distance(pixels) <= self._reached)
-            if not late and not there:
+            began = self.switches[-1] if self.switches else 0
+            stalled = (self._switch == 'stalled' and self._moved[0] > began
+                       and step - self._moved[0] >= STALL)
+            if not late and not there and not stalled:
                 break
             self.switches.append(step)
         return self._targets[len(self.switches)]
+
+
+def _farthest(pixels: np.ndarray, before: np.ndarray) -> float:
+    """Return by how many pixels the object moved that moved most."""
+    return float(np.linalg.norm(np.subtract(pixels, before), axis=-1).max())
 
 
 def targets_by(subgoals: Iterable['Subgoal'], goal_pixels: np.ndarray) -> list[Target]:

@@ -10,7 +10,8 @@ from tap_ros.errors import ConfigError
 from tap_ros.planning.action_sequences import HORIZON, Limits, SequenceShape
 from tap_ros.planning.cem import CEMConfig
 
-SWITCHES = ('reached', 'half')  # when to go on from a subgoal, see hierarchy.py
+SWITCHES = ('reached', 'stalled', 'half')  # when to go on from a subgoal, see hierarchy.py
+STALL = 10  # control periods; most ways between two pushes take fewer
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.goals import Goal
-from tap_ros.planning.hierarchy import Itinerary, Target
+from tap_ros.planning.hierarchy import Itinerary, ItineraryMemory, Target
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.tracking import ObjectTracker
 from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
@@ -117,8 +117,8 @@ class _Round:
     itinerary: Itinerary
 
 
-# What a plan changes: the planner's Memory, the round, Itinerary.switches, ObjectTracker.memory.
-_Kept = tuple[Memory, _Round, list[int], tuple[np.ndarray, np.ndarray] | None]
+# What a plan changes: the planner's Memory, the round, memories of Itinerary and ObjectTracker.
+_Kept = tuple[Memory, _Round, ItineraryMemory, tuple[np.ndarray, np.ndarray] | None]
 
 
 class Reach:
@@ -339,13 +339,13 @@ class Reach:
     def _memory(self, planned: Memory) -> _Kept:
         """Return all that a plan changes: the planner's Memory, and what is set back."""
         assert self._round is not None
-        return (planned, self._round, list(self._round.itinerary.switches),
+        return (planned, self._round, self._round.itinerary.memory,
                 None if self._tracker is None else self._tracker.memory)
 
     def _recall(self, memory: _Kept) -> tuple[Memory, _Round]:
         """Set back what a plan has changed; return the planner's Memory and the round."""
-        planned, self._round, switches, tracked = memory
-        self._round.itinerary.switches = list(switches)
+        planned, self._round, passed, tracked = memory
+        self._round.itinerary.memory = passed
         if self._tracker is not None and tracked is not None:
             self._tracker.memory = tracked
         return planned, self._round

@@ -11,10 +11,11 @@ from tap_ros.planning.hierarchy import (
     choose_sample,
     choose_subgoals,
     Itinerary,
+    MOVED,
     Target,
     targets_by,
 )
-from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_config import STALL, VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.prediction.predictor import Subgoal
@@ -51,6 +52,27 @@ def test_reached_goes_on_at_once_but_not_later_than_half():
     far = np.full((12, 2, 2), 60.0)
     assert stages(Itinerary(targets(2), 12), far) == [0] * 6 + [1] * 6
     assert stages(Itinerary(targets(2), 12, reached=0.0), on_the_spot + 1e-3)[5] == 0
+
+
+def test_stalled_gives_up_a_target_to_which_nothing_moves_any_more():
+    steps, long = 2 * STALL, np.full((4 * STALL, 2, 2), 60.0)
+
+    def switches(path, count=2, switch='stalled'):
+        itinerary = Itinerary(targets(count), 4 * STALL, switch)
+        stages(itinerary, path)
+        return itinerary.switches
+
+    assert switches(long) == [steps]  # the first way may be long
+    trembling = long + 0.3 * MOVED * (-1) ** np.arange(len(long))[:, None, None]
+    assert switches(trembling) == [steps]
+    pushed = long.copy()
+    pushed[:, 1, 0] += np.minimum(np.arange(len(long)), 5) * 1.5 * MOVED  # one object, 5 steps
+    assert switches(pushed) == [5 + STALL] and switches(pushed, switch='reached') == [steps]
+    assert switches(pushed, count=4) == [STALL, 2 * STALL, 3 * STALL]  # no motion to the second
+    slow = long.copy()
+    slow[:, 0, 1] += np.arange(len(long)) * 0.3 * MOVED
+    assert switches(slow) == [steps]
+    assert switches(np.repeat(PLACES[None], 9, 0)) == [0]  # there
 
 
 def test_several_targets_that_are_reached_are_passed_at_once():

@@ -9,7 +9,7 @@ import pytest
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import Target
-from tap_ros.planning.mpc_config import VisualMPCConfig
+from tap_ros.planning.mpc_config import STALL, VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import (
     Aim,
@@ -249,6 +249,22 @@ def test_a_command_says_which_target_it_is_for(mpc):
         reach.sent()
     assert stages[0] == 0 and stages[-1] == 1 and stages == sorted(stages)
     assert reach.switches == [stages.index(1)]
+
+
+def test_what_a_refused_command_answered_is_no_motion(mpc):
+    reach = Reach(mpc, ReachConfig(60, switch='stalled'), 3)
+    reach.step(look(0))
+    reach.head_for([Target(START + 9), GOAL])
+    for t in range(STALL):
+        assert reach.step(look(t, START + 2 * min(t, 1))).stage == 0
+        reach.sent()
+    moved = look(STALL, START + 5)
+    assert reach.step(moved).stage == 0
+    reach.sent()
+    assert reach.refused(moved.stamp_ns, 'the arm stood still')
+    assert reach.step(look(STALL + 1, START + 2)).stage == 0
+    reach.sent()
+    assert reach.step(look(STALL + 2, START + 2)).stage == 1 and reach.switches == [STALL + 1]
 
 
 def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
