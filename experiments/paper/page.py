@@ -41,7 +41,8 @@ from tap_ros.prediction.training_config import DEFAULTS
 # May differ between the methods of a scale, see runs.py.
 SETTINGS = ('decoder', 'skips', 'margin', 'progress_margin', 'match_temperature', 'colour',
             'brightness', 'goal_picture', 'start_crop', 'min_crop', 'initial_weights',
-            'gan_weight', 'kl_weight', 'free_nats', 'kl_warmup', 'posterior_std', 'recursion',
+            'gan_weight', 'kl_weight', 'free_nats', 'kl_warmup', 'posterior_std', 'posterior',
+            'num_targets', 'changed_weight', 'recursion',
             'detach_recursion', 'pretrain_steps')
 GRIDS = {  # what follows <task>-<mode>[-warp] in the name of a picture
     '': 'inputs, each method, and the true frame that matches best',
