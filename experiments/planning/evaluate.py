@@ -8,7 +8,7 @@ from pathlib import Path
 import shlex
 
 from experiments.planning.command import RUNS, TRAINED
-from experiments.planning.films import write_films
+from experiments.planning.films import read_caption, write_films
 from experiments.planning.methods import parse_method, with_samples
 from experiments.planning.page import make_page
 from experiments.planning.results import load_results, make_rows
@@ -26,19 +26,18 @@ def evaluate(args):
     """Run what is missing; write the numbers, the page and the films."""
     if args.scenes < 1:
         raise ConfigError('scenes must be at least 1')
-    out, films = Path(args.out), {}
+    out = Path(args.out)
     if not args.results_only:
         jobs = make_jobs(args)
         seeds = range(args.seed, args.seed + args.scenes)
         files = run_jobs(jobs, seeds, out / 'planning', args.engine)
-        _write_results(out, films)  # first: whatever happens to the films, these stay
+        _write_results(out)  # first: whatever happens to the films, these stay
         for job, file in zip(jobs, files):
             name = f'{job.task}-{job.method.file_name}'
             if not args.no_films and job.method.base != 'nothing':
-                caption = write_films(job, file.scenes, out / 'planning' / f'{name}.png',
-                                      Path(args.recordings) / f'{name}.mcap')
-                films[job.task, job.method.name] = f'planning/{name}.png', caption
-    rows = _write_results(out, films)
+                write_films(job, file.scenes, out / 'planning' / f'{name}.png',
+                            Path(args.recordings) / f'{name}.mcap')
+    rows = _write_results(out)
     for row in rows:
         if row['metric'] == 'final_distance_cm':
             print(f'  {row["task"]} {row["method"]:24} {row["value"]:5.1f} cm '
@@ -46,7 +45,7 @@ def evaluate(args):
     print(f'written: {out / "planning.json"}, {out / "planning.md"}')
 
 
-def _write_results(out, films):
+def _write_results(out):
     """Write planning.json and planning.md from the scenes that were run; return the rows."""
     rows = make_rows(load_results(out / 'planning'))
     if not rows:
@@ -54,7 +53,7 @@ def _write_results(out, films):
     write_rows(out / 'planning.json', rows)
     maps, findings = out / forward.FILE, out / 'planning_findings.md'
     write_atomically(out / 'planning.md', make_page(
-        rows, find_films(out, rows) | films,
+        rows, find_films(out, rows),
         json.loads(maps.read_text()) if maps.exists() else (),
         findings.read_text() if findings.exists() else ''))
     return rows
@@ -135,8 +134,8 @@ def find_films(out, rows):
     """Return the film strips that are there: {(task, method): (file name in out, caption)}."""
     keys = dict.fromkeys((row['task'], row['method']) for row in rows)
     names = {key: f'planning/{key[0]}-{parse_method(key[1]).file_name}.png' for key in keys}
-    return {key: (name, 'the best, the median and the worst scene')
-            for key, name in names.items() if (out / name).exists()}
+    return {key: (name, read_caption(out / name)) for key, name in names.items()
+            if (out / name).exists()}
 
 
 def _command(args, task, method):

@@ -2,15 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Film strips and recordings of the best, the median and the worst scene, run again."""
 
+import io
 from pathlib import Path
 
 from experiments.planning.episode import as_recording
 from experiments.planning.runs import plan_scene
 import numpy as np
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import write_atomically
-from tap_ros.pictures import film_strip, grid, png_bytes
+from tap_ros.pictures import film_strip, grid
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import EpisodeWriter
 
@@ -28,20 +31,17 @@ def write_films(job, scenes, picture, recording):
     """
     Run three scenes again, unless the recording has just these.
 
+    The caption stands in the picture, too, as its Description.
+
     :param job: runs.Job.
     :param scenes: its results by seed.
     :param picture: .png file: a row for each scene.
     :param recording: .mcap file: an episode for each scene.
-    :return: caption of the picture.
     :raises ConfigError: if a scene does not end as it did.
     """
     seeds = pick_scenes(scenes)
-    words = [f'{scenes[s]["final_cm"]:.1f} cm (scene {s})' for s in seeds]
-    subgoal = ', before it the subgoal' if job.method.predicted else ''
-    caption = (f'the best, the median and the worst scene, {words[0]}, {words[1]} and '
-               f'{words[2]}; last column: the goal{subgoal}')
     if Path(picture).exists() and _recorded(recording) == seeds:
-        return caption
+        return
     rows = []
     Path(picture).parent.mkdir(parents=True, exist_ok=True)
     Path(recording).parent.mkdir(parents=True, exist_ok=True)
@@ -58,8 +58,30 @@ def write_films(job, scenes, picture, recording):
             writer.write(as_recording(run, job.task, seed, outcome))
             rows.append([*film_strip(run.frames, PICTURES),
                          *(subgoal.image for subgoal in run.subgoals), run.goal.image])
-    write_atomically(picture, png_bytes(np.ascontiguousarray(grid(rows, scale=2))))
-    return caption
+    write_atomically(picture, _captioned(
+        grid(rows, scale=2), make_caption(scenes, job.method.predicted)))
+
+
+def make_caption(scenes, has_subgoals):
+    """Say what a film strip of these scenes shows."""
+    words = [f'{scenes[seed]["final_cm"]:.1f} cm (scene {seed})' for seed in pick_scenes(scenes)]
+    subgoals = 'each predicted subgoal, and ' if has_subgoals else ''
+    return (f'the best, the median and the worst scene: {words[0]}, {words[1]} and {words[2]}. '
+            f'Each row: {PICTURES} pictures from the first to the last, then {subgoals}the goal')
+
+
+def read_caption(picture):
+    """Return the caption of a film strip, from the file; strips once had none."""
+    with Image.open(picture) as image:
+        return image.text.get('Description', 'the best, the median and the worst scene')
+
+
+def _captioned(image, caption):
+    """Return the bytes of a PNG file with a caption."""
+    about, file = PngInfo(), io.BytesIO()
+    about.add_text('Description', caption)
+    Image.fromarray(image).save(file, 'PNG', pnginfo=about)
+    return file.getvalue()
 
 
 def _recorded(path):

@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import json
 from pathlib import Path
 
-from experiments.planning.films import pick_scenes
+from experiments.planning.films import make_caption, pick_scenes
 from experiments.planning.methods import parse_method
 from experiments.planning.page import make_page
 from experiments.planning.results import make_rows, partners
@@ -221,6 +221,11 @@ def test_films_show_the_best_the_median_and_the_worst_scene():
     scenes = {seed: {'final_cm': cm} for seed, cm in enumerate([3.0, 9.0, 1.0, 5.0, 7.0])}
     assert pick_scenes(scenes) == [2, 3, 1]
     assert pick_scenes({4: {'final_cm': 3.0}}) == [4, 4, 4]
+    assert make_caption(scenes, True) == (
+        'the best, the median and the worst scene: 1.0 cm (scene 2), 5.0 cm (scene 3) and 9.0 cm '
+        '(scene 1). Each row: 10 pictures from the first to the last, then each predicted '
+        'subgoal, and the goal')
+    assert 'subgoal' not in make_caption(scenes, False)
 
 
 @pytest.mark.slow
