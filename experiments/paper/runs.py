@@ -243,7 +243,7 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(['order2', 'order3'], relative + l1_rows[:3], variant=OURS, new_pixels=False)
     add(['order2'], relative + l1_rows[:2], variant='+skips+scratch', new_pixels=False)
     add(['order3'], relative, variant='+skips+pieces', new_pixels=False)
-    add(['order3'], relative + ['fix-wo-gan'], variant='+skips+rounds', new_pixels=False)
+    add(['order2', 'order3'], relative + ['fix-wo-gan'], variant='+skips+rounds', new_pixels=False)
     for variant in (OURS, '+skips+rounds'):
         add(['order2_late'], relative + ['fix-wo-gan'], variant=variant, new_pixels=False)
     # Table 1 with our network.

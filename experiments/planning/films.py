@@ -7,7 +7,6 @@ from pathlib import Path
 
 from experiments.planning.episode import as_recording
 from experiments.planning.runs import plan_scene
-import numpy as np
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from tap_ros.contract import SUCCESS_DISTANCE
