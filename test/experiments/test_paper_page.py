@@ -118,7 +118,7 @@ def test_recursion_is_a_claim_about_the_place(tmp_path):
         shown = {'hand': [1.0] * 40, 'objects': [1.0] * 40}
         return claim(page_of(tmp_path / folder, made_run(
             OURS, scores(0.01), task='pick_place',
-            recursion=[{'way': first, **shown}, {'way': [0.0] * 40, **shown}])), 'recursion: ')
+            recursion=[{'way': first, **shown}, {'way': [0.0] * 40, **shown}])), 'recursion of ')
     assert page('a', [0.9] * 40)[3:5] == ['100% (100% to 100%)', 'yes']
     assert page('b', [0.5] * 40)[3:5] == ['r = 1 is never the place', 'no']
 
