@@ -177,7 +177,7 @@ def test_claims_follow_the_numbers():
     late = make_rows(dict([stored('fix+late', [9.0, 4.0, 9.0]),
                            stored('genmin+relative+late', [2.0, 2.0, 3.0])]))
     page = make_page([{**row, 'task': 'order2'} for row in late], {})
-    assert cells('success via the subgoal minus via the subgoal of `fix`, both trained')[
+    assert cells('success via the subgoal minus via the subgoal of `fix`, both trained on late')[
         3].startswith('+67 points (')
     twice = [{**row, 'task': 'order3', 'method': row['method'].replace(
         'shipped', 'shipped:rounds2')} for row in rows]
