@@ -65,7 +65,7 @@ def make_caption(scenes, has_subgoals):
     """Say what a film strip of these scenes shows."""
     words = [f'{scenes[seed]["final_cm"]:.1f} cm (scene {seed})' for seed in pick_scenes(scenes)]
     subgoals = 'each predicted subgoal, and ' if has_subgoals else ''
-    return (f'the best, the median and the worst scene: {words[0]}, {words[1]} and {words[2]}. '
+    return (f'the best, the median and the worst of {len(scenes)} scenes: {words[0]}, {words[1]} and {words[2]}. '
             f'Each row: {PICTURES} pictures from the first to the last, then {subgoals}the goal')
 
 

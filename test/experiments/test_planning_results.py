@@ -222,8 +222,8 @@ def test_films_show_the_best_the_median_and_the_worst_scene():
     assert pick_scenes(scenes) == [2, 3, 1]
     assert pick_scenes({4: {'final_cm': 3.0}}) == [4, 4, 4]
     assert make_caption(scenes, True) == (
-        'the best, the median and the worst scene: 1.0 cm (scene 2), 5.0 cm (scene 3) and 9.0 cm '
-        '(scene 1). Each row: 10 pictures from the first to the last, then each predicted '
+        'the best, the median and the worst of 5 scenes: 1.0 cm (scene 2), 5.0 cm (scene 3) and '
+        '9.0 cm (scene 1). Each row: 10 pictures from the first to the last, then each predicted '
         'subgoal, and the goal')
     assert 'subgoal' not in make_caption(scenes, False)
 
