@@ -65,8 +65,9 @@ def make_caption(scenes, has_subgoals):
     """Say what a film strip of these scenes shows."""
     words = [f'{scenes[seed]["final_cm"]:.1f} cm (scene {seed})' for seed in pick_scenes(scenes)]
     subgoals = 'each predicted subgoal, and ' if has_subgoals else ''
-    return (f'the best, the median and the worst of {len(scenes)} scenes: {words[0]}, {words[1]} and {words[2]}. '
-            f'Each row: {PICTURES} pictures from the first to the last, then {subgoals}the goal')
+    return (f'the best, the median and the worst of {len(scenes)} scenes: {words[0]}, {words[1]} '
+            f'and {words[2]}. Each row: {PICTURES} pictures from the first to the last, then '
+            f'{subgoals}the goal')
 
 
 def read_caption(picture):
