@@ -4,8 +4,8 @@
 Hierarchical planning: one target after another, the goal last (App. F of the paper).
 
 The paper has one subgoal and switches at half the budget ('half'). Switching as soon as the
-subgoal is reached ('reached') wastes no steps, and giving up one to which nothing moves any more
-('stalled') wastes fewer still; several subgoals share the budget equally.
+subgoal is reached ('reached') wastes no steps. 'stalled' also gives up one to which nothing moves
+any more, which gained nothing significant. Several subgoals share the budget equally.
 """
 
 from collections.abc import Callable, Iterable, Sequence
