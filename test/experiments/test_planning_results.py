@@ -246,6 +246,7 @@ def test_the_command_leaves_numbers_page_strips_and_recordings(tmp_path, capsys)
     assert '--methods shipped:carried:steps2 --scenes 2' in carried[0]['command']
     page = (out / 'planning.md').read_text()
     assert 'planning/push2-direct--steps2.png' in page
+    assert '**direct:steps2**, the best, the median and the worst of 2 scenes: ' in page
     assert (out / 'planning' / 'push2-direct--steps2.png').read_bytes().startswith(b'\x89PNG')
     recorded = recordings / 'push2-shipped--carried--steps2.mcap'
     assert len(list(iter_episodes(recorded))) == 3

@@ -116,8 +116,8 @@ def test_the_readme_says_what_fix_has_in_order():
         assert low < 0, 'not significantly more'
         share, _, _ = measured('planning.json', task=task, method=fix, metric='success_5cm')
         shares += [share, share + value]
-    assert (f'In order `fix` has {shares[0]:.0%} of two and of three objects (60 scenes; the '
-            f'subgoal {shares[1]:.0%} and {shares[3]:.0%}: not significantly more)') in (
+    assert (f'In order {shares[0]:.0%} succeed via `fix`, with two and three objects (60 scenes; '
+            f'via the subgoals {shares[1]:.0%}, {shares[3]:.0%}: not significantly more)') in (
                 ' '.join(README.split()))
     assert round(shares[2], 2) == round(shares[0], 2)
 
