@@ -16,12 +16,12 @@ import time
 from typing import Any
 
 import numpy as np
-from sim_bridge.expert import default_config, ExpertConfig, run_episode
-from sim_bridge.grasp_expert import GraspConfig
-from sim_bridge.looks import DEFAULT_LOOK
 from sim_bridge.simulator import Observation, Simulator
-from sim_bridge.tasks import get_task
-from sim_bridge.timing import TIMINGS
+from sim_bridge.tasks.expert import default_config, ExpertConfig, run_episode
+from sim_bridge.tasks.grasp_expert import GraspConfig
+from sim_bridge.tasks.tasks import get_task
+from sim_bridge.tasks.timing import TIMINGS
+from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.engines.run import run_tasks
 from tap_ros.engines.task import Engine, LOCAL, Task
 from tap_ros.errors import ConfigError, RecordingError

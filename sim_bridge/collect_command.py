@@ -5,11 +5,11 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from sim_bridge.appearance import CHOICES
 from sim_bridge.collect import collect, CollectConfig, CollectSettings
-from sim_bridge.looks import LOOKS
-from sim_bridge.tasks import TASKS
-from sim_bridge.timing import TIMINGS
+from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.tasks.timing import TIMINGS
+from sim_bridge.world.appearance import CHOICES
+from sim_bridge.world.looks import LOOKS
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Folder, one_of
 

@@ -8,13 +8,15 @@ from dataclasses import dataclass, replace
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.appearance import choose_appearance, USUAL
-from sim_bridge.entities import check_free, check_pose, check_velocity
-from sim_bridge.grasping import grasp_place
-from sim_bridge.looks import DEFAULT_LOOK, get_look, GRIP_SPREAD, OBSERVER
-from sim_bridge.moved_goal import check_apart, check_places
-from sim_bridge.places import gripper_away_from
-from sim_bridge.scene import (
+from sim_bridge.tasks.stack_tasks import is_tower, levels
+from sim_bridge.tasks.tasks import get_task, sample_scene
+from sim_bridge.world.appearance import choose_appearance, USUAL
+from sim_bridge.world.entities import check_free, check_pose, check_velocity
+from sim_bridge.world.grasping import grasp_place
+from sim_bridge.world.looks import DEFAULT_LOOK, get_look, GRIP_SPREAD, OBSERVER
+from sim_bridge.world.moved_goal import check_apart, check_places
+from sim_bridge.world.places import gripper_away_from
+from sim_bridge.world.scene import (
     build_scene,
     FINGER_GAP,
     FINGER_TRAVEL,
@@ -22,10 +24,7 @@ from sim_bridge.scene import (
     object_names,
     TIMESTEP,
 )
-from sim_bridge.stack_tasks import is_tower, levels
-from sim_bridge.studio import Studio
-from sim_bridge.tasks import get_task, sample_scene
-from tap_ros import ur10e
+from sim_bridge.world.studio import Studio
 from tap_ros.contract import (
     ACTION_LIMIT,
     CONTROL_PERIOD,
@@ -34,6 +33,7 @@ from tap_ros.contract import (
     WORKSPACE_LOW,
 )
 from tap_ros.errors import SceneError
+from tap_ros.robots import ur10e
 from tap_ros.text import escaped
 
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)

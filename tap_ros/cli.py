@@ -18,9 +18,9 @@ import sys
 from typing import Annotated, Any, cast, TypeAlias
 
 from tap_ros.errors import ConfigError, TapError, UsageError
-from tap_ros.learning.model_option import ModelOption
 from tap_ros.options import parse, parse_known
 from tap_ros.text import escaped
+from tap_ros.training.model_option import ModelOption
 from tyro import conf
 
 # Of a command: the name of its module, or {word: (one line of help, the same)}.
@@ -47,9 +47,9 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'call': ('ask a running predictor node', 'tap_ros.nodes.call_command'),
     'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
-    'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo'),
+    'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo.command'),
     'explore': ('see and try all nodes on a page in the browser',
-                'tap_ros.nodes.explore_command'),
+                'tap_ros.nodes.explorer.command'),
     'bench': ('measure speed; without a name, all of it', {
         'collect': ('speed of collecting', 'experiments.bench.collect'),
         'engine': ('what a task costs beside its own work', 'experiments.bench.engine'),

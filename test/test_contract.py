@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sim_bridge.expert import run_episode
-from sim_bridge.scene import HALF_HEIGHT
 from sim_bridge.simulator import clip_action, ramp_controls, Simulator
-from sim_bridge.tasks import TASKS
+from sim_bridge.tasks.expert import run_episode
+from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.world.scene import HALF_HEIGHT
 from tap_ros import contract
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import load_forward_model

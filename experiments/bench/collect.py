@@ -11,7 +11,7 @@ from typing import Annotated
 
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks import TASKS
+from sim_bridge.tasks.tasks import TASKS
 from tap_ros.engines.task import Engine
 from tap_ros.options import one_of
 

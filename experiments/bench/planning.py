@@ -18,7 +18,7 @@ import numpy as np
 from sim_bridge.simulator import Simulator
 from tap_ros.contract import CLEAR, LOW
 from tap_ros.errors import PlanningError
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.options import ShippedFile
 from tap_ros.planning.action_sequences import FIRST_STD, HORIZON
 from tap_ros.planning.mpc_config import PRESETS, with_preset

@@ -15,10 +15,10 @@ import time
 from typing import Annotated
 
 from experiments.bench.speed import matrix_rate, matrix_side
-from tap_ros.learning.devices import pick_device, pick_precision
 from tap_ros.options import Bags, Flag
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.training.devices import pick_device, pick_precision
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 from tyro import conf

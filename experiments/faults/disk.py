@@ -13,9 +13,9 @@ from experiments.faults.children import Reader, run_limited
 from experiments.faults.fault import Fault
 from experiments.faults.made_files import write_recording
 from tap_ros.errors import TapError
-from tap_ros.learning.weights import load_tensors, save_weights
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.recording.writer import write_metadata
+from tap_ros.training.weights import load_tensors, save_weights
 
 TIMEOUT_S = 180.0
 EXPECTED_S = 20.0

@@ -9,7 +9,7 @@ from experiments.faults.children import Reader
 from experiments.faults.fault import Fault
 from experiments.faults.recordings import one_line
 from safetensors.torch import load
-from tap_ros.learning.weights import content_digest
+from tap_ros.training.weights import content_digest
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL, PREDICTORS
 
 

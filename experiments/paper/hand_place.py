@@ -19,14 +19,14 @@ import shlex
 import sys
 
 import numpy as np
-from sim_bridge.scene import GRIPPER, PUSHER
-from sim_bridge.tasks import TASKS
+from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.world.scene import GRIPPER, PUSHER
 from tap_ros.errors import TapError
 from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.files import write_atomically
-from tap_ros.learning.split import split_episodes
 from tap_ros.options import Bags, File, parse
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.split import split_episodes
 import torch
 from torch import nn
 from tyro import conf

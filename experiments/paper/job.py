@@ -118,10 +118,10 @@ def score(run, config, weights, places):
     from tap_ros.evaluation.bottleneck import bottleneck_share, target_bottlenecks
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.evaluation.samples import score_samples
-    from tap_ros.learning.devices import pick_device
-    from tap_ros.learning.split import split_episodes
     from tap_ros.prediction.predictor import load_network
     from tap_ros.recording.cache import open_recordings
+    from tap_ros.training.devices import pick_device
+    from tap_ros.training.split import split_episodes
     from tap_ros.weights import find_predictor
 
     network, about = load_network(weights, pick_device(config.device))

@@ -30,7 +30,7 @@ from experiments.paper.tables import (
     timing_table,
 )
 import pandas as pd
-from sim_bridge.timing import MORE_FRAMES
+from sim_bridge.tasks.timing import MORE_FRAMES
 from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.evaluation.bottleneck import MIN_MOTION
 from tap_ros.evaluation.samples import NEAR

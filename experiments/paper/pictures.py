@@ -20,14 +20,14 @@ from matplotlib.figure import Figure
 import numpy as np
 from tap_ros.evaluation.samples import draw_latents
 from tap_ros.files import write_atomically
-from tap_ros.images import to_float, to_uint8
-from tap_ros.learning.split import split_episodes, TEST_FRACTION
-from tap_ros.pictures import GAP, grid, png_bytes
+from tap_ros.images.drawing import GAP, grid, png_bytes
+from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.warp import warp
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.split import split_episodes, TEST_FRACTION
 import torch
 
 EPISODES = 5

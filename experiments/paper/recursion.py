@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from tap_ros.evaluation.bottleneck import MIN_MOTION
 from tap_ros.evaluation.shown import ShownScorer
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 import torch

@@ -11,7 +11,7 @@ from pathlib import Path
 import shlex
 
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED, TIMED
-from sim_bridge.tasks import TASKS
+from sim_bridge.tasks.tasks import TASKS
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.methods import parse_method
 from tap_ros.prediction.training_config import TrainingConfig

@@ -5,7 +5,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from sim_bridge.looks import DEFAULT_LOOK, LOOKS
+from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.contract import step_budget
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Flag, Folder, one_of, ShippedFile
@@ -42,8 +42,8 @@ class Options:
         --preset says), plain_cost, every<n>, steps<n>, for example genmin:half:carried.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
-    :param look: of the world, see sim_bridge.looks; pictures are filled behind the robot as the
-        weights' training was, by the looks' robot masks.
+    :param look: of the world, see sim_bridge.world.looks; pictures are filled behind the robot as
+        the weights' training was, by the looks' robot masks.
     :param scenes: how many.
     :param seed: of the first scene.
     :param switch: go on from a subgoal when it is reached; when nothing moves any more, too; or

@@ -15,12 +15,12 @@ from experiments.planning.true_model import TrueModel
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
-from tap_ros.learning.robot_mask import FreeView, trained_robot_mask
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.recording.episode import Episode
+from tap_ros.training.robot_mask import FreeView, trained_robot_mask
 
 
 @dataclass

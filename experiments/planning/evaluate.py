@@ -13,7 +13,7 @@ from experiments.planning.methods import parse_method, with_samples
 from experiments.planning.page import make_page
 from experiments.planning.results import load_results, make_rows
 from experiments.planning.runs import Job, run_jobs
-from sim_bridge.looks import DEFAULT_LOOK
+from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import forward
 from tap_ros.files import write_atomically, write_rows

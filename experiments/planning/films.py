@@ -12,7 +12,7 @@ from PIL.PngImagePlugin import PngInfo
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import write_atomically
-from tap_ros.pictures import film_strip, grid
+from tap_ros.images.drawing import film_strip, grid
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import EpisodeWriter
 

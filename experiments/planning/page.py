@@ -9,7 +9,7 @@ from experiments.paper.published import ORDER_TITLES, PLANNING_BOUNDS, TABLE_2
 from experiments.planning.claims import claims_table
 from experiments.planning.methods import BOUNDS
 import pandas as pd
-from sim_bridge.tasks import get_task
+from sim_bridge.tasks.tasks import get_task
 from tap_ros.contract import step_budget
 from tap_ros.planning.forward_scores import MOVED_PIXELS
 from tap_ros.planning.mpc_config import STALL

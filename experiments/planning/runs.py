@@ -10,19 +10,19 @@ from pathlib import Path
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import Method
 import numpy as np
-from sim_bridge.looks import DEFAULT_LOOK
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks import get_task
+from sim_bridge.tasks.tasks import get_task
+from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.engines.run import run_tasks
 from tap_ros.engines.task import LOCAL, Task
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.files import write_atomically
-from tap_ros.learning.weights import stored_digest
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.training.weights import stored_digest
 import torch
 from tqdm import tqdm
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from experiments.planning.command import RUNS as PLANNED_RUNS
-from sim_bridge.looks import DEFAULT_LOOK, LOOKS
+from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Flag, Folder, one_of
 from tyro import conf
@@ -36,7 +36,7 @@ class Options:
         default those whose weights are there.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
-    :param look: of the world, see sim_bridge.looks.
+    :param look: of the world, see sim_bridge.world.looks.
     :param scenes: how many.
     :param seed: of the first scene.
     :param device: of the networks: cpu or cuda.

@@ -13,11 +13,11 @@ from experiments.planning.episode import View
 from experiments.stacking.reading import Move, PictureReader, read_moves
 import mujoco.rollout
 import numpy as np
-from sim_bridge.expert import run_episode as run_expert
-from sim_bridge.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
+from sim_bridge.tasks.expert import run_episode as run_expert
+from sim_bridge.tasks.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
 from tap_ros.contract import LIFTED, SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError
-from tap_ros.learning.robot_mask import trained_robot_mask
+from tap_ros.training.robot_mask import trained_robot_mask
 
 OVER = 0.045  # m; an object whose place is nearer to another one, from above, is put on that
 ARRIVED = 0.01  # m from its last place, then an object of the expert's is where it goes

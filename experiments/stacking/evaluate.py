@@ -14,7 +14,7 @@ from experiments.stacking.methods import parse_method
 from experiments.stacking.page import make_page
 from experiments.stacking.results import make_rows
 from experiments.stacking.runs import Job, run_scene
-from sim_bridge.looks import DEFAULT_LOOK
+from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.errors import ConfigError
 from tap_ros.files import write_atomically, write_rows
 

@@ -6,7 +6,7 @@ from experiments.stacking.runs import make_episode
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.files import write_atomically
-from tap_ros.pictures import draw_crosses, enlarge, film_strip, grid, png_bytes
+from tap_ros.images.drawing import draw_crosses, enlarge, film_strip, grid, png_bytes
 
 SUCCEED, FAIL = 1, 3  # scenes of each
 FRAMES = 5  # of what was done

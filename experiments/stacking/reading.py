@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from sim_bridge.scene import HALF_HEIGHT
-from sim_bridge.studio import SAMPLES, SHADOW
+from sim_bridge.world.scene import HALF_HEIGHT
+from sim_bridge.world.studio import SAMPLES, SHADOW
 
 # Of the light: so many samples of a pixel are in shadow.
 SHADES = 1 - SHADOW * np.linspace(0, 1, SAMPLES ** 2 + 1)

@@ -11,7 +11,7 @@ import time
 from experiments.planning.runs import digest, load_predictor, load_simulator
 from experiments.stacking.episode import run_episode
 from experiments.stacking.methods import Method
-from sim_bridge.looks import DEFAULT_LOOK
+from sim_bridge.world.looks import DEFAULT_LOOK
 import torch
 
 

@@ -14,9 +14,9 @@ from tap_ros.evaluation.prediction import evaluate, write_pictures
 from tap_ros.evaluation.samples import SAMPLES, score_samples
 from tap_ros.evaluation.shown import SHOWN
 from tap_ros.files import write_atomically
-from tap_ros.learning.weights import load_weights, save_weights
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.weights import load_weights, save_weights
 import torch
 
 THRESHOLD = 2  # px, of the bottleneck frequency on the card

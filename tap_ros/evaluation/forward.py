@@ -12,15 +12,15 @@ import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.files import write_rows
-from tap_ros.learning.filled import FilledStore, with_masks
-from tap_ros.learning.robot_mask import fill_from_past
-from tap_ros.learning.split import split_episodes, TEST_FRACTION
-from tap_ros.learning.weights import load_weights
 from tap_ros.options import Bags, Folder, ShippedFile, Topic
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.inpainted import FilledStore, with_masks
+from tap_ros.training.robot_mask import fill_from_past
+from tap_ros.training.split import split_episodes, TEST_FRACTION
+from tap_ros.training.weights import load_weights
 from tap_ros.weights import FORWARD_MODEL
 
 METHODS = {'map_error': 'forward_model', 'nothing_moves': 'nothing',

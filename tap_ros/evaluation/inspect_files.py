@@ -11,22 +11,22 @@ from typing import Annotated
 
 import numpy as np
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
-from tap_ros.crop import CENTRE, check_trainable
 from tap_ros.errors import ConfigError, ImageError
 from tap_ros.files import storage_errors, write_atomically
-from tap_ros.learning.split import split_episodes, warn_if_none
+from tap_ros.images.crop import CENTRE, check_trainable
+from tap_ros.images.drawing import film_strip, grid, png_bytes
 from tap_ros.options import File, Folder
-from tap_ros.pictures import film_strip, grid, png_bytes
 from tap_ros.recording.attachments import read_attachments, save_attachment
 from tap_ros.recording.bags import check_first_picture, find_bags, find_topics, list_topics
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.columns import first_size
+from tap_ros.recording.damage import seconds
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.lost import seconds
 from tap_ros.recording.reading import Reading, reading_of
 from tap_ros.recording.reading_options import ReadingOptions
 from tap_ros.recording.topics import IMAGE
 from tap_ros.text import escaped, listing
+from tap_ros.training.split import split_episodes, warn_if_none
 from tyro import conf
 
 LARGE = 256  # px; pictures with a longer side are not decoded whole
@@ -61,7 +61,7 @@ def run(args: Options) -> None:
     :raises TapError: for what cannot be read, and for a recording that `train` would refuse.
     """
     if Path(args.path).suffix == '.safetensors':
-        from tap_ros.learning.weights import load_tensors  # torch takes seconds
+        from tap_ros.training.weights import load_tensors  # torch takes seconds
         _, about = load_tensors(args.path)
         print(json.dumps(about, indent=2))
         return

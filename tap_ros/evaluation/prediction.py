@@ -28,18 +28,18 @@ from tap_ros.evaluation.intervals import bootstrap, gain_interval, Interval, mea
 from tap_ros.evaluation.samples import draw_latents, SAMPLES, SampleScores, score_samples
 from tap_ros.evaluation.shown import SHOWN, ShownScorer
 from tap_ros.files import write_atomically
-from tap_ros.images import to_float, to_uint8
-from tap_ros.learning.filled import fill, Filled, with_masks
-from tap_ros.learning.robot_mask import trained_robot_mask
-from tap_ros.learning.split import split_episodes, TEST_FRACTION
+from tap_ros.images.drawing import grid, overlay
+from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.options import Bags, Flag, Folder, Topic
-from tap_ros.pictures import grid, overlay
 from tap_ros.prediction.batches import Batch, make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.networks import Predictor
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.training.inpainted import fill, Filled, with_masks
+from tap_ros.training.robot_mask import trained_robot_mask
+from tap_ros.training.split import split_episodes, TEST_FRACTION
 from tap_ros.weights import PREDICTORS
 import torch
 from tyro import conf

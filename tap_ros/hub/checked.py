@@ -4,9 +4,9 @@
 
 from pathlib import Path
 
-from tap_ros.learning.weights import load_tensors
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.prediction.predictor import load_network
+from tap_ros.training.weights import load_tensors
 
 
 def check_weights(path: Path) -> dict[str, object]:

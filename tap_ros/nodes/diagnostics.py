@@ -12,7 +12,7 @@ from typing import Any, TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
-from tap_ros.nodes.windows import percentiles, rate, Window
+from tap_ros.nodes.rolling_stats import percentiles, rate, Window
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from sensor_msgs.msg import CompressedImage, Image
 from tap_ros.contract import MAP_ENCODING, MASK_ENCODING, MAX_PICTURE_BYTES, PICTURE_ENCODING
-from tap_ros.encodings import decompress, pixel_bytes, to_rgb
 from tap_ros.errors import ImageError
-from tap_ros.images import check_image, resize_image
-from tap_ros.recording.pictures import wrong_mask_value
+from tap_ros.images.encodings import decompress, pixel_bytes, to_rgb
+from tap_ros.images.picture_files import wrong_mask_value
+from tap_ros.images.pixels import check_image, resize_image
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from tap_ros.errors import WeightsError
-from tap_ros.learning.weights import stored_digest
 from tap_ros.recording.new_attachments import MAX_CARD_BYTES
 from tap_ros.text import escaped
+from tap_ros.training.weights import stored_digest
 
 
 def describe_weights(files: Iterable[Path]) -> str:

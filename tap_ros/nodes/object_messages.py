@@ -9,11 +9,11 @@ from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import ObjectState, ObjectStates
-from tap_ros import ur10e
 from tap_ros.contract import GRIPPER_JOINTS
-from tap_ros.crop import Crop
 from tap_ros.errors import ImageError, PlanningError
-from tap_ros.images import in_picture
+from tap_ros.images.crop import Crop
+from tap_ros.images.pixels import in_picture
+from tap_ros.robots import ur10e
 from tap_ros.text import escaped, listing
 
 if TYPE_CHECKING:

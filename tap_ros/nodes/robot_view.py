@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from sensor_msgs.msg import Image
 from tap_ros.contract import ROBOT_MASKS
-from tap_ros.learning.robot_mask import FreeView
 from tap_ros.nodes.image_messages import decode_image, decode_mask, encode_image
 from tap_ros.nodes.topics import to_nanoseconds
+from tap_ros.training.robot_mask import FreeView
 
 if TYPE_CHECKING:
-    from tap_ros.learning.robot_mask import RobotMask
     from tap_ros.nodes.parameters import Parameters
+    from tap_ros.training.robot_mask import RobotMask
 
 CAMERA_MASK = {'mask': (Image, 'camera/robot_mask')}
 GOAL_MASK = {'mask': (Image, 'goal/robot_mask')}

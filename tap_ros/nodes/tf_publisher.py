@@ -9,7 +9,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from sim_bridge.transforms import Transform
+from sim_bridge.world.transforms import Transform
 from tap_ros.nodes.topics import LATCHED
 
 

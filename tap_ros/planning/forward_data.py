@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import RecordingError
-from tap_ros.images import to_float
-from tap_ros.learning.robot_mask import hidden_pixels, RobotMask
+from tap_ros.images.pixels import to_float
 from tap_ros.planning.table import mirror_table
+from tap_ros.training.robot_mask import hidden_pixels, RobotMask
 import torch
 
 if TYPE_CHECKING:
-    from tap_ros.learning.filled import Episodes
+    from tap_ros.training.inpainted import Episodes
 
 COLOUR_ORDERS = ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
 

@@ -26,11 +26,8 @@ from pathlib import Path
 
 import numpy as np
 from tap_ros.contract import ACTION_LIMIT, CLEAR, ROBOT_MASKS, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.crop import Crop, TrainedCrop
 from tap_ros.errors import ConfigError
-from tap_ros.learning.devices import has_bfloat16, placed
-from tap_ros.learning.robot_mask import RobotMask
-from tap_ros.learning.weights import LATER, load_weights, make_network
+from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
 from tap_ros.planning.table import (
     channels_first,
@@ -42,6 +39,9 @@ from tap_ros.planning.table import (
     sample_picture,
     splat_on_table,
 )
+from tap_ros.training.devices import has_bfloat16, placed
+from tap_ros.training.robot_mask import RobotMask
+from tap_ros.training.weights import LATER, load_weights, make_network
 import torch
 from torch import nn
 

@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.planning.forward_model import ForwardModel
 import torch
 
 if TYPE_CHECKING:
-    from tap_ros.learning.filled import Episodes
+    from tap_ros.training.inpainted import Episodes
 
 SCORED_STEPS = (1, 5, 10, 15)
 MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than this by then

@@ -6,9 +6,9 @@ from dataclasses import dataclass, fields
 
 from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
-from tap_ros.learning.robot_mask import RobotMask
-from tap_ros.learning.split import TEST_FRACTION
 from tap_ros.recording.reading import Reading
+from tap_ros.training.robot_mask import RobotMask
+from tap_ros.training.split import TEST_FRACTION
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.errors import ImageError, PlanningError
-from tap_ros.images import check_image, check_pixels, in_picture
+from tap_ros.images.pixels import check_image, check_pixels, in_picture
 
 # What a gripper over the table can be: x, y, z in metres, opening. Anything else is another unit,
 # another frame or nonsense; learned models would answer it with a move all the same.

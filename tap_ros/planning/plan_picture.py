@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.pictures import draw_crosses, enlarge
+from tap_ros.images.drawing import draw_crosses, enlarge
 from tap_ros.planning.table import project
 import torch
 

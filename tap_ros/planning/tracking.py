@@ -10,7 +10,7 @@ and which are hidden by the arm.
 """
 
 import numpy as np
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.table import project, sample_picture
 import torch

@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-from tap_ros.learning.model_option import ModelOption
 from tap_ros.options import Bags, default_text, Folder, Topic
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.recording.reading_options import Part
+from tap_ros.training.model_option import ModelOption
 from tyro import conf
 
 

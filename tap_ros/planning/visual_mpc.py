@@ -22,7 +22,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.errors import PlanningError
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.planning.action_sequences import FULL, HORIZON, Limits, SequenceShape
 from tap_ros.planning.cem import cem
 from tap_ros.planning.forward_model import load_forward_model

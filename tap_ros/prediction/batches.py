@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.learning.frames import Frames, GOAL, MappedFrames
+from tap_ros.training.frames import Frames, GOAL, MappedFrames
 import torch
 
 if TYPE_CHECKING:
-    from tap_ros.learning.filled import Filled
     from tap_ros.recording.cache import EpisodeStore
     from tap_ros.recording.episode import Episode
+    from tap_ros.training.inpainted import Filled
 
 REACHED = 2.0  # px
 
@@ -181,11 +181,11 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     :param store: the EpisodeStore.
     :param episodes: indices of B episodes.
     :param sampling: Sampling; by default all frames between the first and the last.
-    :param frames: where the pictures come from, see learning/frames.py; None: the store.
+    :param frames: where the pictures come from, see training/frames.py; None: the store.
     :param rng: numpy Generator; needed only where something is drawn.
     :param part: slice of the episodes whose pictures are gathered; the others only count for what
         is drawn and for T.
-    :param filled: with a robot mask, where targets and video come from; see learning/filled.py.
+    :param filled: with a robot mask, where targets and video come from; see training/inpainted.py.
     :return: Batch.
     """
     rng = rng or np.random.default_rng(0)

@@ -5,13 +5,13 @@
 from collections.abc import Iterable
 import contextlib
 
-from tap_ros.images import to_float
-from tap_ros.learning.devices import Autocast
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import l1_error
 from tap_ros.prediction.networks import Prediction, Predictor
 from tap_ros.prediction.selection import selection_errors, Targets
 from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.training.devices import Autocast
 import torch
 
 

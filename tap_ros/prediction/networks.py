@@ -13,11 +13,11 @@ import math
 from typing import get_args
 
 from tap_ros.errors import ConfigError
-from tap_ros.learning.weights import LATER
 from tap_ros.prediction.shared_decoder import SharedDecoder
 from tap_ros.prediction.training_config import Decoder
 from tap_ros.prediction.warp import combine, warp
 from tap_ros.text import escaped
+from tap_ros.training.weights import LATER
 import torch
 from torch import nn
 from torch.nn import functional

@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from tap_ros.images import to_float
-from tap_ros.learning.devices import Autocast
-from tap_ros.learning.parallel import ALONE, Processes
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.discriminator import discriminator_loss, generator_loss
@@ -24,6 +22,8 @@ from tap_ros.prediction.networks import Prediction, Predictor
 from tap_ros.prediction.recognition import kl_divergence, Recognition, sample_latent
 from tap_ros.prediction.selection import outer_error, Selection, selection_errors, Targets
 from tap_ros.prediction.training_config import ObjectiveSettings
+from tap_ros.training.devices import Autocast
+from tap_ros.training.parallel import ALONE, Processes
 import torch
 
 

@@ -3,11 +3,11 @@
 """What the network does with a batch, as a picture for people."""
 
 import numpy as np
-from tap_ros.images import to_uint8
-from tap_ros.learning.panels import grey_panels
-from tap_ros.pictures import grid
+from tap_ros.images.drawing import grid
+from tap_ros.images.pixels import to_uint8
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.networks import Prediction
+from tap_ros.training.panels import grey_panels
 import torch
 
 

@@ -10,10 +10,10 @@ from typing import Annotated, TYPE_CHECKING
 
 import cv2
 import numpy as np
-from tap_ros.crop import Crop
 from tap_ros.errors import ConfigError, ImageError
 from tap_ros.files import write_atomically
-from tap_ros.images import in_picture, resize_image, resize_pixels
+from tap_ros.images.crop import Crop
+from tap_ros.images.pixels import in_picture, resize_image, resize_pixels
 from tap_ros.options import File
 from tap_ros.text import escaped
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
@@ -181,7 +181,7 @@ def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],
     :return: bytes of a PNG file.
     """
     from matplotlib.figure import Figure
-    from tap_ros.pictures import OBJECT_COLOURS, overlay
+    from tap_ros.images.drawing import OBJECT_COLOURS, overlay
     count = len(pixels['start'])
     columns = len(pictures) + 1 + bool(count)
     figure = Figure(figsize=(PANEL * columns, (PANEL + 0.3) * len(subgoals)), dpi=DPI,

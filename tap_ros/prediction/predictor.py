@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from tap_ros.crop import trained_crop
 from tap_ros.errors import ConfigError, ImageError, WeightsError
-from tap_ros.images import check_image, check_pixels, to_float, to_uint8
-from tap_ros.learning.devices import placed
-from tap_ros.learning.weights import load_weights, make_network
+from tap_ros.images.crop import trained_crop
+from tap_ros.images.pixels import check_image, check_pixels, to_float, to_uint8
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps, WarpedMaps
 from tap_ros.text import escaped
+from tap_ros.training.devices import placed
+from tap_ros.training.weights import load_weights, make_network
 from tap_ros.weights import find_predictor
 import torch
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 import contextlib
 
 import numpy as np
-from tap_ros.images import to_float
-from tap_ros.learning.devices import Autocast, placed
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.networks import decoder, encoder, initialise, Predictor, PredictorConfig
+from tap_ros.training.devices import Autocast, placed
 import torch
 from torch import nn
 from torch.nn import functional

@@ -5,7 +5,7 @@
 from collections.abc import Callable
 import math
 
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import (

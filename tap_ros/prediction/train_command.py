@@ -4,7 +4,6 @@
 
 from dataclasses import asdict, dataclass
 
-from tap_ros.learning.model_option import ModelOption
 from tap_ros.options import Bags, Folder
 from tap_ros.prediction.training_config import (
     DataSettings,
@@ -15,6 +14,7 @@ from tap_ros.prediction.training_config import (
     TrainingConfig,
 )
 from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.training.model_option import ModelOption
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Options(ModelOption):
 
 def run(args: Options) -> None:
     """Train as the command line says, and print where the weights are."""
-    from tap_ros.learning.parallel import local_rank  # torch takes seconds, --help does without
     from tap_ros.prediction.training import train
+    from tap_ros.training.parallel import local_rank  # torch takes seconds, --help does without
     weights = train(args.config)
     if not local_rank():
         print(weights)

@@ -14,17 +14,8 @@ import time
 from typing import Any
 
 import numpy as np
-from tap_ros.crop import check_trainable
 from tap_ros.errors import ConfigError
-from tap_ros.learning.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
-from tap_ros.learning.devices import Autocast, make_autocast, pick_device, pick_precision
-from tap_ros.learning.filled import fill, Filled, with_masks
-from tap_ros.learning.frames import Frames, MappedFrames, ResidentFrames
-from tap_ros.learning.parallel import joined, Processes, share_batch_norm
-from tap_ros.learning.run_folder import describe_run, run_facts, run_folder
-from tap_ros.learning.schedule import kl_share, learning_rate, match_temperature
-from tap_ros.learning.split import split_episodes, warn_if_none
-from tap_ros.learning.weights import save_weights
+from tap_ros.images.crop import check_trainable
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch, episode_order, make_batch, Sampling
 from tap_ros.prediction.discriminator import Discriminator
@@ -45,6 +36,15 @@ from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
 from tap_ros.recording.bags import check_first_picture
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.reading import reading_of
+from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
+from tap_ros.training.devices import Autocast, make_autocast, pick_device, pick_precision
+from tap_ros.training.frames import Frames, MappedFrames, ResidentFrames
+from tap_ros.training.inpainted import fill, Filled, with_masks
+from tap_ros.training.parallel import joined, Processes, share_batch_norm
+from tap_ros.training.run_folder import describe_run, run_facts, run_folder
+from tap_ros.training.schedule import kl_share, learning_rate, match_temperature
+from tap_ros.training.split import split_episodes, warn_if_none
+from tap_ros.training.weights import save_weights
 import torch
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm

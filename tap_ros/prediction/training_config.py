@@ -12,10 +12,10 @@ from functools import cached_property
 from typing import Any, get_args, Literal
 
 from tap_ros.errors import ConfigError
-from tap_ros.learning.robot_mask import RobotMask
-from tap_ros.learning.split import TEST_FRACTION
 from tap_ros.prediction.methods import Method, Mode, parse_method
 from tap_ros.recording.reading import Reading
+from tap_ros.training.robot_mask import RobotMask
+from tap_ros.training.split import TEST_FRACTION
 
 Decoder = Literal['separate', 'shared']
 GoalPicture = Literal['last', 'recorded', 'mixed']

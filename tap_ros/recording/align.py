@@ -15,13 +15,13 @@ import warnings
 
 import numpy as np
 from numpy.typing import DTypeLike
-from tap_ros import ur10e
 from tap_ros.recording.columns import Columns, pad_objects
+from tap_ros.recording.damage import EVERYTHING, FAR, seconds
 from tap_ros.recording.episode import Episode, RecordingWarning
-from tap_ros.recording.lost import EVERYTHING, FAR, seconds
 from tap_ros.recording.mounts import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.spans import assign, in_gaps, Mark, MAX_JITTER_NS, read_spans, Span
+from tap_ros.robots import ur10e
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
 _LOOKED_AT = 4096  # messages looked at together

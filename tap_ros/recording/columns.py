@@ -18,16 +18,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tap_ros import ur10e
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ImageError, RecordingError
+from tap_ros.images.picture_files import read_compressed, read_mask, read_pixels
 from tap_ros.recording import topics
 from tap_ros.recording.container import McapFile
-from tap_ros.recording.lost import describe, EVERYTHING, FAR, FRAMES, gaps, Loss, NOTHING
+from tap_ros.recording.damage import describe, EVERYTHING, FAR, FRAMES, gaps, Loss, NOTHING
 from tap_ros.recording.messages import decode
-from tap_ros.recording.pictures import read_compressed, read_mask, read_pixels
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import Mark
+from tap_ros.robots import ur10e
 from tap_ros.text import escaped
 
 _ENDINGS = ('_log', '_stamp', '_names', '_event', '_index')  # of column names

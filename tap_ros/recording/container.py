@@ -23,7 +23,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Schema
 from tap_ros.errors import RecordingError
 from tap_ros.recording.chunks import read_chunk, read_record, unpack
-from tap_ros.recording.lost import FAR, Loss, NOTHING
+from tap_ros.recording.damage import FAR, Loss, NOTHING
 from tap_ros.recording.records import in_order, OTHERS, Records, TOPIC_RECORDS
 from tap_ros.recording.summary import ChunkEntry, MAGIC, read_summary, RECORD
 from tap_ros.text import escaped

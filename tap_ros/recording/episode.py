@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from tap_ros.errors import RecordingError
-from tap_ros.recording.pictures import wrong_mask_value
+from tap_ros.images.picture_files import wrong_mask_value
 
 OUTCOMES = ('success', 'failure', 'interrupted', '')
 

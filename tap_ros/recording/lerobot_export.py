@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from tap_ros.errors import ConfigError, RecordingError, StorageError
 from tap_ros.files import storage_errors
+from tap_ros.images.drawing import png_bytes
 from tap_ros.options import Bags, Flag, Folder
-from tap_ros.pictures import png_bytes
 from tap_ros.recording import lerobot
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.reading import reading_of

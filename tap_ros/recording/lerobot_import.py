@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 from tap_ros.contract import MAX_PICTURE_BYTES
-from tap_ros.crop import Crop
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.files import only_writer
+from tap_ros.images.crop import Crop
 from tap_ros.options import Folder
 from tap_ros.recording import lerobot
 from tap_ros.recording.episode import Episode, OUTCOMES

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tap_ros.errors import RecordingError
 from tap_ros.files import write_atomically
-from tap_ros.ur10e import Mount, SIMULATED
+from tap_ros.robots.ur10e import Mount, SIMULATED
 
 FILE_NAME = 'arm_mount.json'
 _MAX_BYTES = 2**16

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import RecordingError
+from tap_ros.images.picture_files import read_pixels
 from tap_ros.recording import topics
 from tap_ros.recording.messages import decode
-from tap_ros.recording.pictures import read_pixels
 
 CARD = '/model_card'  # how topics of model cards end
 CARD_TYPE = 'std_msgs/msg/String'
@@ -71,7 +71,7 @@ def _goal(name: str, data: bytes) -> NewAttachment | None:
     picture = read_pixels(message)
     if not picture.size:
         return None
-    from tap_ros.pictures import png_bytes  # cv2 takes a moment, and few files have a goal
+    from tap_ros.images.drawing import png_bytes  # cv2 takes a moment, and few files have a goal
     stamp = message.header.stamp
     return NewAttachment(name, PNG, png_bytes(picture), max(stamp.sec * 10**9 + stamp.nanosec, 0))
 

@@ -10,8 +10,8 @@ import numpy as np
 from tap_ros.recording.align import assemble, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
+from tap_ros.recording.damage import EVERYTHING
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.lost import EVERYTHING
 from tap_ros.recording.mounts import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 

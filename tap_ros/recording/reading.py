@@ -10,7 +10,7 @@ from typing import Any, TYPE_CHECKING
 from tap_ros.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tap_ros.crop import Crop
+    from tap_ros.images.crop import Crop
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,9 @@ class Reading:
     @cached_property
     def cut(self) -> 'Crop':
         """What part of the pictures is used, as a Crop."""
-        from tap_ros.crop import Crop  # here, as numpy takes a moment, and --help does without
+        from tap_ros.images.crop import (
+            Crop,  # here, as numpy takes a moment, and --help does without
+        )
         return Crop(self.crop, self.size)
 
 

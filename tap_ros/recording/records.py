@@ -8,7 +8,7 @@ import struct
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from tap_ros.errors import RecordingError
-from tap_ros.recording.lost import FAR
+from tap_ros.recording.damage import FAR
 from tap_ros.recording.summary import ChunkEntry, MAGIC, RECORD, Summary
 
 TOPIC_RECORDS: dict[int, type[Schema] | type[Channel]] = {

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from tap_ros.recording.lost import EVERYTHING, FAR
+from tap_ros.recording.damage import EVERYTHING, FAR
 
 Mark = tuple[str, int, str]  # task, seed, outcome
 

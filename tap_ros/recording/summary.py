@@ -12,7 +12,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, Schema, Statistic
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.recording.chunks import DAMAGE
-from tap_ros.recording.lost import FAR
+from tap_ros.recording.damage import FAR
 
 RECORD = struct.Struct('<BQ')  # opcode, length of what follows
 _FOOTER = struct.Struct('<BQQQI')  # opcode, length, summary start, summary offsets start, crc

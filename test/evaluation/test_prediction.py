@@ -19,12 +19,12 @@ from tap_ros.evaluation.bottleneck import (
 )
 from tap_ros.evaluation.prediction import evaluate, Options, run, write_pictures
 from tap_ros.evaluation.samples import draw_latents, score_samples
-from tap_ros.images import to_float
-from tap_ros.learning.weights import save_weights
+from tap_ros.images.pixels import to_float
 from tap_ros.options import parse
 from tap_ros.prediction.batches import fixed_time, make_batch, Sampling
 from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
+from tap_ros.training.weights import save_weights
 import torch
 
 SIZE = 32

@@ -12,9 +12,9 @@ from experiments.paper.results import write_results
 from experiments.paper.runs import paper_runs
 from made_runs import made_run, save_runs, scores
 import numpy as np
-from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.weights import save_weights
 import torch
 
 OURS, GENMIN, FIX = 'genmin-wo-gan+progress+skips', 'genmin-wo-gan+skips', 'fix-wo-gan+skips'

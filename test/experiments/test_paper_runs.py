@@ -10,10 +10,10 @@ from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED
 from experiments.paper.runs import FINE_TUNED, LONG, paper_runs, PaperRun, SCALES, SINGLE
 from experiments.weights.recipes import RECIPES
 import pytest
-from sim_bridge.tasks import TASKS
+from sim_bridge.tasks.tasks import TASKS
 from tap_ros.errors import ConfigError
-from tap_ros.learning.checkpoints import FREE
 from tap_ros.prediction.training_config import DEFAULTS
+from tap_ros.training.checkpoints import FREE
 from tap_ros.weights import find_predictor
 
 ROOT = Path(__file__).parents[2]

@@ -32,9 +32,9 @@ import pytest
 from tap_ros.engines.task import Engine
 from tap_ros.errors import ConfigError
 from tap_ros.files import locked
-from tap_ros.learning.split import split_episodes
 from tap_ros.options import parse
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.split import split_episodes
 from tap_ros.weights import find_predictor
 
 ROOT = Path(__file__).parents[2]

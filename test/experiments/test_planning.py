@@ -16,12 +16,11 @@ from experiments.planning.methods import BASES, parse_method
 from experiments.planning.true_model import TrueModel
 import numpy as np
 import pytest
-from sim_bridge.places import nearest_first
 from sim_bridge.simulator import Simulator
+from sim_bridge.world.places import nearest_first
 from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError
-from tap_ros.images import to_float
-from tap_ros.learning.robot_mask import FreeView
+from tap_ros.images.pixels import to_float
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.map_model import MapModel
 from tap_ros.planning.mpc_config import LARGE, PAPER, VisualMPCConfig
@@ -29,6 +28,7 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.recording.episode import check_episode
+from tap_ros.training.robot_mask import FreeView
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 import torch
 

@@ -10,13 +10,13 @@ from experiments.stacking.methods import BASES, parse_method
 from experiments.stacking.reading import Move, PictureReader, read_moves
 import numpy as np
 import pytest
-from sim_bridge.scene import HALF_HEIGHT
 from sim_bridge.simulator import Simulator
-from sim_bridge.stack_tasks import is_tower
+from sim_bridge.tasks.stack_tasks import is_tower
+from sim_bridge.world.scene import HALF_HEIGHT
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError
-from tap_ros.learning.robot_mask import FreeView
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.training.robot_mask import FreeView
 
 SEEDS = range(FIRST_SCENE, FIRST_SCENE + 6)
 CLEAR_SCENE = FIRST_SCENE + 7  # SPOT and what is above block 0 are in front of no other block

@@ -15,16 +15,15 @@ from rclpy.qos import qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.crop import Crop, TrainedCrop
 from tap_ros.errors import ConfigError, ImageError
-from tap_ros.learning.weights import save_weights
+from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import decode_image, encode_image
 from tap_ros.nodes.object_messages import encode_joints, encode_objects
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.planner_setup import declare_parameters
-from tap_ros.nodes.pulled import PulledObservations
-from tap_ros.nodes.sight import Sight
+from tap_ros.nodes.on_demand import PulledObservations
+from tap_ros.nodes.planner.planner_inputs import Sight
+from tap_ros.nodes.planner.settings import declare_parameters
 from tap_ros.nodes.subscriptions import Heard, subscribe
 from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
@@ -32,6 +31,7 @@ from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import trained_reading
 from tap_ros.recording.writer import BagWriter
+from tap_ros.training.weights import save_weights
 
 pytestmark = pytest.mark.slow
 STAMP = to_stamp(2_500_000_000)

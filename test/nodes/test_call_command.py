@@ -10,8 +10,8 @@ import numpy as np
 from processes import NodeProcess
 import pytest
 from tap_ros.cli import main
-from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.training.weights import save_weights
 
 pytestmark = pytest.mark.slow
 

@@ -14,11 +14,12 @@ import yaml
 FILE = Path(__file__).parents[2] / 'config/tap_ros.yaml'
 NODES = {key.removeprefix('/**/'): values['ros__parameters']
          for key, values in yaml.safe_load(FILE.read_text()).items()}
-DECLARED_IN = {'sim_node': 'sim_bridge.sim_node', 'recorder_node': 'tap_ros.nodes.recorder_node',
-               'predictor_node': 'tap_ros.nodes.predictor_setup',
-               'visual_mpc_node': 'tap_ros.nodes.planner_setup',
-               'robot_mask_node': 'tap_ros.nodes.robot_mask_setup',
-               'explorer_node': 'tap_ros.nodes.explorer_node'}
+DECLARED_IN = {'sim_node': 'sim_bridge.ros.sim_node',
+               'recorder_node': 'tap_ros.nodes.recorder.node',
+               'predictor_node': 'tap_ros.nodes.predictor.settings',
+               'visual_mpc_node': 'tap_ros.nodes.planner.settings',
+               'robot_mask_node': 'tap_ros.nodes.robot_mask.settings',
+               'explorer_node': 'tap_ros.nodes.explorer.node'}
 LEFT_OUT = {'sim_node': set(), 'predictor_node': set(), 'visual_mpc_node': {'weights'},
             'recorder_node': {'topics'}, 'robot_mask_node': set(), 'explorer_node': set()}
 

@@ -16,10 +16,10 @@ from processes import Client, NodeProcess, page_address
 import pytest
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_ros.contract import SUCCESS_DISTANCE
+from tap_ros.images.drawing import overlay
 from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.subgoal_messages import decode_subgoal
 from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.pictures import overlay
 from websockets.sync.client import connect
 
 BROWSER = next(filter(None, map(shutil.which, (

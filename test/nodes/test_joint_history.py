@@ -5,12 +5,12 @@
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
-from tap_ros import ur10e
 from tap_ros.errors import KinematicsError, PlanningError
-from tap_ros.nodes.arm_joints import ArmJoints, tells_gripper
 from tap_ros.nodes.joint_history import JointHistory
 from tap_ros.nodes.object_messages import decode_gripper, encode_joints
+from tap_ros.nodes.planner.arm_joints import ArmJoints, tells_gripper
 from tap_ros.nodes.topics import to_nanoseconds, to_stamp
+from tap_ros.robots import ur10e
 
 MS = 10**6
 PARAMS = {'mount_x': 0.2, 'mount_y': 0.6, 'mount_z': -0.05, 'mount_turn': 0.4,

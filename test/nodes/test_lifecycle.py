@@ -16,7 +16,6 @@ from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from tap_msgs.action import ReachGoal
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.learning.weights import stored_digest
 from tap_ros.nodes.clients import (
     call,
     Newest,
@@ -25,6 +24,7 @@ from tap_ros.nodes.clients import (
     wait_for_result,
 )
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS
+from tap_ros.training.weights import stored_digest
 from tap_ros.weights import FORWARD_MODEL
 from test_predictor_node import pictures, Service, weights_file, WITH_GOAL
 

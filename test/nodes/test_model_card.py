@@ -6,9 +6,9 @@ from lively import lively_network
 from processes import NodeProcess
 import pytest
 from std_msgs.msg import String
-from tap_ros.learning.weights import save_weights, stored_digest
 from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.topics import LATCHED
+from tap_ros.training.weights import save_weights, stored_digest
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
 

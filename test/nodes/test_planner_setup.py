@@ -6,7 +6,7 @@ import pytest
 from tap_msgs.action import ReachGoal
 from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
-from tap_ros.nodes.planner_setup import check_request, unlike_training
+from tap_ros.nodes.planner.settings import check_request, unlike_training
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 

@@ -16,12 +16,12 @@ from sim_bridge.simulator import Simulator
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.srv import ResetScene
-from tap_ros.learning.weights import save_weights
 from tap_ros.nodes.clients import call, CallError, cancel_goal, send_goal, wait_for_result
 from tap_ros.nodes.topics import STREAM
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.training.weights import save_weights
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
 
 pytestmark = pytest.mark.slow

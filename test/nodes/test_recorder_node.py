@@ -19,15 +19,15 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
-from tap_ros import ur10e
 from tap_ros.nodes.clients import call
 from tap_ros.nodes.image_messages import encode_image
-from tap_ros.nodes.recorder_node import RecorderNode
+from tap_ros.nodes.recorder.node import RecorderNode
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.attachments import read_attachments
 from tap_ros.recording.messages import decode
 from tap_ros.recording.mounts import ArmMount, read_mount
 from tap_ros.recording.reader import iter_episodes
+from tap_ros.robots import ur10e
 
 
 def read(folder):

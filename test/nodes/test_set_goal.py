@@ -9,8 +9,8 @@ from action_msgs.msg import GoalStatus
 from loop import SEED
 import numpy as np
 import pytest
-from sim_bridge.moved_goal import move_goal
 from sim_bridge.simulator import Simulator
+from sim_bridge.world.moved_goal import move_goal
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectState, ObjectStates

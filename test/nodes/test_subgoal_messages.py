@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ImageError, PlanningError
-from tap_ros.images import resize_pixels
+from tap_ros.images.pixels import resize_pixels
 from tap_ros.nodes.subgoal_messages import decode_subgoals, encode_subgoal
 from tap_ros.nodes.topics import to_stamp
 from tap_ros.prediction.predictor import Subgoal

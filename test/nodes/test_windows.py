@@ -6,7 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from tap_ros.nodes.windows import percentiles, rate, Window
+from tap_ros.nodes.rolling_stats import percentiles, rate, Window
 
 
 @pytest.mark.parametrize('frequency', [0.5, 4.0, 30.0, 5000.0])

@@ -17,9 +17,9 @@ OWN = ('tap_ros', 'sim_bridge', 'experiments')
 
 # What takes seconds to import: what each node does without, so that it is back soon after a crash.
 DONE_WITHOUT = {
-    ('sim_bridge.sim_node', 'tap_ros.nodes.recorder_node'):
+    ('sim_bridge.ros.sim_node', 'tap_ros.nodes.recorder.node'):
         ('torch', 'cv2', 'scipy', 'matplotlib', 'pandas', 'tensorboard', 'tyro'),
-    ('tap_ros.nodes.predictor_node', 'tap_ros.nodes.visual_mpc_node'):
+    ('tap_ros.nodes.predictor.node', 'tap_ros.nodes.planner.node'):
         ('scipy', 'matplotlib', 'pandas', 'tensorboard', 'mujoco', 'tyro'),
 }
 PRINT_LOADED = """
@@ -85,7 +85,7 @@ def layer(name):
 
 
 def may_import_ros(name):
-    return name.endswith('_node') or 'nodes' in name.split('.')
+    return 'nodes' in name.split('.') or name.startswith('sim_bridge.ros')
 
 
 def test_every_folder_has_its_row_and_every_row_its_folder():

@@ -9,11 +9,6 @@ from made_episodes import cover, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.learning.checkpoints import save_checkpoint
-from tap_ros.learning.filled import FilledStore
-from tap_ros.learning.robot_mask import fill_from_past, trained_robot_mask
-from tap_ros.learning.split import split_episodes
-from tap_ros.learning.weights import load_tensors
 from tap_ros.planning.forward_data import augment_windows, read_windows
 from tap_ros.planning.forward_loss import forward_loss
 from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig, load_forward_model
@@ -22,6 +17,11 @@ from tap_ros.planning.forward_training import train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.planning.table import fit_arm, fit_shift, project
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.checkpoints import save_checkpoint
+from tap_ros.training.inpainted import FilledStore
+from tap_ros.training.robot_mask import fill_from_past, trained_robot_mask
+from tap_ros.training.split import split_episodes
+from tap_ros.training.weights import load_tensors
 import torch
 from toy_world import ARM, make_episode, SIZE, TABLE
 

@@ -4,10 +4,10 @@
 
 import pytest
 from tap_ros.errors import ConfigError, WeightsError
-from tap_ros.learning.devices import has_bfloat16
-from tap_ros.learning.weights import save_weights
 from tap_ros.planning.forward_model import ForwardModelConfig, load_forward_model
 from tap_ros.prediction.warp import one_hot_maps
+from tap_ros.training.devices import has_bfloat16
+from tap_ros.training.weights import save_weights
 import torch
 from toy_world import ARM, TABLE
 

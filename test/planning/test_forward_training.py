@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file
 from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.learning.split import split_episodes
-from tap_ros.learning.weights import load_tensors
 from tap_ros.planning.forward_data import (
     augment_windows,
     COLOUR_ORDERS,
@@ -29,6 +27,8 @@ from tap_ros.planning.forward_training import draw_step, model_config, train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.planning.table import project
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.split import split_episodes
+from tap_ros.training.weights import load_tensors
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 from toy_world import make_episode, TABLE, to_pixels

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.forward_model import load_forward_model
 from tap_ros.planning.forward_scores import map_errors

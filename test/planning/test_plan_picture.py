@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sim_bridge.looks import get_look
+from sim_bridge.world.looks import get_look
 from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.pictures import OBJECT_COLOURS
+from tap_ros.images.drawing import OBJECT_COLOURS
 from tap_ros.planning.forward_model import ForwardModelConfig, load_forward_model
 from tap_ros.planning.plan_picture import (
     CHOSEN,

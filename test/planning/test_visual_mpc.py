@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, PlanningError
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.forward_model import load_forward_model

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tap_ros.learning.frames import ResidentFrames
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import (
     episode_order,
@@ -16,6 +15,7 @@ from tap_ros.prediction.batches import (
     uses_recorded_goal,
 )
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.frames import ResidentFrames
 import torch
 
 

@@ -8,9 +8,7 @@ from made_episodes import cover, move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.images import to_float
-from tap_ros.learning.filled import fill
-from tap_ros.learning.weights import load_weights
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.discriminator import Discriminator
@@ -22,6 +20,8 @@ from tap_ros.prediction.selection import Targets
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import ObjectiveSettings, TrainingConfig
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.inpainted import fill
+from tap_ros.training.weights import load_weights
 import torch
 
 CHOSEN = [0, 1, 2, 3]

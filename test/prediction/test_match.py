@@ -7,12 +7,12 @@ import math
 
 import pytest
 from tap_ros.errors import ConfigError
-from tap_ros.learning.parallel import Processes
-from tap_ros.learning.schedule import match_temperature
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import match_step
 from tap_ros.prediction.objective import Draws
 from tap_ros.prediction.training_config import ObjectiveSettings
+from tap_ros.training.parallel import Processes
+from tap_ros.training.schedule import match_temperature
 import torch
 
 N = 20000  # episodes that are alike

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.held_out import held_out_scores

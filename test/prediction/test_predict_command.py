@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from tap_ros.cli import main
-from tap_ros.learning.weights import save_weights
 from tap_ros.prediction.predict_command import fit
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.recording.reader import iter_episodes
+from tap_ros.training.weights import save_weights
 
 
 @pytest.fixture(scope='module')

@@ -15,16 +15,16 @@ import pytest
 from tap_ros.cli import main
 from tap_ros.errors import ConfigError, StorageError, WeightsError
 from tap_ros.files import only_writer
-from tap_ros.images import to_float
-from tap_ros.learning import devices
-from tap_ros.learning.parallel import Processes
-from tap_ros.learning.schedule import kl_share, learning_rate
-from tap_ros.learning.weights import load_tensors, load_weights, save_tensors
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training import devices
+from tap_ros.training.parallel import Processes
+from tap_ros.training.schedule import kl_share, learning_rate
+from tap_ros.training.weights import load_tensors, load_weights, save_tensors
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 

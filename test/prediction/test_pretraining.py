@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from tap_ros.images import to_float
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.pretraining import frame_gan, pretrain_decoders
 import torch

@@ -7,16 +7,16 @@ import json
 
 import numpy as np
 import pytest
-from tap_ros.images import to_float
-from tap_ros.learning.checkpoints import start
-from tap_ros.learning.frames import MappedFrames
-from tap_ros.learning.parallel import Processes
-from tap_ros.learning.schedule import learning_rate
-from tap_ros.learning.weights import load_tensors
+from tap_ros.images.pixels import to_float
 from tap_ros.prediction import training
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
+from tap_ros.training.checkpoints import start
+from tap_ros.training.frames import MappedFrames
+from tap_ros.training.parallel import Processes
+from tap_ros.training.schedule import learning_rate
+from tap_ros.training.weights import load_tensors
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 

@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image as Picture
 import pytest
 from tap_ros.cli import main
-from tap_ros.crop import Crop
 from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.images.crop import Crop
 from tap_ros.recording.bags import check_first_picture, reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import encode

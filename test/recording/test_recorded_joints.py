@@ -5,7 +5,6 @@
 from made_episodes import assert_all_equal
 import numpy as np
 import pytest
-from tap_ros import ur10e
 from tap_ros.errors import RecordingError
 from tap_ros.recording import topics
 from tap_ros.recording.cache import open_recordings
@@ -14,6 +13,7 @@ from tap_ros.recording.messages import encode
 from tap_ros.recording.mounts import ArmMount, FILE_NAME, write_mount
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import write_metadata
+from tap_ros.robots import ur10e
 
 FRAMES, PERIOD, FAST = 6, 250_000_000, 4_000_000  # ns: of the camera, of the driver
 STANDS = ArmMount(ur10e.Mount((0.3, 0.5, 0.0), 1.0, 0.17), 0.5)

@@ -14,8 +14,8 @@ from experiments.paper.places import is_collected
 import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig
-from sim_bridge.expert import run_episode
 from sim_bridge.simulator import Simulator
+from sim_bridge.tasks.expert import run_episode
 from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.engines.task import Engine
 from tap_ros.errors import ConfigError, StorageError

@@ -7,7 +7,8 @@ from itertools import product
 import mujoco
 import numpy as np
 import pytest
-from sim_bridge.entities import (
+from sim_bridge.simulator import Simulator
+from sim_bridge.world.entities import (
     box_around,
     box_of,
     matching,
@@ -15,8 +16,7 @@ from sim_bridge.entities import (
     overlaps_sphere,
     PoseError,
 )
-from sim_bridge.scene import box_shape, HALF_HEIGHT, ObjectShape, random_shape
-from sim_bridge.simulator import Simulator
+from sim_bridge.world.scene import box_shape, HALF_HEIGHT, ObjectShape, random_shape
 from tap_ros.errors import SceneError
 
 FREE = (-0.3, 0.3, HALF_HEIGHT, 0, 0, 0, 1)

@@ -4,12 +4,12 @@
 
 import numpy as np
 import pytest
-from sim_bridge.camera import Camera
-from sim_bridge.looks import OBSERVER
-from sim_bridge.moved_goal import check_places, move_goal
-from sim_bridge.places import GRIPPER_MARGIN
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks import sample_scene, TASKS
+from sim_bridge.tasks.tasks import sample_scene, TASKS
+from sim_bridge.world.camera import Camera
+from sim_bridge.world.looks import OBSERVER
+from sim_bridge.world.moved_goal import check_places, move_goal
+from sim_bridge.world.places import GRIPPER_MARGIN
 from tap_ros.contract import ROBOT_MASK_FREE
 from tap_ros.errors import SceneError
 

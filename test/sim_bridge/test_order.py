@@ -7,13 +7,13 @@ from itertools import pairwise
 import mujoco.rollout
 import numpy as np
 import pytest
-from sim_bridge.expert import run_episode
-from sim_bridge.order_tasks import EDGE_RANGE, NEAR, ORDER_SEPARATION
-from sim_bridge.places import GOAL_DISTANCE, GRIPPER_MARGIN, GRIPPER_RANGE, nearest_first
-from sim_bridge.push_order import best_push, find_order
-from sim_bridge.pushes import Moment, PushRollouts
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks import sample_scene, TASKS
+from sim_bridge.tasks.expert import run_episode
+from sim_bridge.tasks.order_tasks import EDGE_RANGE, NEAR, ORDER_SEPARATION
+from sim_bridge.tasks.push_order import best_push, find_order
+from sim_bridge.tasks.pushes import Moment, PushRollouts
+from sim_bridge.tasks.tasks import sample_scene, TASKS
+from sim_bridge.world.places import GOAL_DISTANCE, GRIPPER_MARGIN, GRIPPER_RANGE, nearest_first
 from tap_ros.contract import SUCCESS_DISTANCE
 
 ORDERED = [task for task in TASKS.values() if task.ordered]

@@ -4,12 +4,8 @@
 
 import numpy as np
 import pytest
-from sim_bridge.grasping import GRASP_YAW
-from sim_bridge.looks import GRIP_SPREAD, LOOKS
-from sim_bridge.places import GOAL_DISTANCE, GOAL_YAW_RANGE, OBJECT_RANGE
-from sim_bridge.scene import build_scene, random_shape
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks import (
+from sim_bridge.tasks.tasks import (
     GOAL_SEPARATION,
     GRASP_RANGE,
     GRASP_REACH_RANGE,
@@ -18,6 +14,10 @@ from sim_bridge.tasks import (
     sample_scene,
     TASKS,
 )
+from sim_bridge.world.grasping import GRASP_YAW
+from sim_bridge.world.looks import GRIP_SPREAD, LOOKS
+from sim_bridge.world.places import GOAL_DISTANCE, GOAL_YAW_RANGE, OBJECT_RANGE
+from sim_bridge.world.scene import build_scene, random_shape
 from tap_ros.contract import WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 

@@ -6,12 +6,18 @@ import mujoco.rollout
 import numpy as np
 import pytest
 from sim_bridge.collect import make_episode
-from sim_bridge.expert import run_episode
-from sim_bridge.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
-from sim_bridge.scene import HALF_HEIGHT
 from sim_bridge.simulator import Simulator
-from sim_bridge.stack_tasks import BLOCK_RANGE, BLOCK_SEPARATION, HAND_MARGIN, is_tower, levels
-from sim_bridge.tasks import sample_scene, TASKS
+from sim_bridge.tasks.expert import run_episode
+from sim_bridge.tasks.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
+from sim_bridge.tasks.stack_tasks import (
+    BLOCK_RANGE,
+    BLOCK_SEPARATION,
+    HAND_MARGIN,
+    is_tower,
+    levels,
+)
+from sim_bridge.tasks.tasks import sample_scene, TASKS
+from sim_bridge.world.scene import HALF_HEIGHT
 
 STACKING = [task for task in TASKS.values() if task.kind == 'stack']
 SEEDS = range(8)

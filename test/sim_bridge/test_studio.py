@@ -7,18 +7,18 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 import pytest
-from sim_bridge.appearance import Appearance, choose_appearance, USUAL
-from sim_bridge.camera import Camera
 from sim_bridge.collect import collect, CollectConfig
-from sim_bridge.expert import run_episode
-from sim_bridge.looks import LOOKS, OBSERVER
-from sim_bridge.robot_description import robot_description, TIP_FRAME
 from sim_bridge.simulator import Simulator
-from sim_bridge.studio import Studio
-from tap_ros import ur10e
+from sim_bridge.tasks.expert import run_episode
+from sim_bridge.world.appearance import Appearance, choose_appearance, USUAL
+from sim_bridge.world.camera import Camera
+from sim_bridge.world.looks import LOOKS, OBSERVER
+from sim_bridge.world.robot_description import robot_description, TIP_FRAME
+from sim_bridge.world.studio import Studio
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import KinematicsError, SceneError
 from tap_ros.recording.reader import iter_episodes
+from tap_ros.robots import ur10e
 
 TASKS = ('push2', 'pick_place')
 ACTIONS = np.array([[0.06, -0.03, -0.05, 1], [-0.08, 0.05, 0, 1], [0, 0.08, 0.1, 0]])

@@ -4,11 +4,16 @@
 
 import numpy as np
 import pytest
-from sim_bridge.looks import get_look, OBSERVER
-from sim_bridge.robot_description import robot_description, TIP_FRAME
-from sim_bridge.transforms import arm_transforms, camera_transform, fixed_arm_transforms, Transform
-from tap_ros import ur10e
-from tap_ros.robot.urdf import read_urdf
+from sim_bridge.world.looks import get_look, OBSERVER
+from sim_bridge.world.robot_description import robot_description, TIP_FRAME
+from sim_bridge.world.transforms import (
+    arm_transforms,
+    camera_transform,
+    fixed_arm_transforms,
+    Transform,
+)
+from tap_ros.robots import ur10e
+from tap_ros.robots.urdf import read_urdf
 
 
 def test_the_arm_is_where_its_urdf_has_it():

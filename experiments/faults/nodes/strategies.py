@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 from experiments.faults.nodes.world import first_pictures
 from hypothesis import strategies as st
-from sim_bridge.robot_description import robot_description
+from sim_bridge.world.robot_description import robot_description
 from tap_ros.contract import (
     ENCODINGS,
     GRIPPER_JOINTS,
@@ -20,7 +20,7 @@ from tap_ros.contract import (
     ROBOT_MASK_HAND,
 )
 from tap_ros.errors import TapError
-from tap_ros.ur10e import JOINTS
+from tap_ros.robots.ur10e import JOINTS
 
 MASK = 'sensor_msgs/Image mask'  # what comes after a blank tells strategies apart
 TOPICS = {

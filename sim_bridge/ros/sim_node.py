@@ -1,0 +1,475 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The simulator as a ROS node: camera, objects and clock out, twist commands in."""
+
+import math
+import sys
+import time
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Twist, TwistStamped
+import numpy as np
+from numpy.typing import ArrayLike
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from sim_bridge.simulator import Observation, Simulator
+from sim_bridge.tasks.run_state import MAX_PERIODS, RunState
+from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.world.appearance import CHOICES
+from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
+from sim_bridge.world.moved_goal import move_goal
+from sim_bridge.world.robot_description import robot_description
+from sim_bridge.world.transforms import arm_transforms, camera_transform, fixed_arm_transforms
+from std_msgs.msg import Float64, String
+from std_srvs.srv import SetBool
+from tap_msgs.msg import CommandRefused, Episode, ObjectStates
+from tap_msgs.srv import ResetScene, SetGoal, StepScene
+from tap_ros.contract import (
+    ACTION_LIMIT,
+    CAMERA_FRAME,
+    CONTROL_PERIOD,
+    OBSERVER_FRAME,
+    WORLD_FRAME,
+)
+from tap_ros.errors import TapError
+from tap_ros.nodes.diagnostics import Diagnostics
+from tap_ros.nodes.image_messages import encode_image, encode_mask
+from tap_ros.nodes.object_messages import (
+    decode_objects,
+    encode_camera_info,
+    encode_joints,
+    encode_objects,
+)
+from tap_ros.nodes.observations import reception_time
+from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.run import answering, run_node
+from tap_ros.nodes.subscriptions import subscribe
+from tap_ros.nodes.tf_publisher import TransformPublisher
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
+
+PERIOD_NS = round(CONTROL_PERIOD * 1e9)
+FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
+RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
+MAX_TIMEOUT = 60.0  # s
+LAST_WORDS_S = 1.0  # s that the end of the last episode may take to arrive
+
+
+class SimNode(Node):
+    """
+    Steps and renders in the thread that spins, to which the OpenGL context belongs.
+
+    Lock-step: a command stamped like the newest image, or unstamped, lets one control period pass.
+    Meanwhile the newest image, and what belongs to it, is sent again and again with the same
+    stamp, so that who waits for it, or comes late, has it.
+    Real time: a timer does, with the command that came since the last period, else standing still.
+    A command is valid for command_timeout after it came; later the arm stands still.
+    A zero twist without a stamp means stop in both modes and lets no time pass. Whoever sends a
+    command that is not carried out learns it from arm/refused.
+    Paused or stopped: commands are refused, and what came before or meanwhile is not made up for.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('sim_node')
+        self.params = declare_parameters(self)
+        task = self.params['task']
+        self._sim = self._simulator(task)
+        self._hide_arm = False
+        self._opening = 0.0  # the newest gripper command
+        self._twist: np.ndarray | None = None  # real time: the command for the next period
+        self._valid_until = 0.0  # monotonic time at which it runs out
+        self._timeout = self.params['command_timeout']  # s that a command is valid
+        self._stamp_ns = FIRST_STAMP  # of the newest image; never goes back, unlike the physics
+        self._answered_ns = 0  # stamp of the newest image that was answered by a command
+        self._reset_ns = FIRST_STAMP
+        self._goal_ns = 0  # stamp of the newest goal
+        self._num_steps = 0
+        self._in_episode = False
+        self.state = RunState.PLAYING
+        self._played_at = 0.0  # monotonic time at which it was set so
+        self._diagnostics = Diagnostics(
+            self, {'arm/delta_twist_cmds': math.inf, 'gripper/command': math.inf})
+        self._create_publishers()
+        # Subscribed before the twist, so that of two commands sent together it is taken first.
+        for kind, topic, callback, qos in (
+                (Float64, 'gripper/command', self._on_gripper, STREAM),
+                (TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM),
+                (Float64, 'arm/command_timeout', self._on_timeout, LATCHED)):
+            subscribe(self, kind, topic, callback, qos)
+        self._reset(task, self.params['seed'], False)
+        for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
+                                   (SetGoal, 'sim/set_goal', self._on_set_goal),
+                                   (StepScene, 'sim/step', self._on_step),
+                                   (SetBool, 'sim/pause', self._on_pause)):
+            self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
+        try:
+            from sim_bridge.ros.standard_services import StandardServices
+        except ImportError:
+            pass  # no wheel has simulation_interfaces
+        else:
+            StandardServices(self)
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        if self.params['lock_step']:
+            mode = 'lock-step'
+            self.create_timer(RESEND_S, self._send_newest, clock=clock)
+        else:
+            factor = self.params['real_time_factor']
+            self.create_timer(CONTROL_PERIOD / factor, self._on_timer, clock=clock)
+            mode = f'{factor:g} x real time'
+        self.get_logger().info(
+            f'ready: task {task}, seed {self.params["seed"]}, {mode}')
+
+    def close(self) -> None:
+        """End the episode, and wait a moment for whoever records it."""
+        self._end_episode()
+        self._sim.close()
+        self._episode.wait_for_all_acked(Duration(seconds=LAST_WORDS_S))
+
+    def _create_publishers(self) -> None:
+        self._newest: dict[str, Any] = {}  # topic -> the message sent last
+        self._streams = {
+            topic: self.create_publisher(kind, topic, STREAM) for topic, kind in {
+                'clock': ClockMessage, 'joint_states': JointState, 'objects': ObjectStates,
+                'camera/camera_info': CameraInfo, 'camera/robot_mask': Image,
+                'camera/image_raw': Image}.items()}
+        self._goal_mask = self.create_publisher(Image, 'goal/robot_mask', LATCHED)
+        self._description = self.create_publisher(String, 'robot_description', LATCHED)
+        self._description.publish(String(data=robot_description()))
+        if self.params['observer']:
+            self._streams['observer/image_raw'] = self.create_publisher(
+                Image, 'observer/image_raw', STREAM)
+        self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
+        self._transforms = TransformPublisher(self)
+        self._episode = self.create_publisher(Episode, 'episode', STREAM)
+        self._goal_image = self.create_publisher(Image, 'goal/image', LATCHED)
+        self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
+
+    # Commands
+
+    def _on_gripper(self, message: Float64, info: dict[str, Any]) -> None:
+        self._diagnostics.received('gripper/command')
+        reason = self._refuse_paused(info)
+        if reason:
+            self.get_logger().warning(
+                f'gripper/command ignored: {reason}', throttle_duration_sec=5.0)
+            return
+        if not math.isfinite(message.data):
+            self.get_logger().warning(
+                f'gripper/command ignored: data is {message.data}; expected a number from '
+                '0 (closed) to 1 (open)')
+            return
+        self._opening = min(max(message.data, 0.0), 1.0)
+
+    def _on_twist(self, message: TwistStamped, info: dict[str, Any]) -> None:
+        self._diagnostics.received('arm/delta_twist_cmds')
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        move = np.array([getattr(message.twist.linear, axis) for axis in 'xyz'])
+        if stamp_ns == 0 and not move.any():
+            self._twist = None
+            return
+        reason = (self._refuse_paused(info)
+                  or self._refuse_twist(message.twist, move, stamp_ns))
+        if reason:
+            self.get_logger().warning(f'arm/delta_twist_cmds ignored: {reason}')
+            self._diagnostics.error(f'arm/delta_twist_cmds ignored: {reason}')
+            self._refused.publish(CommandRefused(header=message.header, message=reason))
+            return
+        if (np.abs(move) > ACTION_LIMIT).any():
+            self.get_logger().warning(
+                f'arm/delta_twist_cmds limited: {move} to +-{ACTION_LIMIT} m per control period',
+                throttle_duration_sec=5.0)
+        self._answered_ns = max(stamp_ns, self._answered_ns)
+        if self.params['lock_step']:
+            self._step(move)
+        else:
+            self._twist = move
+            self._valid_until = (reception_time(info)
+                                 + self._timeout / self.params['real_time_factor'])
+
+    def _on_timeout(self, message: Float64) -> None:
+        if not 0 < message.data <= MAX_TIMEOUT:
+            self.get_logger().warning(
+                f'arm/command_timeout ignored: data is {message.data}; expected seconds, more '
+                f'than 0 and at most {MAX_TIMEOUT:g}')
+            return
+        self._timeout = message.data
+
+    def _refuse_paused(self, info: dict[str, Any]) -> str:
+        """Say why a command that came now cannot be used; an empty string if it can."""
+        if self.state is not RunState.PLAYING:
+            return 'the simulation is paused; call sim/pause with data false'
+        if reception_time(info) < self._played_at:
+            return 'it came while the simulation was paused'
+        return ''
+
+    def _refuse_twist(self, twist: Twist, move: np.ndarray, stamp_ns: int) -> str:
+        """Say why a command cannot be used; an empty string if it can."""
+        for axis, value in zip('xyz', move):
+            if not math.isfinite(value):
+                return f'twist.linear.{axis} is {value}; expected finite numbers'
+        if any(getattr(twist.angular, axis) != 0 for axis in 'xyz'):
+            return 'twist.angular is not zero; this gripper moves but cannot turn'
+        try:
+            self._sim.check_action(np.append(move, self._opening))
+        except TapError as error:
+            return str(error)
+        if stamp_ns == 0:
+            return ''
+        if stamp_ns > self._stamp_ns:
+            return (f'its stamp {stamp_ns} ns is newer than the newest image '
+                    f'({self._stamp_ns} ns); use the stamp of the image it answers')
+        if stamp_ns <= self._answered_ns or stamp_ns < self._reset_ns:
+            return f'the image stamped {stamp_ns} ns was answered before, or is of an old scene'
+        if self.params['lock_step'] and stamp_ns < self._stamp_ns:
+            return (f'it answers the image stamped {stamp_ns} ns; '
+                    f'the newest is stamped {self._stamp_ns} ns')
+        return ''
+
+    def _on_timer(self) -> None:
+        if self.state is RunState.PLAYING:
+            move, self._twist = self._twist, None
+            if move is None or time.monotonic() > self._valid_until:
+                move = np.zeros(3)
+            self._step(move)
+
+    # Services
+
+    def _on_reset(self, request: ResetScene.Request,
+                  response: ResetScene.Response) -> ResetScene.Response:
+        try:
+            self._reset(request.task or 'push2', request.seed, request.hide_arm)
+        except TapError as error:
+            response.message = str(error)
+            return response
+        response.success = True
+        response.message = f'{self._sim.task.name}, seed {request.seed}'
+        return response
+
+    def _on_set_goal(self, request: SetGoal.Request,
+                     response: SetGoal.Response) -> SetGoal.Response:
+        camera, poses = self._sim.camera, self._sim.goal().object_poses
+        try:
+            names, pixels = decode_objects(
+                request.objects, 'objects', (camera.height, camera.width))
+            self._sim.set_goal(move_goal(camera, poses, names, pixels))
+        except TapError as error:
+            response.message = str(error)
+            return response
+        self._publish_goal()
+        response.success = True
+        response.message = f'moved {", ".join(names)}'
+        return response
+
+    def _on_step(self, request: StepScene.Request,
+                 response: StepScene.Response) -> StepScene.Response:
+        periods = request.num_periods or 1
+        if periods > MAX_PERIODS:
+            response.message = (
+                f'num_periods is {periods}; expected 1 to {MAX_PERIODS}, call more often')
+        elif self.state is RunState.PLAYING and not self.params['lock_step']:
+            response.message = (
+                'time passes by itself; pause with sim/pause first, or start with lock_step')
+        else:
+            for _ in range(periods):
+                self.wait_period()
+            response.success = True
+            response.message = f'{periods} control periods passed'
+        response.stamp = self.stamp
+        return response
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self.set_state(RunState.PAUSED if request.data else RunState.PLAYING)
+        response.success = True
+        response.message = 'paused' if request.data else 'running'
+        return response
+
+    # What all services are made of
+
+    @property
+    def sim(self) -> Simulator:
+        """Return the simulator of the present scene."""
+        return self._sim
+
+    @property
+    def stamp(self) -> Time:
+        """Return the stamp of the newest picture."""
+        return to_stamp(self._stamp_ns)
+
+    def set_state(self, state: RunState) -> None:
+        """Let time pass or not; what was commanded before and is not done yet is forgotten."""
+        if state is not self.state:
+            self._twist = None
+            self._opening = float(self._sim.target[3])
+            self._played_at = time.monotonic() if state is RunState.PLAYING else math.inf
+            self.state = state
+
+    def wait_period(self) -> None:
+        """Let one control period pass in which the arm stands still."""
+        self._leave_start()
+        self._step(np.zeros(3))
+
+    def _leave_start(self) -> None:
+        """Note that the first scene is no longer at its start, which is what stopped says."""
+        if self.state is RunState.STOPPED:
+            self.state = RunState.PAUSED
+
+    def restart(self) -> None:
+        """Start the first scene again, as when the node was started."""
+        state = self.state
+        self._reset(self.params['task'], self.params['seed'], False)
+        self.state = state  # stopped stays stopped: it is the first scene
+
+    def repeat(self) -> None:
+        """Start the present scene again."""
+        self._reset(self._sim.task.name, self._sim.scene.seed, self._hide_arm)
+
+    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike) -> None:
+        """Put an object elsewhere (see Simulator.put_object) and publish what is seen then."""
+        self._sim.put_object(name, pose, velocity)
+        self._leave_start()
+        self._stamp_ns += 1  # pictures are told apart by their stamps
+        self._publish(self._sim.observe())
+
+    # Simulation
+
+    def _simulator(self, task: str) -> Simulator:
+        return Simulator(task, self.params['image_size'], self.params['look'],
+                         self.params['appearance'])
+
+    def _reset(self, task: str, seed: int, hide_arm: bool) -> None:
+        """Start a scene; if it cannot be, the present one stays as it is."""
+        if task == self._sim.task.name:
+            sim = self._sim
+        else:
+            sim = self._simulator(task)
+        self._end_episode()
+        observation = sim.reset(seed)
+        if sim is not self._sim:
+            self._sim.close()
+        self._sim, self._hide_arm = sim, hide_arm
+        self._leave_start()
+        self._opening, self._twist = 0.0, None
+        self._stamp_ns += PERIOD_NS
+        self._reset_ns = self._stamp_ns
+        self._num_steps = 0
+        self._in_episode = True
+        self._publish_episode(Episode.START, '')
+        self._publish_fixed_transforms()
+        self._publish_goal()
+        self._publish(observation)
+
+    def _step(self, move: np.ndarray) -> None:
+        """Let one control period pass and publish what the camera then sees."""
+        begin = time.perf_counter()
+        observation = self._sim.step(np.append(move, self._opening))
+        self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'step')
+        self._stamp_ns += PERIOD_NS
+        self._num_steps += 1
+        self._publish(observation)
+
+    def _end_episode(self) -> None:
+        if self._in_episode:
+            self._in_episode = False
+            outcome = self._sim.outcome() if self._num_steps else 'interrupted'
+            self._publish_episode(Episode.END, outcome)
+
+    # Messages
+
+    def _publish(self, observation: Observation) -> None:
+        if self._hide_arm:
+            observation = self._sim.observe(hide_arm=True)
+        stamp = to_stamp(self._stamp_ns)
+        camera = self._sim.camera
+        self._newest = {
+            'clock': ClockMessage(clock=stamp),
+            'joint_states': encode_joints(
+                observation.gripper, stamp, WORLD_FRAME, observation.arm_joints),
+            'objects': encode_observed(observation, stamp),
+            'camera/camera_info': encode_camera_info(
+                camera.K, (camera.height, camera.width), stamp, CAMERA_FRAME),
+            'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME),
+            'camera/robot_mask': encode_mask(observation.robot_mask, stamp, CAMERA_FRAME)}
+        if self.params['observer']:
+            self._newest['observer/image_raw'] = encode_image(
+                self._sim.observer_picture(), stamp, OBSERVER_FRAME)
+        self._transforms.moving(arm_transforms(observation.arm_joints), stamp)
+        self._send_newest()
+
+    def _publish_fixed_transforms(self) -> None:
+        """Tell where the cameras and the foot of the arm are in this scene."""
+        fixed = [camera_transform(self._sim.camera, CAMERA_FRAME),
+                 camera_transform(OBSERVER, OBSERVER_FRAME), *fixed_arm_transforms()]
+        self._transforms.fixed(fixed, to_stamp(self._stamp_ns))
+
+    def _send_newest(self) -> None:
+        """Send what the camera sees now, again if need be."""
+        for topic, message in self._newest.items():
+            self._streams[topic].publish(message)
+
+    def _publish_goal(self) -> None:
+        goal = self._sim.goal(self._hide_arm or self.params['hide_arm_in_goal'])
+        # Goals are told apart by their stamps, also where no time has passed between them.
+        self._goal_ns = max(self._stamp_ns, self._goal_ns + 1)
+        stamp = to_stamp(self._goal_ns)
+        self._goal_objects.publish(encode_observed(goal, stamp))
+        self._goal_image.publish(encode_image(goal.image, stamp, CAMERA_FRAME))
+        self._goal_mask.publish(encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
+
+    def _publish_episode(self, event: int, outcome: str) -> None:
+        scene = self._sim.scene
+        message = Episode(event=event, task=scene.task.name, seed=scene.seed, outcome=outcome)
+        # Not before its goal, else a recording would not count that.
+        message.header.stamp = to_stamp(max(self._stamp_ns, self._goal_ns))
+        message.header.frame_id = WORLD_FRAME
+        self._episode.publish(message)
+
+
+def declare_parameters(node: Node) -> Parameters:
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('task', 'push2', 'Task of the first scene.', choices=list(TASKS))
+    parameters.declare('seed', 0, 'Seed of the first scene.', low=0, high=2**62)
+    parameters.declare('image_size', 64, 'Width and height of the pictures in pixels.',
+                       low=16, high=1024)
+    parameters.declare(
+        'look', DEFAULT_LOOK,
+        "What the camera's pictures show: the whole UR10e at a wooden table, or its hand alone.",
+        choices=list(LOOKS))
+    parameters.declare(
+        'appearance', 'usual', 'Table, light and camera; random: drawn from '
+        'the seed of each scene.', choices=list(CHOICES))
+    parameters.declare(
+        'observer', False, 'Publish observer/image_raw, a view from the side for people.')
+    parameters.declare(
+        'lock_step', False,
+        'True: each twist command lets one control period pass, so that runs repeat exactly. '
+        'False: time passes by itself.')
+    parameters.declare('real_time_factor', 1.0,
+                       'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
+    parameters.declare('command_timeout', 1.0,
+                       'Simulated seconds that a command is valid after it came; then the arm '
+                       'stands still. Its sender may say otherwise on arm/command_timeout.',
+                       low=0.001, high=60.0)
+    parameters.declare('hide_arm_in_goal', False,
+                       'Leave the arm out of the goal picture, from the next one on.',
+                       read_only=False)
+    return parameters
+
+
+def encode_observed(observation: Observation, stamp: Time) -> ObjectStates:
+    """Encode the objects of an Observation, which come from the simulator itself."""
+    return encode_objects(
+        observation.object_names, observation.object_pixels, observation.object_poses, stamp,
+        WORLD_FRAME, ObjectStates.SOURCE_GROUND_TRUTH)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; the answer is the exit code of the process."""
+    return run_node(SimNode, 'sim_node', args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,107 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Draw scenes in which the order of the pushes matters: each object stands on the next one's goal.
+
+The objects are a chain. The last one of it stands near an edge of the workspace and goes along the
+edge; the one before goes outwards, to where the last one stood, and with three objects the first
+goes to where the second stood. The gripper begins beside the first, away from the others. Whoever
+begins with that one pushes what stands on its goal outwards, where the gripper cannot get behind
+it any more.
+"""
+
+import numpy as np
+from sim_bridge.world.places import (
+    apart,
+    GOAL_DISTANCE,
+    GRIPPER_HEIGHT,
+    GRIPPER_MARGIN,
+    GRIPPER_RANGE,
+    OBJECT_RANGE,
+)
+from sim_bridge.world.scene import ObjectShape, random_shape
+from tap_ros.contract import WORKSPACE_HIGH
+
+EDGE_RANGE = (0.35, 0.38)  # m from the middle, where the object at the edge stands
+OUTWARDS = 0.35  # rad, largest angle between the edge's normal and the way onto that place
+ALONG = (1.7, 2.1)  # rad, between the edge's normal and the way of the object at the edge
+NEAR = 0.02  # m, largest distance from an object to the goal on which it stands
+ORDER_SEPARATION = 0.17  # m between object origins at the start, and between goals
+FREE_WAY = 0.13  # m, least from a way to the objects that stand beside it, in the right order
+BEHIND = 0.13  # m, where a push begins
+HAND_DISTANCE = (GRIPPER_MARGIN, 0.24)  # m from the first object of the chain to the gripper
+
+
+def draw_shapes(rng: np.random.Generator, count: int) -> tuple[ObjectShape, ...]:
+    """Draw shapes that do not touch each other ORDER_SEPARATION apart, whatever their yaw."""
+    while True:
+        shapes = tuple(random_shape(rng) for _ in range(count))
+        if sum(sorted(_radius(shape) for shape in shapes)[-2:]) < ORDER_SEPARATION:
+            return shapes
+
+
+def draw_chain(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Draw where objects stand and go, object i to where object i + 1 stands, and the gripper.
+
+    :param rng: numpy Generator.
+    :param count: K objects; the right order is from the last one to the first.
+    :return: starts (K, 2) and goals (K, 2) of the objects, (3,) of the gripper; metres.
+    """
+    while True:
+        starts, goals = _at_the_edge(rng, count)
+        if not (_inside(starts, EDGE_RANGE[1]) and _inside(goals, EDGE_RANGE[1])
+                and apart(starts, ORDER_SEPARATION) and apart(goals, ORDER_SEPARATION)
+                and _free(starts, goals)):
+            continue
+        away = starts[0] - goals[0]
+        angle = np.arctan2(away[1], away[0]) + rng.uniform(-1, 1)
+        hand = starts[0] + rng.uniform(*HAND_DISTANCE) * _along(angle)
+        gaps = np.linalg.norm(starts - hand, axis=1)
+        if gaps.min() >= GRIPPER_MARGIN and gaps.argmin() == 0 and _inside(hand, GRIPPER_RANGE):
+            return starts, goals, np.append(hand, rng.uniform(0, GRIPPER_HEIGHT))
+
+
+def _at_the_edge(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draw starts and goals, (K, 2) each, not all of them allowed."""
+    edge = rng.integers(4) * np.pi / 2
+    turn = np.array([[np.cos(edge), -np.sin(edge)], [np.sin(edge), np.cos(edge)]])
+    starts, goals = np.empty((2, count, 2))
+    starts[-1] = rng.uniform(*EDGE_RANGE), rng.uniform(-OBJECT_RANGE, OBJECT_RANGE)
+    goals[-1] = starts[-1] + GOAL_DISTANCE * _along(rng.choice([-1, 1]) * rng.uniform(*ALONG))
+    for k in range(count - 2, -1, -1):
+        goals[k] = starts[k + 1] + rng.uniform(0, NEAR) * _along(rng.uniform(0, 2 * np.pi))
+        most = OUTWARDS if k == count - 2 else np.pi
+        starts[k] = goals[k] - GOAL_DISTANCE * _along(rng.uniform(-most, most))
+    return starts @ turn.T, goals @ turn.T
+
+
+def _free(starts: np.ndarray, goals: np.ndarray) -> bool:
+    """Tell whether, from the last object to the first, nothing stands in the way of the arm."""
+    positions = starts.copy()
+    for k in range(len(starts) - 1, -1, -1):
+        along = (goals[k] - starts[k]) / GOAL_DISTANCE
+        behind = starts[k] - BEHIND * along
+        way = behind + np.linspace(0, 1, 18)[:, None] * (goals[k] - behind)
+        others = np.delete(positions, k, axis=0)
+        gaps = np.linalg.norm(way[:, None] - others, axis=-1)
+        if gaps.min() < FREE_WAY or not _inside(behind, WORKSPACE_HIGH[0]):
+            return False
+        positions[k] = goals[k]
+    return True
+
+
+def _inside(positions: np.ndarray, limit: float) -> bool:
+    return bool((np.abs(positions) <= limit).all())
+
+
+def _along(angle: float) -> np.ndarray:
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _radius(shape: ObjectShape) -> float:
+    """Return how far a shape reaches from its origin, in m."""
+    if shape.kind == 'disc':
+        return shape.half_sizes[0][0]
+    return max(float(np.linalg.norm(np.abs(centre) + np.array(size)[:2]))
+               for centre, size in zip(shape.centres, shape.half_sizes))

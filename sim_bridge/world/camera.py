@@ -1,0 +1,150 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The camera's geometry, and off-screen rendering."""
+
+import contextlib
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+from sim_bridge.world.appearance import Appearance
+from sim_bridge.world.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
+from tap_ros.errors import SceneError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera; pixel (0, 0) is the centre of the top-left pixel."""
+
+    width: int
+    height: int
+    tilt: float = CAMERA_TILT  # rad from straight down
+    fovy: float = CAMERA_FOVY  # degrees
+    position: tuple[float, float, float] = CAMERA_POSITION  # m
+    turn: float = 0.0  # rad about the vertical; at 0 it looks along y
+
+    @property
+    def K(self) -> np.ndarray:
+        """Intrinsics, 3x3, in pixels."""
+        focal = 0.5 * self.height / np.tan(np.radians(self.fovy) / 2)
+        return np.array([
+            [focal, 0, (self.width - 1) / 2], [0, focal, (self.height - 1) / 2], [0, 0, 1]])
+
+    @property
+    def extrinsics(self) -> np.ndarray:
+        """World to camera, 3x4, metres; the camera looks along +z, x right, y down."""
+        c, s = np.cos(self.tilt), np.sin(self.tilt)
+        rotation = np.array([[1, 0, 0], [0, -c, -s], [0, s, -c]])
+        if self.turn:
+            c, s = np.cos(self.turn), np.sin(self.turn)
+            rotation = rotation @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        return np.column_stack([rotation, -rotation @ np.array(self.position)])
+
+    @property
+    def quaternion(self) -> np.ndarray:
+        """Orientation w, x, y, z of MuJoCo's camera, which looks along -z."""
+        tilt = np.array([np.cos(self.tilt / 2), np.sin(self.tilt / 2), 0, 0])
+        turn = np.array([np.cos(self.turn / 2), 0, 0, np.sin(self.turn / 2)])
+        product = np.zeros(4)
+        mujoco.mju_mulQuat(product, turn, tilt)
+        return product
+
+    def project(self, points: ArrayLike) -> np.ndarray:
+        """
+        Project points of the world into the picture.
+
+        :param points: (..., 3) metres.
+        :return: (..., 2) pixels (u, v) = (column, row).
+        """
+        rotation, translation = self.extrinsics[:, :3], self.extrinsics[:, 3]
+        rays = (np.asarray(points) @ rotation.T + translation) @ self.K.T
+        return rays[..., :2] / rays[..., 2:]
+
+    def on_table(self, pixels: ArrayLike, height: ArrayLike = 0.0) -> np.ndarray:
+        """
+        Return where the rays of pixels meet the table's plane, z = 0, or one above it.
+
+        :param pixels: (..., 2) (u, v).
+        :param height: z of the plane in m, beneath the camera, or one for each pixel (...).
+        :return: (..., 2) x, y in m; infinite for rays that do not meet it.
+        """
+        pixels = np.asarray(pixels, np.float64)
+        rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1)
+        rays = rays @ np.linalg.inv(self.K).T @ self.extrinsics[:, :3]
+        with np.errstate(divide='ignore', invalid='ignore'):
+            far = np.where(
+                rays[..., 2] < 0, (np.asarray(height) - self.position[2]) / rays[..., 2], np.inf)
+            return np.array(self.position[:2]) + far[..., None] * rays[..., :2]
+
+    def moved(self, appearance: Appearance) -> 'Camera':
+        """Return this camera where an Appearance puts it."""
+        x, y, z = np.add(self.position, appearance.camera_offset).tolist()
+        return replace(self, position=(x, y, z), tilt=self.tilt + appearance.camera_tilt)
+
+    def resized(self, width: int, height: int) -> 'Camera':
+        """Return a camera with the same view and other pixels."""
+        return replace(self, width=width, height=height)
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture, and where the robot is in it."""
+
+    picture: np.ndarray  # uint8 (H, W, 3) rgb
+    robot_mask: np.ndarray  # uint8 (H, W), values as in contract.py
+    arm_joints: np.ndarray  # (6,) rad, of the UR10e
+
+
+class OpenGL:
+    """
+    An off-screen OpenGL context; it belongs to the thread that built it.
+
+    Building a context costs far more than a picture, so one is kept for many models that share
+    their visual settings.
+
+    :param model: mujoco.MjModel with these settings.
+    :param width: of pictures, in pixels.
+    :param height: of pictures, in pixels.
+    :raises SceneError: when nothing can be rendered.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        # Torch's CUDA build brings triton, whose LLVM has to be loaded before that of Mesa.
+        with contextlib.suppress(ImportError):
+            import triton  # noqa: F401
+        try:
+            self._gl = mujoco.GLContext(width, height)
+            self._gl.make_current()
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        except Exception as error:
+            raise SceneError(
+                f'cannot render off-screen ({error}); on Debian and Ubuntu: '
+                'apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl') from error
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+
+    def draw(self, scene: mujoco.MjvScene, numbers: bool = False) -> np.ndarray:
+        """
+        Draw a scene.
+
+        :param scene: mujoco.MjvScene.
+        :param numbers: draw the `segid` of each geom instead of its colour.
+        :return: uint8 (H, W, 3) rgb; or int64 (H, W), -1 where no geom is.
+        """
+        self._gl.make_current()
+        for flag in (mujoco.mjtRndFlag.mjRND_SEGMENT, mujoco.mjtRndFlag.mjRND_IDCOLOR):
+            scene.flags[flag] = numbers
+        picture = np.empty((self._viewport.height, self._viewport.width, 3), np.uint8)
+        mujoco.mjr_render(self._viewport, scene, self._context)
+        mujoco.mjr_readPixels(picture, None, self._viewport, self._context)
+        picture = np.ascontiguousarray(picture[::-1])
+        if not numbers:
+            return picture
+        return picture[..., 0] + 2 ** 8 * picture[..., 1].astype(np.int64) - 1
+
+    def close(self) -> None:
+        """Free the context."""
+        self._gl.make_current()  # else another context's objects would be freed
+        self._context.free()
+        self._gl.free()

@@ -1,0 +1,3 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""ROS messages, live or recorded, to arrays and back."""

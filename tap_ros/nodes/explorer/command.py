@@ -1,0 +1,83 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The command `python -m tap_ros explore`: all nodes, and a page in the browser to try them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+import re
+import time
+from typing import Annotated
+
+from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
+from tap_ros.errors import ConfigError, TapError
+from tap_ros.nodes.demo.command import new_folder
+from tap_ros.nodes.node_processes import NodeProcesses
+from tap_ros.options import Folder, one_of
+from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
+
+_READY_S = 120.0
+_LOOK_S = 0.2
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param task: of the first scene; its predictor is the one that is started.
+    :param seed: of the first scene.
+    :param look: of the world, see sim_node.
+    :param host: address at which browsers find the page; 0.0.0.0: of every network of this
+        machine, with a token.
+    :param port: of the page; 0: any that is free.
+    :param token: that browsers must give; empty: made up where one is needed.
+    :param logs: folder for the nodes' logs; a number is added when it exists.
+    """
+
+    task: Annotated[str, one_of(TASKS)] = 'push2'
+    seed: int = 1_000_000
+    look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
+    host: str = '127.0.0.1'
+    port: int = 8000
+    token: str = ''
+    logs: Folder = 'runs/explore'
+
+
+def run(args: Options) -> None:
+    """
+    Start the nodes, say where the page is, and wait for Ctrl-C.
+
+    :raises ConfigError: for a port or seed that there is not.
+    :raises NodeEnded: when a node ends; the message has the end of its log.
+    """
+    if not 0 <= args.port < 2**16 or args.seed < 0:
+        raise ConfigError('port: expected 0 to 65535; seed: 0 or more')
+    folder = new_folder(args.logs)
+    with NodeProcesses(folder) as processes:
+        # In lock-step a scene waits for those who look at it, however slow the machine is.
+        processes.start('sim_node', lock_step=True, task=args.task, seed=args.seed, look=args.look)
+        processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
+                        else DEFAULT_PREDICTOR)
+        processes.start('visual_mpc_node')
+        token = {'token': args.token} if args.token else {}
+        processes.start('explorer_node', host=args.host, port=args.port, **token)
+        print(f'starting nodes; their logs are in {folder}', flush=True)
+        for name in ('sim_node', 'predictor_node', 'visual_mpc_node', 'explorer_node'):
+            found = _wait_until_ready(processes, folder / f'{name}.log')
+        print(f'open {found} in a browser; Ctrl-C ends all nodes', flush=True)
+        while True:
+            time.sleep(_LOOK_S)
+            processes.check()
+
+
+def _wait_until_ready(processes: NodeProcesses, log: Path) -> str:
+    """Wait until a node says that it is ready; return the address in what it says, if any."""
+    deadline = time.monotonic() + _READY_S
+    while time.monotonic() < deadline:
+        processes.check()
+        found = re.search(r'ready: (?:open (\S+))?', log.read_text(errors='replace'))
+        if found:
+            return found[1] or ''
+        time.sleep(_LOOK_S)
+    raise TapError(f'{log}: the node is not ready after {_READY_S:g} s')

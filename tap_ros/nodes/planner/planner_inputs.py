@@ -1,0 +1,274 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What visual_mpc_node sees: messages put together by their stamp, and decoded once."""
+
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import replace
+import time
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from sensor_msgs.msg import CompressedImage, Image, JointState
+from tap_msgs.msg import Episode, ObjectStates
+from tap_ros.errors import ImageError, KinematicsError, PlanningError, TapError
+from tap_ros.images.crop import TrainedCrop
+from tap_ros.images.pixels import check_image
+from tap_ros.nodes.camera_topic import camera_topic
+from tap_ros.nodes.image_messages import decode_image, encode_image
+from tap_ros.nodes.object_messages import decode_cut_objects, decode_gripper, match_objects
+from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
+from tap_ros.nodes.planner.arm_joints import ArmJoints, tells_gripper
+from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
+from tap_ros.nodes.subscriptions import subscribe
+from tap_ros.nodes.topics import STREAM, to_nanoseconds
+from tap_ros.planning.reach import Seen
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from tap_ros.nodes.parameters import Parameters
+
+def sensor_topics(params: 'Parameters') -> dict[str, tuple[type, str]]:
+    """Return {short name: (message type, topic name)}, with the robot mask when one is used."""
+    topics = {'image': camera_topic(params), 'objects': (ObjectStates, 'objects'),
+              'joints': (JointState, 'joint_states')}
+    return topics | (CAMERA_MASK if params['robot_mask'] != 'none' else {})
+
+
+class Sight:
+    """
+    The newest picture with its objects and joints, for one goal at a time.
+
+    With the parameter robot_mask the picture is without the robot, all that is seen; a picture
+    whose mask has not come is not seen. Joint states that do not say where the gripper is, but
+    where the joints of the arm are, have times of their own: the gripper of a picture is found
+    between the states before and after it.
+
+    :param node: rclpy Node.
+    :param params: its Parameters.
+    :param crop: returns the TrainedCrop: what the planner makes of pictures, and the size that
+        they get.
+    :param on_message: called with the topic name after each message.
+    :ivar sensors: Observations.
+    :ivar robot: RobotView.
+    :ivar messages: {topic: message} that the newest Seen was decoded from.
+    """
+
+    def __init__(self, node: 'Node', params: 'Parameters', crop: Callable[[], TrainedCrop],
+                 on_message: Callable[[str], object]) -> None:
+        self._node, self._params, self._crop_now = node, params, crop
+        self._camera_size: tuple[int, int] | None = None
+        self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
+        self.robot = RobotView(params['robot_mask'])
+        self._types = sensor_topics(params)
+        self._tell = on_message
+        self.sensors = Observations(*self._types)
+        self._arm = ArmJoints(params)
+        self._useless = ''  # why the joint states cannot be used
+        self.begin(0.0)
+        self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
+                               others={'joints': self._on_joints})
+        subscribe(node, Episode, 'episode', self._on_episode, STREAM)
+
+    @property
+    def _crop(self) -> TrainedCrop:
+        """Return what the planner makes of pictures now."""
+        return self._crop_now()
+
+    def topics(self, objects: bool = True) -> tuple[str, ...]:
+        """Return the names of what is looked at, with or without the objects."""
+        return tuple(topic for topic in self._types if objects or topic != 'objects')
+
+    def begin(self, since: float) -> None:
+        """Begin a goal: only what is received from this monotonic time on is seen."""
+        self._since = since
+        self._seen: Seen | None = None
+        self.messages: dict[str, Any] = {}
+        self._publishers = self._count_publishers()
+
+    def look(self, topics: Collection[str]) -> tuple[Seen | None, str]:
+        """
+        Return what was seen last.
+
+        :param topics: those that are needed, as topics gives them; without objects their pixels
+            are None.
+        :return: Seen, or None when nothing was; which sensors are silent, '' if none is.
+        :raises TapError: for messages that cannot be used.
+        """
+        self._check_publishers()
+        moment = self.sensors.moment(topics, since=self._since)
+        lacking = self._lacking(topics)
+        if moment is None:
+            return None, lacking or self._unmatched_joints() or (
+                f'no messages of the same stamp on {self._names(topics)} since the goal was '
+                'accepted')
+        times: dict[str, Any] = {
+            'received': moment.received, 'scene_ns': self._scene_ns(moment.stamp_ns),
+            'jumps': self.sensors.jumps}
+        if self._seen is not None and (self._seen.stamp_ns, self._seen.jumps) == (
+                moment.stamp_ns, times['jumps']):
+            self._seen = replace(self._seen, **times)
+        else:
+            moment = self._without_robot(moment)
+            self._seen = self._decode(moment, topics, times)
+            self.messages = moment.messages
+        return self._seen, lacking
+
+    def newest_stamp(self) -> int:
+        """Return the stamp of the newest picture that has come with its joints, in ns."""
+        moment = self.sensors.moment(('image', 'joints'))
+        return moment.stamp_ns if moment is not None else -1
+
+    def _scene_ns(self, stamp_ns: int) -> int:
+        """Return when the scene began, 0 if that is unknown or of another clock."""
+        begun_ns, jumps = self._mark
+        known = jumps == self.sensors.jumps and begun_ns <= stamp_ns + JUMP_NS
+        return begun_ns if known else 0
+
+    def _without_robot(self, moment: Moment) -> Moment:
+        """Take the robot out of the picture of a Moment, if that is wanted; it is raw then."""
+        messages = moment.messages
+        if self.robot.used:
+            image = self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
+        elif isinstance(messages['image'], CompressedImage):
+            header = messages['image'].header
+            image = encode_image(decode_image(messages['image'], self._types['image'][1]),
+                                 header.stamp, header.frame_id)
+        else:
+            return moment
+        return replace(moment, messages=messages | {'image': image})
+
+    def cut(self, message: Image, name: str) -> np.ndarray:
+        """
+        Return a picture as the planner sees it, uint8 (H, W, 3).
+
+        :param message: sensor_msgs/Image.
+        :param name: how errors call it.
+        :raises ImageError: for one that cannot be used, or cut as in the training.
+        """
+        picture = decode_image(message, name)
+        return check_image(self._crop.of(picture.shape[:2], name).image(picture), name,
+                           self._crop.size)
+
+    def decode_positions(self, message: ObjectStates, name: str,
+                         picture: Image | None = None) -> tuple[tuple[str, ...], np.ndarray]:
+        """
+        Decode where objects are, in the pixels that the planner works with.
+
+        :param message: tap_msgs/ObjectStates, in pixels of a picture.
+        :param name: how errors call it.
+        :param picture: the picture; None: the one that was seen last.
+        :return: names, and pixels (K, 2) float32.
+        :raises TapError: see object_messages.decode_objects; also outside of the part that is
+            used.
+        """
+        size = (self._camera_size or self._crop.size if picture is None
+                else (picture.height, picture.width))
+        return decode_cut_objects(message, name, size, self._crop.of(size, name))
+
+    def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
+        """Take joint states; they may be the gripper's, the arm's, or another driver's."""
+        received, name = reception_time(info), self._types['joints'][1]
+        self._tell(name)
+        if tells_gripper(message):
+            self.sensors.put('joints', message, received)
+            return
+        try:
+            new = self._arm.take(message, received)
+        except TapError as error:
+            self._useless = f'{self._names(["joints"])}: {error}'
+            return
+        if new:
+            self._useless = ''
+        if self._arm.used:
+            self.sensors.heard('joints', self._arm.received, new)
+            for stamp_ns in self.sensors.without('joints', 'image'):
+                self._match_joints(stamp_ns)
+
+    def _match_joints(self, stamp_ns: int) -> None:
+        """Add the gripper's state at the time of a picture, once the arm's joints are known."""
+        with suppress(KinematicsError):  # who looks at it is told
+            self.sensors.attach('joints', stamp_ns, *self._arm.state(stamp_ns))
+
+    def _unmatched_joints(self) -> str:
+        """Say why the newest picture has no joints, where it should have those of an arm."""
+        newest = self.sensors.moment(('image',))
+        if not self._arm.used or newest is None:
+            return ''
+        try:
+            self._arm.state(newest.stamp_ns)
+        except KinematicsError as error:
+            return f'{self._names(["joints"])}: {error}'
+        return ''
+
+    def _on_message(self, name: str) -> None:
+        """Take notice of what the camera sees between the goals, too."""
+        self._tell(name)
+        if self._arm.used and name == self._types['image'][1]:
+            newest = self.sensors.moment(('image',))
+            if newest is not None:
+                self._match_joints(newest.stamp_ns)  # again, if the picture was sent again
+        if not self.robot.used or name not in (self._types['image'][1], self._types['mask'][1]):
+            return
+        moment = self.sensors.moment(('image', 'mask'))
+        if moment is not None:
+            with suppress(TapError):  # who looks at it is told
+                self._without_robot(moment)
+
+    def _decode(self, moment: Moment, topics: Collection[str], times: dict[str, Any]) -> Seen:
+        """Return a Seen; the objects keep the order in which they were seen first."""
+        first, pixels = self._seen, None
+        names = first.names if first else ()
+        name, crop = self._types['image'][1], self._crop
+        picture = decode_image(moment.messages['image'], name)
+        self._camera_size = picture.shape[:2]
+        if crop.crop and crop.camera_size and crop.camera_size != self._camera_size:
+            # The model knows where the table is in the pictures of one camera.
+            raise ImageError('{0}: pictures of {2}x{1} pixels; the forward model was trained on '
+                             'those of {4}x{3}, send such ones'.format(
+                                 name, *self._camera_size, *crop.camera_size))
+        if 'objects' in topics:
+            found, pixels = self.decode_positions(moment.messages['objects'], 'objects')
+            if set(found) == set(names):
+                pixels = match_objects(names, found, pixels, 'the first objects', 'objects')
+            else:
+                names = found
+        image = check_image(
+            crop.of(self._camera_size, name).image(picture), name, crop.size)
+        gripper = decode_gripper(moment.messages['joints'])
+        return Seen(image, gripper, names, pixels, moment.stamp_ns, **times)
+
+    def _lacking(self, topics: Collection[str]) -> str:
+        missing = self.sensors.missing(topics)
+        if 'joints' in missing and self._useless:
+            return self._useless
+        if missing:
+            return f'nothing has come on {self._names(missing, explained=True)}'
+        ages = self.sensors.ages(topics, time.monotonic())
+        silent = [topic for topic in topics if ages[topic] > self._params['max_silence']]
+        if 'joints' in silent and self._useless:
+            return self._useless
+        return f'nothing new has come on {self._names(silent, explained=True)}' if silent else ''
+
+    def _count_publishers(self) -> dict[str, int]:
+        return {topic: self._node.count_publishers(name)
+                for topic, (_, name) in self._types.items()}
+
+    def _check_publishers(self) -> None:
+        """Refuse to go on by two cameras that take turns; their stamps need not differ."""
+        for topic, count in self._count_publishers().items():
+            if count > max(self._publishers[topic], 1):
+                raise PlanningError(
+                    f'the scene has changed: {count} nodes publish on {self._names([topic])} '
+                    'now; leave one, and send the goal again')
+
+    def _names(self, topics: Collection[str], explained: bool = False) -> str:
+        names = {topic: self._node.resolve_topic_name(self._types[topic][1]) for topic in topics}
+        return ', '.join(self.sensors.explained(*pair) if explained else pair[1]
+                         for pair in names.items())
+
+    def _on_episode(self, message: Episode) -> None:
+        if message.event == Episode.START:
+            self._mark = to_nanoseconds(message.header.stamp), self.sensors.jumps
+            self.robot.clear()
+            self.sensors.wake()

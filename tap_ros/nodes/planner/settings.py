@@ -1,0 +1,165 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from tap_ros.contract import (
+    CLIMB_LIMIT,
+    CONTROL_PERIOD,
+    GOAL_TOLERANCE,
+    MOVE_LIMIT,
+    step_budget,
+    WORLD_FRAME,
+)
+from tap_ros.errors import ConfigError
+from tap_ros.nodes.camera_topic import declare_transport
+from tap_ros.nodes.lifecycle import declare_autostart
+from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.nodes.planner.arm_joints import declare_mount, declare_opening
+from tap_ros.nodes.robot_view import declare_robot_mask
+from tap_ros.planning.forward_model import ForwardModel
+from tap_ros.planning.mpc_config import PRESETS, STALL, SWITCHES, with_preset
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.text import escaped
+from tap_ros.weights import FORWARD_MODEL
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from tap_msgs.action import ReachGoal
+
+MODES = ('subgoal', 'direct')
+TRACKING = ('ground_truth', 'carried')
+MAX_BUDGET = 1000
+MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
+
+
+def declare_parameters(node: 'Node') -> Parameters:
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    declare_autostart(parameters)
+    parameters.declare('weights', str(FORWARD_MODEL),
+                       'File of weights (.safetensors) of a forward model. Can be changed while '
+                       'the node is inactive.', read_only=False)
+    parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
+                       choices=['cpu', 'cuda'])
+    parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
+                       'with more samples, or what the paper says.', choices=list(PRESETS))
+    parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
+    declare_transport(parameters)
+    declare_robot_mask(parameters)
+    parameters.declare('control_period', CONTROL_PERIOD,
+                       'Seconds (of image stamps) that the arm takes for one command.',
+                       low=0.01, high=10.0)
+    parameters.declare('twist_scale', 1.0,
+                       'Factor of what is sent: 1 for metres per control period, '
+                       '1 / control_period for metres per second as MoveIt Servo takes them.',
+                       low=0.001, high=1000.0)
+    parameters.declare('stamp_with_now', False,
+                       'Stamp commands with the time of sending, as MoveIt Servo wants them, '
+                       'instead of the stamp of the image that they answer.')
+    parameters.declare('command_frame', WORLD_FRAME, 'Frame of the commands, for their header.')
+    for name, default, low, high, description in (
+            ('max_step_xy', MOVE_LIMIT, 0.001, MOVE_LIMIT, 'Largest |dx| and |dy| of a command in '
+             'metres; the planner knows it, from the next goal on.'),
+            ('max_step_z', CLIMB_LIMIT, 0.02, CLIMB_LIMIT,
+             'Largest |dz| of a command in metres; likewise.'),
+            ('goal_tolerance', GOAL_TOLERANCE, 0.0, 64.0,
+             'A goal is reached at this mean distance of the objects in pixels, a subgoal where '
+             'the mean expected distance to its maps is so much above the least possible.')):
+        parameters.declare(name, default, description, low=low, high=high, read_only=False)
+    parameters.declare('switch', 'reached', 'When to go on from a subgoal: when it is reached, '
+                       'or its share of the budget spent; also when an object has moved and then '
+                       f'none for {STALL} commands (stalled); or at its share (half), as the '
+                       'paper does.',
+                       choices=SWITCHES, read_only=False)
+    parameters.declare('subgoal_rounds', 1, 'How often a goal in subgoal mode asks for subgoals: '
+                       'again, from what is seen then, when those of a round are passed.',
+                       low=1, high=16, read_only=False)
+    parameters.declare('tracking', 'ground_truth', 'Where the objects are: as objects says at '
+                       'every picture (ground_truth), or there only at first, then carried by '
+                       'the forward model and found again in the pictures.', choices=TRACKING,
+                       read_only=False)
+    parameters.declare('max_silence', 0.35,
+                       'The arm is stopped when the picture, the objects or the joints have been '
+                       'silent for so many seconds, or when the last command is so old. Has to '
+                       'be longer than the time from one picture to the next.',
+                       low=0.05, high=60.0, read_only=False)
+    parameters.declare('command_timeout', 0.5,
+                       'Seconds that a command is valid after it came; told to the arm on '
+                       'arm/command_timeout.', low=0.01, high=60.0)
+    parameters.declare('max_age', 3.0,
+                       'Seconds; what was received longer ago is not acted upon, so a plan that '
+                       'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
+    declare_mount(parameters)
+    declare_opening(parameters)
+    parameters.declare('joint_prefix', '',
+                       "What the names of the arm's joints begin with, before "
+                       'shoulder_pan_joint and so on.')
+    parameters.declare('image_timeout', 5.0,
+                       'Seconds without a usable observation after which a goal is aborted.',
+                       low=0.1, high=600.0, read_only=False)
+    parameters.declare('predictor_timeout', 20.0, 'Seconds to wait for a subgoal.',
+                       low=0.1, high=600.0, read_only=False)
+    return parameters
+
+
+def load_planner(parameters: Parameters, weights: str) -> VisualMPC:
+    """
+    Load weights, and plan once, so that the first command comes as fast as the others.
+
+    :param parameters: of the node.
+    :param weights: file of a forward model.
+    :return: VisualMPC.
+    :raises WeightsError: when the file cannot be used.
+    :raises ConfigError: when the device is not there.
+    """
+    check_device(parameters['device'])
+    config = with_preset(
+        parameters['preset'],
+        arm_hidden=parameters['arm_hidden'] or parameters['robot_mask'] == 'all')
+    mpc = VisualMPC.load(weights, config, parameters['device'])
+    height, width = mpc.image_size
+    pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
+    mpc.plan(Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels),
+             mpc.goal(pixels))
+    return mpc
+
+
+def unlike_training(mpc: VisualMPC, robot_mask: str) -> str:
+    """
+    Say whether the pictures are unlike those that the model was trained on, '' if they are not.
+
+    :param mpc: of load_planner; robot_mask: parameter of the node.
+    """
+    assert isinstance(mpc.model, ForwardModel)
+    trained = mpc.model.config.robot_mask
+    if robot_mask == trained:
+        return ''
+    return (f'parameter robot_mask is {robot_mask}, but the forward model was trained on pictures '
+            f'as with {trained}; plans may be worse')
+
+
+def check_request(request: 'ReachGoal.Goal') -> str:
+    """
+    Check what can be checked of a goal alone, and return its mode, the default filled in.
+
+    :raises ConfigError: for an unknown mode, a budget or seed out of range, or more samples than
+        can be weighed.
+    """
+    if request.seed < 0:
+        raise ConfigError(f'seed is {request.seed}; expected 0 or more')
+    mode = request.mode or 'subgoal'
+    if mode not in MODES:
+        raise ConfigError(f'mode is {escaped(repr(mode), 60)}; valid modes: {", ".join(MODES)}')
+    if request.step_budget > MAX_BUDGET:
+        raise ConfigError(f'step_budget is {request.step_budget}; expected 1 to {MAX_BUDGET}, or '
+                          f'0 for {step_budget(2)}, with three objects {step_budget(3)}')
+    samples, depth = request.num_samples or 1, request.recursion_depth or 1
+    if mode == 'subgoal' and samples > 1 and samples * (depth + 1) > MAX_CHOICE:
+        raise ConfigError(
+            f'num_samples x (recursion_depth + 1) is {samples} x {depth + 1} = '
+            f'{samples * (depth + 1)}; at most {MAX_CHOICE} plans are made to choose a sample')
+    return mode

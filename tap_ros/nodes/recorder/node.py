@@ -1,0 +1,352 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Records topics into an MCAP bag, as they come off the wire."""
+
+from dataclasses import dataclass
+from importlib import import_module
+import math
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from std_srvs.srv import SetBool
+from tap_ros.errors import ConfigError, RecordingError, StorageError
+from tap_ros.nodes.diagnostics import Diagnostics
+from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.planner.arm_joints import declare_mount, declare_opening, declared_mount
+from tap_ros.nodes.run import run_node
+from tap_ros.nodes.topics import SERVICE_QOS
+from tap_ros.recording import topics
+from tap_ros.recording.mounts import ArmMount, write_mount
+from tap_ros.recording.new_attachments import CARD_TYPE
+from tap_ros.recording.writer import BagWriter
+from tap_ros.text import escaped
+
+DEPTH = 100  # messages that may wait while the disk is slow
+CARDS = ('predictor_node/model_card', 'visual_mpc_node/model_card')
+TYPES = {
+    **{name.lstrip('/'): kind for name, kind in topics.TYPES.items()},
+    'subgoal': 'tap_msgs/msg/Subgoal',
+    'subgoal/image': 'sensor_msgs/msg/Image',
+    'subgoal/overlay': 'sensor_msgs/msg/Image',
+    'plan/distance': 'std_msgs/msg/Float64',
+    **dict.fromkeys(CARDS, CARD_TYPE)}
+LATCHED = ('goal/image', 'goal/robot_mask', 'goal/objects', 'subgoal', 'subgoal/image',
+           'subgoal/overlay', *CARDS)
+PERIODIC = ('camera/image_raw', 'camera/camera_info', 'objects', 'joint_states')
+MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls it stale
+LONG = 1000  # characters of an answer
+
+
+@dataclass
+class Source:
+    """A topic that is recorded."""
+
+    type_name: str
+    qos: QoSProfile
+    subscription: Subscription
+
+
+class RecorderNode(Node):
+    """
+    Writes serialized messages as they are; ends the bag properly on a signal.
+
+    Goal pictures and model cards are attached, too. When the disk is full or gone it says so,
+    keeps what was written readable, and stays up.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('recorder_node')
+        self.params = declare_parameters(self)
+        self._writer: BagWriter | None = None
+        # Why what was asked for last is not recorded, or not whole.
+        self._failure: str | None = None
+        self._count = self._unflushed = 0
+        self._sources: dict[str, Source] = {}  # resolved topic -> Source
+        # Latched topic -> what write_raw takes, for bags that start later.
+        self._last: dict[str, tuple[str, bytes, topics.Qos]] = {}
+        # Resolved topic and policy to subscribe to anew.
+        self._mismatched: list[tuple[str, Any]] = []
+        self._wanted = list(self.params['topics'])
+        if not self._wanted:
+            raise ConfigError('parameter topics: is empty; name at least one topic')
+        self._diagnostics = Diagnostics(self, {
+            name: MAX_AGE if name.lstrip('/') in PERIODIC else math.inf for name in self._wanted})
+        if self.params['record_on_start']:
+            self._start()
+        self._subscribe_known()
+        self.create_service(
+            SetBool, 'recorder/record', self._on_record, qos_profile=SERVICE_QOS)
+        self.create_timer(0.5, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info(
+            f'ready: recording to {escaped(self._writer.folder)}' if self._writer
+            else 'ready: call recorder/record with data true to start')
+
+    def close(self) -> int:
+        """Finish the bag; return the exit code, 1 when the last one is not whole."""
+        self._finish()
+        return int(self._failure is not None)
+
+    # Bags
+
+    def _start(self) -> Path:
+        """
+        Begin a new bag.
+
+        :return: its folder.
+        :raises TapError: when it cannot be made, or written to.
+        """
+        self._failure = None
+        folder = free_folder(self.params['folder'])
+        self._writer = BagWriter(folder, compression=self.params['compression'])
+        self._count = self._unflushed = 0
+        now = time.time_ns()
+        for topic, (type_name, data, qos) in self._last.items():
+            self._write(topic, type_name, data, now, now, qos)
+        self._write_mount()
+        if self._writer is not None:
+            self._flush()  # a full disk is to be known now, not at the first message
+        if self._failure is not None:
+            raise RecordingError(self._failure)
+        return folder
+
+    def _write_mount(self) -> None:
+        """Say where the arm stands, unless that is where the reader takes it to stand anyway."""
+        arm = ArmMount(declared_mount(self.params), self.params['fixed_opening'])
+        if self._writer is not None and arm != ArmMount():
+            try:
+                write_mount(self._writer.folder, arm)
+            except StorageError as error:
+                self._give_up(error)
+
+    def _finish(self) -> str:
+        """End the bag; return what became of it, for people."""
+        self._take_waiting()
+        if self._writer is None:
+            return self._failure or 'nothing was being recorded'
+        writer, self._writer = self._writer, None
+        try:
+            writer.close()
+        except Exception as error:
+            self._failure = (
+                f'{escaped(writer.folder)}: the bag could not be finished: {escaped(error)}; what '
+                'was flushed before stays readable')
+            self.get_logger().error(self._failure)
+            self._diagnostics.error(self._failure)
+            return self._failure
+        text = f'{self._count} messages in {escaped(writer.folder)}'
+        self.get_logger().info(f'recorded {text}')
+        return text
+
+    def _write(self, topic: str, type_name: str, data: bytes, log_time_ns: int,
+               publish_time_ns: int, qos: topics.Qos) -> None:
+        if self._writer is None:
+            return
+        try:
+            self._writer.write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
+        except RecordingError as error:  # of this topic alone
+            self._tell(f'{escaped(topic)}: a message was not recorded', error)
+            return
+        except Exception as error:
+            self._give_up(error)
+            return
+        self._count += 1
+        self._unflushed += 1
+
+    def _flush(self) -> None:
+        """Bring what was written so far to the disk."""
+        self._unflushed = 0
+        if self._writer is None:
+            return
+        try:
+            self._writer.flush()
+        except Exception as error:
+            self._give_up(error)
+
+    def _give_up(self, error: Exception) -> None:
+        """Stop recording after a failed write."""
+        if self._writer is None:
+            return
+        writer, self._writer = self._writer, None
+        writer.abandon()
+        self._failure = (
+            f'{escaped(writer.folder)}: cannot be written ({escaped(error)}); recording has '
+            f'stopped after {self._count} messages, those flushed before stay readable. Make '
+            'room, then call recorder/record with data true: it starts a new folder')
+        self.get_logger().error(self._failure)
+        self._diagnostics.error(self._failure)
+
+    def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        try:
+            if not request.data:
+                response.message = self._finish()
+            else:
+                folder = self._writer.folder if self._writer else self._start()
+                response.message = f'recording to {escaped(folder)}'
+            response.success = self._failure is None
+        except Exception as error:  # whatever it is, the caller gets an answer
+            self._failure = response.message = escaped(error, LONG)
+            response.success = False
+            self.get_logger().error(f'recorder/record: {self._failure}')
+        return response
+
+    # Topics
+
+    def _subscribe_known(self) -> None:
+        """Subscribe to wanted topics whose type is known, here or to the running system."""
+        found = dict(self.get_topic_names_and_types())
+        for name in list(self._wanted):
+            topic = self.resolve_topic_name(name)
+            type_name = TYPES.get(name.lstrip('/')) or next(iter(found.get(topic, [])), None)
+            if type_name is None:
+                continue
+            self._wanted.remove(name)
+            try:
+                self._subscribe(topic, type_name, QoSProfile(
+                    depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE,
+                    durability=DurabilityPolicy.TRANSIENT_LOCAL
+                    if name.lstrip('/') in LATCHED or self._is_latched(topic)
+                    else DurabilityPolicy.VOLATILE))
+            except ConfigError as error:
+                self.get_logger().error(f'{escaped(topic)} is not recorded: {escaped(error)}')
+
+    def _is_latched(self, topic: str) -> bool:
+        """Tell whether all who publish a topic keep messages for late joiners."""
+        publishers = self.get_publishers_info_by_topic(topic)
+        return {publisher.qos_profile.durability for publisher in publishers} == {
+            DurabilityPolicy.TRANSIENT_LOCAL}
+
+    def _subscribe(self, topic: str, type_name: str, qos: QoSProfile) -> None:
+        def on_message(data: bytes, info: dict[str, Any]) -> None:
+            try:
+                self._on_message(topic, data, info)
+            except Exception as error:  # no message ends the node
+                self._tell(f'{escaped(topic)}: a message was not recorded', error)
+
+        def on_mismatch(info: Any) -> None:
+            self._mismatched.append((topic, info.last_policy_kind))
+
+        subscription = self.create_subscription(
+            message_class(type_name), topic, on_message,  # type: ignore[arg-type]  # with the info
+            qos, raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=on_mismatch, use_default_callbacks=False))
+        self._sources[topic] = Source(type_name, qos, subscription)
+
+    def _on_message(self, topic: str, data: bytes, info: dict[str, Any]) -> None:
+        self._diagnostics.received(topic)
+        source = self._sources[topic]
+        latched = source.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        qos = topics.Qos(
+            depth=1 if latched else 10,
+            durability='transient_local' if latched else 'volatile',
+            reliability='reliable' if source.qos.reliability == ReliabilityPolicy.RELIABLE
+            else 'best_effort')
+        if latched:
+            self._last[topic] = (source.type_name, data, qos)
+        if self._writer is not None:
+            received = info['received_timestamp'] or time.time_ns()
+            self._write(topic, source.type_name, data, received,
+                        info['source_timestamp'] or received, qos)
+
+    def _take_waiting(self) -> None:
+        """Record what has arrived and waits for its callback, such as the end of an episode."""
+        try:
+            for source in self._sources.values():
+                subscription = source.subscription
+                for _ in range(DEPTH):
+                    with subscription.handle:
+                        taken = subscription.handle.take_message(subscription.msg_type, True)
+                    if taken is None:
+                        break
+                    subscription.callback(*taken)
+        except Exception as error:  # the bag is finished all the same
+            self._tell('the last messages were not recorded', error)
+
+    def _on_timer(self) -> None:
+        try:
+            self._look_after()
+        except Exception as error:
+            self._tell('the topics could not be looked after', error)
+
+    def _tell(self, what: str, error: Exception) -> None:
+        """Log what a callback raised; not each time, for it may come with every message."""
+        self.get_logger().error(
+            f'{what}: {type(error).__name__}: {escaped(error)}', throttle_duration_sec=1.0)
+
+    def _look_after(self) -> None:
+        """Bring what was written to the disk, and look after topics."""
+        if self._writer is not None and self._unflushed:
+            self._flush()
+        while self._mismatched:  # a publisher offers less than was asked for: ask for less
+            topic, policy = self._mismatched.pop()
+            source = self._sources[topic]
+            if policy == QoSPolicyKind.RELIABILITY:
+                source.qos.reliability, offered = ReliabilityPolicy.BEST_EFFORT, 'best effort'
+            elif policy == QoSPolicyKind.DURABILITY:
+                source.qos.durability, offered = DurabilityPolicy.VOLATILE, 'volatile'
+            else:
+                self.get_logger().error(
+                    f'{escaped(topic)}: its publisher offers an unfit {escaped(policy)}')
+                continue
+            self.get_logger().info(
+                f'{escaped(topic)}: recorded as {offered}, like it is published')
+            self.destroy_subscription(source.subscription)
+            self._subscribe(topic, source.type_name, source.qos)
+        if self._wanted:
+            self._subscribe_known()
+
+
+def declare_parameters(node: Node) -> Parameters:
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('folder', 'bags/recording',
+                       'Folder of the bag; if it exists, a number is added to the name.')
+    parameters.declare('topics', list(TYPES), 'Topics to record.')
+    parameters.declare('compression', 'zstd', 'Compression of chunks.',
+                       choices=['zstd', 'lz4', 'none'])
+    declare_mount(parameters)
+    declare_opening(parameters)
+    parameters.declare('record_on_start', True,
+                       'Record from the start; else from the call of recorder/record on.')
+    return parameters
+
+
+def free_folder(wanted: str | Path) -> Path:
+    """Return this folder, or the first one with a number added that does not exist."""
+    folder, number = Path(wanted), 1
+    while folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        number += 1
+        folder = Path(f'{wanted}-{number}')
+    return folder
+
+
+def message_class(type_name: str) -> type:
+    """
+    Import the class of a message type.
+
+    :param type_name: for example 'sensor_msgs/msg/Image'.
+    :raises ConfigError: when its package is not installed.
+    """
+    try:
+        package, _, name = type_name.split('/')
+        return getattr(import_module(f'{package}.msg'), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            f'message type {escaped(type_name)} is not installed; source the workspace that has it'
+        ) from error
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; the answer is the exit code of the process."""
+    return run_node(RecorderNode, 'recorder_node', args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,195 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Publishes where a real robot hides the scene: its URDF, projected into each picture."""
+
+from collections import deque
+from dataclasses import dataclass
+import math
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import String
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
+from tap_ros.errors import KinematicsError, TapError
+from tap_ros.nodes.diagnostics import Diagnostics
+from tap_ros.nodes.image_messages import encode_mask
+from tap_ros.nodes.joint_history import JointHistory
+from tap_ros.nodes.object_messages import decode_camera_info
+from tap_ros.nodes.observations import reception_time
+from tap_ros.nodes.robot_mask.settings import (
+    CameraPlace,
+    declare_parameters,
+    declared_light,
+    hand_link,
+    named_robot,
+)
+from tap_ros.nodes.run import run_node
+from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD
+from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.robots.silhouette import Body, draw_mask, View
+from tap_ros.robots.urdf import read_urdf, Robot
+from tap_ros.text import escaped
+
+STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
+WAITING = 10  # pictures that may wait for their joint states
+
+
+@dataclass(eq=False)
+class Picture:
+    """A picture that has no mask yet."""
+
+    info: CameraInfo
+    received: float  # s, monotonic
+
+
+class RobotMaskNode(Node):
+    """
+    Answers each camera/camera_info, which comes with every picture, with a mask of its stamp.
+
+    Joints are taken between the joint states before and after the picture, so a mask waits for the
+    next joint state. Where the joints, the robot or the camera are not known there is no mask, and
+    log and diagnostics say why: who uses masks then does not use the picture.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('robot_mask_node')
+        self.params = declare_parameters(self)
+        self._light = declared_light(self.params)
+        self._camera = CameraPlace(self, self.params)
+        self._hand, self._base = hand_link(self.params), self.params['base_frame']
+        self._waiting: deque[Picture] = deque(maxlen=WAITING)
+        self._robot: Robot | None = None
+        self._diagnostics = Diagnostics(self, {
+            'camera/camera_info': STALE_S, 'joint_states': STALE_S,
+            'robot_description': math.inf})
+        self._masks = self.create_publisher(Image, 'camera/robot_mask', STREAM)
+        self._heard: list[Heard] = []
+        robot = named_robot(self.params)
+        if robot is None:
+            self._heard.append(Heard(
+                self, String, 'robot_description', self._on_description, LATCHED))
+        else:
+            self._use(robot)
+        self._heard += [
+            Heard(self, JointState, 'joint_states', self._on_joints, STREAM),
+            Heard(self, CameraInfo, 'camera/camera_info', self._on_camera_info, STREAM)]
+        self.create_timer(
+            LOOK_PERIOD, self._look_after, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(
+            0.2, self._give_up_waiting, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.get_logger().info(f'ready: {self.params["urdf"] or "waits for robot_description"}')
+
+    def close(self) -> None:
+        """End; there is nothing to be finished."""
+
+    def _use(self, robot: Robot) -> None:
+        """
+        Draw this robot from now on.
+
+        :raises ConfigError: when it lacks the links that the parameters name.
+        """
+        hand = robot.held_by(self._hand) if self._hand else set()
+        robot.held_by(self._base or robot.root)
+        self._labels = [ROBOT_MASK_HAND if shape.link in hand else ROBOT_MASK_ARM
+                        for shape in robot.shapes]
+        prefix = self.params['joint_prefix']
+        self._history = JointHistory([prefix + name for name in robot.positions])
+        self._robot = robot
+
+    def _on_description(self, message: String) -> None:
+        self._diagnostics.received('robot_description')
+        try:
+            self._use(read_urdf(message.data, 'robot_description'))
+        except TapError as error:
+            self._tell(error)
+
+    def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
+        self._diagnostics.received('joint_states')
+        if self._robot is None:
+            return
+        try:
+            if self._history.add(message, reception_time(info)):
+                self._answer_waiting()
+        except TapError as error:
+            self._tell(f'joint_states: {error}')
+
+    def _on_camera_info(self, message: CameraInfo, info: dict[str, Any]) -> None:
+        self._diagnostics.received('camera/camera_info')
+        self._waiting.append(Picture(message, reception_time(info)))
+        self._answer_waiting()
+
+    def _answer_waiting(self) -> None:
+        """Publish the masks of all pictures whose joints are known by now."""
+        if self._robot is None:
+            return
+        for picture in list(self._waiting):
+            try:
+                mask = self._mask(self._robot, picture.info)
+            except KinematicsError:  # of joints: they may come, see _give_up_waiting
+                continue
+            except TapError as error:
+                self._tell(error)
+            else:
+                header = picture.info.header
+                self._masks.publish(encode_mask(mask, header.stamp, header.frame_id))
+            self._waiting.remove(picture)
+
+    def _look_after(self) -> None:
+        """Ask for what is offered."""
+        for heard in self._heard:
+            heard.look_after()
+
+    def _give_up_waiting(self) -> None:
+        """Say why pictures that have waited for too long get no mask."""
+        while self._waiting and (
+                time.monotonic() - self._waiting[0].received > self.params['max_silence']):
+            picture = self._waiting.popleft()
+            if self._robot is None:
+                self._tell('nothing that can be used has come on robot_description; name a file '
+                           'by the parameter urdf')
+                continue
+            try:
+                self._mask(self._robot, picture.info)
+            except TapError as error:
+                self._tell(error)
+
+    def _mask(self, robot: Robot, info: CameraInfo) -> np.ndarray:
+        """
+        Draw the mask of a picture.
+
+        :raises KinematicsError: when joints or camera are not known for its time.
+        """
+        begin = time.perf_counter()
+        K, size = decode_camera_info(info, self.params['rectified'])
+        found = self._history.at(to_nanoseconds(info.header.stamp), self.params['max_silence'])
+        poses = robot.poses(dict(zip(robot.positions, found.positions)))
+        base = self._base or robot.root
+        to_base = np.linalg.inv(poses[base])
+        bodies = []
+        for shape, label in zip(robot.shapes, self._labels):
+            pose = to_base @ poses[shape.link]
+            bodies.append(Body(shape.corners @ pose[:3, :3].T + pose[:3, 3], label))
+        view = View(K, size, self._camera.pose(base, info.header.frame_id))
+        mask = draw_mask(bodies, view, self.params['dilation'], self._light)
+        self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'mask')
+        return mask
+
+    def _tell(self, error: object) -> None:
+        """Log what keeps a picture without a mask; not each time."""
+        self._diagnostics.error(error)
+        self.get_logger().error(
+            f'no robot mask: {escaped(error, 1000)}', throttle_duration_sec=5.0)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; the answer is the exit code of the process."""
+    return run_node(RobotMaskNode, 'robot_mask_node', args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

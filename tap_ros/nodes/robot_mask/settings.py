@@ -1,0 +1,172 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of robot_mask_node, the robot that they name, and where its camera is."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from tap_ros.errors import ConfigError, KinematicsError
+from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.planner.arm_joints import declare_mount, declared_mount
+from tap_ros.robots.silhouette import Light
+from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
+from tap_ros.text import escaped
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+
+OWN = 'ur10e'  # the arm of this package
+PLACES = ('parameters', 'tf')
+
+
+def declare_parameters(node: 'Node') -> Parameters:
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('urdf', '',
+                       'Shape of the robot: a URDF file; ur10e: the arm of this package, at '
+                       'mount_x and so on; empty: the topic robot_description.')
+    parameters.declare('joint_prefix', '',
+                       'What names in joint_states begin with, before those of the robot.')
+    parameters.declare('hand_link', '',
+                       'Link that is the hand, with all that it carries; empty: there is none, or '
+                       'with ur10e its own.')
+    parameters.declare('hand_radius', 0.06,
+                       'With ur10e: radius of a cylinder around the hand, from the flange to the '
+                       'fingertips, m.', low=0.001, high=1.0)
+    parameters.declare('camera_pose', 'parameters',
+                       'Where the camera is: as camera_x and so on say, or tf.', choices=PLACES)
+    for axis in 'xyz':
+        parameters.declare(f'camera_{axis}', 0.0,
+                           f'{axis} of the camera in base_frame, m.', low=-100.0, high=100.0)
+    for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
+        parameters.declare(
+            f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
+            'optical frame (z forward, x right, y down in the picture) into base_frame.',
+            low=-1.0, high=1.0)
+    parameters.declare('base_frame', '',
+                       'Link of the robot in which the pose of the camera is given; empty: its '
+                       'root.')
+    parameters.declare('rectified', False,
+                       'The pictures are rectified: P of camera_info counts, else K.')
+    parameters.declare('dilation', 1.0,
+                       'Pixels by which the mask is larger than the shapes on all sides.',
+                       low=0.0, high=100.0, read_only=False)
+    parameters.declare('shadow', False,
+                       'Mark the shadow on the table, too, as of one light from afar.')
+    parameters.declare('table_height', 0.0, 'z of the table in base_frame, m.',
+                       low=-10.0, high=10.0)
+    for axis, value in zip('xyz', (0.0, 0.0, -1.0)):
+        parameters.declare(f'light_{axis}', value,
+                           f'{axis} of the direction in which the light shines, in base_frame.',
+                           low=-100.0, high=100.0)
+    parameters.declare('max_silence', 0.35,
+                       'Seconds; a picture without joint states nearer to it than this gets no '
+                       'mask.', low=0.05, high=60.0, read_only=False)
+    declare_mount(parameters)
+    return parameters
+
+
+def named_robot(parameters: Parameters) -> Robot | None:
+    """
+    Return the robot that the parameter urdf names, None where it comes as a message.
+
+    :raises ConfigError: when the file cannot be used.
+    """
+    urdf = parameters['urdf']
+    if not urdf:
+        return None
+    if urdf == OWN:
+        from sim_bridge.world.robot_description import robot_description  # brings mujoco
+        text = robot_description(declared_mount(parameters), parameters['hand_radius'])
+        return read_urdf(text, OWN)
+    path = Path(urdf)
+    try:
+        if not path.is_file() or path.stat().st_size > MOST_CHARACTERS:
+            raise ConfigError(f'parameter urdf: {escaped(urdf)} is no file of at most '
+                              f'{MOST_CHARACTERS} bytes; expected a URDF, or {OWN}')
+        return read_urdf(path.read_text('utf-8', 'replace'), escaped(urdf))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f'parameter urdf: {escaped(urdf)}: {escaped(error)}') from error
+
+
+def hand_link(parameters: Parameters) -> str:
+    """Return the link that is the hand, or an empty string."""
+    from_parameter = parameters['hand_link']
+    if not from_parameter and parameters['urdf'] == OWN:
+        from sim_bridge.world.robot_description import TIP_FRAME
+        return TIP_FRAME
+    return from_parameter
+
+
+def declared_light(parameters: Parameters) -> Light | None:
+    """
+    Return the light whose shadows are marked, if they are.
+
+    :raises ConfigError: for a light that does not shine down.
+    """
+    if not parameters['shadow']:
+        return None
+    direction = np.array([parameters[f'light_{axis}'] for axis in 'xyz'])
+    if direction[2] >= 0:
+        raise ConfigError(f'parameter light_z: is {direction[2]:g}; expected less than 0: light '
+                          'shines down')
+    return Light(direction, parameters['table_height'])
+
+
+class CameraPlace:
+    """
+    The pose of the camera in base_frame.
+
+    :param node: rclpy Node.
+    :param parameters: its Parameters.
+    :raises ConfigError: for a quaternion of no direction, and for tf where it is not installed.
+    """
+
+    def __init__(self, node: 'Node', parameters: Parameters) -> None:
+        self._buffer = None
+        if parameters['camera_pose'] == 'tf':
+            try:
+                from tf2_ros import Buffer, TransformListener
+            except ImportError as error:
+                raise ConfigError('parameter camera_pose: tf2_ros is not installed; valid here: '
+                                  'parameters') from error
+            self._buffer = Buffer()
+            self._listener = TransformListener(self._buffer, node)
+            return
+        self._pose = _pose([parameters[f'camera_{axis}'] for axis in 'xyz'],
+                           [parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')])
+
+    def pose(self, base: str, camera: str) -> np.ndarray:
+        """
+        Return the pose (4, 4).
+
+        :param base: frame in which it is wanted.
+        :param camera: optical frame, as the pictures name it.
+        :raises KinematicsError: when tf does not know it.
+        """
+        if self._buffer is None:
+            return self._pose
+        from rclpy.time import Time
+        from tf2_ros import TransformException
+        try:
+            found = self._buffer.lookup_transform(base, camera, Time()).transform
+        except TransformException as error:
+            raise KinematicsError(f'tf: {escaped(error)}') from error
+        place, turn = found.translation, found.rotation
+        return _pose([place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w])
+
+
+def _pose(place: list[float], quaternion: list[float]) -> np.ndarray:
+    """Return a pose (4, 4) from a place (3,) and a quaternion x, y, z, w of any length."""
+    length = float(np.linalg.norm(quaternion))
+    if length < 0.1:
+        raise ConfigError('parameters camera_qx to camera_qw: a quaternion of no direction')
+    x, y, z, w = np.array(quaternion) / length
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+    pose[:3, 3] = place
+    return pose

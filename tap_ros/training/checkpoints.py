@@ -1,0 +1,166 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The state of a training run, and its way to a file and back.
+
+Batches and augmentation are drawn from (seed, step), so that there are no random numbers in it.
+"""
+
+from collections.abc import Mapping
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Generic, TypeVar
+
+from tap_ros.errors import ConfigError, WeightsError
+from tap_ros.text import escaped
+from tap_ros.training.devices import placed
+from tap_ros.training.weights import load_tensors, save_tensors
+import torch
+
+Trained = TypeVar('Trained', bound=torch.nn.Module)
+
+# Settings that change where a run happens and what it shows, not what it learns.
+FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
+_REMEDY = 'remove it to begin anew, or choose another --out folder'
+
+
+@dataclass
+class TrainingState(Generic[Trained]):
+    """
+    What changes during training.
+
+    :param network: the network that is trained.
+    :param average: moving average of its weights, in eval mode; what is shipped.
+    :param helpers: ModuleDict of the networks that only training needs: recognition,
+        discriminators; may be empty.
+    :param optimizers: list of Adams: of the network with what is trained along with it, and, if
+        there are discriminators, theirs.
+    :param step: number of steps done.
+    :param seconds: time they took, over all sessions.
+    :param precision: what the networks run in, 'float32' or 'bfloat16'; '': nothing was chosen.
+    """
+
+    network: Trained
+    average: Trained
+    helpers: torch.nn.ModuleDict
+    optimizers: list[torch.optim.Optimizer]
+    step: int = 0
+    seconds: float = 0.0
+    precision: str = ''
+
+    @torch.no_grad()
+    def update_average(self, decay: float) -> None:
+        """
+        Move the average towards the network; faster at the beginning.
+
+        :param decay: share of the average that stays, 0..1.
+        """
+        decay = min(decay, (1 + self.step) / (10 + self.step))
+        averages: list[torch.Tensor] = list(self.average.parameters())
+        weights: list[torch.Tensor] = list(self.network.parameters())
+        torch._foreach_lerp_(averages, weights, 1 - decay)
+        for mine, other in zip(self.average.buffers(), self.network.buffers()):
+            mine.copy_(other)  # batch norm's statistics are averages already
+
+
+def start(network: Trained, learning_rate: float, device: torch.device,
+          helpers: Mapping[str, torch.nn.Module] | None = None) -> TrainingState[Trained]:
+    """
+    Begin a training run.
+
+    :param network: with fresh weights.
+    :param learning_rate: of Adam.
+    :param device: torch device.
+    :param helpers: dict of the networks that only training needs. Those whose name ends in
+        'discriminator' are trained against the others.
+    :return: TrainingState.
+    """
+    helpers = placed(torch.nn.ModuleDict(helpers or {}), device)
+    network = placed(network, device)
+    average = copy.deepcopy(network).eval().requires_grad_(False)
+    groups = [list(network.parameters()), []]
+    for name, helper in helpers.items():
+        groups[name.endswith('discriminator')] += helper.parameters()
+    # DCGAN's beta1 of 0.5 where networks are trained against each other.
+    betas = (0.5 if groups[1] else 0.9, 0.999)
+    optimizers: list[torch.optim.Optimizer] = [
+        torch.optim.Adam(group, learning_rate, betas, fused=True) for group in groups if group]
+    return TrainingState(network, average, helpers, optimizers)
+
+
+def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mapping[str, Any],
+                    data_hash: str) -> None:
+    """
+    Write the whole state of a run, in one step.
+
+    :param path: the file.
+    :param state: TrainingState.
+    :param settings: dict of the run's settings.
+    :param data_hash: of the recordings.
+    :raises StorageError: if the disk is full; the checkpoint before stays.
+    """
+    tensors = {f'network.{name}': value for name, value in state.network.state_dict().items()}
+    tensors |= {f'average.{name}': value for name, value in state.average.state_dict().items()}
+    tensors |= {f'helpers.{name}': value for name, value in state.helpers.state_dict().items()}
+    for k, optimizer in enumerate(state.optimizers):
+        for i, values in optimizer.state_dict()['state'].items():
+            tensors |= {f'optimizer.{k}.{i}.{name}': value for name, value in values.items()}
+    save_tensors(path, tensors, {
+        'kind': 'checkpoint', 'step': state.step, 'seconds': state.seconds,
+        'precision': state.precision, 'settings': settings, 'data_hash': data_hash})
+
+
+def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mapping[str, Any],
+                    data_hash: str, defaults: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """
+    Put the state of a run back.
+
+    :param path: the file; if there is none, nothing happens.
+    :param state: TrainingState as start made it; changed in place.
+    :param settings: dict of the run's settings.
+    :param data_hash: of the recordings.
+    :param defaults: dict of what settings were before they existed.
+    :raises ConfigError: if the checkpoint is of other settings or other recordings.
+    :raises WeightsError: if it is damaged, or no checkpoint of such a network.
+    """
+    if not Path(path).exists():
+        return
+    tensors, about = load_tensors(path)
+    if (about.get('kind') != 'checkpoint' or not isinstance(about.get('settings'), dict)
+            or not isinstance(about.get('step'), int)
+            or not isinstance(about.get('seconds'), (int, float))
+            or about.get('precision', '') not in ('', 'float32', 'bfloat16')):
+        raise WeightsError(f'{escaped(path)}: is no checkpoint; {_REMEDY}')
+    for name, value in settings.items():
+        before = about['settings'].get(name, defaults.get(name))
+        if name not in FREE and before != value:
+            raise ConfigError(
+                f'{escaped(path)}: made with {name}={escaped(repr(before))}, not {value!r}; to go '
+                'on with it give the same settings, else choose another --out folder')
+    if about.get('data_hash') != data_hash:
+        raise ConfigError(f'{escaped(path)}: made from other recordings; to go on with it give '
+                          'the same ones in the same order, else choose another --out folder')
+    try:
+        _put_back(state, tensors)
+    except (LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise WeightsError(f'{escaped(path)}: is a checkpoint of something else '
+                           f'({escaped(error)}); {_REMEDY}') from error
+    state.step, state.seconds = about['step'], about['seconds']
+    state.precision = about.get('precision', '')
+
+
+def _put_back(state: TrainingState[Any], tensors: Mapping[str, torch.Tensor]) -> None:
+    """Put tensors of a checkpoint back into networks and optimizers."""
+    for prefix, module in (('network.', state.network), ('average.', state.average),
+                           ('helpers.', state.helpers)):
+        module.load_state_dict({name[len(prefix):]: value for name, value in tensors.items()
+                                if name.startswith(prefix)})
+    for k, optimizer in enumerate(state.optimizers):
+        for i, weight in enumerate(optimizer.param_groups[0]['params']):
+            for name in [name for name in tensors if name.startswith(f'optimizer.{k}.{i}.')]:
+                value = tensors[name].to(weight.device)
+                if value.shape == weight.shape:  # the fused Adam wants the weight's own strides
+                    value = torch.empty_like(weight).copy_(value)
+                optimizer.state[weight][name.rsplit('.', 1)[1]] = value

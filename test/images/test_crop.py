@@ -1,0 +1,86 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What part of a camera's pictures is used: picture, mask and pixels stay together."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.errors import ImageError
+from tap_ros.images.crop import Crop, trained_crop, TrainedCrop
+
+
+@given(st.integers(60, 200), st.integers(60, 200), st.sampled_from(['centre', '7,3,50', '0,0,60']),
+       st.sampled_from([0, 16, 64, 100]), st.randoms(use_true_random=False))
+def test_a_dot_and_its_position_move_together(height, width, part, size, random):
+    crop = Crop(part, size)
+    left, top, side, _ = crop.window((height, width))
+    reach = max(side / (size or side), 1) + 3  # so that the scaled dot is inside
+    u, v = (random.uniform(low + reach, low + side - 1 - reach) for low in (left, top))
+    y, x = np.mgrid[:height, :width]
+    blob = np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * (reach / 3) ** 2))
+    picture = np.repeat((255 * blob)[..., None], 3, -1).astype(np.uint8)
+    cut = crop.image(picture)
+    assert cut.shape[:2] == crop.cut_size((height, width)) == ((size or side,) * 2)
+    y, x = np.mgrid[:cut.shape[0], :cut.shape[1]]
+    weight = cut[..., 0] / cut[..., 0].sum()
+    expected = crop.pixels(np.array([[u, v]], np.float32), (height, width))[0]
+    assert expected.dtype == np.float32
+    np.testing.assert_allclose([(weight * x).sum(), (weight * y).sum()], expected, atol=0.15)
+
+
+def test_without_a_part_and_a_size_nothing_changes():
+    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    pixels = np.array([[1.1, 2.7]], np.float32)
+    assert not Crop()
+    np.testing.assert_array_equal(Crop().image(picture), picture)
+    assert Crop().pixels(pixels, (5, 7)) is pixels
+
+
+def test_a_scaled_mask_hides_all_that_the_robot_is_mixed_into():
+    rng = np.random.default_rng(1)
+    mask = np.full((96, 128), ROBOT_MASK_FREE, np.uint8)
+    mask[30:41, 50:57], mask[41:52, 50:57] = ROBOT_MASK_ARM, ROBOT_MASK_HAND
+    crop = Crop('centre', 24)
+    cut = crop.mask(mask)
+    assert cut.shape == (24, 24) and set(np.unique(cut)) == {0, 128, 255}
+    # Whatever the robot looks like, pixels that are free are the same.
+    bare = rng.integers(0, 256, (96, 128, 3), np.uint8)
+    for robot in (0, 255):
+        shown = np.where((mask > 0)[..., None], np.uint8(robot), bare)
+        same = (crop.image(shown) == crop.image(bare)).all(-1)
+        assert same[cut == ROBOT_MASK_FREE].all()
+    # And no more is masked than that.
+    assert (cut != ROBOT_MASK_FREE).sum() < 4 * (mask > 0).sum() / 16
+
+
+def trained(part, size, camera=(480, 640), network=64):
+    return TrainedCrop(Crop(part, size), camera, (network, network))
+
+
+def test_pictures_that_stream_in_are_cut_as_in_training():
+    assert trained('centre', 64).of((480, 640), 'start') == Crop('centre', 64)
+    assert trained('centre', 64).of((720, 1280), 'start') == Crop('centre', 64)  # another camera
+    assert trained('80,0,480', 64).of((480, 640), 'start') == Crop('80,0,480', 64)
+    assert not trained('centre', 64).of((64, 64), 'start')  # cut already
+    assert not trained('', 0, (64, 64)).of((480, 640), 'start')  # never were; it is refused later
+    assert trained('8,8,32', 64, (64, 64)).of((64, 64), 'start') == Crop('8,8,32', 64)
+    # Pictures that were not scaled in training are, if the camera has more pixels now.
+    assert trained('centre', 0, (64, 80)).of((480, 640), 'start') == Crop('centre', 64)
+
+
+@pytest.mark.parametrize('crop, size, words', [
+    (trained('80,0,480', 64), (240, 320), 'start: 320x240 .*the part 80,0,480 of pictures of '
+                                          '640x480; send such ones, or 64x64'),
+    (trained('', 64, (96, 96)), (480, 640), 'start: pictures of 640x480 .* are not square')])
+def test_pictures_that_cannot_be_cut_so_are_refused(crop, size, words):
+    with pytest.raises(ImageError, match=words):
+        crop.of(size, 'start')
+
+
+@pytest.mark.parametrize('training', [
+    {}, {'settings': None}, {'settings': {'crop': 'x', 'size': 5}}, {'settings': {'crop': 3}},
+    {'settings': {}, 'camera_size': [1]}, {'settings': {'size': '64'}}])
+def test_weights_that_tell_no_crop_have_none(training):
+    assert trained_crop(training, (64, 64)) == TrainedCrop(Crop(), None, (64, 64))

@@ -1,0 +1,50 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the pictures for people."""
+
+import numpy as np
+import pytest
+from tap_ros.images.drawing import film_strip, grid, overlay
+
+SCALE = 4
+
+
+def test_the_overlay_shows_each_map_where_it_is():
+    start = np.full((16, 16, 3), 128, np.uint8)
+    maps = np.zeros((2, 16, 16))
+    maps[0, 3, 12] = maps[1, 12, 3] = 1
+    shown = overlay(start, maps, SCALE)
+    assert shown.shape == (16 * SCALE, 16 * SCALE, 3)
+    changed = (shown != 128).any(axis=-1).reshape(16, SCALE, 16, SCALE).any(axis=(1, 3))
+    rows, columns = np.nonzero(changed)  # a glow around each, as one pixel is hardly seen
+    near = np.minimum(np.hypot(rows - 3, columns - 12), np.hypot(rows - 12, columns - 3))
+    assert near.max() < 5 and len(rows) > 20
+    strength = np.abs(shown.astype(int) - 128).sum(-1)[::SCALE, ::SCALE]
+    for row, column in ((3, 12), (12, 3)):
+        around = strength[row - 3:row + 4, column - 3:column + 4]
+        assert np.unravel_index(around.argmax(), around.shape) == (3, 3)
+    marked = overlay(start, maps, SCALE, np.array([[8, 8], [2, 2]]), np.array([[4, 4], [9, 9]]))
+    assert (marked != shown).any()
+
+
+@pytest.mark.parametrize('far', [20, -20, 5.4e8, -5.4e8, 3e38])
+def test_marks_outside_the_picture_are_not_seen_however_far(far):
+    start, maps = np.full((16, 16, 3), 128, np.uint8), np.zeros((0, 16, 16))
+    for pixel in ((far, 5), (5, far), (far, far)):
+        shown = overlay(start, maps, SCALE, np.array([pixel], np.float32),
+                        np.array([pixel], np.float64))
+        assert (shown == 128).all()
+    for pixel in ((-0.5, 5), (5, 15.5)):  # at the border half of a mark is
+        assert (overlay(start, maps, SCALE, [pixel]) != 128).any()
+
+
+def test_a_strip_begins_and_ends_with_the_episode():
+    frames = [np.full((4, 4, 3), t, np.uint8) for t in range(17)]
+    strip = film_strip(frames, 5)
+    assert [int(frame[0, 0, 0]) for frame in strip] == [0, 4, 8, 12, 16]
+
+
+def test_panels_keep_their_pixels_and_have_white_between_them():
+    sheet = grid([[np.zeros((3, 3, 3), np.uint8)] * 2], scale=2)
+    assert sheet.shape == (6, 14, 3)
+    assert (sheet[:, 6:8] == 255).all() and not sheet[:, :6].any()

@@ -1,0 +1,105 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the demo's page, table and film."""
+
+import base64
+from dataclasses import replace
+import io
+import re
+
+import numpy as np
+from PIL import Image, ImageSequence
+import pytest
+from tap_ros.nodes.demo.film import FRAME_MS, GAP, HEAD, HEIGHT, HOLD_MS, SMALL, write_film
+from tap_ros.nodes.demo.report import results_table, Run, SceneRuns, write_report
+
+
+@pytest.fixture
+def scenes():
+    rng = np.random.default_rng(0)
+
+    def picture():
+        return rng.integers(0, 255, (16, 16, 3), np.uint8)
+
+    def run(end):
+        return Run([picture() for _ in range(4)], np.linspace(0.2, end, 4)[:, None].repeat(2, 1),
+                   'ended <early> & well', 500.0)
+    maps = np.zeros((2, 16, 16))
+    maps[:, 4, 5] = 1
+    return [SceneRuns(
+        'push2', seed, picture(), picture(), np.ones((2, 2)), np.full((2, 2), 9.0), picture(),
+        maps, {'direct': run(0.11), 'subgoal': run(0.05)}) for seed in (7, 8)]
+
+
+def test_the_table_shows_centimetres_and_their_mean(scenes):
+    other = replace(scenes[0], task='order2')
+    lines = results_table([*scenes, other]).splitlines()
+    assert lines[2].split() == ['push2', '7', '20.0', '11.0', '5.0']
+    assert lines[4].split() == ['push2,', 'mean', 'of', '2', '20.0', '11.0', '5.0']
+    assert lines[-1].split()[:4] == ['order2,', 'mean', 'of', '1']
+
+
+def test_the_page_is_one_file_with_everything_inside(scenes, tmp_path):
+    path = tmp_path / 'report.html'
+    write_report(path, scenes, 'made by a test', {'command': 'a <b>', 'date': 'today'})
+    page = path.read_text()
+    assert '<dt>command</dt><dd>a &lt;b&gt;</dd><dt>date</dt><dd>today</dd>' in page
+    rows = re.findall(r'<tr class="(\w*)"><th scope="row">(.*?)</th>(.*?)</tr>', page)
+    assert [(kind, label, re.findall('<td>(.*?)</td>', cells)) for kind, label, cells in rows] == [
+        ('', 'push2 7', ['20.0', '11.0', '5.0']), ('', 'push2 8', ['20.0', '11.0', '5.0']),
+        ('mean', 'push2, mean of 2', ['20.0', '11.0', '5.0'])]
+    assert '<h2>push2 7</h2>' in page and '<h2>push2 8</h2>' in page
+    assert page.count('data:image/png;base64,') == page.count('<img ')
+    assert 'http' not in page and '<early>' not in page and '&lt;early&gt; &amp;' in page
+
+
+def test_the_page_has_a_film_where_there_are_pictures_from_the_side(scenes, tmp_path):
+    side = [np.full((24, 32, 3), grey, np.uint8) for grey in (0, 80, 160, 240)]
+    scenes[1].runs['direct'] = replace(scenes[1].runs['direct'], side=side)
+    scenes[0] = replace(scenes[0], runs={}, expert=side)  # nothing was planned
+    path = tmp_path / 'report.html'
+    write_report(path, scenes)
+    films = re.findall('data:image/webp;base64,([^"]*)"', path.read_text())
+    assert len(films) == 2
+    for data in films:
+        film = Image.open(io.BytesIO(base64.b64decode(data)))
+        greys = [np.asarray(frame.convert('L'), int).mean()
+                 for frame in ImageSequence.Iterator(film)]
+        assert np.abs(np.subtract(greys, [0, 80, 160, 240])).max() < 8
+
+
+@pytest.mark.parametrize('seen', ['frames', 'side'])
+def test_the_film_shows_each_run_to_its_end_and_stops_there(scenes, tmp_path, seen):
+    path = tmp_path / 'demo.webp'
+    greys = {'direct': (0, 60, 120, 180), 'subgoal': (240, 90)}  # one run is shorter
+    for scene in scenes:
+        for mode, run in scene.runs.items():
+            pictures = [np.full((16, 32, 3), grey, np.uint8) for grey in greys[mode]]
+            scene.runs[mode] = replace(run, **{seen: pictures})
+    write_film(path, scenes)
+    film, shown, milliseconds = Image.open(path), [], 0
+    centres = [2 * GAP + SMALL + i * (2 * HEIGHT + GAP) + HEIGHT for i in (0, 1)]
+    for frame in ImageSequence.Iterator(film):
+        pixels = np.array(frame.convert('L'), int)[-GAP - 4]  # a row that no mark reaches
+        shown.append(tuple(pixels[centres]))
+        milliseconds += frame.info['duration']
+    expected = [(0, 240), (60, 90), (120, 90), (180, 90)] * len(scenes)
+    assert np.abs(np.subtract(shown, expected)).max() <= 6
+    assert milliseconds == len(scenes) * (3 * FRAME_MS + HOLD_MS)
+    assert film.info['loop'] == 0  # for ever
+
+
+def test_the_film_marks_the_goals_in_the_view_that_it_shows(scenes, tmp_path):
+    path, black = tmp_path / 'demo.webp', np.zeros((30, 40, 3), np.uint8)
+    scene = replace(scenes[0], side_goal_pixels=np.array([[10.0, 7.0], [30.0, 22.0]]))
+    for mode, run in scene.runs.items():
+        scene.runs[mode] = replace(run, side=[black])
+    write_film(path, [scene])
+    film = np.array(Image.open(path).convert('RGB'), int)
+    left, top = 2 * GAP + SMALL, HEAD
+    panel = film[top:top + HEIGHT, left:left + HEIGHT * 4 // 3]
+    v, u = (panel.max(-1) > 128).nonzero()
+    marks = np.stack([u, v], -1) * 30 / HEIGHT - 0.5
+    for place in scene.side_goal_pixels:
+        assert np.abs(marks - place).max(1).min() < 0.5
+    assert np.abs(marks[:, None] - scene.side_goal_pixels).max(-1).min(1).max() < 1.5

@@ -1,0 +1,212 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the explorer's server, over real sockets of this machine."""
+
+from contextlib import contextmanager, ExitStack
+import http.client
+import json
+import socket
+import threading
+import time
+
+import pytest
+from tap_ros.errors import ConfigError
+from tap_ros.nodes.explorer.board import Board
+from tap_ros.nodes.explorer.commands import parse_command
+from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+TOKEN = 'a token'
+HARD = 'a&b c#d/?='
+
+
+@contextmanager
+def serving(**options):
+    """Serve a board; the commands are in server.commands."""
+    board, commands = Board(), []
+    server = ExplorerServer(board, lambda text: commands.append(parse_command(text)), port=0,
+                            **options)
+    server.board, server.commands = board, commands
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def get(server, path='/', **headers):
+    """Return status, headers and body of an answer."""
+    connection = http.client.HTTPConnection('127.0.0.1', server.port, timeout=10)
+    connection.request('GET', path, headers=headers)
+    answer = connection.getresponse()
+    body = answer.read()
+    connection.close()
+    return answer.status, answer.headers, body
+
+
+def browse(server, query='', **headers):
+    return connect(f'ws://127.0.0.1:{server.port}/socket{query}', additional_headers=headers,
+                   open_timeout=10, close_timeout=2, compression=None)
+
+
+def wait_until(condition, seconds=10):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_the_page_its_script_and_its_style_are_served():
+    with serving() as server:
+        for path, words in (('/', b'<canvas id="goal"'), ('/explorer.js', b'WebSocket'),
+                            ('/explorer.css', b'canvas')):
+            status, headers, body = get(server, path)
+            assert status == 200 and words in body
+            assert "script-src 'self'" in headers['Content-Security-Policy']
+        assert get(server, '/../../setup.py')[0] == get(server, '/nothing')[0] == 404
+
+
+def test_a_browser_gets_all_that_is_there_and_then_what_changes():
+    with serving() as server:
+        server.board.put('state', '{"kind": "state"}')
+        server.board.put('camera', b'a picture')
+        with browse(server) as browser:
+            assert [browser.recv(5), browser.recv(5)] == [
+                '{"kind": "state"}', b'camera\0a picture']
+            server.board.put('camera', b'another')
+            assert browser.recv(5) == b'camera\0another'
+
+
+def test_commands_arrive_and_bad_ones_are_answered_to_who_sent_them():
+    with serving() as server, browse(server) as browser, browse(server) as other:
+        browser.send('{"do": "cancel"}')
+        browser.send('{"do": "fly"}')
+        answer = json.loads(browser.recv(5))
+        assert answer['kind'] == 'error' and 'do: expected' in answer['text']
+        assert len(server.commands) == 1
+        server.board.put('state', '{}')
+        assert other.recv(5) == '{}', 'others are not told'
+
+
+def test_a_slow_browser_holds_up_nobody_and_gets_the_newest():
+    with serving() as server, browse(server) as slow, browse(server) as quick:
+        for i in range(200):
+            server.board.put('camera', bytes([i]) * 200_000)
+            if i % 10 == 9:
+                last = quick.recv(5)
+        wait_until(lambda: quick.recv(5)[7] == 199 if last[7] != 199 else True)
+        seen = [slow.recv(5)[7]]
+        while seen[-1] != 199:
+            seen.append(slow.recv(5)[7])
+        assert len(seen) < 200, 'what was replaced is not sent'
+
+
+def test_browsers_that_leave_leave_nothing_behind():
+    with serving() as server:
+        with browse(server):
+            pass
+        wait_until(lambda: server.browsers == 0)
+        threads = threading.active_count()
+        for _ in range(50):
+            with browse(server):
+                pass
+        wait_until(lambda: server.browsers == 0 and server.board.watched == 0)
+        wait_until(lambda: threading.active_count() <= threads)
+
+
+def test_a_browser_that_vanishes_is_let_go():
+    with serving() as server:
+        with browse(server) as browser:
+            wait_until(lambda: server.browsers == 1)
+            browser.socket.shutdown(socket.SHUT_RDWR)
+            wait_until(lambda: server.browsers == 0 and server.board.watched == 0)
+
+
+def test_too_long_a_command_ends_the_connection_alone():
+    with serving() as server:
+        with browse(server) as browser, pytest.raises(ConnectionClosed):
+            browser.send('x' * (MAX_COMMAND + 1))
+            browser.recv(5)
+        with browse(server) as browser:
+            server.board.put('state', '{}')
+            assert browser.recv(5) == '{}'
+
+
+def test_another_page_of_the_same_browser_is_refused():
+    with serving() as server:
+        for origin in ('http://evil.example', f'http://evil.example:{server.port}', 'null'):
+            with pytest.raises(InvalidStatus, match='403'), browse(server, Origin=origin):
+                pass
+        with browse(server, Origin=f'http://127.0.0.1:{server.port}'):
+            pass
+
+
+def test_a_foreign_name_that_leads_here_is_refused():
+    with serving() as server:
+        assert get(server, Host=f'evil.example:{server.port}')[0] == 403
+        for host in ('localhost', '127.0.0.1', '[::1]'):
+            assert get(server, Host=f'{host}:{server.port}')[0] == 200
+
+
+def test_a_token_is_asked_for_by_page_and_socket():
+    with serving(token=TOKEN) as server:
+        assert get(server, server.url.removeprefix(f'http://127.0.0.1:{server.port}'))[0] == 200
+        assert get(server)[0] == get(server, '/?token=wrong')[0] == 401
+        assert get(server, '/?token=a%20token')[0] == 200
+        with pytest.raises(InvalidStatus, match='401'), browse(server):
+            pass
+        with browse(server, '?token=a%20token'):
+            pass
+        assert get(server, '/?token=a%20token', Host='robot.example:1')[0] == 200
+
+
+def test_any_token_stands_in_the_address_as_it_is_asked_for():
+    with serving(token=HARD) as server:
+        path = server.url.removeprefix(f'http://127.0.0.1:{server.port}')
+        assert ' ' not in path and get(server, path)[0] == 200
+
+
+def test_whoever_opens_it_to_others_gets_a_token():
+    with serving(host='0.0.0.0') as server:
+        path = server.url.removeprefix(f'http://0.0.0.0:{server.port}')
+        assert len(path) > 20 and get(server)[0] == 401 and get(server, path)[0] == 200
+
+
+def test_so_many_browsers_and_no_more():
+    with serving() as server:
+        with ExitStack() as browsers:
+            for _ in range(MAX_BROWSERS):
+                browsers.enter_context(browse(server))
+            with pytest.raises(InvalidStatus, match='503'), browse(server):
+                pass
+        wait_until(lambda: server.browsers == 0)
+        with browse(server):
+            pass
+
+
+def test_a_port_that_is_taken_is_named():
+    with serving() as server, pytest.raises(ConfigError, match=f'port.*{server.port}'):
+        ExplorerServer(Board(), print, port=server.port)
+
+
+@pytest.mark.parametrize('host', ['', 'a' * 70, 'a\0b', '256.0.0.1', 'no.such.host.invalid'])
+def test_an_address_that_is_none_is_refused(host):
+    with pytest.raises(ConfigError, match='host'):
+        ExplorerServer(Board(), print, host=host, port=0)
+
+
+def test_what_ends_frees_its_port():
+    with ExitStack() as stack:
+        with serving() as server:
+            browser = stack.enter_context(browse(server))
+        with pytest.raises(ConnectionClosed):
+            browser.recv(5)
+    again = ExplorerServer(Board(), print, port=server.port)
+    again.close()
+
+
+@pytest.mark.parametrize('host, mine', [
+    ('localhost', True), ('127.0.0.1', True), ('127.9.9.9', True), ('::1', True),
+    ('0.0.0.0', False), ('192.168.0.1', False), ('localhost.evil.example', False), ('', False)])
+def test_what_leads_to_this_machine_alone(host, mine):
+    assert is_loopback(host) == mine

@@ -1,0 +1,114 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Masks cover what MuJoCo draws of the arm, and the shadow that points of it throw."""
+
+import numpy as np
+import pytest
+from sim_bridge.simulator import Simulator
+from sim_bridge.world.robot_description import robot_description
+from sim_bridge.world.studio import Studio
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.robots import ur10e
+from tap_ros.robots.silhouette import Body, draw_mask, Light, View
+from tap_ros.robots.urdf import read_urdf
+
+ARM, HAND = ROBOT_MASK_ARM, ROBOT_MASK_HAND
+K = np.array([[60.0, 0, 31.5], [0, 60.0, 31.5], [0, 0, 1]])
+DOWN = np.diag([1.0, -1, -1, 1])  # a camera that looks down the world's z
+SIZE = (64, 64)
+
+
+def camera_at(height):
+    pose = DOWN.copy()
+    pose[2, 3] = height
+    return View(K, SIZE, pose)
+
+
+def cube(x, y, z, half):
+    signs = np.stack(np.meshgrid(*[[-1, 1]] * 3), -1).reshape(-1, 3)
+    return np.array([x, y, z]) + half * signs
+
+
+@pytest.fixture(scope='module')
+def arms():
+    """Return pictures of the simulator: camera, joints, and masks without the shadows."""
+    add_shadows = Studio._add_shadows
+
+    def bodies_only(self, own):
+        labels = add_shadows(self, own)
+        labels[labels[:, 1] == 1] = ROBOT_MASK_FREE
+        return labels
+
+    seen = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Studio, '_add_shadows', bodies_only)
+        simulator = Simulator('push2', 64, 'ur10e')
+        for seed in range(6):
+            observation = simulator.reset(seed)
+            seen.append((observation.arm_joints, observation.robot_mask))
+        camera = simulator.camera
+        simulator.close()
+    pose = np.eye(4)
+    pose[:3, :3] = camera.extrinsics[:, :3].T
+    pose[:3, 3] = camera.position
+    return View(camera.K, SIZE, pose), seen
+
+
+@pytest.mark.parametrize('dilation, overlap, free', [(0, 0.75, 0.96), (1, 0.55, 0.9)])
+def test_the_arm_is_covered_and_the_rest_is_free(arms, dilation, overlap, free):
+    view, seen = arms
+    robot = read_urdf(robot_description(), 'own')
+    overlaps, left = [], []
+    for joints, true in seen:
+        poses = robot.poses(dict(zip(ur10e.JOINTS, joints)))
+        bodies = [Body(s.corners @ poses[s.link][:3, :3].T + poses[s.link][:3, 3], ARM)
+                  for s in robot.shapes]
+        mask = draw_mask(bodies, view, dilation)
+        arm, rest = true == ARM, true == ROBOT_MASK_FREE
+        covered = mask[arm] == ARM  # a pixel is the arm's if one of its samples is
+        assert covered.all() if dilation else covered.mean() > 0.99
+        overlaps.append(arm.sum() / (arm | (mask == ARM) & rest).sum())
+        left.append((mask[rest] == ROBOT_MASK_FREE).mean())
+    assert np.mean(overlaps) > overlap and np.mean(left) > free
+
+
+def test_dilation_enlarges_by_so_many_pixels_on_all_sides():
+    masks = [draw_mask([Body(cube(0, 0, 0.5, 0.1), ARM)], camera_at(2), px) for px in (0, 5)]
+    sizes = [[np.ptp(axis) + 1 for axis in np.nonzero(mask)] for mask in masks]
+    np.testing.assert_array_equal(np.subtract(*sizes[::-1]), [10, 10])
+
+
+def test_what_is_nearer_hides_what_is_behind():
+    near, far = Body(cube(0, 0, 0.5, 0.1), HAND), Body(cube(0, 0, 0.0, 0.2), ARM)
+    for bodies in ([near, far], [far, near]):
+        mask = draw_mask(bodies, camera_at(2), 0)
+        assert mask[32, 32] == HAND and set(np.unique(mask)) == {0, HAND, ARM}
+
+
+def test_what_is_beside_or_behind_the_camera_is_cut_off():
+    assert not draw_mask([Body(cube(0, 0, 3, 0.1), ARM)], camera_at(2), 3).any()
+    mask = draw_mask([Body(cube(1.2, 0, 2, 1.0), ARM)], camera_at(2), 0)
+    assert (mask[:, 50:] == ARM).all() and not mask[:, :30].any()
+
+
+def test_shadows_lie_where_light_through_the_body_meets_the_table():
+    rng = np.random.default_rng(0)
+    corners, light = cube(-0.2, 0.1, 0.3, 0.08), Light(np.array([0.5, -0.4, -1.0]), 0.05)
+    view = camera_at(2)
+    mask = draw_mask([Body(corners, ARM)], view, 0, light)
+    inside = rng.dirichlet(np.ones(8), 3000) @ corners
+    thrown = inside + (inside[:, 2:] - 0.05) * light.direction
+    assert np.allclose(thrown[:, 2], 0.05)
+    for points in (inside, thrown):
+        rays = (points * [1, -1, -1] + [0, 0, 2]) @ K.T
+        u, v = np.rint(rays[:, :2] / rays[:, 2:]).astype(int).T
+        assert (mask[v, u] == ARM).all()
+    assert mask.astype(bool).sum() < 2 * draw_mask(
+        [Body(corners, ARM)], view, 0).astype(bool).sum() + 20
+
+
+def test_what_is_below_the_table_throws_no_shadow():
+    light = Light(np.array([1.0, 0, -1]))
+    below = Body(cube(0, 0, -0.5, 0.1), ARM)
+    bare = draw_mask([below], camera_at(2), 0)
+    np.testing.assert_array_equal(draw_mask([below], camera_at(2), 0, light), bare)

@@ -1,0 +1,167 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a robot hides is filled with what was seen there, nearest in time or last."""
+
+import dataclasses
+
+from made_episodes import cover, make_episode, write_bag
+import numpy as np
+import pytest
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASKS
+from tap_ros.errors import RecordingError
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.episode import RecordingWarning
+from tap_ros.training.frames import GOAL, MappedFrames, ResidentFrames
+from tap_ros.training.inpainted import fill, FilledStore, with_masks
+from tap_ros.training.robot_mask import (
+    fill_from_past,
+    fill_in_time,
+    FreeView,
+    hidden_pixels,
+    trained_robot_mask,
+)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """Give each test a cache of its own."""
+    monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
+
+
+def still(T=9, seed=0):
+    """Make an episode in which nothing moves; return it and the one with a robot before it."""
+    episode = make_episode(seed, T=T)
+    scene = np.repeat(episode.frames[:1], T, 0)
+    episode = dataclasses.replace(episode, frames=scene, goal_frame=scene[0])
+    return episode, cover(episode)
+
+
+def random_masks(T, seed=0):
+    """Draw masks that hide most, and some pixels always or never."""
+    values = [ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM]
+    masks = np.random.default_rng(seed).choice(values, (T, 8, 12)).astype(np.uint8)
+    masks[:, 0], masks[:, 1] = ROBOT_MASK_ARM, ROBOT_MASK_FREE
+    return masks
+
+
+def test_the_hand_stays_with_arm_and_goes_with_all():
+    masks = np.array([ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM], np.uint8)
+    assert [hidden_pixels(masks, name).tolist() for name in ROBOT_MASKS] == [
+        [False, False, False], [False, False, True], [False, True, True]]
+
+
+@pytest.mark.parametrize('robot_mask', ['arm', 'all'])
+def test_a_scene_that_stands_still_comes_back_where_it_is_ever_seen(robot_mask):
+    scene, episode = still()
+    filled, seen = fill_in_time(episode.frames, episode.robot_masks, robot_mask)
+    assert seen.sum() == seen.size - 4  # all but the base
+    hand = (episode.robot_masks == ROBOT_MASK_HAND) & (robot_mask == 'arm')
+    np.testing.assert_array_equal(filled[:, seen][~hand[:, seen]],
+                                  scene.frames[:, seen][~hand[:, seen]])
+    np.testing.assert_array_equal(filled[hand], episode.frames[hand])
+    np.testing.assert_array_equal(filled[:, ~seen], episode.frames[:, ~seen])  # as recorded
+
+
+@pytest.mark.parametrize('robot_mask', ['arm', 'all'])
+def test_the_nearest_frame_fills_and_of_two_the_earlier_one(robot_mask):
+    T = 7
+    frames, masks = make_episode(1, T=T).frames, random_masks(T)
+    masks[:, 2] = ROBOT_MASK_HAND
+    hidden = hidden_pixels(masks, robot_mask)
+    filled, seen = fill_in_time(frames, masks, robot_mask)
+    for t, v, u in np.ndindex(hidden.shape):
+        free = [s for s in range(T) if masks[s, v, u] == ROBOT_MASK_FREE]
+        source = min(free, key=lambda s: (abs(s - t), s)) if free and hidden[t, v, u] else t
+        assert filled[t, v, u].tolist() == frames[source, v, u].tolist()
+        assert seen[v, u] == (bool(free) or not hidden[:, v, u].any())
+
+
+@pytest.mark.parametrize('robot_mask', ['arm', 'all'])
+def test_a_stream_is_filled_with_what_was_seen_last(robot_mask):
+    T = 7
+    frames, masks = make_episode(2, T=T).frames, random_masks(T, 2)
+    hidden = hidden_pixels(masks, robot_mask)
+    view = FreeView(robot_mask)
+    for t in range(T):
+        filled = view.update(frames[t], masks[t])
+        for v, u in np.ndindex(masks.shape[1:]):
+            free = [s for s in range(t + 1) if masks[s, v, u] == ROBOT_MASK_FREE]
+            source = free[-1] if free and hidden[t, v, u] else t
+            assert filled[v, u].tolist() == frames[source, v, u].tolist()
+
+
+def test_a_view_remembers_only_what_it_is_shown_to_remember():
+    scene, episode = still()
+    view, frame, mask = FreeView('all'), episode.frames, episode.robot_masks
+    np.testing.assert_array_equal(view.fill(frame[0], mask[0]), frame[0])  # nothing is known
+    first = view.update(frame[0], mask[0])
+    np.testing.assert_array_equal(first, frame[0])
+    for _ in range(2):
+        np.testing.assert_array_equal(view.fill(frame[8], mask[8])[mask[0] == 0],
+                                      scene.frames[0][mask[0] == 0])
+    view.clear()
+    np.testing.assert_array_equal(view.fill(frame[8], mask[8]), frame[8])
+    view.update(frame[0], mask[0])
+    larger = np.zeros((9, 12, 3), np.uint8)
+    np.testing.assert_array_equal(view.update(larger, np.zeros((9, 12), np.uint8)), larger)
+    assert not np.array_equal(frame[0], first * 0)  # what was given stays as it is
+
+
+@pytest.mark.parametrize('robot_mask', ['arm', 'all'])
+def test_filled_recordings_are_read_like_recordings(tmp_path, robot_mask):
+    plain = make_episode(9, T=4, start=10**12)
+    episodes = [cover(make_episode(s, T=5 + s, start=(s + 1) * 10**10), seed=s) for s in range(3)]
+    episodes.append(dataclasses.replace(episodes[0], goal_mask=None, stamps=episodes[0].stamps
+                                        + 5 * 10**11))
+    store = open_recordings([
+        write_bag(tmp_path / 'a', episodes), write_bag(tmp_path / 'b', [plain])])
+    found = FilledStore(store, robot_mask)
+    assert len(found) == 5 and found.num_frames == store.num_frames
+    for i, episode in enumerate(episodes):
+        expected, seen = fill_in_time(episode.frames, episode.robot_masks, robot_mask)
+        np.testing.assert_array_equal(found.frames(i), expected)
+        np.testing.assert_array_equal(found[i].frames, expected)
+        np.testing.assert_array_equal(found.seen[i], seen)
+        behind = fill_in_time(episode.frames, episode.robot_masks, 'all')[0][-1]
+        goal = expected[-1] if i == 3 else np.where(
+            hidden_pixels(episode.goal_mask, robot_mask)[..., None], behind, episode.goal_frame)
+        np.testing.assert_array_equal(found[i].goal_frame, goal)
+    np.testing.assert_array_equal(found.frames(4), plain.frames)
+    np.testing.assert_array_equal(found[4].goal_frame, plain.goal_frame)
+    assert found.seen[4].all()
+    chosen, times = [3, 4, 0], np.array([[0, 1, GOAL], [GOAL, 2, 3], [1, 1, 4]])
+    assert MappedFrames(found)(chosen, times).equal(ResidentFrames(found, 'cpu')(chosen, times))
+    assert fill(store, 'none') is None
+
+
+def test_only_episodes_with_masks_are_trained_on(tmp_path):
+    masked = [cover(make_episode(s, start=(s + 1) * 10**10)) for s in range(2)]
+    plain = [make_episode(s, start=(s + 1) * 10**10) for s in range(2, 4)]
+    store = open_recordings([write_bag(tmp_path / 'a', masked), write_bag(tmp_path / 'b', plain)])
+    parts = np.array([0, 2, 3]), np.array([1])
+    assert with_masks(store, parts, 'none') is parts
+    with pytest.warns(RecordingWarning, match='2 of 4 episodes are left out'):
+        training, held_out = with_masks(store, parts, 'arm')
+    assert training.tolist() == [0] and held_out.tolist() == [1]
+    with pytest.raises(RecordingError, match='0 of 2 to train on .* record /camera/robot_mask .* '
+                                             '--robot-mask none'):
+        with_masks(store, (np.array([2, 3]), np.array([1])), 'all')
+
+
+@pytest.mark.parametrize('training, expected', [
+    ({}, ('none', 0.0)), ({'settings': None}, ('none', 0.0)), ({'settings': {}}, ('none', 0.0)),
+    ({'settings': {'robot_mask': 'arm', 'fill_context': 0.5}}, ('arm', 0.5)),
+    ({'settings': {'robot_mask': 'hat', 'fill_context': 1}}, ('none', 0.0))])
+def test_weights_of_any_version_tell_what_they_were_trained_with(training, expected):
+    assert trained_robot_mask(training) == expected
+
+
+@pytest.mark.parametrize('robot_mask', ROBOT_MASKS)
+def test_an_episode_filled_from_its_past_is_what_a_view_of_the_stream_shows(robot_mask):
+    episode = make_episode(3, T=9)
+    masks = random_masks(9)
+    filled, known = fill_from_past(episode.frames, masks, robot_mask)
+    view = FreeView(robot_mask)
+    shown = [view.update(*both) for both in zip(episode.frames, masks)]
+    np.testing.assert_array_equal(filled, shown)
+    assert known[1].all() and (robot_mask == 'none' or not known[0].any())

@@ -1,0 +1,317 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of weights files, and what is said about files that are none."""
+
+from dataclasses import replace
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.torch import save_file
+from tap_ros.errors import WeightsError
+from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.predictor import load_network
+from tap_ros.training.weights import (
+    load_tensors,
+    load_weights,
+    make_config,
+    make_network,
+    save_tensors,
+    save_weights,
+    stored_digest,
+)
+from tap_ros.weights import FORWARD_MODEL, PREDICTORS
+import torch
+
+ROOT = Path(__file__).parents[2]
+CONFIG = PredictorConfig(base_width=4, image_size=16, new_pixels=False)
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / 'folder' / 'weights.safetensors'
+    save_weights(path, Predictor(CONFIG).to(memory_format=torch.channels_last), 'predictor',
+                 CONFIG, {'seed': 3})
+    return path
+
+
+def test_weights_round_trip(path):
+    network = Predictor(CONFIG)
+    save_weights(path, network, 'predictor', CONFIG, {'seed': 3, 'scores': {'min_l1': 0.5}})
+    values, state, training = load_weights(path, 'predictor')
+    assert make_config(PredictorConfig, values, path) == CONFIG
+    assert training == {'seed': 3, 'scores': {'min_l1': 0.5}}
+    other = make_network(Predictor, PredictorConfig, values, state, path)
+    for name, tensor in network.state_dict().items():
+        assert other.state_dict()[name].equal(tensor), name
+
+
+def test_nothing_else_is_left_in_the_folder(path):
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+
+
+def test_failed_writing_leaves_the_old_file(path):
+    before = path.read_bytes()
+    with pytest.raises(TypeError):
+        save_weights(path, Predictor(CONFIG), 'predictor', CONFIG, {'unstorable': object()})
+    assert path.read_bytes() == before
+    assert len(list(path.parent.iterdir())) == 1
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(WeightsError, match=r'none\.safetensors: no such.*train'):
+        load_weights(tmp_path / 'none.safetensors', 'predictor')
+
+
+@pytest.mark.parametrize('size', [0, 5, 100, 5000, -1])
+def test_truncated_file(path, size):
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(WeightsError, match='weights.safetensors: damaged, truncated'):
+        load_weights(path, 'predictor')
+
+
+def test_wrong_kind(path):
+    with pytest.raises(WeightsError, match='of a predictor, not of a forward_model'):
+        load_weights(path, 'forward_model')
+
+
+def test_somebody_elses_safetensors(tmp_path):
+    save_file({'weight': torch.zeros(2)}, tmp_path / 'other.safetensors')
+    with pytest.raises(WeightsError, match='other.safetensors: written by format None'):
+        load_weights(tmp_path / 'other.safetensors', 'predictor')
+
+
+@pytest.mark.parametrize('config', [
+    CONFIG, replace(CONFIG, decoder='shared'), replace(CONFIG, decoder='shared', skips=True)])
+def test_a_network_comes_back_with_its_decoder(tmp_path, config):
+    network = Predictor(config).eval()
+    save_weights(tmp_path / 'weights', network, 'predictor', config, {})
+    other, _ = load_network(tmp_path / 'weights')
+    context = torch.rand(1, 2, 3, 16, 16)
+    assert other.config == config
+    assert other(context).image.allclose(network(context).image, atol=1e-5)
+
+
+def test_files_of_earlier_versions_lack_the_decoder_and_are_the_same_network(path):
+    values, state, _ = load_weights(path, 'predictor')
+    old = {name: value for name, value in values.items() if name not in ('decoder', 'skips')}
+    assert make_config(PredictorConfig, old, path) == CONFIG
+    save_weights(path.with_name('old'), state, 'predictor', old, {})
+    context = torch.rand(1, 2, 3, 16, 16)
+    before, after = (load_network(name)[0](context).image
+                     for name in (path, path.with_name('old')))
+    assert before.equal(after)
+    for name in old:  # all the others are needed
+        with pytest.raises(WeightsError, match=f'lacks the configuration {name}'):
+            make_config(PredictorConfig, {k: v for k, v in old.items() if k != name}, path)
+
+
+@pytest.mark.parametrize('values, expected', [
+    ({'decoder': 3}, 'expected a word'), ({'decoder': ['shared']}, 'expected a word'),
+    ({'decoder': 'x' * 10 ** 6}, 'expected one of separate, shared'),
+    ({'decoder': 'separate', 'skips': True}, 'skips'), ({'base_width': '4'}, 'a whole number')])
+def test_a_configuration_of_wrong_words_is_refused_in_one_line(path, values, expected):
+    known = load_weights(path, 'predictor')[0]
+    with pytest.raises(WeightsError, match=expected) as error:
+        make_config(PredictorConfig, known | values, path)
+    assert str(error.value).isprintable() and len(str(error.value)) < 500
+
+
+def test_unknown_configuration(path):
+    with pytest.raises(WeightsError, match='unknown configuration wings; known are base_width'):
+        make_config(PredictorConfig, {'wings': 2}, path)
+
+
+def test_wrong_size(path):
+    values, state, _ = load_weights(path, 'predictor')
+    with pytest.raises(WeightsError, match='encoder.0.weight has size'):
+        make_network(Predictor, PredictorConfig, values | {'base_width': 8}, state, path)
+    with pytest.raises(WeightsError, match='missing.*pixel_decoder'):
+        make_network(Predictor, PredictorConfig, values | {'new_pixels': True}, state, path)
+
+
+def test_a_pickle_is_not_loaded(tmp_path):
+    torch.save({'weight': torch.zeros(2)}, tmp_path / 'pickle.safetensors')
+    with pytest.raises(WeightsError, match='damaged|no safetensors'):
+        load_weights(tmp_path / 'pickle.safetensors', 'predictor')
+
+
+def test_configuration_is_readable_json(path):
+    header = path.read_bytes()
+    length = int.from_bytes(header[:8], 'little')
+    about = json.loads(json.loads(header[8:8 + length])['__metadata__']['about'])
+    assert about['kind'] == 'predictor' and about['config']['base_width'] == 4
+
+
+def refusal(load, *arguments):
+    """Return what is said; it is one line that names the file."""
+    with pytest.raises(WeightsError) as error:
+        load(*arguments)
+    text = str(error.value)
+    assert text.isprintable() and str(arguments[0]) in text
+    return text
+
+
+def test_any_flip_of_a_bit_is_refused(path):
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    header = 8 + int.from_bytes(whole[:8], 'little')
+    places = [*range(8), *rng.integers(8, header, 200), *rng.integers(header, len(whole), 200)]
+    for place in map(int, places):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        refusal(load_network, path)
+    path.write_bytes(whole)
+    load_network(path)
+
+
+def test_swapped_tensors_and_another_description_are_refused(path):
+    whole = path.read_bytes()
+    tensors = load_tensors(path)[0]
+    first, second = next((a, b) for a in tensors for b in tensors
+                         if a < b and tensors[a].shape == tensors[b].shape
+                         and not tensors[a].equal(tensors[b]) and len(a) == len(b))
+    path.write_bytes(whole.replace(first.encode(), b'?').replace(
+        second.encode(), first.encode()).replace(b'?', second.encode()))
+    refusal(load_network, path)
+    assert b'16.0' in whole
+    path.write_bytes(whole.replace(b'16.0', b'61.0'))
+    assert 'SHA-256' in refusal(load_network, path)
+
+
+def test_the_digest_is_of_the_content_alone(path, tmp_path):
+    save_tensors(tmp_path / 'again', *load_tensors(path))
+    assert stored_digest(tmp_path / 'again') == stored_digest(path)
+    tensors, about = load_tensors(path)
+    save_tensors(tmp_path / 'other', tensors, about | {'training': {'seed': 4}})
+    assert stored_digest(tmp_path / 'other') != stored_digest(path)
+    tensors['encoder.0.weight'][0, 0, 0, 0] += 1
+    save_tensors(tmp_path / 'other', tensors, about)
+    assert stored_digest(tmp_path / 'other') != stored_digest(path)
+
+
+def test_planning_results_are_of_one_forward_model_and_the_page_says_where_it_is_another():
+    results = ROOT / 'docs' / 'results'
+    used, = {json.loads(file.read_text())['settings']['forward_weights']
+             for file in (results / 'planning').glob('*.json')}
+    shipped = used == stored_digest(FORWARD_MODEL)[:16]
+    assert shipped == ('of an earlier world' not in (results / 'planning.md').read_text())
+
+
+@pytest.mark.parametrize('change', [
+    lambda tensor: torch.zeros_like(tensor),
+    lambda tensor: tensor * torch.nan if tensor.dim() > 1 else tensor,
+    lambda tensor: tensor + torch.inf if tensor.dim() == 1 else tensor],
+    ids=['zero', 'nan', 'infinite'])
+@pytest.mark.parametrize('shipped, load', [
+    (PREDICTORS['push2'], load_network), (FORWARD_MODEL, load_forward_model)],
+    ids=['predictor', 'forward'])
+def test_weights_that_are_zero_or_not_finite_are_refused(tmp_path, shipped, load, change):
+    tensors, about = load_tensors(shipped)
+    save_tensors(tmp_path / 'w', {name: change(tensor) if tensor.is_floating_point() else tensor
+                                  for name, tensor in tensors.items()}, about)
+    assert 'zero' in (text := refusal(load, tmp_path / 'w')) or 'not finite' in text
+
+
+@pytest.mark.parametrize('name, value', [
+    ('flow_scale', float('nan')), ('flow_scale', float('inf')), ('flow_scale', '16'),
+    ('flow_scale', None), ('flow_scale', True), ('base_width', 4.0), ('base_width', -4),
+    ('base_width', 10 ** 9), ('base_width', 10 ** 400), ('image_size', 2 ** 30),
+    ('new_pixels', 0), ('new_pixels', []), ('code_size', 2 ** 30), ('latent_size', 2 ** 30),
+    ('num_context', 10 ** 6), ('wings\n\x1b', 2), ('code_size', ...)])
+def test_a_configuration_that_cannot_be_is_refused(path, name, value):
+    tensors, about = load_tensors(path)
+    about['config'][name] = value
+    if value is ...:
+        del about['config'][name]
+    save_tensors(path, tensors, about)
+    assert name.split('\n')[0] in refusal(load_network, path)
+
+
+@pytest.mark.parametrize('name, value', [
+    ('table', [1.0] * 8), ('table', [float('nan')] * 9), ('arm', 3), ('arm', [[1]] * 12),
+    ('table_cells', 10 ** 6), ('blocks', 10 ** 9), ('crop_cells', [20]), ('crop_cells', []),
+    ('crop_cells', [20.0, 24.0]), ('workspace_low', [0.0]), ('sprite_size', 0), ('table', ...)])
+def test_a_forward_model_that_cannot_be_is_refused(tmp_path, name, value):
+    tensors, about = load_tensors(FORWARD_MODEL)
+    about['config'][name] = value
+    if value is ...:
+        del about['config'][name]
+    save_tensors(tmp_path / 'w', tensors, about)
+    refusal(load_forward_model, tmp_path / 'w')
+
+
+@pytest.mark.parametrize('change', [
+    lambda about: about.pop('training'), lambda about: about.pop('kind'),
+    lambda about: about.pop('config'), lambda about: about.update(config=None),
+    lambda about: about.update(config=[]), lambda about: about.update(training='much'),
+    lambda about: about.update(kind={'predictor': '\n\x1b[2J'})])
+def test_a_description_that_lacks_something_is_refused(path, change):
+    tensors, about = load_tensors(path)
+    change(about)
+    save_tensors(path, tensors, about)
+    refusal(load_network, path)
+
+
+@pytest.mark.parametrize('text', ['', '{', '[]', 'null', '3', '[' * 200_000, '{"a":' * 200_000,
+                                  '\ud800'], ids=range(8))
+def test_a_description_that_is_none_is_refused(path, text):
+    tensors, _ = load_tensors(path)
+    for digest in ('0' * 64, ''):
+        with open(path, 'wb') as stream:
+            stream.write(safetensors_of(tensors, {
+                'format': 'tap_ros 2', 'about': text, 'sha256': digest}))
+        refusal(load_network, path)
+
+
+def safetensors_of(tensors, metadata):
+    """Return a file's bytes, with a header of our own writing."""
+    entries, data = {'__metadata__': metadata}, b''
+    for name, tensor in tensors.items():
+        raw = tensor.reshape(-1).view(torch.uint8).numpy().tobytes()
+        kind = {torch.float32: 'F32', torch.int64: 'I64'}[tensor.dtype]
+        entries[name] = {'dtype': kind, 'shape': list(tensor.shape),
+                         'data_offsets': [len(data), len(data) + len(raw)]}
+        data += raw
+    header = json.dumps(entries).encode()
+    return len(header).to_bytes(8, 'little') + header + data
+
+
+def test_a_file_without_sha_256_is_refused_with_the_remedy(path):
+    tensors, about = load_tensors(path)
+    metadata = {'format': 'tap_ros 1', 'about': json.dumps(about)}
+    save_file(tensors, path, metadata)
+    assert 'format tap_ros 1, not by tap_ros 2' in (text := refusal(load_network, path))
+    assert 'train again' in text
+    save_file(tensors, path, metadata | {'format': 'tap_ros 2'})
+    refusal(load_network, path)
+
+
+@pytest.mark.parametrize('header', [
+    b'', b'\xff' * 8, (2 ** 40).to_bytes(8, 'little'), (10).to_bytes(8, 'little') + b'[' * 10,
+    (2).to_bytes(8, 'little') + b'[]', (4).to_bytes(8, 'little') + b'null',
+    (20).to_bytes(8, 'little') + b'{"__metadata__": 3} '])
+def test_a_header_that_is_none_is_refused(path, header):
+    path.write_bytes(header + bytes(100) * (len(header) == 8))
+    refusal(load_network, path)
+
+
+def test_a_huge_header_and_a_deep_one_are_refused(path):
+    for header in (b' ' * 2 ** 23, b'[' * 2 ** 20, b'{"a":' * 2 ** 18):
+        path.write_bytes(len(header).to_bytes(8, 'little') + header)
+        refusal(load_network, path)
+
+
+def test_what_is_no_file_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / 'fifo')
+    (tmp_path / 'memory').symlink_to('/proc/self/mem')  # whoever reads it, it cannot be
+    (tmp_path / 'loop').symlink_to(tmp_path / 'loop')
+    (tmp_path / 'closed').write_bytes(b'')
+    (tmp_path / 'closed').chmod(0)
+    for name in ('fifo', 'memory', 'loop', 'closed', 'closed/below', '', 'n' * 300, '\0'):
+        with pytest.raises(WeightsError) as error:
+            load_network(tmp_path / name)
+        assert str(error.value).isprintable()
