@@ -1,0 +1,53 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Parts that can be replaced by name: those of this package, and those that other packages add.
+
+Another package adds one by an entry point, without a fork:
+
+    [project.entry-points.'tap_ros.arms']
+    xarm7 = 'my_package.xarm7:XArm7'
+"""
+
+from difflib import get_close_matches
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+from tap_ros.errors import ConfigError
+
+# By group: name -> 'module:attribute'.
+BUILT_IN: dict[str, dict[str, str]] = {
+    'tap_ros.arms': {},
+    'tap_ros.forward_models': {},
+    'tap_ros.predictors': {},
+    'tap_ros.solvers': {},
+    'tap_ros.worlds': {},
+}
+
+
+def names(group: str) -> list[str]:
+    """Return the names of a group, sorted: those of this package and those of entry points."""
+    return sorted({*BUILT_IN[group], *(point.name for point in entry_points(group=group))})
+
+
+def load_plugin(group: str, name: str) -> Any:
+    """
+    Import what a name stands for.
+
+    :param group: one of BUILT_IN, such as 'tap_ros.arms'.
+    :param name: of this package, or of an entry point of the group; this package's go first.
+    :return: the class or object.
+    :raises ConfigError: for an unknown name; it names the nearest one and all valid ones.
+    """
+    place = BUILT_IN[group].get(name)
+    if place is not None:
+        module, _, attribute = place.partition(':')
+        return getattr(import_module(module), attribute)
+    for point in entry_points(group=group, name=name):
+        return point.load()
+    valid = names(group)
+    near = get_close_matches(name, valid, 1)
+    meant = f'did you mean {near[0]!r}? ' if near else ''
+    kind = group.partition('.')[2].removesuffix('s').replace('_', ' ')
+    raise ConfigError(f'{kind} {name!r} is unknown; {meant}valid: {", ".join(valid) or "none"}')
