@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from tap_ros.errors import ConfigError
+from tap_ros.search import cross_entropy, finite
 
 
 @dataclass(frozen=True)
@@ -55,25 +56,14 @@ def cem(cost: Callable[[np.ndarray], np.ndarray], mean: np.ndarray, std: np.ndar
     :return: best sample (D,); its cost, not the one by recheck; the best num_elites of all
         iterations (E, D), the cheapest first.
     """
-    best, best_costs = np.empty((0, len(mean))), np.empty(0)
-    for iteration in range(config.num_iterations):
-        # draw
-        samples = mean + std * rng.standard_normal((config.num_samples, len(mean)))
-        if iteration == 0 and proposals is not None and len(proposals):
+    def draw(elites: np.ndarray | None) -> np.ndarray:
+        middle, spread = (mean, std) if elites is None else (elites.mean(0), elites.std(0))
+        noise = rng.standard_normal((config.num_samples, len(middle)))
+        samples = middle + spread * noise
+        if elites is None and proposals is not None and len(proposals):
             samples[-len(proposals):] = proposals[-config.num_samples:]
-        samples = samples if repair is None else repair(samples)
-        # judge
-        costs = _finite(cost(samples))
-        elites = samples[np.argsort(costs, kind='stable')[:config.num_elites]]
-        best, best_costs = np.concatenate([best, samples]), np.concatenate([best_costs, costs])
-        first = np.argsort(best_costs, kind='stable')[:config.num_elites]
-        best, best_costs = best[first], best_costs[first]
-        # refit
-        mean, std = elites.mean(0), elites.std(0)
-    winner = 0 if recheck is None else int(np.argmin(_finite(recheck(best))))
-    return best[winner], float(best_costs[winner]), best
+        return samples if repair is None else repair(samples)
 
-
-def _finite(costs: np.ndarray) -> np.ndarray:
-    """Return costs as float64, the worst where they are not numbers."""
-    return np.nan_to_num(np.asarray(costs, np.float64), nan=np.inf, posinf=np.inf)
+    best, costs = cross_entropy(draw, cost, config.num_iterations, config.num_elites)
+    winner = 0 if recheck is None else int(np.argmin(finite(recheck(best))))
+    return best[winner], float(costs[winner]), best
