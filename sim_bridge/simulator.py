@@ -1,9 +1,10 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated world: reset, step, observe. Knows nothing of ROS."""
+"""The MuJoCo table, a World: reset, step, observe. Knows nothing of ROS."""
 
+from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -14,7 +15,7 @@ from sim_bridge.world.appearance import choose_appearance, USUAL
 from sim_bridge.world.entities import check_free, check_pose, check_velocity
 from sim_bridge.world.grasping import grasp_place
 from sim_bridge.world.looks import DEFAULT_LOOK, get_look, GRIP_SPREAD, OBSERVER
-from sim_bridge.world.moved_goal import check_apart, check_places
+from sim_bridge.world.moved_goal import check_apart, check_places, places_from
 from sim_bridge.world.places import gripper_away_from
 from sim_bridge.world.scene import (
     build_scene,
@@ -25,6 +26,7 @@ from sim_bridge.world.scene import (
     TIMESTEP,
 )
 from sim_bridge.world.studio import Studio
+from sim_bridge.world_protocol import Observation
 from tap_ros.contract import (
     ACTION_LIMIT,
     CONTROL_PERIOD,
@@ -44,20 +46,6 @@ BENT = 0.1  # share of the fingers' travel that they may be beyond their ends
 GRASP_HEIGHT = 0.012  # m of the gripper when it holds an object on the table, in the goal picture
 LEAVE_HEIGHT = 0.12  # m of the gripper when it has put the object down, in the goal picture
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
-
-
-@dataclass(frozen=True)
-class Observation:
-    """What the camera and the sensors say at one moment; object poses are ground truth."""
-
-    image: np.ndarray  # (H, W, 3) uint8 rgb
-    stamp_ns: int  # simulated time
-    gripper: np.ndarray  # (4,) float32: x, y, z of the fingertips in m, opening in [0, 1]
-    object_names: tuple[str, ...]
-    object_pixels: np.ndarray  # (K, 2) float32 (u, v) of the object origins
-    object_poses: np.ndarray  # (K, 7) float64: x, y, z in m, quaternion x, y, z, w
-    robot_mask: np.ndarray  # (H, W) uint8, values as in contract.py
-    arm_joints: np.ndarray  # (6,) float64 rad, of the UR10e
 
 
 def clip_action(action: ArrayLike) -> np.ndarray:
@@ -104,7 +92,7 @@ def ramp_controls(target: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, 
 
 class Simulator:
     """
-    A table with a gripper, objects and a camera.
+    A table with a gripper, objects and a camera: the World 'mujoco_table'.
 
     :param task: name of a task, see tasks.TASKS.
     :param image_size: pixels of the square picture.
@@ -126,6 +114,21 @@ class Simulator:
         self._renderer: Studio | None = None
         self._observer: Studio | None = None
         self._worn = USUAL  # the appearance of the present scene
+
+    @property
+    def task_name(self) -> str:
+        """Return the name of the task."""
+        return self.task.name
+
+    @property
+    def camera_matrix(self) -> np.ndarray:
+        """Return the intrinsics (3, 3) in pixels."""
+        return self.camera.K
+
+    @property
+    def camera_pose(self) -> np.ndarray:
+        """Return the pose (4, 4) of the camera's optical frame in the world."""
+        return self.camera.pose
 
     def reset(self, seed: int) -> Observation:
         """
@@ -208,6 +211,16 @@ class Simulator:
             self._goal = [self.photograph(poses, hide_arm=hide_arm) for hide_arm in (False, True)]
         finally:
             mujoco.mj_copyData(self.data, self.model, before)
+
+    def move_goal(self, names: Sequence[str], pixels: np.ndarray) -> None:
+        """
+        Put the goals of some objects where pixels of its picture show the table, see set_goal.
+
+        :param names: of the objects that move; the others' goals stay.
+        :param pixels: (len(names), 2) (u, v).
+        :raises SceneError: as set_goal does, and for names that no object has.
+        """
+        self.set_goal(places_from(self.camera, self.goal().object_poses, names, pixels))
 
     def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike = (0,) * 6) -> None:
         """

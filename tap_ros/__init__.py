@@ -23,6 +23,7 @@ _EXPORTS = {
     'SubgoalPredictor': 'tap_ros.prediction.predictor',
     'TapError': 'tap_ros.errors',
     'VisualMPC': 'tap_ros.planning.visual_mpc',
+    'World': 'sim_bridge.world_protocol',
 }
 __all__ = list(_EXPORTS)
 

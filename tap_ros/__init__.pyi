@@ -3,6 +3,7 @@
 """The names of __all__ for type checkers, which cannot see what __init__.py exports lazily."""
 
 from sim_bridge.simulator import Simulator as Simulator
+from sim_bridge.world_protocol import World as World
 from tap_ros.errors import TapError as TapError
 from tap_ros.planning.visual_mpc import VisualMPC as VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor as SubgoalPredictor

@@ -22,7 +22,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     'tap_ros.forward_models': {},
     'tap_ros.predictors': {},
     'tap_ros.solvers': {},
-    'tap_ros.worlds': {},
+    'tap_ros.worlds': {'mujoco_table': 'sim_bridge.simulator:Simulator'},
 }
 
 

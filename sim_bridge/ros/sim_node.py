@@ -16,14 +16,12 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from sim_bridge.simulator import Observation, Simulator
 from sim_bridge.tasks.run_state import MAX_PERIODS, RunState
-from sim_bridge.tasks.tasks import TASKS
 from sim_bridge.world.appearance import CHOICES
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
-from sim_bridge.world.moved_goal import move_goal
 from sim_bridge.world.robot_description import robot_description
-from sim_bridge.world.transforms import arm_transforms, camera_transform, fixed_arm_transforms
+from sim_bridge.world.transforms import arm_transforms, fixed_arm_transforms, Transform
+from sim_bridge.world_protocol import ability, make_world, Observation, World
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
@@ -50,11 +48,13 @@ from tap_ros.nodes.run import answering, run_node
 from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.tf_publisher import TransformPublisher
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
+from tap_ros.plugins import names
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
 MAX_TIMEOUT = 60.0  # s
+OPTIONS = {'look': DEFAULT_LOOK, 'appearance': 'usual'}  # of worlds that take them
 LAST_WORDS_S = 1.0  # s that the end of the last episode may take to arrive
 
 
@@ -76,9 +76,11 @@ class SimNode(Node):
         super().__init__('sim_node')
         self.params = declare_parameters(self)
         task = self.params['task']
-        self._sim = self._simulator(task)
+        self._sim = self._make_world(task)
+        self._seed, self._scenes = 0, 0  # of the present scene, and how many there were
         self._hide_arm = False
         self._opening = 0.0  # the newest gripper command
+        self._done_opening = 0.0  # that of the last period
         self._twist: np.ndarray | None = None  # real time: the command for the next period
         self._valid_until = 0.0  # monotonic time at which it runs out
         self._timeout = self.params['command_timeout']  # s that a command is valid
@@ -245,16 +247,15 @@ class SimNode(Node):
             response.message = str(error)
             return response
         response.success = True
-        response.message = f'{self._sim.task.name}, seed {request.seed}'
+        response.message = f'{self._sim.task_name}, seed {request.seed}'
         return response
 
     def _on_set_goal(self, request: SetGoal.Request,
                      response: SetGoal.Response) -> SetGoal.Response:
-        camera, poses = self._sim.camera, self._sim.goal().object_poses
         try:
             names, pixels = decode_objects(
-                request.objects, 'objects', (camera.height, camera.width))
-            self._sim.set_goal(move_goal(camera, poses, names, pixels))
+                request.objects, 'objects', self._sim.goal().image.shape[:2])
+            ability(self._sim, 'move_goal')(names, pixels)
         except TapError as error:
             response.message = str(error)
             return response
@@ -289,9 +290,14 @@ class SimNode(Node):
     # What all services are made of
 
     @property
-    def sim(self) -> Simulator:
-        """Return the simulator of the present scene."""
+    def sim(self) -> World:
+        """Return the world of the present scene."""
         return self._sim
+
+    @property
+    def scenes(self) -> int:
+        """Return how many scenes there were, with the present one."""
+        return self._scenes
 
     @property
     def stamp(self) -> Time:
@@ -302,7 +308,7 @@ class SimNode(Node):
         """Let time pass or not; what was commanded before and is not done yet is forgotten."""
         if state is not self.state:
             self._twist = None
-            self._opening = float(self._sim.target[3])
+            self._opening = self._done_opening
             self._played_at = time.monotonic() if state is RunState.PLAYING else math.inf
             self.state = state
 
@@ -324,34 +330,36 @@ class SimNode(Node):
 
     def repeat(self) -> None:
         """Start the present scene again."""
-        self._reset(self._sim.task.name, self._sim.scene.seed, self._hide_arm)
+        self._reset(self._sim.task_name, self._seed, self._hide_arm)
 
     def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike) -> None:
         """Put an object elsewhere (see Simulator.put_object) and publish what is seen then."""
-        self._sim.put_object(name, pose, velocity)
+        ability(self._sim, 'put_object')(name, pose, velocity)
         self._leave_start()
         self._stamp_ns += 1  # pictures are told apart by their stamps
         self._publish(self._sim.observe())
 
     # Simulation
 
-    def _simulator(self, task: str) -> Simulator:
-        return Simulator(task, self.params['image_size'], self.params['look'],
-                         self.params['appearance'])
+    def _make_world(self, task: str) -> World:
+        options = {name: self.params[name] for name in OPTIONS
+                   if self.params[name] != OPTIONS[name]}
+        return make_world(self.params['world'], task, self.params['image_size'], **options)
 
     def _reset(self, task: str, seed: int, hide_arm: bool) -> None:
         """Start a scene; if it cannot be, the present one stays as it is."""
-        if task == self._sim.task.name:
+        if task == self._sim.task_name:
             sim = self._sim
         else:
-            sim = self._simulator(task)
+            sim = self._make_world(task)
         self._end_episode()
         observation = sim.reset(seed)
         if sim is not self._sim:
             self._sim.close()
-        self._sim, self._hide_arm = sim, hide_arm
+        self._sim, self._hide_arm, self._seed = sim, hide_arm, seed
+        self._scenes += 1
         self._leave_start()
-        self._opening, self._twist = 0.0, None
+        self._opening, self._done_opening, self._twist = 0.0, 0.0, None
         self._stamp_ns += PERIOD_NS
         self._reset_ns = self._stamp_ns
         self._num_steps = 0
@@ -365,6 +373,7 @@ class SimNode(Node):
         """Let one control period pass and publish what the camera then sees."""
         begin = time.perf_counter()
         observation = self._sim.step(np.append(move, self._opening))
+        self._done_opening = self._opening
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'step')
         self._stamp_ns += PERIOD_NS
         self._num_steps += 1
@@ -382,26 +391,30 @@ class SimNode(Node):
         if self._hide_arm:
             observation = self._sim.observe(hide_arm=True)
         stamp = to_stamp(self._stamp_ns)
-        camera = self._sim.camera
         self._newest = {
             'clock': ClockMessage(clock=stamp),
             'joint_states': encode_joints(
                 observation.gripper, stamp, WORLD_FRAME, observation.arm_joints),
             'objects': encode_observed(observation, stamp),
             'camera/camera_info': encode_camera_info(
-                camera.K, (camera.height, camera.width), stamp, CAMERA_FRAME),
+                self._sim.camera_matrix, observation.image.shape[:2], stamp, CAMERA_FRAME),
             'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME),
             'camera/robot_mask': encode_mask(observation.robot_mask, stamp, CAMERA_FRAME)}
         if self.params['observer']:
             self._newest['observer/image_raw'] = encode_image(
-                self._sim.observer_picture(), stamp, OBSERVER_FRAME)
-        self._transforms.moving(arm_transforms(observation.arm_joints), stamp)
+                ability(self._sim, 'observer_picture')(), stamp, OBSERVER_FRAME)
+        if len(observation.arm_joints):
+            self._transforms.moving(arm_transforms(observation.arm_joints), stamp)
         self._send_newest()
 
     def _publish_fixed_transforms(self) -> None:
         """Tell where the cameras and the foot of the arm are in this scene."""
-        fixed = [camera_transform(self._sim.camera, CAMERA_FRAME),
-                 camera_transform(OBSERVER, OBSERVER_FRAME), *fixed_arm_transforms()]
+        poses = {CAMERA_FRAME: self._sim.camera_pose}
+        if hasattr(self._sim, 'observer_picture'):
+            poses[OBSERVER_FRAME] = OBSERVER.pose
+        fixed = [Transform(WORLD_FRAME, frame, pose)
+                 for frame, pose in poses.items() if pose is not None]
+        fixed += fixed_arm_transforms()
         self._transforms.fixed(fixed, to_stamp(self._stamp_ns))
 
     def _send_newest(self) -> None:
@@ -419,8 +432,8 @@ class SimNode(Node):
         self._goal_mask.publish(encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
 
     def _publish_episode(self, event: int, outcome: str) -> None:
-        scene = self._sim.scene
-        message = Episode(event=event, task=scene.task.name, seed=scene.seed, outcome=outcome)
+        message = Episode(
+            event=event, task=self._sim.task_name, seed=self._seed, outcome=outcome)
         # Not before its goal, else a recording would not count that.
         message.header.stamp = to_stamp(max(self._stamp_ns, self._goal_ns))
         message.header.frame_id = WORLD_FRAME
@@ -430,16 +443,18 @@ class SimNode(Node):
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    parameters.declare('task', 'push2', 'Task of the first scene.', choices=list(TASKS))
+    parameters.declare('world', 'mujoco_table', 'The simulated world; other packages may add '
+                       'some.', choices=names('tap_ros.worlds'))
+    parameters.declare('task', 'push2', 'Task of the first scene, one that the world has.')
     parameters.declare('seed', 0, 'Seed of the first scene.', low=0, high=2**62)
     parameters.declare('image_size', 64, 'Width and height of the pictures in pixels.',
                        low=16, high=1024)
     parameters.declare(
-        'look', DEFAULT_LOOK,
+        'look', OPTIONS['look'],
         "What the camera's pictures show: the whole UR10e at a wooden table, or its hand alone.",
         choices=list(LOOKS))
     parameters.declare(
-        'appearance', 'usual', 'Table, light and camera; random: drawn from '
+        'appearance', OPTIONS['appearance'], 'Table, light and camera; random: drawn from '
         'the seed of each scene.', choices=list(CHOICES))
     parameters.declare(
         'observer', False, 'Publish observer/image_raw, a view from the side for people.')

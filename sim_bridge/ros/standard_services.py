@@ -145,7 +145,7 @@ class StandardServices:
     async def _step(self, handle: 'ServerGoalHandle') -> str:
         """Make the steps of a goal; return what ended it early, else an empty string."""
         node, steps = self._node, handle.request.steps
-        scene = node.sim.scene
+        scene = node.scenes
         for done in range(1, steps + 1):
             node.wait_period()
             handle.publish_feedback(SimulateSteps.Feedback(
@@ -156,7 +156,7 @@ class StandardServices:
             node.executor.wake()  # else it would wait for a message
             await _Turn()
             why = ('cancelled' if handle.is_cancel_requested else
-                   'the scene was reset' if node.sim.scene is not scene else
+                   'the scene was reset' if node.scenes != scene else
                    '' if node.state is RunState.PAUSED else
                    f'the simulation was set {node.state.name.lower()}')
             if why:

@@ -4,6 +4,7 @@
 
 import contextlib
 from dataclasses import dataclass, replace
+import weakref
 
 import mujoco
 import numpy as np
@@ -40,6 +41,14 @@ class Camera:
             c, s = np.cos(self.turn), np.sin(self.turn)
             rotation = rotation @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         return np.column_stack([rotation, -rotation @ np.array(self.position)])
+
+    @property
+    def pose(self) -> np.ndarray:
+        """Pose (4, 4) of the optical frame in the world: z ahead, x right, y down (REP 103)."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.extrinsics[:, :3].T
+        pose[:3, 3] = self.position
+        return pose
 
     @property
     def quaternion(self) -> np.ndarray:
@@ -123,6 +132,8 @@ class OpenGL:
                 f'cannot render off-screen ({error}); on Debian and Ubuntu: '
                 'apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl') from error
         self._viewport = mujoco.MjrRect(0, 0, width, height)
+        # Dropped without close, MuJoCo would free another context's objects.
+        self._finalizer = weakref.finalize(self, _free, self._gl, self._context)
 
     def draw(self, scene: mujoco.MjvScene, numbers: bool = False) -> np.ndarray:
         """
@@ -144,7 +155,12 @@ class OpenGL:
         return picture[..., 0] + 2 ** 8 * picture[..., 1].astype(np.int64) - 1
 
     def close(self) -> None:
-        """Free the context."""
-        self._gl.make_current()  # else another context's objects would be freed
-        self._context.free()
-        self._gl.free()
+        """Free the context; once is enough, and none is needed where this object is dropped."""
+        self._finalizer()
+
+
+def _free(gl: mujoco.GLContext, context: mujoco.MjrContext) -> None:
+    """Free a context while it is the current one."""
+    gl.make_current()
+    context.free()
+    gl.free()

@@ -13,8 +13,8 @@ from tap_ros.errors import SceneError
 from tap_ros.text import listing
 
 
-def move_goal(camera: Camera, poses: np.ndarray, names: Sequence[str],
-              pixels: np.ndarray) -> np.ndarray:
+def places_from(camera: Camera, poses: np.ndarray, names: Sequence[str],
+                pixels: np.ndarray) -> np.ndarray:
     """
     Turn pixels of a goal picture into places of the goal.
 

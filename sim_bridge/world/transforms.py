@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.world.camera import Camera
 from sim_bridge.world.robot_description import BASE_FRAME, joint_origins, LINKS, TIP_FRAME
 from tap_ros.contract import WORLD_FRAME
 from tap_ros.robots import ur10e
@@ -28,19 +27,6 @@ class Transform:
         wxyz = np.empty(4)
         mujoco.mju_mat2Quat(wxyz, self.pose[:3, :3].ravel())
         return np.roll(wxyz, -1)
-
-
-def camera_transform(camera: Camera, frame: str) -> Transform:
-    """
-    Return where a camera is in the world.
-
-    :param camera: Camera.
-    :param frame: name of its optical frame: z looks ahead, x right, y down (REP 103).
-    """
-    pose = np.eye(4)
-    pose[:3, :3] = camera.extrinsics[:, :3].T
-    pose[:3, 3] = camera.position
-    return Transform(WORLD_FRAME, frame, pose)
 
 
 def fixed_arm_transforms(mount: ur10e.Mount = ur10e.SIMULATED) -> list[Transform]:

@@ -10,7 +10,6 @@ from loop import SEED
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from sim_bridge.world.moved_goal import move_goal
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectState, ObjectStates
@@ -44,9 +43,8 @@ def moved_simulator(seed):
     """Reset a simulator of this process and move its goal likewise."""
     sim = Simulator('push2')
     try:
-        seen, goal = sim.reset(seed), sim.goal()
-        sim.set_goal(move_goal(
-            sim.camera, goal.object_poses, list(MOVED), np.array(list(MOVED.values()))))
+        seen = sim.reset(seed)
+        sim.move_goal(list(MOVED), np.array(list(MOVED.values())))
         yield sim, seen
     finally:
         sim.close()

@@ -8,7 +8,7 @@ from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import sample_scene, TASKS
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.looks import OBSERVER
-from sim_bridge.world.moved_goal import check_places, move_goal
+from sim_bridge.world.moved_goal import check_places, places_from
 from sim_bridge.world.places import GRIPPER_MARGIN
 from tap_ros.contract import ROBOT_MASK_FREE
 from tap_ros.errors import SceneError
@@ -179,12 +179,12 @@ def test_objects_that_are_not_named_stay_and_pixels_are_those_of_the_goal_pictur
     simulator.reset(3)
     goal, camera = simulator.goal(), simulator.camera
     poses, names = goal.object_poses, goal.object_names
-    stay = move_goal(camera, poses, names[::-1], goal.object_pixels[::-1])
+    stay = places_from(camera, poses, names[::-1], goal.object_pixels[::-1])
     np.testing.assert_allclose(stay, poses[:, :2], atol=1e-6)
-    places = move_goal(camera, poses, names[1:], np.array([[15.25, 30.5]]))
+    places = places_from(camera, poses, names[1:], np.array([[15.25, 30.5]]))
     np.testing.assert_array_equal(places[0], poses[0, :2])
     simulator.set_goal(places)
     np.testing.assert_allclose(simulator.goal().object_pixels[1], [15.25, 30.5], atol=1e-5)
     for unfit, words in (((), 'empty.*object_0'), (('cup',), 'cup.*object_0, object_1')):
         with pytest.raises(SceneError, match=words):
-            move_goal(camera, poses, unfit, np.zeros((len(unfit), 2)))
+            places_from(camera, poses, unfit, np.zeros((len(unfit), 2)))

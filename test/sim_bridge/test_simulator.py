@@ -151,3 +151,12 @@ def test_fingers_pressed_beyond_their_ends_are_told_as_a_planner_accepts_them(si
     gripper = simulator.observe().gripper
     assert (gripper >= GRIPPER_LOW).all() and (gripper <= GRIPPER_HIGH).all()
     assert abs(gripper[3] - np.clip(pressed, 0, 1)) == pytest.approx(0.1)
+
+
+def test_a_dropped_simulator_leaves_the_pictures_of_others_alone(simulator):
+    before = simulator.reset(3).image
+    other = Simulator('push2')
+    other.reset(4)
+    simulator.observe()  # whose context is the current one when the other is dropped
+    del other
+    np.testing.assert_array_equal(simulator.observe().image, before)

@@ -8,7 +8,6 @@ from sim_bridge.world.looks import get_look, OBSERVER
 from sim_bridge.world.robot_description import robot_description, TIP_FRAME
 from sim_bridge.world.transforms import (
     arm_transforms,
-    camera_transform,
     fixed_arm_transforms,
     Transform,
 )
@@ -33,7 +32,7 @@ def test_the_arm_is_where_its_urdf_has_it():
 @pytest.mark.parametrize('camera', [OBSERVER, get_look('hand').camera(False, 64, 64)])
 def test_a_camera_sees_in_its_optical_frame_what_it_projects(camera):
     points = np.random.default_rng(1).uniform(-0.2, 0.2, (5, 3))
-    pose = camera_transform(camera, 'eye').pose
+    pose = camera.pose
     x, y, z = np.linalg.inv(pose)[:3] @ np.column_stack([points, np.ones(5)]).T
     pixels = np.column_stack([x / z, y / z]) * camera.K[0, 0] + camera.K[:2, 2]
     assert (z > 0).all()
