@@ -16,6 +16,7 @@ if 'OMP_WAIT_POLICY' not in os.environ:
 
 # What most users need; each is imported when it is asked for, so that nodes stay light.
 _EXPORTS = {
+    'Client': 'tap_ros.nodes.client',
     'EpisodeWriter': 'tap_ros.recording.writer',
     'iter_episodes': 'tap_ros.recording.reader',
     'open_recordings': 'tap_ros.recording.cache',

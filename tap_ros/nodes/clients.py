@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""For programs that use the nodes: calls with a time-out, goals, and the newest messages."""
+"""Calls with a time-out, goals, and the newest messages, of a node that another thread spins."""
 
 from collections.abc import Callable
 import threading
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Found = TypeVar('Found')
 
 NEWBORN_S = 0.7  # until others have heard of a node that has just started
+POLL_S = 0.05  # between two looks at whether a server still lives
 
 
 class CallError(TapError):
@@ -74,25 +75,18 @@ def call(client: 'Client', request: Any, timeout_s: float,
         the wait was given up.
     """
     deadline = time.monotonic() + timeout_s
-    name = client.service_name
-    if server is not None and not server.wait_until_alive(min(NEWBORN_S, timeout_s)):
-        raise CallError(f'service {name}: its node, {server.name}, has ended; start it again')
+    name = f'service {client.service_name}'
+    _expect_alive(name, timeout_s, server)
     while not client.wait_for_service(timeout_sec=min(0.1, timeout_s)):
         if time.monotonic() >= deadline or give_up():
-            raise CallError(
-                f'service {name}: nobody offers it after {timeout_s:g} s; '
-                'start its node and wait until it says that it is ready')
+            raise CallError(f'{name}: nobody offers it after {timeout_s:g} s; start '
+                            f'{_named(server)} and wait until it says that it is ready')
     future = client.call_async(request)
-    done = threading.Event()
-    future.add_done_callback(lambda _: done.set())
     try:
-        while not done.wait(min(0.05, max(deadline - time.monotonic(), 0))):
-            if not client.service_is_ready() or (server is not None and server.dead):
-                raise CallError(f'service {name}: its node ended during the call')
-            if time.monotonic() >= deadline or give_up():
-                raise CallError(
-                    f'service {name}: no answer within {timeout_s:g} s; '
-                    'its node may be busy or stopped')
+        if not _wait_for_server(future, deadline, f'{name}: its node ended during the call',
+                                client.service_is_ready, server, give_up):
+            raise CallError(f'{name}: no answer within {timeout_s:g} s; {_named(server)} may be '
+                            'busy or stopped')
     finally:
         client.remove_pending_request(future)  # else a lost call stays pending for ever
     return future.result()
@@ -112,14 +106,13 @@ def in_executor(node: 'Node', function: Callable[[], Found], timeout_s: float) -
     :raises CallError: when the node is not spun, or its thread is busy for too long.
     """
     done = threading.Event()
-    found: list[Found] = []
-    failed: list[Exception] = []
+    outcome: list[tuple[Any, Exception | None]] = []
 
     def run() -> None:
         try:
-            found.append(function())
+            outcome.append((function(), None))
         except Exception as error:  # it would end the executor
-            failed.append(error)
+            outcome.append((None, error))
         done.set()
 
     if node.executor is None:
@@ -128,9 +121,10 @@ def in_executor(node: 'Node', function: Callable[[], Found], timeout_s: float) -
     if not done.wait(timeout_s):
         raise CallError(f'node {node.get_name()}: its callbacks have kept it busy for '
                         f'{timeout_s:g} s')
-    if failed:
-        raise failed[0]
-    return found[0]
+    (found, failed), = outcome
+    if failed is not None:
+        raise failed
+    return found
 
 
 def cancel_goal(handle: 'ClientGoalHandle', timeout_s: float = 1.0) -> 'Future':
@@ -166,24 +160,20 @@ def send_goal(action_client: 'ActionClient', goal: Any, timeout_s: float,
     :return: the client's goal handle.
     :raises CallError: when no server answers in time, or it rejects the goal.
     """
-    name = action_client._action_name
+    name = f'action {action_client._action_name}'
     deadline = time.monotonic() + timeout_s
-    if server is not None and not server.wait_until_alive(min(NEWBORN_S, timeout_s)):
-        raise CallError(f'action {name}: its node, {server.name}, has ended; start it again')
+    _expect_alive(name, timeout_s, server)
     if not action_client.wait_for_server(timeout_sec=timeout_s):
-        raise CallError(f'action {name}: nobody offers it after {timeout_s:g} s')
+        raise CallError(f'{name}: nobody offers it after {timeout_s:g} s; start {_named(server)}')
     told = None if on_feedback is None else lambda message: on_feedback(message.feedback)
     future = in_executor(
         action_client._node, lambda: action_client.send_goal_async(goal, told), timeout_s)
-    while not wait_for_future(future, 0.05):
-        if not action_client.server_is_ready() or (server is not None and server.dead):
-            raise CallError(f'action {name}: its node ended before it answered the goal')
-        if time.monotonic() >= deadline:
-            raise CallError(f'action {name}: no answer to the goal within {timeout_s:g} s')
+    if not _wait_for_server(future, deadline, f'{name}: its node ended before it answered',
+                            action_client.server_is_ready, server):
+        raise CallError(f'{name}: no answer to the goal within {timeout_s:g} s')
     handle = future.result()
     if not handle.accepted:
-        raise CallError(
-            f'action {name}: the goal was rejected; the log of its node says why')
+        raise CallError(f'{name}: the goal was rejected; the log of {_named(server)} says why')
     return handle
 
 
@@ -201,15 +191,13 @@ def wait_for_result(handle: 'ClientGoalHandle', timeout_s: float,
     client = handle._action_client
     deadline = time.monotonic() + timeout_s
     future = in_executor(client._node, handle.get_result_async, timeout_s)
-    while not wait_for_future(future, 0.05):
-        if not client.server_is_ready() or (server is not None and server.dead):
-            raise CallError(f'action {client._action_name}: its node ended before the goal did; '
-                            'what the arm does now is up to its driver')
-        if time.monotonic() >= deadline:
-            cancelled = wait_for_future(cancel_goal(handle), 1.0)
-            raise CallError(
-                f'the goal has not ended within {timeout_s:g} s and '
-                + ('was cancelled' if cancelled else 'its node does not answer the cancel'))
+    if not _wait_for_server(
+            future, deadline, f'action {client._action_name}: its node ended before the goal did; '
+            'what the arm does now is up to its driver', client.server_is_ready, server):
+        cancelled = wait_for_future(cancel_goal(handle), 1.0)
+        raise CallError(
+            f'the goal has not ended within {timeout_s:g} s and '
+            + ('was cancelled' if cancelled else 'its node does not answer the cancel'))
     answer = future.result()
     if answer.status == GoalStatus.STATUS_UNKNOWN:
         raise CallError('the action server does not know the goal; was it started anew?')
@@ -259,3 +247,31 @@ class Newest:
             self._message = message
             self._count += 1
             self._condition.notify_all()
+
+
+def _named(server: 'Liveness | None') -> str:
+    return 'its node' if server is None else server.name
+
+
+def _expect_alive(name: str, timeout_s: float, server: 'Liveness | None') -> None:
+    """Raise CallError if a node that was heard before has ended."""
+    if server is not None and not server.wait_until_alive(min(NEWBORN_S, timeout_s)):
+        raise CallError(f'{name}: its node, {server.name}, has ended; start it again')
+
+
+def _wait_for_server(future: 'Future', deadline: float, ended: str, ready: Callable[[], bool],
+                     server: 'Liveness | None', give_up: Callable[[], bool] = lambda: False
+                     ) -> bool:
+    """
+    Wait for what a server answers; tell whether it has come before the deadline.
+
+    :raises CallError: saying `ended`, when the node of the server ends meanwhile.
+    """
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    while not done.wait(min(POLL_S, max(deadline - time.monotonic(), 0.0))):
+        if not ready() or (server is not None and server.dead):
+            raise CallError(ended)
+        if time.monotonic() >= deadline or give_up():
+            return False
+    return True

@@ -1,0 +1,424 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes as one plain class: arrays in, arrays out, no rclpy to know."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+import queue
+from queue import SimpleQueue
+import threading
+import time
+from typing import Any, Self, TYPE_CHECKING
+
+from action_msgs.msg import GoalStatus
+import numpy as np
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
+from rclpy.exceptions import InvalidNamespaceException
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import Image
+from std_srvs.srv import SetBool
+from tap_msgs.action import ReachGoal
+from tap_msgs.msg import ObjectStates
+from tap_msgs.srv import PredictSubgoal, ResetScene, SetGoal, StepScene
+from tap_ros.contract import CAMERA_FRAME
+from tap_ros.errors import ConfigError
+from tap_ros.nodes.clients import (
+    call,
+    CallError,
+    cancel_goal,
+    send_goal,
+    Spinner,
+    wait_for_result,
+)
+from tap_ros.nodes.heartbeat import Liveness
+from tap_ros.nodes.image_messages import decode_image, encode_image
+from tap_ros.nodes.middleware import configure_fast_dds
+from tap_ros.nodes.object_messages import decode_objects, encode_objects
+from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.subgoal_messages import decode_subgoals
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
+from tap_ros.text import escaped
+
+if TYPE_CHECKING:
+    from rclpy.action.client import ClientGoalHandle
+    from tap_ros.prediction.predictor import Subgoal
+
+SERVICES: dict[str, tuple[type, str, str]] = {  # type, name, the node that offers it
+    'predict': (PredictSubgoal, 'predict_subgoal', 'predictor_node'),
+    'reset': (ResetScene, 'sim/reset', 'sim_node'),
+    'set_goal': (SetGoal, 'sim/set_goal', 'sim_node'),
+    'step': (StepScene, 'sim/step', 'sim_node'),
+    'pause': (SetBool, 'sim/pause', 'sim_node'),
+    'record': (SetBool, 'recorder/record', 'recorder_node')}
+READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'recorder_node': 'record'}
+PLANNER = 'visual_mpc_node'
+ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_CANCELED: 'cancelled',
+        GoalStatus.STATUS_ABORTED: 'aborted'}
+VIEWS = {'camera': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
+         'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
+NOWHERE = (0, 0, 0, 0, 0, 0, 1)  # a pose that says nothing
+
+
+@dataclass(frozen=True)
+class View:
+    """
+    A picture and the objects in it.
+
+    :param image: (H, W, 3) uint8.
+    :param names: of K objects.
+    :param pixels: (K, 2) float32, (u, v) of each.
+    :param positions: (K, 3) m; zeros or NaN where nobody knows them.
+    :param stamp_ns: of the picture.
+    """
+
+    image: np.ndarray
+    names: tuple[str, ...]
+    pixels: np.ndarray
+    positions: np.ndarray
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class ReachResult:
+    """
+    How a goal ended.
+
+    :param end: 'succeeded' (also when the budget was spent), 'cancelled' or 'aborted'.
+    :param success: whether the goal was reached.
+    :param message: why not, or what was reached.
+    :param steps: commands sent.
+    :param expected_distance: px, mean over the objects, at the end.
+    """
+
+    end: str
+    success: bool
+    message: str
+    steps: int
+    expected_distance: float
+
+
+class Reaching:
+    """
+    A goal that the planner pursues; iterate over it for feedback until it ends.
+
+    A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px) and planning_ms.
+
+    :ivar handle: rclpy's handle of the goal.
+    """
+
+    def __init__(self, handle: 'ClientGoalHandle', feedback: 'SimpleQueue[Any]',
+                 deadline: float, server: Liveness) -> None:
+        self.handle = handle
+        self._feedback, self._deadline, self._server = feedback, deadline, server
+        self._result: ReachResult | Exception | None = None
+        self._thread = threading.Thread(target=self._wait, name='reaching', daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[ReachGoal.Feedback]:
+        while self._thread.is_alive() or not self._feedback.empty():
+            try:
+                yield self._feedback.get(timeout=0.05)
+            except queue.Empty:
+                continue
+        self.result()  # raises what has ended it
+
+    def cancel(self) -> None:
+        """Ask for the end of the goal; result tells when it has come."""
+        cancel_goal(self.handle)
+
+    def result(self) -> ReachResult:
+        """
+        Wait for the end.
+
+        :raises CallError: when the planner ends before, or takes longer than it was given; then
+            the goal is cancelled.
+        """
+        self._thread.join()
+        if not isinstance(self._result, ReachResult):
+            raise self._result or CallError('reach_goal: ended without a result')
+        return self._result
+
+    def _wait(self) -> None:
+        try:
+            status, result = wait_for_result(
+                self.handle, max(self._deadline - time.monotonic(), 0.0), self._server)
+            self._result = ReachResult(
+                ENDS.get(status, 'aborted'), result.success, result.message, result.steps,
+                result.expected_distance)
+        except Exception as error:
+            self._result = error
+
+
+class Client:
+    """
+    What other programs do with the nodes: predict, reach goals, reset scenes, record, look.
+
+    Each call ends within its time-out; errors name the node that is silent, ended or refused.
+
+    :param namespace: of the nodes.
+    :param timeout_s: most seconds of a call that is given no other time-out.
+    :param node: rclpy Node that another thread spins, to use instead of one of its own.
+    """
+
+    def __init__(self, namespace: str = '', timeout_s: float = 20.0,
+                 node: Node | None = None) -> None:
+        self.timeout_s = timeout_s
+        self._context: Context | None = None
+        if node is None:
+            configure_fast_dds()
+            self._context = Context()
+            rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+            try:
+                node = Node('tap_ros_client', namespace=namespace, context=self._context)
+            except InvalidNamespaceException as error:
+                self._context.try_shutdown()
+                raise ConfigError(f'namespace {escaped(namespace, 60)}: is no name of a '
+                                  'namespace, such as /left') from error
+            self._spinner = Spinner(node)
+            self._spinner.__enter__()
+        self.node = node
+        self._group = ReentrantCallbackGroup()
+        self._lock = threading.RLock()
+        self._made: dict[str, Any] = {}  # what was asked for so far
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End; a goal in progress goes on."""
+        if self._context is not None:
+            self._spinner.__exit__()
+            self.node.destroy_node()
+            self._context.try_shutdown()
+            self._context = None
+
+    # Nodes
+
+    def is_ready(self, name: str) -> bool:
+        """Tell whether a node ('predictor_node', ...) offers what it offers once it is ready."""
+        if name == PLANNER:
+            return bool(self._planner().server_is_ready())
+        return bool(self._service(READY[name]).service_is_ready())
+
+    def wait_until_ready(self, *names: str, timeout_s: float = 90.0,
+                         check: Callable[[], object] = lambda: None) -> None:
+        """
+        Wait until nodes are ready.
+
+        :param names: of the nodes, such as 'predictor_node'; none: predictor and planner.
+        :param timeout_s: most seconds to wait.
+        :param check: called ten times a second; what it raises ends the wait.
+        :raises CallError: naming those that are not ready in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        waiting = names or ('predictor_node', PLANNER)
+        while waiting := tuple(name for name in waiting if not self.is_ready(name)):
+            check()
+            if time.monotonic() > deadline:
+                raise CallError(f'{", ".join(waiting)}: not ready after {timeout_s:g} s; start '
+                                'what is missing, and see its log')
+            time.sleep(0.1)
+
+    def call(self, service: str, timeout_s: float | None = None,
+             give_up: Callable[[], bool] = lambda: False, **fields: Any) -> Any:
+        """
+        Call a service with messages, as they are in ROS.
+
+        :param service: one of SERVICES.
+        :param fields: of its request.
+        :return: its response.
+        :raises CallError: when it does not answer in time, ends, or refuses.
+        """
+        kind, _, server = SERVICES[service]
+        client = self._service(service)
+        response = call(client, kind.Request(**fields),  # type: ignore[attr-defined]
+                        timeout_s or self.timeout_s, give_up, self._liveness(server))
+        if not response.success:
+            raise CallError(f'{client.service_name} refused: {escaped(response.message, 1000)}')
+        return response
+
+    # Subgoals and goals
+
+    def predict(self, start: np.ndarray | None = None, goal: np.ndarray | None = None,
+                start_pixels: np.ndarray | None = None, goal_pixels: np.ndarray | None = None,
+                num_samples: int = 1, recursion_depth: int = 1, seed: int = 0, mode: str = '',
+                timeout_s: float | None = None) -> 'list[Subgoal]':
+        """
+        Ask the predictor for subgoals, as SubgoalPredictor.predict in one process.
+
+        :param start: (H, W, 3) uint8; None: the newest picture of the camera.
+        :param goal: likewise; None: the newest goal picture.
+        :param start_pixels: (K, 2) (u, v) of objects in the start picture; None: those of the
+            topic where the picture is, else no maps.
+        :param goal_pixels: of the same objects in the goal picture.
+        :param mode: 'bidirectional' or 'forward'; '': what the node has weights for.
+        :return: list of Subgoal, earliest first, sample after sample; their mass is NaN. Objects
+            of topics are in the order of the message.
+        :raises CallError: as call.
+        """
+        response = self.call('predict', timeout_s, **request_fields(
+            start=start, goal=goal, start_objects=start_pixels, goal_objects=goal_pixels),
+            num_samples=num_samples, recursion_depth=recursion_depth, seed=seed, mode=mode)
+        return subgoals_of(response)
+
+    def reach(self, goal: np.ndarray | None = None, goal_pixels: Mapping[str, Any] | None = None,
+              mode: str = 'subgoal', step_budget: int = 0, recursion_depth: int = 1,
+              num_samples: int = 1, seed: int = 0,
+              on_feedback: Callable[[ReachGoal.Feedback], object] | None = None,
+              timeout_s: float = 600.0) -> Reaching:
+        """
+        Have the planner move the arm until the objects are where a goal picture shows them.
+
+        :param goal: (H, W, 3) uint8; None: the newest goal picture.
+        :param goal_pixels: {object: (u, v)} in the goal picture; None: those of the topic.
+        :param mode: 'subgoal', via predicted subgoals, or 'direct'.
+        :param step_budget: most commands; 0: the planner's default.
+        :param recursion_depth: subgoals in a row.
+        :param num_samples: of them to choose from.
+        :param on_feedback: called with each feedback by another thread; without it they are
+            kept for the iteration over what is returned.
+        :param timeout_s: most seconds until the end; then the goal is cancelled.
+        :return: Reaching, once the goal is accepted.
+        :raises CallError: when the planner does not answer, or rejects it: it has another goal.
+        """
+        deadline = time.monotonic() + timeout_s
+        pixels = goal_pixels or {}
+        feedback: SimpleQueue[Any] = SimpleQueue()
+        request = ReachGoal.Goal(
+            mode=mode, step_budget=step_budget, recursion_depth=recursion_depth,
+            num_samples=num_samples, seed=seed, **request_fields(
+                goal_image=goal, goal_objects=list(pixels.values()) or None, names=tuple(pixels)))
+        handle = send_goal(self._planner(), request, min(self.timeout_s, timeout_s),
+                           on_feedback or feedback.put, self._liveness(PLANNER))
+        return Reaching(handle, feedback, deadline, self._liveness(PLANNER))
+
+    # Simulator and recorder
+
+    def reset(self, task: str = 'push2', seed: int = 0,
+              hide_arm: bool = False) -> tuple[View, View]:
+        """
+        Start a scene in the simulator.
+
+        :return: the first view of the camera, and the goal.
+        :raises CallError: when the simulator refuses, or shows nothing.
+        """
+        self._views('goal')  # subscribed before something comes
+        before = self.camera().stamp_ns
+        self.call('reset', task=task, seed=seed, hide_arm=hide_arm)
+        goal = self.goal(before)
+        return self.camera(goal.stamp_ns - 1), goal
+
+    def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
+        """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""
+        self.call('set_goal', **request_fields(
+            objects=list(pixels.values()), names=tuple(pixels)))
+
+    def pause(self, paused: bool = True) -> None:
+        """Pause the simulator, or let it go on."""
+        self.call('pause', data=paused)
+
+    def start_recording(self) -> str:
+        """Have recorder_node begin a recording; return what it says."""
+        return str(self.call('record', data=True).message)
+
+    def stop_recording(self) -> str:
+        """End the recording; return what the node says."""
+        return str(self.call('record', data=False).message)
+
+    # What is seen
+
+    def camera(self, after_ns: int = -1, objects: bool = True,
+               timeout_s: float | None = None) -> View:
+        """
+        Return the camera's newest picture.
+
+        :param after_ns: wait for one that is stamped later than this.
+        :param objects: wait for one with the objects in it.
+        :raises CallError: naming the silent topic.
+        """
+        return self._view('camera', after_ns, objects, timeout_s)
+
+    def goal(self, after_ns: int = -1, objects: bool = True,
+             timeout_s: float | None = None) -> View:
+        """Return the newest goal picture, as camera does."""
+        return self._view('goal', after_ns, objects, timeout_s)
+
+    # What is made when it is asked for first
+
+    def _once(self, name: str, make: Callable[[], Any]) -> Any:
+        with self._lock:
+            if name not in self._made:
+                self._made[name] = make()
+            return self._made[name]
+
+    def _service(self, name: str) -> Any:
+        kind, topic, _ = SERVICES[name]
+        return self._once(topic, lambda: self.node.create_client(
+            kind, topic, qos_profile=SERVICE_QOS, callback_group=self._group))
+
+    def _planner(self) -> Any:
+        return self._once('reach_goal', lambda: ActionClient(
+            self.node, ReachGoal, 'reach_goal', callback_group=self._group))
+
+    def _liveness(self, name: str) -> Liveness:
+        liveness: Liveness = self._once(name, lambda: Liveness(self.node, name, self._group))
+        return liveness
+
+    def _views(self, name: str) -> Observations:
+        def subscribed() -> Observations:
+            views = Observations(*VIEWS[name], latched=name == 'goal')
+            views.subscribe(self.node, VIEWS[name], LATCHED if name == 'goal' else STREAM,
+                            self._group)
+            return views
+        views: Observations = self._once(name, subscribed)
+        return views
+
+    def _view(self, name: str, after_ns: int, objects: bool, timeout_s: float | None) -> View:
+        views, timeout_s = self._views(name), timeout_s or self.timeout_s
+        found = views.wait(('image', 'objects') if objects else ('image',), timeout_s, after_ns)
+        topics = {each: topic for each, (_, topic) in VIEWS[name].items()}
+        if found is None:
+            silent = 'objects' if views.newest('image', after_ns=after_ns) else 'image'
+            topic = views.explained(silent, self.node.resolve_topic_name(topics[silent]))
+            raise CallError(f'{topic}: nothing new came within {timeout_s:g} s')
+        listed = found.get('objects', ObjectStates())
+        names, pixels = decode_objects(listed, topics['objects'])
+        places = [one.pose.position for one in listed.objects]
+        return View(decode_image(found['image'], topics['image']), names, pixels,
+                    np.array([(p.x, p.y, p.z) for p in places]).reshape(-1, 3),
+                    to_nanoseconds(found['image'].header.stamp))
+
+
+def request_fields(names: Sequence[str] = (), **arrays: Any) -> dict[str, Any]:
+    """
+    Turn pictures (H, W, 3) and pixels (K, 2) into messages; leave out those that are None.
+
+    :param names: of the objects; by default 'object 1' and so on.
+    :return: {field: message}.
+    """
+    fields: dict[str, Any] = {}
+    for name, values in arrays.items():
+        if values is None:
+            continue
+        values = np.asarray(values)
+        fields[name] = encode_image(values, to_stamp(0), CAMERA_FRAME) if values.ndim == 3 else (
+            encode_objects(names or [f'object {k + 1}' for k in range(len(values))], values,
+                           np.array([NOWHERE] * len(values)), to_stamp(0), CAMERA_FRAME,
+                           ObjectStates.SOURCE_TRACKED))
+    return fields
+
+
+def subgoals_of(response: PredictSubgoal.Response) -> 'list[Subgoal]':
+    """Return the subgoals of an answer, their objects in the order of the first one."""
+    if not response.subgoals:
+        return []
+    first = response.subgoals[0]
+    return decode_subgoals(
+        response, tuple(first.object_names), (first.image.height, first.image.width))
