@@ -22,7 +22,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
     'tap_ros.forward_models': {},
     'tap_ros.predictors': {},
     'tap_ros.solvers': {},
-    'tap_ros.worlds': {'mujoco_table': 'sim_bridge.simulator:Simulator'},
+    'tap_ros.worlds': {'metaworld': 'sim_bridge.gym_world:metaworld',
+                       'mujoco_table': 'sim_bridge.simulator:Simulator'},
 }
 
 

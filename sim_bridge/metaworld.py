@@ -1,0 +1,195 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Meta-World's environments, bound to GymWorld.
+
+Its table lies between robot and camera: our origin is its (0, 0.65, 0), turned by half a turn, so
+that x is to the right and y away from the camera, which stands opposite the robot.
+"""
+
+from dataclasses import replace
+from typing import Any
+import warnings
+
+import mujoco
+import numpy as np
+from sim_bridge.world.camera import Camera
+from tap_ros.contract import (
+    CONTROL_PERIOD,
+    ROBOT_MASK_ARM,
+    ROBOT_MASK_FREE,
+    ROBOT_MASK_HAND,
+)
+from tap_ros.errors import ConfigError, SceneError
+
+ORIGIN = np.array([0.0, 0.65, 0.01])  # m, of our frame in Meta-World's
+TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about the vertical
+CAMERA = Camera(64, 64, tilt=0.6, fovy=42.0, position=(0.0, -0.78, 1.2))  # in our frame
+GAIN = 8.0  # of the command over the gap to where the fingertips shall be, 1/m
+SOLVING_STEPS = 400  # environment steps that the scripted policy has at most
+SETTLING_STEPS = 5  # after the success
+
+
+class MetaWorld:
+    """
+    One Meta-World environment with one object, a Binding.
+
+    :param task: its name, such as 'push-v3'.
+    :param image_size: width and height of the pictures in pixels.
+    :raises ConfigError: if Meta-World is not installed.
+    :raises SceneError: for an unknown task.
+    """
+
+    object_names: tuple[str, ...] = ('object_0',)
+
+    def __init__(self, task: str, image_size: int = 64) -> None:
+        self.task_name = task
+        self.env, self.policy = make_env(task)
+        self.camera = replace(CAMERA, width=image_size, height=image_size)
+        model = self.env.model
+        model.vis.global_.fovy = self.camera.fovy
+        model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0  # 7 ms instead of 300
+        self._renderer = mujoco.Renderer(model, image_size, image_size)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+        self._view = _free_camera(self.camera)
+        self._option = mujoco.MjvOption()
+        self._option.sitegroup[:] = 0  # the goal is drawn as a site
+        self._labels = _labels(model)
+        self._seen: np.ndarray = np.empty(0)
+        self._info: dict[str, Any] = {}
+
+    def reset(self, seed: int) -> None:
+        """Begin the scene of a seed."""
+        self.env.seed(seed)
+        self._seen, self._info = self.env.reset(seed=seed)
+
+    def move(self, target: np.ndarray, opening: float) -> None:
+        """Move the fingertips to a place (3,) m of our frame, in one control period."""
+        for _ in range(round(CONTROL_PERIOD / self.env.dt)):
+            gap = (target - self.gripper()[:3]) * TURN
+            self.act(np.append(np.clip(GAIN * gap, -1, 1), 1 - 2 * opening))
+
+    def act(self, action: np.ndarray) -> None:
+        """Take one step of the environment with its own action (4,), each in [-1, 1]."""
+        self._seen, _, _, _, self._info = self.env.step(
+            np.clip(action, -1, 1).astype(np.float32))
+
+    def gripper(self) -> np.ndarray:
+        """Return (4,): the fingertips' place in m and the opening from 0 to 1."""
+        return np.append(to_ours(self.env.tcp_center), np.clip(self._seen[3], 0, 1))
+
+    def object_poses(self) -> np.ndarray:
+        """Return (1, 7): the object's place in m, its quaternion in the environment's frame."""
+        return np.concatenate([to_ours(self._seen[4:7]), self._seen[7:11]])[None]
+
+    def goal_places(self) -> np.ndarray:
+        """Return (1, 3) m, where the object shall be."""
+        return to_ours(self.env._target_pos)[None]
+
+    def succeeds(self) -> bool:
+        """Return whether the environment says that it is solved."""
+        return bool(self._info.get('success', 0) >= 1)
+
+    def draw(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the picture, without the marker of the goal, and the robot mask."""
+        renderer = self._renderer
+        renderer.update_scene(self.env.data, self._view, self._option)
+        image = renderer.render()
+        renderer.enable_segmentation_rendering()
+        try:
+            ids = renderer.render()
+        finally:
+            renderer.disable_segmentation_rendering()
+        geom = ids[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
+        return image, np.where(geom, self._labels[ids[..., 0]], ROBOT_MASK_FREE).astype(np.uint8)
+
+    def solve(self) -> None:
+        """
+        Let Meta-World's scripted policy act until the environment says that it is solved.
+
+        :raises SceneError: if it does not come to that.
+        """
+        for _ in range(SOLVING_STEPS):
+            with warnings.catch_warnings(action='ignore'):  # it commands more than is allowed
+                action = self.policy.get_action(self._seen)
+            self.act(np.asarray(action, np.float64))
+            if self.succeeds():
+                break
+        else:
+            raise SceneError(f'task {self.task_name}: the scripted policy does not solve this '
+                             'scene; take another seed')
+        for _ in range(SETTLING_STEPS):
+            self.act(np.array([0, 0, 0, 1 - 2 * self.gripper()[3]]))
+
+    def close(self) -> None:
+        """Free the renderer and the environment."""
+        self._renderer.close()
+        self.env.close()
+
+
+def make_env(task: str) -> tuple[Any, Any]:
+    """
+    Make an environment of Meta-World that draws its scene from the seed of reset.
+
+    :param task: its name.
+    :return: the environment, and the scripted policy that its authors ship for it.
+    :raises ConfigError: if Meta-World is not installed.
+    :raises SceneError: for an unknown task.
+    """
+    try:
+        from metaworld import sawyer_xyz_env
+        from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+        from metaworld.policies import ENV_POLICY_MAP
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            'world metaworld: Meta-World is not installed; type `pip install gymnasium imageio '
+            '&& pip install --no-deps metaworld`, as it asks for an older mujoco') from error
+    if task not in ALL_V3_ENVIRONMENTS:
+        raise SceneError(f'task {task!r} is unknown; valid: {", ".join(ALL_V3_ENVIRONMENTS)}')
+    # Meta-World 3.1 writes rows of 11 numbers; MuJoCo 4 has 12.
+    setattr(sawyer_xyz_env.SawyerMocapBase, 'reset_mocap_welds', _reset_mocap_welds)  # noqa: B010
+    env = ALL_V3_ENVIRONMENTS[task]()
+    env._set_task_called, env._freeze_rand_vec, env.seeded_rand_vec = True, False, True
+    env._partially_observable = False
+    vars(env).pop('sawyer_observation_space', None)  # cached, with the goal clipped to 0
+    env.max_path_length = 10 ** 9
+    policy: Any = ENV_POLICY_MAP[task]
+    return env, policy()
+
+
+def to_ours(place: np.ndarray) -> np.ndarray:
+    """Return a place (3,) of Meta-World's frame in ours, m."""
+    return (np.asarray(place, np.float64) - ORIGIN) * TURN
+
+
+def _reset_mocap_welds(self: Any) -> None:
+    """Let the hand follow its mocap body without an offset."""
+    welds = self.model.eq_type == mujoco.mjtEq.mjEQ_WELD
+    self.model.eq_data[welds, :11] = (0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5)
+
+
+def _free_camera(camera: Camera) -> mujoco.MjvCamera:
+    """Return a camera of our frame for MuJoCo's renderer, in Meta-World's frame."""
+    place = np.array(camera.position) * TURN + ORIGIN
+    azimuth, elevation = camera.turn + 1.5 * np.pi, camera.tilt - np.pi / 2
+    ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+                      np.sin(elevation)])
+    view = mujoco.MjvCamera()
+    view.lookat, view.distance = place + ahead, 1.0
+    view.azimuth, view.elevation = np.degrees(azimuth), np.degrees(elevation)
+    return view
+
+
+def _labels(model: mujoco.MjModel) -> np.ndarray:
+    """Return what each geom is in a robot mask, uint8 (G,)."""
+    def below(root: str) -> set[int]:
+        found = {mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, root)}
+        for body in range(1, model.nbody):  # parents come first
+            if model.body_parentid[body] in found:
+                found.add(body)
+        return found
+
+    hand, arm = below('hand'), below('base')
+    return np.array([ROBOT_MASK_HAND if body in hand else ROBOT_MASK_ARM if body in arm
+                     else ROBOT_MASK_FREE for body in model.geom_bodyid], np.uint8)

@@ -1,0 +1,109 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""A Gymnasium environment is a World: a dummy of a few lines, and Meta-World."""
+
+import numpy as np
+import pytest
+from sim_bridge.gym_world import GymWorld
+from sim_bridge.world.camera import Camera
+from sim_bridge.world_protocol import make_world
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
+from tap_ros.errors import SceneError
+
+
+class Dot:
+    """One object that is wherever the fingertips are; its goal is 10 cm to the right."""
+
+    task_name, object_names, camera = 'dot', ('dot',), Camera(16, 16)
+
+    def reset(self, seed):
+        self.place = np.random.default_rng(seed).uniform(-0.1, 0.1, 3) * (1, 1, 0)
+        self.wanted = self.place + (0.1, 0, 0)
+
+    def move(self, target, opening):
+        self.place = target
+
+    def gripper(self):
+        return np.append(self.place, 1.0)
+
+    def object_poses(self):
+        return np.append(self.place, (0, 0, 0, 1))[None]
+
+    def goal_places(self):
+        return self.wanted[None]
+
+    def succeeds(self):
+        return np.linalg.norm(self.place - self.wanted) < 0.01
+
+    def draw(self):
+        return np.full((16, 16, 3), 9, np.uint8), np.zeros((16, 16), np.uint8)
+
+    def solve(self):
+        self.place = self.wanted
+
+    def close(self):
+        pass
+
+
+def test_an_environment_becomes_a_world_by_a_binding():
+    world = GymWorld(Dot(), Dot())
+    with pytest.raises(SceneError, match='reset it first'):
+        world.observe()
+    start, goal = world.reset(3), world.goal()
+    np.testing.assert_allclose(goal.object_poses - start.object_poses, [[.1, 0, 0, 0, 0, 0, 0]])
+    assert world.outcome() == 'failure'
+    seen = world.step([0.05, 0, 0, 0])
+    assert world.distances() == pytest.approx([0.05]) and seen.stamp_ns == 250_000_000
+    world.step([0.05, 0, 0, 0])
+    assert world.outcome() == 'success'
+    for bad in ([0, 0, 0], [np.nan, 0, 0, 0]):
+        with pytest.raises(SceneError, match='4 finite numbers'):
+            world.step(bad)
+    with pytest.raises(SceneError, match='shows no goal'):
+        world = GymWorld(Dot())
+        world.reset(1)
+        world.goal()
+
+
+@pytest.fixture(scope='module')
+def metaworld():
+    pytest.importorskip('metaworld')
+    world = make_world('metaworld', 'push-v3', 64)
+    yield world
+    world.close()
+
+
+def test_meta_world_moves_as_it_is_told_and_repeats_from_its_seed(metaworld):
+    first = metaworld.reset(5)
+    seen = [metaworld.step([0.05, -0.02, 0, 1]) for _ in range(3)][-1]
+    np.testing.assert_allclose(
+        seen.gripper[:3] - first.gripper[:3], [0.15, -0.06, 0], atol=0.01)
+    again = metaworld.reset(5)
+    np.testing.assert_array_equal(again.image, first.image)
+    assert not np.array_equal(metaworld.reset(6).image, first.image)
+
+
+def test_the_goal_of_meta_world_shows_the_object_where_it_shall_be(metaworld):
+    start, goal = metaworld.reset(5), metaworld.goal()
+    assert np.linalg.norm(goal.object_poses[0, :3] - start.object_poses[0, :3]) > 0.1
+    assert metaworld.distances() > 0.1 and metaworld.outcome() == 'failure'
+    gap = np.linalg.norm(goal.object_poses[0, :3] - metaworld._acting.goal_places()[0])
+    assert gap < 0.05  # its own tolerance
+    changed = np.abs(goal.image.astype(int) - start.image).max(-1) > 30
+    u, v = np.rint(goal.object_pixels[0]).astype(int)
+    assert changed[v - 2:v + 3, u - 2:u + 3].any()
+
+
+def test_the_robot_mask_of_meta_world_covers_what_moves_with_the_arm(metaworld):
+    before = metaworld.reset(5)
+    after = metaworld.step([-0.08, 0, 0.0, 1])
+    changed = np.abs(after.image.astype(int) - before.image).max(-1) > 40
+    masked = (before.robot_mask > 0) | (after.robot_mask > 0)
+    assert {ROBOT_MASK_ARM, ROBOT_MASK_HAND} <= set(np.unique(before.robot_mask))
+    assert changed.any() and (changed & ~masked).sum() <= 0.05 * changed.sum()
+
+
+def test_an_unknown_task_is_named():
+    pytest.importorskip('metaworld')
+    with pytest.raises(SceneError, match="'push-v4' is unknown"):
+        make_world('metaworld', 'push-v4')
