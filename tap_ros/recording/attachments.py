@@ -9,15 +9,11 @@ from pathlib import Path
 import re
 import zlib
 
-from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex
+from mcap.records import Attachment
 from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
-from tap_ros.recording.chunks import read_record
-from tap_ros.recording.container import McapFile
-from tap_ros.recording.records import Records
-from tap_ros.recording.summary import MAGIC, read_summary, RECORD
-from tap_ros.text import escaped
+from tap_ros.recording.damage import describe
+from tap_ros.recording.mcap_file import McapFile, read_record
 
 MAX_BYTES = 2**28  # of one attachment that is read
 MAX_NAME = 100  # characters of a file's name
@@ -42,31 +38,16 @@ class Attached:
 
 def read_attachments(path: str | Path) -> Iterator[Attached]:
     """
-    Yield the attachments of a file, in its order, where its summary lists them by that.
+    Yield the attachments of a file, in its order, as far as its records can be told apart.
 
     :param path: of an .mcap file, whole or damaged.
     :return: iterator over Attached; one is in memory at a time.
     :raises RecordingError: when the file is missing, empty, no regular file, or not MCAP.
     """
-    data = McapFile(path).data
-    summary, _ = read_summary(data)
-    if summary is None or not summary.placed or summary.attachments is None:
-        records = Records(data, summary, lambda *_: None, lambda *_: None)
-        for _ in records.parts(indexed=False):
-            pass
-        yield from (_read(data[start:end]) for start, end in records.attachments)
-        return
-    left = summary.start  # an index may name the same bytes again and again
-    for entry in sorted(summary.attachments, key=lambda entry: entry.offset):
-        start, end = entry.offset + RECORD.size, entry.offset + entry.length
-        if start < len(MAGIC) + RECORD.size or not start <= end <= summary.start or (
-                RECORD.unpack_from(data, entry.offset) != (Opcode.ATTACHMENT, end - start)):
-            yield _unusable('it is not where the summary says', entry)
-        elif entry.length > left:
-            yield _unusable('the summary lists it again', entry)
-        else:
-            left -= entry.length
-            yield _read(data[start:end], entry)
+    file = McapFile(path)
+    yield from map(_read, file.attachments())
+    for line in describe(file.losses):
+        yield Attached('', '', 0, 0, None, line)
 
 
 def save_attachment(attached: Attached, folder: str | Path) -> Path:
@@ -107,25 +88,18 @@ def safe_name(name: str) -> str:
     return path.stem[:MAX_NAME - len(suffix)] + suffix
 
 
-def _read(content: memoryview, entry: AttachmentIndex | None = None) -> Attached:
-    """Read the content of an attachment record; entry: what the summary says of it."""
+def _read(content: memoryview) -> Attached:
+    """Read the content of an attachment record."""
     if len(content) > MAX_BYTES:
-        return _unusable(f'it has {len(content)} bytes; at most {MAX_BYTES} are read', entry)
+        return Attached('', '', 0, 0, None,
+                        f'it has {len(content)} bytes; at most {MAX_BYTES} are read')
     try:
-        found = read_record(Attachment, content, whole=True)
+        found = read_record(Attachment, content)
     except RecordingError as error:
-        return _unusable(str(error), entry)
+        return Attached('', '', 0, 0, None, str(error))
     crc = int.from_bytes(content[-4:], 'little')
     wrong = crc and zlib.crc32(content[:-4]) != crc
     return Attached(
         found.name, found.media_type, found.log_time, len(found.data),
         None if wrong else found.data,
         'its checksum is wrong; restore the file from a copy' if wrong else '')
-
-
-def _unusable(why: str, entry: AttachmentIndex | None) -> Attached:
-    """Return what is known of an attachment that cannot be read."""
-    if entry is None:
-        return Attached('', '', 0, 0, None, why)
-    return Attached(escaped(entry.name), entry.media_type, entry.log_time, entry.data_size, None,
-                    why)

@@ -13,9 +13,9 @@ from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.images.crop import CENTRE, check_trainable
 from tap_ros.recording import topics
 from tap_ros.recording.columns import Columns, first_size
-from tap_ros.recording.container import Channel, McapFile
 from tap_ros.recording.damage import describe
 from tap_ros.recording.episode import RecordingWarning
+from tap_ros.recording.mcap_file import Channel, McapFile
 from tap_ros.recording.messages import check_schema
 from tap_ros.recording.metadata import bag_files, FILE_NAME
 from tap_ros.recording.reading import Reading, trained_reading

@@ -22,8 +22,8 @@ from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ImageError, RecordingError
 from tap_ros.images.picture_files import read_compressed, read_mask, read_pixels
 from tap_ros.recording import topics
-from tap_ros.recording.container import McapFile
 from tap_ros.recording.damage import describe, EVERYTHING, FAR, FRAMES, gaps, Loss, NOTHING
+from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.messages import decode
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import Mark
@@ -107,8 +107,8 @@ def decode_file(path: str | Path, found: dict[str, str],
     while True:
         decoder = _Decoder(McapFile(path), found, write_frame, write_mask, size, reading)
         try:
-            for topic, log, data in decoder.file.messages(set(found.values())):
-                decoder.take(topic, log, data)
+            for channel, log, _, data in decoder.file.messages(set(found.values())):
+                decoder.take(channel.topic, log, data)
             most = decoder.most_frequent_size()
             if most == decoder.columns.camera_size and (
                     most is None or decoder.mask_size in (None, most)):
@@ -128,7 +128,7 @@ def first_size(paths: Iterable[str | Path], found: dict[str, str]) -> tuple[int,
     :raises RecordingError: when nothing can be read.
     """
     for file in map(McapFile, paths):
-        for _, _, data in file.messages({found[topics.IMAGE]}):
+        for *_, data in file.messages({found[topics.IMAGE]}):
             compressed = _is_compressed(file, found)
             with suppress(RecordingError):
                 pixels = read_compressed(decode(topics.COMPRESSED, data)) if compressed else (
@@ -170,7 +170,7 @@ class _Decoder:
         self.goals: dict[str, list[tuple[np.ndarray, tuple[int, ...]]]] = {
             'goal': [], 'goal_mask': []}
         self.state_bytes = 0  # of messages that are no pictures
-        self.most_state_bytes = _FREE_STATES + _STATES_PER_BYTE * len(file.data)
+        self.most_state_bytes = _FREE_STATES + _STATES_PER_BYTE * file.size
         decoders = {
             topics.IMAGE: self._image, topics.ROBOT_MASK: self._mask,
             topics.GOAL_IMAGE: lambda *a: self._goal_picture(

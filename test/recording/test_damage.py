@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 import numpy as np
 import pytest
 from tap_ros.errors import RecordingError
-from tap_ros.recording import chunks
+from tap_ros.recording import mcap_file
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.file_writer import FileWriter
@@ -161,7 +161,7 @@ def chunk_bomb(path, claimed, content):
 
 
 def test_chunks_that_claim_too_much_are_not_unpacked(tmp_path):
-    chunk_bomb(tmp_path / 'a.mcap', chunks.MAX_CHUNK_BYTES + 1, bytes(100))
+    chunk_bomb(tmp_path / 'a.mcap', mcap_file.MAX_CHUNK_BYTES + 1, bytes(100))
     with pytest.raises(RecordingError, match='a.mcap: chunk .* claims to unpack to'):
         open_recordings(tmp_path)
 
