@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from tap_ros.errors import WeightsError
-from tap_ros.recording.new_attachments import MAX_CARD_BYTES
+from tap_ros.recording.attachments import MAX_CARD_BYTES
 from tap_ros.text import escaped
 from tap_ros.training.weights import stored_digest
 

@@ -3,28 +3,28 @@
 """
 Recordings as memory maps: decoded once, kept in a cache, then read at the speed of memory.
 
-Each MCAP file has a folder in the cache, named after the SHA-256 of its content, with the frames
-as one uint8 array, the robot masks as another, and all else as columns. Any number of processes
-may build and read it at once.
+Each file of a recording has a folder in the cache, named after the SHA-256 of its content, with
+the frames as one uint8 array, the robot masks as another, and all else as columns. Any number of
+processes may build and read it at once.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import hashlib
 import json
+import math
 import multiprocessing
 import os
 from pathlib import Path
 import shutil
 import tempfile
-import threading
-from typing import BinaryIO
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors import safe_open, SafetensorError
+from safetensors.numpy import save_file
 from tap_ros.errors import RecordingError
 from tap_ros.recording.align import assemble, EpisodeTable, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_paths, warn_of_damage
@@ -34,11 +34,9 @@ from tap_ros.recording.mounts import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tqdm import tqdm
 
-FORMAT = 4  # of a cache folder; another number makes all files be decoded again
+FORMAT = 5  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
-_NPY_HEADER = 128  # bytes kept free for the header of frames.npy, which is known last
-_PARSING = threading.Lock()
 _GOALS = ('goal_frames', 'goal_masks')  # of Columns, kept among the arrays
 
 
@@ -107,12 +105,12 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
               delay=1) as bar:
         jobs = _jobs(bags, [find_topics(bag, reading.image_topic) for bag in bags], reading,
                      cache_dir)
-        loaded = {job: _load(job.folder, job.path) for bag in jobs for job in bag}
+        loaded = {job: _load(job) for bag in jobs for job in bag}
         bar.update(sum(job.size for job, part in loaded.items() if part is not None))
         missing = [job for job, part in loaded.items() if part is None]
         for job in _built(missing):
             bar.update(job.size)
-        loaded |= {job: _load(job.folder, job.path) for job in missing}
+        loaded |= {job: _load(job) for job in missing}
     unread = next((job.folder for job, part in loaded.items() if part is None), None)
     if unread is not None:
         raise RecordingError(f'{unread}: the cache cannot be read back; is the disk full?')
@@ -213,7 +211,7 @@ def _runs(parts: Iterable[Columns]) -> list[list[Columns]]:
 
 def _build(job: _Job) -> None:
     """Decode a file into its cache folder, which appears complete or not at all."""
-    path, folder = job.path, job.folder
+    folder = job.folder
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=folder.name + '.', dir=folder.parent))
@@ -222,97 +220,69 @@ def _build(job: _Job) -> None:
             f'{folder.parent}: the cache cannot be written ({error.strerror}); set {ENVIRONMENT} '
             'to a folder that can') from error
     try:
-        with open(part / 'frames.npy', 'wb') as frames, open(part / 'masks.npy', 'wb') as masks:
+        with open(part / 'frames', 'wb') as frames, open(part / 'masks', 'wb') as masks:
             def restart() -> None:
                 for stream in (frames, masks):
-                    _empty(stream)
+                    stream.seek(0)
+                    stream.truncate()
 
-            restart()
-            columns = decode_file(path, dict(job.found), lambda pixels: frames.write(pixels.data),
+            columns = decode_file(job.path, dict(job.found),
+                                  lambda pixels: frames.write(pixels.data),
                                   lambda mask: masks.write(mask.data), restart, job.reading)
-            size = columns.image_size or (0, 0)
-            _write_header(frames, (len(columns.arrays.get('frame_log', ())), *size, 3))
-            _write_header(masks, (len(columns.arrays.get('mask_log', ())), *size))
-        if 'mask_log' not in columns.arrays:
-            (part / 'masks.npy').unlink()
-        _sort_frames(part / 'frames.npy', columns.arrays)
+        order = columns.arrays.pop('frame_order', None)
+        if order is not None and (np.diff(order) != 1).any():  # they were not logged in order
+            frames_in_order = _map(part / 'frames', len(order), *columns.image_size or (), 3)
+            frames_in_order[order].tofile(part / 'sorted')
+            os.replace(part / 'sorted', part / 'frames')
         arrays = {k: np.ascontiguousarray(a) for k, a in columns.arrays.items()}
         arrays |= {key: pictures for key in _GOALS
                    if (pictures := getattr(columns, key)) is not None}
         save_file(arrays, part / 'columns.safetensors', {'columns': columns.describe()})
-        _put(part, folder, path)
+        _put(part, job)
     except OSError as error:
         raise RecordingError(f'{folder}: the cache cannot be written: {error}') from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _put(part: Path, folder: Path, path: Path) -> None:
+def _put(part: Path, job: _Job) -> None:
     """Give a finished folder its name; one that is there stays, unless it cannot be read."""
-    if folder.exists() and _load(folder, path) is None:
-        broken = Path(tempfile.mkdtemp(prefix=folder.name + '.', dir=folder.parent))
-        try:
-            os.rename(folder, broken / 'broken')
-        except FileNotFoundError:  # another process was faster
-            pass
+    if job.folder.exists() and _load(job) is None:
+        broken = part.with_name(part.name + '.broken')
+        with suppress(FileNotFoundError):  # another process was faster
+            os.rename(job.folder, broken)
         shutil.rmtree(broken, ignore_errors=True)
     try:
-        os.rename(part, folder)
+        os.rename(part, job.folder)
     except OSError:
-        if _load(folder, path) is None:  # else another process was faster
+        if _load(job) is None:  # else another process was faster
             raise
 
 
-def _empty(stream: BinaryIO) -> None:
-    """Keep but the room for the header."""
-    stream.seek(0)
-    stream.truncate()
-    stream.write(bytes(_NPY_HEADER))
+def _map(path: Path, *shape: int) -> np.ndarray:
+    """Map pictures into memory, uint8 of a shape; raise ValueError for a file of another size."""
+    if path.stat().st_size != math.prod(shape):
+        raise ValueError(f'{path}: of another size')
+    return np.memmap(path, np.uint8, 'r', shape=shape)
 
 
-def _write_header(stream: BinaryIO, shape: tuple[int, ...]) -> None:
-    """Put the header of an .npy file in front of what was written."""
-    text = repr({'descr': '|u1', 'fortran_order': False, 'shape': shape})
-    magic = np.lib.format.magic(1, 0)
-    length = _NPY_HEADER - len(magic) - 2
-    stream.seek(0)
-    stream.write(magic + length.to_bytes(2, 'little') + text.ljust(length - 1).encode() + b'\n')
-
-
-def _sort_frames(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Bring the frames into the order of their log times, which they nearly always have."""
-    order = arrays.pop('frame_order', None)
-    if order is not None and (np.diff(order) != 1).any():
-        frames = _map(path)
-        np.save(path, frames[order], allow_pickle=False)
-
-
-def _map(path: Path) -> np.ndarray:
-    """Map the frames or masks of a cache folder."""
-    # numpy reads the header with ast, which now and then fails when threads do so at once.
-    with _PARSING:
-        return np.load(path, mmap_mode='r')
-
-
-def _load(folder: Path, source: Path) -> Columns | None:
+def _load(job: _Job) -> Columns | None:
     """Return the Columns of a cache folder, or None when it is not there or not complete."""
+    path = job.folder / 'columns.safetensors'
     try:
-        arrays = load_file(folder / 'columns.safetensors')
-        with open(folder / 'columns.safetensors', 'rb') as stream:
-            length = int.from_bytes(stream.read(8), 'little')
-            about = json.loads(json.loads(stream.read(length))['__metadata__']['columns'])
-        count, num_masks = (len(arrays.get(f'{name}_log', ())) for name in ('frame', 'mask'))
-        frames = _map(folder / 'frames.npy') if count else None
-        masks = _map(folder / 'masks.npy') if num_masks else None
-        if frames is not None and frames.shape != (count, *about['image_size'], 3):
-            return None
-        if masks is not None and masks.shape != (num_masks, *about['image_size']):
-            return None
-    except (OSError, EOFError, SafetensorError, ValueError, KeyError):
+        with safe_open(path, 'numpy') as file:
+            about = json.loads(file.metadata()['columns'])
+            arrays = {key: file.get_tensor(key) for key in file.keys()}
+        frames, masks = (
+            _map(job.folder / name, len(arrays[log]), *about['image_size'], *channels)
+            if log in arrays else None
+            for name, log, channels in (('frames', 'frame_log', [3]), ('masks', 'mask_log', [])))
+    except (OSError, SafetensorError, ValueError, LookupError, TypeError):
         return None
+    image_size, camera_size = (about[key] and tuple(about[key]) for key in (
+        'image_size', 'camera_size'))
     return Columns(
-        str(source), tuple(about['image_size']) if count else None,
-        tuple(about['camera_size']) if count else None, frames,
+        str(job.path), image_size, camera_size, frames,
         **{key: arrays.pop(key, None) for key in _GOALS}, masks=masks, arrays=arrays,
         names=[tuple(n) for n in about['names']], marks=[tuple(m) for m in about['marks']],
         damage=about['damage'])

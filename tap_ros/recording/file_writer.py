@@ -16,8 +16,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
 from tap_ros.recording import metadata, topics
+from tap_ros.recording.attachments import NewAttachments
 from tap_ros.recording.messages import schema_text, type_hash
-from tap_ros.recording.new_attachments import NewAttachments
 
 LIBRARY = 'tap_ros 1'
 CHUNK_BYTES = 786432  # rosbag2's default
@@ -84,10 +84,10 @@ class FileWriter:
         publish = log_time_ns if publish_time_ns is None else publish_time_ns
         with storage_errors(self.path):
             self._writer.add_message(channel, int(log_time_ns), data, int(publish), info['count'])
-            file = self._attached.new(topic, type_name, data) if self._attached else None
-            if file is not None:
+            file = self._attached and self._attached.new(topic, type_name, data, log_time_ns)
+            if file:
                 self._writer.add_attachment(
-                    file.created_ns, int(log_time_ns), file.name, file.media_type, file.data)
+                    file.create_time, file.log_time, file.name, file.media_type, file.data)
         info['count'] += 1
         total = self._info
         first = total['message_count'] == 0

@@ -14,9 +14,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 from tap_ros.cli import main
 from tap_ros.recording import attachments
-from tap_ros.recording.attachments import read_attachments, save_attachment
+from tap_ros.recording.attachments import MAX_CARD_BYTES, read_attachments, save_attachment
 from tap_ros.recording.messages import encode
-from tap_ros.recording.new_attachments import MAX_CARD_BYTES
 from tap_ros.recording.writer import BagWriter
 
 IMAGE, STRING = 'sensor_msgs/msg/Image', 'std_msgs/msg/String'
@@ -125,7 +124,7 @@ def test_what_cannot_be_attached_is_recorded_as_ever(tmp_path, kind, data):
 
 
 def test_a_recording_does_not_fill_with_attachments(tmp_path, monkeypatch):
-    monkeypatch.setattr('tap_ros.recording.new_attachments.MAX_BYTES', 1000)
+    monkeypatch.setattr('tap_ros.recording.attachments.MAX_NEW_BYTES', 1000)
     noise = np.random.default_rng(0).integers(0, 256, (9, 192), np.uint8)
     file = record(tmp_path / 'bag', *(('/goal/image', IMAGE, picture(data=d)) for d in noise))
     found = list(read_attachments(file))

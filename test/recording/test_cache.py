@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cache holds what the recording holds, whoever builds it and whatever happened to it."""
 
-from concurrent.futures import ThreadPoolExecutor
 import os
 import shutil
 import subprocess
@@ -67,27 +66,19 @@ def test_other_content_is_another_key(tmp_path, episodes):
     assert len(hashes) == 2
 
 
-@pytest.mark.parametrize('damage', [
-    lambda folder: (folder / 'frames.npy').unlink(),
-    lambda folder: os.truncate(folder / 'frames.npy', 200),
-    lambda folder: os.truncate(folder / 'frames.npy', 0),
-    lambda folder: (folder / 'columns.safetensors').unlink(),
-    lambda folder: os.truncate(folder / 'columns.safetensors', 100),
-    lambda folder: (folder / 'columns.safetensors').write_bytes(b'nonsense' * 9),
-    lambda folder: os.truncate(
-        folder / 'columns.safetensors', (folder / 'columns.safetensors').stat().st_size - 1)])
-def test_damaged_caches_are_built_again(bag, episodes, cache, damage):
-    open_recordings(bag)
-    for folder in cache.iterdir():
-        damage(folder)
-    assert_all_equal(open_recordings(bag), episodes)
-
-
-def test_many_may_build_at_once(bag, episodes, cache):
-    with ThreadPoolExecutor(6) as pool:
-        for store in pool.map(lambda _: open_recordings(bag, progress=False), range(6)):
-            assert_all_equal(store, episodes)
-    assert len(list(cache.iterdir())) == 2  # a folder a file, nothing unfinished
+def test_damaged_caches_are_built_again(bag, episodes, cache):
+    for name, size in (('frames', None), ('frames', 200), ('columns.safetensors', None),
+                       ('columns.safetensors', 0), ('columns.safetensors', 100),
+                       ('columns.safetensors', -1)):
+        open_recordings(bag)
+        for folder in cache.iterdir():
+            path = folder / name
+            if size is None:
+                path.unlink()
+            else:
+                os.truncate(path, size % path.stat().st_size)
+        assert_all_equal(open_recordings(bag), episodes)
+    assert len(list(cache.iterdir())) == 2  # a folder a file, nothing broken is left
 
 
 def test_many_processes_may_build_at_once(bag, cache):
@@ -147,8 +138,3 @@ def test_images_of_one_store_share_their_size(tmp_path):
             writer.write(make_episode(size=size))
     with pytest.raises(RecordingError, match=r'large.mcap \(8x16\), .*small.mcap \(8x8\)'):
         open_recordings([tmp_path / 'large', tmp_path / 'small'])
-    with pytest.raises(RecordingError, match='images of different sizes'):
-        with EpisodeWriter(tmp_path / 'both.mcap') as writer:
-            writer.write(make_episode(size=(8, 8)))
-            writer.write(make_episode(size=(4, 16)))  # as many bytes
-        open_recordings(tmp_path / 'both.mcap')

@@ -91,18 +91,12 @@ def test_masks_are_views_of_memory_maps(tmp_path, covered):
     assert isinstance(masks, np.memmap) and not masks.flags.writeable
 
 
-def test_recordings_without_masks_are_cached_as_before(bag, cache):
-    open_recordings(bag)
-    assert {path.name for folder in cache.iterdir() for path in folder.iterdir()} == {
-        'frames.npy', 'columns.safetensors'}
-
-
 @pytest.mark.parametrize('damage', ['remove', 'cut'])
 def test_caches_that_lost_their_masks_are_built_again(tmp_path, covered, cache, damage):
     bag = write_bag(tmp_path / 'bag', covered)
     open_recordings(bag)
     for folder in cache.iterdir():
-        path = folder / 'masks.npy'
+        path = folder / 'masks'
         if damage == 'remove':
             path.unlink()
         else:

@@ -23,8 +23,8 @@ from tap_ros.nodes.planner.arm_joints import declare_mount, declare_opening, dec
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import SERVICE_QOS
 from tap_ros.recording import topics
+from tap_ros.recording.attachments import CARD_TYPE
 from tap_ros.recording.mounts import ArmMount, write_mount
-from tap_ros.recording.new_attachments import CARD_TYPE
 from tap_ros.recording.writer import BagWriter
 from tap_ros.text import escaped
 
