@@ -36,7 +36,7 @@ help:
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
 	@echo 'make faults  inject every fault into real nodes and files, in docs/results: five hours;'
-	@echo '             goes on where it was interrupted; ARGS=--list, ARGS="--only NAME"'
+	@echo '             ARGS="-k silent": only those; ARGS="--share 0.1": a tenth of the trials'
 	@echo 'make bench   measure the speed of each part; ARGS=...'
 	@echo 'make lint    check the style of the code and its types'
 	@echo 'make build   only the set-up: .venv, install/; then, to work in it:'
@@ -63,7 +63,7 @@ paper: build
 	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(if $(SCALE),--scale $(SCALE)) $(ARGS)
 
 faults: build
-	@$(ENTER); $(DOMAIN); python -m tap_ros evaluate faults $(ARGS)
+	@$(ENTER); $(DOMAIN); python -m pytest -m fault --share 1 --report docs/results test/faults $(ARGS)
 
 bench: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros bench $(ARGS)

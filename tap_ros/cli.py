@@ -41,7 +41,6 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                      'experiments.planning.command'),
         'stacking': ('stack objects via predicted subgoals and score the towers',
                      'experiments.stacking.command'),
-        'faults': ('inject faults into real nodes and files', 'experiments.faults.nodes.command'),
     }),
     'predict': ('predict subgoals from picture files', 'tap_ros.prediction.predict_command'),
     'call': ('ask a running predictor node', 'tap_ros.nodes.call_command'),

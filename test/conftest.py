@@ -23,6 +23,20 @@ settings.register_profile(
 settings.load_profile('tap_ros')
 
 
+def pytest_addoption(parser):
+    """Let `pytest -m fault` be told how often each fault is tried, and where to report it."""
+    parser.addoption('--share', type=float, default=0.02, help='share of the trials of each fault')
+    parser.addoption('--report', default='', help='folder of faults.json and faults.md')
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out the faults, unless they are asked for."""
+    if 'fault' not in config.option.markexpr:
+        faults = [item for item in items if item.get_closest_marker('fault')]
+        items[:] = [item for item in items if not item.get_closest_marker('fault')]
+        config.hook.pytest_deselected(items=faults)
+
+
 @pytest.hookimpl(optionalhook=True)  # of xdist
 def pytest_xdist_make_scheduler(config, log):
     """Give the tests of a file to one worker, and all tests of real nodes to one."""

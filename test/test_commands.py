@@ -32,7 +32,7 @@ SHOWN = {  # one of those with the same options
     for command in re.findall(r'-m tap_ros ([^`\n;|]+?)(?: #.*)?(?=[`\n;])', page.read_text())
     if '...' not in command and '--tyro' not in command}.values()
 IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --scale full --list', 'bench',
-                   'evaluate faults --only camera-silent', 'bench planning']
+                   'bench planning']
 
 
 def settings(line):
@@ -162,6 +162,6 @@ def test_a_shell_completes_commands_options_and_choices(tmp_path):
                                *words], capture_output=True, text=True).stdout.split()
 
     assert completed('ev') == ['evaluate']
-    assert {'prediction', 'faults'} <= set(completed('evaluate', ''))
+    assert {'prediction', 'planning'} <= set(completed('evaluate', ''))
     assert completed('train', '--learning') == ['--learning-rate']
     assert completed('collect', '--engine', '') == ['local', 'ray']

@@ -4,10 +4,12 @@
 
 from collections import Counter
 import json
+import os
 from pathlib import Path
+import platform
+import time
 import tomllib
 
-from experiments.faults.results import describe_machine
 from experiments.mutants.tool import BUDGET_S, VERSION
 from tap_ros.files import write_atomically
 
@@ -51,7 +53,8 @@ def write_page(chosen, total, seed):
     :param seed: of the draw.
     """
     tried = [mutant for mutant in chosen if mutant.status != 'not checked']
-    about = describe_machine()
+    about = {'machine': f'{platform.machine()}, {os.cpu_count()} cores',
+             'date': time.strftime('%Y-%m-%d'), 'commit': ''}
     every = sum(total.values())
     sampled = len(chosen) < every
     found = {

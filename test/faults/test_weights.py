@@ -5,45 +5,55 @@
 import json
 import struct
 
-from experiments.faults.children import Reader
-from experiments.faults.fault import Fault
-from experiments.faults.recordings import one_line
+from fault_files import assert_refused, Reader
+from fault_report import fault
+import numpy as np
 from safetensors.torch import load
 from tap_ros.training.weights import content_digest
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL, PREDICTORS
 
+PREDICTOR = PREDICTORS[DEFAULT_PREDICTOR]
 
-def flips(job):
-    """Load weights with one bit flipped."""
+
+@fault('one bit of a weights file flipped', 'refused in one line, or what is computed with is the '
+       'same to the bit', 5000, 's to load it')
+def test_weights_flips(trials, tmp_path):
+    random = np.random.default_rng(0)
     whole = FORWARD_MODEL.read_bytes()
     header = struct.unpack('<Q', whole[:8])[0] + 8
-    path = job.folder / 'flipped.safetensors'
+    path = tmp_path / 'flipped.safetensors'
     with Reader() as reader:
         right = reader.read('weights', FORWARD_MODEL)['content']
-        for trial in job.trials():
+        for trial in trials:
             # Every tenth in the description, which is a small part of the file.
-            at = int(job.random.integers(header if trial % 10 == 0 else len(whole)))
+            at = int(random.integers(header if trial % 10 == 0 else len(whole)))
             data = bytearray(whole)
-            data[at] ^= 1 << int(job.random.integers(8))
+            data[at] ^= 1 << int(random.integers(8))
             path.write_bytes(data)
-            found = reader.read('weights', path)
-            why = _refusal(found, path.name)
-            if found['error'] is None:
-                why = '' if found['content'] == right else 'other weights were accepted'
-            job.record(not why, why, found['seconds'])
+            with trials.one():
+                found = reader.read('weights', path)
+                trials.measured(found['seconds'])
+                if found['error'] is None:
+                    assert found['content'] == right, 'other weights were accepted'
+                else:
+                    assert_refused(found, path.name)
 
 
-def nonsense(job):
-    """Load weights whose description or numbers are nonsense."""
+@fault('nonsense in a weights file', 'refused in one line that names the file', 160,
+       's to refuse it')
+def test_weights_nonsense(trials, tmp_path):
     makers = list(_nonsense())
-    path = job.folder / 'nonsense.safetensors'
+    path = tmp_path / 'nonsense.safetensors'
+    step = max(1, len(makers) // trials.count)
     with Reader() as reader:
-        for trial in job.trials():
-            what, source, change = makers[trial % len(makers)]
+        for trial in trials:
+            what, source, change = makers[trial * step % len(makers)]
             path.write_bytes(_changed(source, change))
-            found = reader.read('weights' if source == FORWARD_MODEL else 'predictor', path)
-            why = _refusal(found, path.name)
-            job.record(not why, f'{what}: {why}', found['seconds'])
+            with trials.one():
+                found = reader.read('weights' if source == FORWARD_MODEL else 'predictor', path)
+                trials.measured(found['seconds'])
+                assert found['error'] is not None, f'{what}: accepted'
+                assert_refused(found, path.name)
 
 
 def _nonsense():
@@ -54,20 +64,13 @@ def _nonsense():
             return numbers
         return change
 
-    def field(name, value):
+    def field(name, value, inside=None):
         def change(header, numbers):
             fields = json.loads(header['__metadata__']['about'])
-            fields.pop(name, None)
+            target = fields if inside is None else fields[inside]
+            target.pop(name, None)
             if value is not ...:
-                fields[name] = value
-            header['__metadata__']['about'] = json.dumps(fields)
-            return numbers
-        return change
-
-    def setting(name, value):
-        def change(header, numbers):
-            fields = json.loads(header['__metadata__']['about'])
-            fields['config'][name] = value
+                target[name] = value
             header['__metadata__']['about'] = json.dumps(fields)
             return numbers
         return change
@@ -76,7 +79,7 @@ def _nonsense():
         header.pop('__metadata__')
         return numbers
 
-    for source in (FORWARD_MODEL, PREDICTORS[DEFAULT_PREDICTOR]):
+    for source in (FORWARD_MODEL, PREDICTOR):
         yield 'zero weights', source, lambda header, numbers: bytes(len(numbers))
         yield 'infinite weights', source, lambda header, numbers: b'\x00\x00\x80\x7f' * (
             len(numbers) // 4) + bytes(len(numbers) % 4)
@@ -89,9 +92,9 @@ def _nonsense():
         for name, value in (('image_size', 0), ('image_size', -1), ('image_size', 10**9),
                             ('width', 10**9), ('image_size', 'x'), ('width', None),
                             ('x\n\x1b[31m', 1)):
-            yield f'{name}: {value}', source, setting(name, value)
-    yield 'flow_scale: NaN', PREDICTORS[DEFAULT_PREDICTOR], setting('flow_scale', float('nan'))
-    yield 'flow_scale: 1e30', PREDICTORS[DEFAULT_PREDICTOR], setting('flow_scale', 1e30)
+            yield f'{name}: {value}', source, field(name, value, 'config')
+    for value in (float('nan'), 1e30):
+        yield f'flow_scale: {value}', PREDICTOR, field('flow_scale', value, 'config')
 
 
 def _changed(source, change):
@@ -110,22 +113,3 @@ def _pack(header, numbers):
     packed = json.dumps(header).encode()
     packed += b' ' * (-len(packed) % 8)
     return struct.pack('<Q', len(packed)) + packed + numbers
-
-
-def _refusal(found, name):
-    """Say why an answer is no clear refusal."""
-    if found['error'] is None:
-        return 'accepted'
-    if not found['expected']:
-        return f'{found["kind"]}: {found["error"]}'
-    return one_line(found['error'], name)
-
-
-FAULTS = [
-    Fault('weights-flips', 'one bit of a weights file flipped', 'A bad disk or download changed '
-          'the weights. A planner or predictor that computes with them would push objects to '
-          'wrong places.', 'Refused in one line, or what is computed with is the same to the bit.',
-          5000, 0.03, flips, 'to load it', 's'),
-    Fault('weights-nonsense', 'nonsense in a weights file', 'A file of another program or '
-          'version, an edited one, or one whose training went wrong.', 'Refused in one line '
-          'that names the file.', 160, 0.15, nonsense, 'to refuse it', 's')]

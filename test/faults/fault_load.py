@@ -3,7 +3,7 @@
 """
 Clients that call predict_subgoal as fast as they are answered, in a process of their own.
 
-    python -m experiments.faults.nodes.load CLIENTS SECONDS CALLS DEPTH
+    python fault_load.py CLIENTS SECONDS CALLS DEPTH
 
 Each client sends its next request when the one before is answered, until so many seconds have
 passed or it has made so many calls (0: any number). DEPTH answers wait in its queue. One line of
@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 
-from experiments.faults.nodes.world import predict_fields
+from fault_world import predict_fields
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -31,38 +31,34 @@ class Caller:
     One client.
 
     :param node: rclpy Node.
-    :param until: time.monotonic() at which it sends no more.
     :param calls: most calls; 0: any number.
     :param depth: answers that wait in its queue, those to all other clients among them.
     """
 
-    def __init__(self, node, until, calls, depth):
-        self._client = node.create_client(
+    def __init__(self, node, calls, depth):
+        self.client = node.create_client(
             PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth))
         self._request = PredictSubgoal.Request(**predict_fields())
-        self._until, self._left = until, calls or float('inf')
+        self._left = calls or float('inf')
         self._future = self._sent = None
-        self.ends, self.times, self.done = Counter(), [], False
+        self.until = float('inf')  # time.monotonic() at which it sends no more
+        self.ends, self.done = Counter(), False
         self.answered = 0.0  # when the last answer came
-
-    def ready(self):
-        """Tell whether the service is there."""
-        return self._client.service_is_ready()
 
     def send(self):
         """Send a request, unless it is time to end."""
-        if self._left <= 0 or time.monotonic() >= self._until:
+        if self._left <= 0 or time.monotonic() >= self.until:
             self.done = True
             return
         self._left -= 1
         self._sent = time.monotonic()
-        self._future = self._client.call_async(self._request)
+        self._future = self.client.call_async(self._request)
         self._future.add_done_callback(self._on_answer)
 
     def look(self):
         """Give up a call that was not answered for too long."""
         if not self.done and time.monotonic() > self._sent + PATIENCE_S:
-            self._client.remove_pending_request(self._future)
+            self.client.remove_pending_request(self._future)
             self.ends['lost'] += 1
             self.send()
 
@@ -71,7 +67,6 @@ class Caller:
             return
         response = future.result()
         self.answered = time.monotonic()
-        self.times.append(self.answered - self._sent)
         busy = 'busy' in response.message
         self.ends['good' if response.success else 'busy' if busy else 'refused'] += 1
         if response.success:
@@ -80,18 +75,16 @@ class Caller:
             threading.Timer(0.05, self.send).start()
 
 
-def main():
+def main(count, seconds, calls, depth):
     """Call, and print what came of it."""
-    count, seconds = int(sys.argv[1]), float(sys.argv[2])
-    calls, depth = int(sys.argv[3]), int(sys.argv[4])
     context = Context()
     context.init()
     node = Node('load', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    begin = time.monotonic()
-    callers = [Caller(node, begin + 3600, calls, depth) for _ in range(count)]
-    while not all(caller.ready() for caller in callers) and time.monotonic() < begin + 20:
+    callers = [Caller(node, int(calls), int(depth)) for _ in range(int(count))]
+    late = time.monotonic() + 20
+    while not all(one.client.service_is_ready() for one in callers) and time.monotonic() < late:
         executor.spin_once(timeout_sec=0.1)
     settled = time.monotonic() + 1.0
     while time.monotonic() < settled:
@@ -100,20 +93,19 @@ def main():
     sys.stdin.readline()
     begin = time.monotonic()
     for caller in callers:
-        caller._until = begin + seconds
+        caller.until = begin + float(seconds)
         caller.send()
     while not all(caller.done for caller in callers):
         executor.spin_once(timeout_sec=0.2)
         for caller in callers:
             caller.look()
     ends = sum((caller.ends for caller in callers), Counter())
-    times = sorted(time for caller in callers for time in caller.times)
-    print(json.dumps({**ends, 'seconds': max(caller.answered for caller in callers) - begin,
-                      'median_s': times[len(times) // 2] if times else None}), flush=True)
+    last = max(caller.answered for caller in callers)
+    print(json.dumps({**ends, 'seconds': last - begin}), flush=True)
     executor.shutdown()
     node.destroy_node()
     context.try_shutdown()
 
 
 if __name__ == '__main__':
-    main()
+    main(*sys.argv[1:])

@@ -3,8 +3,6 @@
 """
 The process that reads damaged files, so that a crash, a hang or a bomb ends it and not the run.
 
-    python -m experiments.faults.reading
-
 A line of standard input is a JSON list: what to read, and the file. The line that answers says
 what came of it. Whatever the files hold, nothing but such lines is printed.
 """

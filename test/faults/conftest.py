@@ -1,0 +1,43 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Faults: each test makes many trials and, with --report, leaves a row of a table."""
+
+from fault_report import save, Trials
+import pytest
+
+
+@pytest.fixture
+def trials(request):
+    """Return the Trials of the test's fault."""
+    report = request.config.getoption('--report')
+    # Without a report other tests, and other programs, may run meanwhile.
+    return Trials(request.node.get_closest_marker('fault').kwargs,
+                  request.config.getoption('--share'), patience=1.0 if report else 8.0)
+
+
+@pytest.fixture(scope='session')
+def rig(tmp_path_factory):
+    """Return the Rig that all faults of nodes share; it starts what each needs."""
+    from fault_rig import Rig  # needs ROS, which faults of files do without
+    with Rig(tmp_path_factory.mktemp('logs')) as rig:
+        yield rig
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Write the row of a fault, however its test ends, and fail it if a trial did not hold."""
+    trials = pyfuncitem.funcargs.get('trials')
+    error = None
+    try:
+        result = yield
+        if trials is not None:
+            assert trials.held == trials.tried > 0, trials.why_not()
+        return result
+    except BaseException as raised:
+        error = None if isinstance(raised, AssertionError) else raised
+        raise
+    finally:
+        folder = pyfuncitem.config.getoption('--report')
+        if folder and trials is not None and not isinstance(error, KeyboardInterrupt):
+            name = pyfuncitem.name.removeprefix('test_').replace('_', '-')
+            save(folder, trials.row(name.replace('[', '-').rstrip(']'), error))

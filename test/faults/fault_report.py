@@ -1,0 +1,186 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A fault is a test that makes many trials; what came of them is a row of faults.json.
+
+Rows of a run are written one by one, so that an interrupted run leaves those it has finished.
+"""
+
+from collections import Counter
+from contextlib import contextmanager
+import json
+import os
+from pathlib import Path
+import platform
+import re
+import subprocess
+import time
+
+import pytest
+from tap_ros.errors import TapError
+from tap_ros.files import write_atomically, write_rows
+from tap_ros.text import escaped
+
+ROOT = Path(__file__).parents[2]
+MAX_REASONS = 4
+HEAD = """\
+# Faults
+
+Each row is a fault that was injected into real nodes, processes of their own that talk over DDS,
+or into real files. *Held*: trials in which what must happen did happen. Numbers are the worst of
+all trials unless said otherwise. `make faults` (about five hours) makes this page and
+[faults.json](faults.json), which has each row's machine, date and commit; `python -m pytest -m
+fault` tries each fault a few times.
+
+| injected | must happen | held | seen |
+| --- | --- | ---: | --- |
+"""
+
+
+def fault(injected, promise, count, figure='', summary=max):
+    """
+    Mark a test as a fault.
+
+    :param injected: what goes wrong, a few words.
+    :param promise: what must happen in a trial that counts as held.
+    :param count: how many trials the whole run makes.
+    :param figure: what is measured in a trial, unit first; empty if nothing is.
+    :param summary: which of the trials' figures is shown.
+    """
+    return pytest.mark.fault(injected=injected, promise=promise, count=count, figure=figure,
+                             summary=summary)
+
+
+class Trials:
+    """
+    The trials of one fault.
+
+    :param mark: keywords of `fault`.
+    :param share: of the fault's count that is tried; at least one trial is made.
+    :param patience: factor of what a promise says in seconds; more than 1 on a machine that does
+        something else meanwhile.
+    :ivar note: for the row, beside the figure.
+    """
+
+    def __init__(self, mark, share, patience):
+        self.mark, self.share, self.patience = mark, share, patience
+        self.count = max(1, round(mark['count'] * share))
+        self.tried = self.held = 0
+        self.note = ''
+        self.figures, self.reasons = [], Counter()
+        self._begin = time.monotonic()
+
+    def __iter__(self):
+        yield from range(self.count)
+
+    @contextmanager
+    def one(self):
+        """Take down a trial, which held if the with-block raises neither assertion nor error."""
+        try:
+            yield
+        except (AssertionError, TapError, pytest.fail.Exception) as error:
+            self.record(str(error).split('\nassert ')[0] or 'no reason was given')
+        else:
+            self.record()
+
+    def record(self, why='', times=1):
+        """
+        Take down what came of equal trials.
+
+        :param why: what happened instead, empty where the promise held.
+        :param times: of how many.
+        """
+        self.tried += times
+        if why:
+            self.reasons[escaped(why, 200)] += times
+        else:
+            self.held += times
+
+    def measured(self, figure):
+        """Take down what was measured in a trial."""
+        self.figures.append(float(figure))
+
+    def why_not(self):
+        """Return the most frequent reasons why the promise did not hold, in one line."""
+        alike, examples = Counter(), {}
+        for why, times in self.reasons.items():
+            key = re.sub(r'\d+', '#', why)  # reasons that differ in numbers only count as one
+            alike[key] += times
+            examples.setdefault(key, why)
+        return '; '.join(f'{times} times: {examples[key]}'
+                         for key, times in alike.most_common(MAX_REASONS))
+
+    def row(self, name, error=None):
+        """Return the row of a fault, after an exception if one ended it."""
+        figure = self.mark['summary'](self.figures) if self.figures else None
+        if error is not None:
+            self.record(f'the trials were ended by {type(error).__name__}: {error}')
+        return {
+            'fault': name, 'injected': self.mark['injected'], 'promise': self.mark['promise'],
+            'tried': self.tried, 'held': self.held,
+            'figure': figure if figure is None else round_figure(figure),
+            'what': self.mark['figure'], 'note': self.note, 'why_not': self.why_not(),
+            'share': self.share, 'seconds': round(time.monotonic() - self._begin, 1),
+            **describe_machine()}
+
+
+def round_figure(value):
+    """Return four significant digits; text for what JSON has no number for."""
+    return float(f'{value:.4g}') if abs(value) < float('inf') else str(value)
+
+
+def save(folder, row):
+    """
+    Put a row into faults.json of a folder, in place of an older one, and write the page anew.
+
+    :param folder: of faults.json and faults.md.
+    :param row: of Trials.row.
+    """
+    path = Path(folder) / 'faults.json'
+    rows = {old['fault']: old for old in json.loads(path.read_text())} if path.exists() else {}
+    rows[row['fault']] = row
+    write_rows(path, rows.values())
+    write_atomically(path.with_suffix('.md'), page(rows.values()))
+
+
+def page(rows):
+    """Return the page of all rows; rows of the same fault in several forms share a line."""
+    lines = {}
+    for row in rows:
+        lines.setdefault((row['injected'], row['promise']), []).append(row)
+    return HEAD + ''.join(_line(*texts, rows) for texts, rows in lines.items())
+
+
+def _line(injected, promise, rows):
+    """Return one line of the table."""
+    tried, held = (sum(row[key] for row in rows) for key in ('tried', 'held'))
+    figures = [row['figure'] for row in rows if row['figure'] is not None]
+    seen = ' / '.join(f'{figure:.3g}' if isinstance(figure, float) else figure
+                      for figure in figures)
+    parts = [f'{seen} {rows[0]["what"]}'.strip() if figures else '',
+             *(row['why_not'] for row in rows), *dict.fromkeys(row['note'] for row in rows)]
+    words = '; '.join(filter(None, parts)).replace('|', '\\|').replace('<', '\\<')
+    share = f'{held} of {tried}'
+    return f'| {injected} | {promise} | {share if held == tried else f"**{share}**"} | {words} |\n'
+
+
+def describe_machine():
+    """Return what every row says of the machine and the code."""
+    try:
+        lines = Path('/proc/cpuinfo').read_text().splitlines()
+        cpu = next(line.split(':', 1)[1].strip() for line in lines if 'model name' in line)
+    except (OSError, StopIteration):
+        cpu = platform.machine()
+    return {'machine': f'{cpu}, {os.cpu_count()} cores', 'date': time.strftime('%Y-%m-%d'),
+            'commit': _git('rev-parse', '--short', 'HEAD') + (
+                '+' if _git('status', '--porcelain', '-uno', '--', '*.py') else '')}
+
+
+def _git(*words):
+    """Return what git says of this checkout; empty without git."""
+    try:
+        run = subprocess.run(['git', *words], cwd=ROOT, text=True, stdout=subprocess.PIPE,
+                             stderr=subprocess.DEVNULL)
+    except OSError:
+        return ''
+    return run.stdout.strip() if run.returncode == 0 else ''

@@ -1,0 +1,153 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Full disks: one clear line, an exit code that is not 0, and what was there stays readable."""
+
+from contextlib import contextmanager
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+
+from fault_files import Reader, run_limited, write_recording
+from fault_report import fault
+import numpy as np
+import pytest
+from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.recording.writer import write_metadata
+from tap_ros.training.weights import load_tensors, save_weights
+
+TIMEOUT_S = 180.0
+CLEAR = 'one line that says so, exit code not 0; finished files can be read'
+
+
+@contextmanager
+def small_disk(folder, size_bytes):
+    """
+    Give a folder that holds no more than so much, for the with-block.
+
+    :param folder: made if it is not there.
+    :param size_bytes: size of the file system.
+    :return: whether there is one; this user may not be allowed to mount it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    mounted = shutil.which('mount') and subprocess.run(
+        ['mount', '-t', 'tmpfs', '-o', f'size={size_bytes}', 'tmpfs', str(folder)],
+        stderr=subprocess.DEVNULL).returncode == 0
+    try:
+        yield mounted
+    finally:
+        if mounted:
+            subprocess.run(['umount', '-l', str(folder)], check=True)
+
+
+def run_on_full_disk(mounted, size_bytes, *words):
+    """
+    Run `python -m tap_ros` with too little room; raise AssertionError unless it says so.
+
+    :param mounted: of small_disk; without one no file of the run may grow beyond the size.
+    :param size_bytes: its size.
+    :param words: of the command.
+    :return: the seconds it took.
+    """
+    ended = run_limited([sys.executable, '-m', 'tap_ros', *map(str, words)], TIMEOUT_S,
+                        None if mounted else size_bytes)
+    assert ended.code is not None, f'still ran after {TIMEOUT_S:.0f} s'
+    assert 'Traceback' not in ended.text, f'a traceback: {ended.text.strip().splitlines()[-1]}'
+    assert ended.code > 0, f'exit code {ended.code}'
+    errors = [line for line in ended.text.splitlines() if line.startswith('error: ')]
+    assert len(errors) == 1, f'{len(errors)} error lines'
+    return ended.seconds
+
+
+@fault('the disk is full while recordings are collected', CLEAR, 20, 's until it ended (median)',
+       statistics.median)
+def test_disk_full_collect(trials, tmp_path):
+    random = np.random.default_rng(0)
+    for trial in trials:
+        disk, size = tmp_path / f'disk{trial}', int(random.integers(80_000, 400_000))
+        with trials.one(), small_disk(disk, size) as mounted:
+            (disk / 'old').mkdir()
+            write_recording(disk / 'old' / 'old_0.mcap', episodes=2, length=3)
+            write_metadata(disk / 'old')
+            trials.measured(run_on_full_disk(
+                mounted, size, 'collect', '--out', disk / 'new', '--episodes', 30,
+                '--episodes-per-file', 2, '--workers', 1, '--seed', trial))
+            for folder in sorted({path.parent for path in disk.rglob('*.mcap')}):
+                found = assert_readable(folder)
+                assert folder.name != 'old' or (
+                    not found['warnings'] and len(found['content']) == 2), (
+                    'the recording that was there before is damaged')
+
+
+def assert_readable(bag):
+    """Raise AssertionError unless a recording can be read; return the dict of Reader.read."""
+    with Reader() as reader:
+        found = reader.read('recording', bag)
+    assert found['error'] is None, f'what is left cannot be read: {found["error"]}'
+    return found
+
+
+@fault('the disk is full while weights are trained', CLEAR, 20, 's until it ended (median)',
+       statistics.median)
+def test_disk_full_train(trials, tmp_path):
+    random = np.random.default_rng(0)
+    source = tmp_path / 'source'
+    source.mkdir()
+    write_recording(source / 'source_0.mcap', episodes=8, length=8, size=64)
+    write_metadata(source)
+    network, old = Predictor(PredictorConfig(base_width=1)), tmp_path / 'old.safetensors'
+    save_weights(old, network, 'predictor', network.config, {})
+    for trial in trials:
+        disk = tmp_path / f'disk{trial}'
+        size = old.stat().st_size + int(random.integers(20_000, 400_000))
+        with trials.one(), small_disk(disk, size) as mounted:
+            shutil.copy(old, disk)
+            trials.measured(run_on_full_disk(
+                mounted, size, 'train', '--recordings', source, '--out', disk, '--steps', 20,
+                '--batch-size', 4, '--base-width', 4, '--save-every', 5))
+            assert (disk / old.name).exists(), 'the weights that were there before are gone'
+            for path in disk.rglob('*.safetensors'):
+                load_tensors(path)
+            litter = [*disk.rglob('*.part'), *disk.rglob('*.tmp')]
+            assert not litter, f'left behind: {litter}'
+
+
+@pytest.mark.ros
+@fault('the disk is full while recorder_node records', 'error in log and answer, exit code not 0; '
+       'what was recorded can be read', 20)
+def test_disk_full_recorder(trials, rig, tmp_path):
+    from std_srvs.srv import SetBool
+    from tap_ros.nodes.clients import call
+    random = np.random.default_rng(0)
+    rig.need()
+    for trial in trials:
+        disk = tmp_path / f'disk{trial}'
+        with trials.one(), small_disk(disk, int(random.integers(400_000, 1_200_000))) as mounted:
+            if not mounted:
+                pytest.skip('no file system may be mounted here; try as root')
+            node = rig.start('recorder_node', folder=disk / 'bag', compression='none')
+            node.wait_for('ready')
+            with rig.world(30.0):
+                deadline = time.monotonic() + 30
+                while '[ERROR]' not in node.text:
+                    assert time.monotonic() < deadline, 'no error in the log'
+                    time.sleep(0.1)
+                fill(disk / 'rest')
+                answer = call(rig.record_client, SetBool.Request(data=True), 10.0)
+                assert not answer.success, f'recorder/record says success: {answer.message}'
+            assert node.alive, f'it ended: {node.last_line()}'
+            assert node.end(), 'exit code 0 though the recording is not whole'
+            assert 'Traceback' not in node.text, 'a traceback'
+            assert_readable(disk / 'bag')
+        rig.remove('recorder_node')
+
+
+def fill(path):
+    """Take what room is left."""
+    with path.open('wb', buffering=0) as file:
+        try:
+            while True:
+                file.write(bytes(4096))
+        except OSError:
+            pass
