@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from rclpy.action.client import ClientGoalHandle
     from tap_ros.prediction.predictor import Subgoal
 
-SERVICES: dict[str, tuple[type, str, str]] = {  # type, name, the node that offers it
+SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offers it
     'predict': (PredictSubgoal, 'predict_subgoal', 'predictor_node'),
     'reset': (ResetScene, 'sim/reset', 'sim_node'),
     'set_goal': (SetGoal, 'sim/set_goal', 'sim_node'),
@@ -202,10 +202,10 @@ class Client:
     # Nodes
 
     def is_ready(self, name: str) -> bool:
-        """Tell whether a node ('predictor_node', ...) offers what it offers once it is ready."""
+        """Tell whether a node ('predictor_node', ...) is ready, or one of SERVICES is offered."""
         if name == PLANNER:
             return bool(self._planner().server_is_ready())
-        return bool(self._service(READY[name]).service_is_ready())
+        return bool(self._service(READY.get(name, name)).service_is_ready())
 
     def wait_until_ready(self, *names: str, timeout_s: float = 90.0,
                          check: Callable[[], object] = lambda: None) -> None:
@@ -235,11 +235,12 @@ class Client:
         :param fields: of its request.
         :return: its response.
         :raises CallError: when it does not answer in time, ends, or refuses.
+        :raises ConfigError: for values that a field cannot hold.
         """
         kind, _, server = SERVICES[service]
-        client = self._service(service)
-        response = call(client, kind.Request(**fields),  # type: ignore[attr-defined]
-                        timeout_s or self.timeout_s, give_up, self._liveness(server))
+        client, request = self._service(service), _message(kind.Request, fields)
+        response = call(client, request, timeout_s or self.timeout_s, give_up,
+                        self._liveness(server))
         if not response.success:
             raise CallError(f'{client.service_name} refused: {escaped(response.message, 1000)}')
         return response
@@ -291,10 +292,10 @@ class Client:
         deadline = time.monotonic() + timeout_s
         pixels = goal_pixels or {}
         feedback: SimpleQueue[Any] = SimpleQueue()
-        request = ReachGoal.Goal(
-            mode=mode, step_budget=step_budget, recursion_depth=recursion_depth,
-            num_samples=num_samples, seed=seed, **request_fields(
-                goal_image=goal, goal_objects=list(pixels.values()) or None, names=tuple(pixels)))
+        request = _message(ReachGoal.Goal, request_fields(
+            tuple(pixels), goal_image=goal, goal_objects=list(pixels.values()) or None) | {
+                'mode': mode, 'step_budget': step_budget, 'recursion_depth': recursion_depth,
+                'num_samples': num_samples, 'seed': seed})
         handle = send_goal(self._planner(), request, min(self.timeout_s, timeout_s),
                            on_feedback or feedback.put, self._liveness(PLANNER))
         return Reaching(handle, feedback, deadline, self._liveness(PLANNER))
@@ -317,8 +318,7 @@ class Client:
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""
-        self.call('set_goal', **request_fields(
-            objects=list(pixels.values()), names=tuple(pixels)))
+        self.call('set_goal', **request_fields(tuple(pixels), objects=list(pixels.values())))
 
     def pause(self, paused: bool = True) -> None:
         """Pause the simulator, or let it go on."""
@@ -390,13 +390,11 @@ class Client:
             raise CallError(f'{topic}: nothing new came within {timeout_s:g} s')
         listed = found.get('objects', ObjectStates())
         names, pixels = decode_objects(listed, topics['objects'])
-        places = [one.pose.position for one in listed.objects]
         return View(decode_image(found['image'], topics['image']), names, pixels,
-                    np.array([(p.x, p.y, p.z) for p in places]).reshape(-1, 3),
-                    to_nanoseconds(found['image'].header.stamp))
+                    positions_of(listed), to_nanoseconds(found['image'].header.stamp))
 
 
-def request_fields(names: Sequence[str] = (), **arrays: Any) -> dict[str, Any]:
+def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any]:
     """
     Turn pictures (H, W, 3) and pixels (K, 2) into messages; leave out those that are None.
 
@@ -415,6 +413,12 @@ def request_fields(names: Sequence[str] = (), **arrays: Any) -> dict[str, Any]:
     return fields
 
 
+def positions_of(message: ObjectStates) -> np.ndarray:
+    """Return (K, 3) metres."""
+    points = [state.pose.position for state in message.objects]
+    return np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
+
+
 def subgoals_of(response: PredictSubgoal.Response) -> 'list[Subgoal]':
     """Return the subgoals of an answer, their objects in the order of the first one."""
     if not response.subgoals:
@@ -422,3 +426,11 @@ def subgoals_of(response: PredictSubgoal.Response) -> 'list[Subgoal]':
     first = response.subgoals[0]
     return decode_subgoals(
         response, tuple(first.object_names), (first.image.height, first.image.width))
+
+
+def _message(kind: Callable[..., Any], fields: Mapping[str, Any]) -> Any:
+    """Return a message; raise ConfigError for what one of its fields cannot hold."""
+    try:
+        return kind(check_fields=True, **fields)
+    except AssertionError as error:
+        raise ConfigError(escaped(error)) from error

@@ -69,7 +69,7 @@ def test_a_refusal_says_why_and_writes_nothing(weights, tmp_path, capsys):
     (['--namespace', '/nobody', '--timeout', '2'],
      '/nobody/predict_subgoal: nobody offers it after 2 s'),
     (['--objects', '3,4'], '--objects: name the picture that they are in, --start FILE'),
-    (['--samples', '0'], '--samples 0: expected 1 or more'),
+    (['--samples', '-1'], "The 'num_samples' field must be an unsigned integer"),
     (['--out', 'a.txt'], 'expected a .png file'),
     (['--start', 'nowhere.png'], 'nowhere.png')])
 def test_what_cannot_be_asked_is_named(words, reason, capsys):

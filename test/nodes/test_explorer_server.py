@@ -12,7 +12,7 @@ import time
 import pytest
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.explorer.board import Board
-from tap_ros.nodes.explorer.commands import parse_command
+from tap_ros.nodes.explorer.calls import parse_command
 from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect

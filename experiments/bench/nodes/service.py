@@ -19,18 +19,13 @@ import threading
 import time
 
 import numpy as np
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
-from tap_ros.nodes.clients import call, CallError, Spinner
-from tap_ros.nodes.image_messages import encode_image
+from tap_ros.nodes.client import Client, request_fields
+from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.node_processes import NodeProcesses
-from tap_ros.nodes.object_messages import encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import DEFAULT_PREDICTOR
@@ -121,15 +116,14 @@ def compare_latency(stream, rounds, calls):
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
     start, goal = pictures()
     times = {'alone': [], 'service': []}
-    with client_node('bench_client') as node:
-        client = node.create_client(PredictSubgoal, SERVICE, qos_profile=SERVICE_QOS)
-        request = make_request()
-        call(client, request, 120)
+    with Client(timeout_s=TIMEOUT) as client:
+        request = make_fields()
+        client.call('predict', 120, **request)
         for _ in range(rounds):
             os.kill(stream.pid, signal.SIGSTOP)
             times['alone'].append(timed(lambda: predictor.predict(start, goal, *PIXELS), calls))
             os.kill(stream.pid, signal.SIGCONT)
-            times['service'].append(timed(lambda: call(client, request, TIMEOUT), calls))
+            times['service'].append(timed(lambda: client.call('predict', **request), calls))
     return np.concatenate(times['alone']), np.concatenate(times['service'])
 
 
@@ -181,8 +175,9 @@ def ask_many(clients, seconds, depth, barrier, results):
     latencies, busy, lost = [], [], []
     qos = QoSProfile(depth=depth)
 
+    request = PredictSubgoal.Request(**make_fields())
+
     def ask(client, deadline):
-        request = make_request()
         while (begin := time.monotonic()) < deadline:
             try:
                 response = call(client, request, TIMEOUT)
@@ -194,11 +189,11 @@ def ask_many(clients, seconds, depth, barrier, results):
             else:
                 busy.append(response.message)
 
-    with client_node(f'bench_clients_{os.getpid()}') as node:
-        each = [node.create_client(PredictSubgoal, SERVICE, qos_profile=qos)
+    with Client() as owner:
+        each = [owner.node.create_client(PredictSubgoal, SERVICE, qos_profile=qos)
                 for _ in range(clients)]
         for client in each:
-            call(client, make_request(), 120)
+            call(client, request, 120)
         barrier.wait(300)
         begin = time.monotonic()
         threads = [threading.Thread(target=ask, args=(client, begin + seconds))
@@ -208,20 +203,6 @@ def ask_many(clients, seconds, depth, barrier, results):
         for thread in threads:
             thread.join()
         results.put((np.array(latencies), len(busy), len(lost), time.monotonic() - begin))
-
-
-@contextlib.contextmanager
-def client_node(name):
-    """Give a node of its own context that a thread spins."""
-    context = Context()
-    rclpy.init(context=context)
-    node = Node(name, context=context)
-    try:
-        with Spinner(node):
-            yield node
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
 
 
 @contextlib.contextmanager
@@ -239,19 +220,19 @@ def streaming(rate):
 
 def publish(rate):
     """Publish a start at this rate and a goal once, until killed."""
-    with client_node('bench_camera') as node:
-        image = node.create_publisher(Image, 'camera/image_raw', STREAM)
-        objects = node.create_publisher(ObjectStates, 'objects', STREAM)
-        goals = (node.create_publisher(Image, 'goal/image', LATCHED),
-                 node.create_publisher(ObjectStates, 'goal/objects', LATCHED))
-        request = make_request()
-        for publisher, message in zip(goals, (request.goal, request.goal_objects)):
-            publisher.publish(message)
+    with Client() as client:
+        image = client.node.create_publisher(Image, 'camera/image_raw', STREAM)
+        objects = client.node.create_publisher(ObjectStates, 'objects', STREAM)
+        goals = (client.node.create_publisher(Image, 'goal/image', LATCHED),
+                 client.node.create_publisher(ObjectStates, 'goal/objects', LATCHED))
+        request = make_fields()
+        for publisher, name in zip(goals, ('goal', 'goal_objects')):
+            publisher.publish(request[name])
         while True:
             stamp = to_stamp(time.time_ns())
-            for publisher, message in ((image, request.start), (objects, request.start_objects)):
-                message.header.stamp = stamp
-                publisher.publish(message)
+            for publisher, name in ((image, 'start'), (objects, 'start_objects')):
+                request[name].header.stamp = stamp
+                publisher.publish(request[name])
             time.sleep(1 / rate)
 
 
@@ -260,12 +241,8 @@ def pictures():
     return np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
 
 
-def make_request():
-    """Return a request that has all it needs."""
-    stamp = to_stamp(1)
-    start, goal = (encode_image(picture, stamp, CAMERA_FRAME) for picture in pictures())
-    start_objects, goal_objects = (
-        encode_objects(NAMES, pixels, [[0, 0, 0, 0, 0, 0, 1]] * len(NAMES), stamp, WORLD_FRAME,
-                       ObjectStates.SOURCE_TRACKED) for pixels in PIXELS)
-    return PredictSubgoal.Request(
-        start=start, goal=goal, start_objects=start_objects, goal_objects=goal_objects)
+def make_fields():
+    """Return the fields of a request that has all it needs."""
+    start, goal = pictures()
+    return request_fields(NAMES, start=start, goal=goal, start_objects=PIXELS[0],
+                          goal_objects=PIXELS[1])

@@ -10,6 +10,7 @@ the subgoal is predicted only; nothing here plans grasps.
 
 from dataclasses import dataclass
 from functools import partial
+import math
 import os
 from pathlib import Path
 import platform
@@ -18,25 +19,19 @@ import shutil
 import subprocess
 import sys
 import time
-from typing import Annotated, Any
+from typing import Annotated, Any, TYPE_CHECKING
 
-from action_msgs.msg import GoalStatus
 import numpy as np
-import rclpy
-from rclpy.action import ActionClient
-from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.expert import run_episode
 from sim_bridge.tasks.tasks import get_task, TASKS
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
-from tap_msgs.action import ReachGoal
-from tap_msgs.msg import ObjectStates, Subgoal
-from tap_msgs.srv import PredictSubgoal, ResetScene
+from tap_msgs.msg import ObjectStates
 from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError, TapError
-from tap_ros.nodes.clients import call, send_goal, Spinner, wait_for_result
+from tap_ros.nodes.client import Client, positions_of, View
+from tap_ros.nodes.clients import CallError
 from tap_ros.nodes.demo.film import write_film
 from tap_ros.nodes.demo.report import (
     results_table,
@@ -45,23 +40,25 @@ from tap_ros.nodes.demo.report import (
     write_overview,
     write_report,
 )
-from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.image_messages import decode_image, decode_map
+from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.node_processes import NodeProcesses
-from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import STREAM, to_nanoseconds
 from tap_ros.options import Flag, Folder, one_of
 from tap_ros.planning.scenes import FIRST_SCENE
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tqdm import tqdm
 from tyro import conf
 
+if TYPE_CHECKING:
+    from rclpy.node import Node
+    from tap_ros.prediction.predictor import Subgoal
+
 USUAL_TASKS = ('push2', 'order2', 'stack2')
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 MODES = ('direct', 'subgoal')
-START_TIMEOUT_S = 90.0
-CALL_TIMEOUT_S = 20.0
 STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
+TOPICS = {'camera/image_raw': Image, 'objects': ObjectStates, 'observer/image_raw': Image,
+          'plan/overlay': Image}
 
 
 class Watch:
@@ -71,162 +68,65 @@ class Watch:
     :param node: rclpy Node that another thread spins.
     """
 
-    def __init__(self, node: Node) -> None:
-        self._kept: dict[str, dict[int, Any]] = {}
-        self._topics = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
-                        'side': (Image, 'observer/image_raw'),
-                        'plan': (Image, 'plan/overlay')}
-        for topic, (message_type, name) in self._topics.items():
-            node.create_subscription(message_type, name, partial(self._keep, topic), STREAM)
-        self.begin()
+    def __init__(self, node: 'Node') -> None:
+        self._kept: dict[str, dict[int, Any]] = {topic: {} for topic in TOPICS}
+        for topic, kind in TOPICS.items():
+            node.create_subscription(kind, topic, partial(self._keep, topic), STREAM)
 
-    def begin(self) -> None:
-        """Forget what was seen."""
-        self.first_ns = 0  # what is stamped before this is of another scene
-        self._kept = {topic: {} for topic in self._topics}
+    def since(self, first_ns: int, *topics: str) -> list[tuple[Any, ...]]:
+        """Return the messages that came on all of some topics, in order of their stamps."""
+        kept = [dict(self._kept[topic]) for topic in topics]
+        return [tuple(messages[stamp] for messages in kept)
+                for stamp in sorted(set.intersection(*map(set, kept))) if stamp >= first_ns]
 
-    def seen(self) -> tuple[list[Image], list[ObjectStates]]:
-        """Return the images and the objects that belong to them, in order of their stamps."""
-        images, objects = dict(self._kept['image']), dict(self._kept['objects'])
-        stamps = self._in_order(set(images) & set(objects))
-        return [images[stamp] for stamp in stamps], [objects[stamp] for stamp in stamps]
-
-    def shown(self, topic: str) -> list[Image]:
-        """Return the pictures from the 'side' or of each 'plan', in order of their stamps."""
-        pictures = dict(self._kept[topic])
-        return [pictures[stamp] for stamp in self._in_order(set(pictures))]
-
-    def _in_order(self, stamps: set[int]) -> list[int]:
-        return sorted(stamp for stamp in stamps if stamp >= self.first_ns)
+    def pictures(self, first_ns: int, topic: str) -> list[np.ndarray]:
+        """Return those of one topic, uint8 (H, W, 3)."""
+        return [decode_image(image, topic) for image, in self.since(first_ns, topic)]
 
     def _keep(self, topic: str, message: Any) -> None:
         self._kept[topic][to_nanoseconds(message.header.stamp)] = message
 
 
-class DemoClient:
-    """
-    The demo's own node: it resets the scene, asks for a subgoal and for pushes, and watches.
-
-    :param processes: NodeProcesses to keep an eye on.
-    :param task: what is done; where it is pushing, there is a planner to be waited for.
-    """
-
-    def __init__(self, processes: NodeProcesses, task: str) -> None:
-        self.node = rclpy.create_node(f'demo_{task}')
-        self._processes = processes
-        self._reset = self.node.create_client(ResetScene, 'sim/reset')
-        self._predict = self.node.create_client(
-            PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS)
-        self._reach = ActionClient(self.node, ReachGoal, 'reach_goal')
-        self._plans = not get_task(task).gripping
-        self._alive = {name: Liveness(self.node, name) for name in (
-            'sim_node', 'predictor_node', 'visual_mpc_node')}
-        self._camera = Watch(self.node)
-        self._goal = Observations('image', 'objects', latched=True)
-        self._goal.subscribe(self.node, {
-            'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}, LATCHED)
-
-    def wait_until_ready(self) -> None:
-        """Wait until every node offers what it offers only when it is ready."""
-        deadline = time.monotonic() + START_TIMEOUT_S
-        waiting = {
-            'sim_node': self._reset.service_is_ready,
-            'predictor_node': self._predict.service_is_ready}
-        if self._plans:
-            waiting['visual_mpc_node'] = self._reach.server_is_ready
-        while waiting:
-            self._processes.check()
-            for name in [name for name, ready in waiting.items() if ready()]:
-                print(f'  {name} is ready', flush=True)
-                del waiting[name]
+def predict(client: Client) -> 'Subgoal':
+    """Ask for a subgoal as a person would by hand: with an empty request."""
+    deadline = time.monotonic() + client.timeout_s
+    while True:
+        try:
+            subgoal = client.predict()[0]
+            if len(subgoal.object_maps):
+                return subgoal
+        except CallError:  # right after the start it may not have heard of the simulator yet
             if time.monotonic() > deadline:
-                raise TapError(
-                    f'{", ".join(waiting)} not ready after {START_TIMEOUT_S:g} s; see the logs')
-            time.sleep(0.1)
-        # That of the first scene, which is kept for late joiners: the next one is another.
-        self._goal.wait(('image', 'objects'), CALL_TIMEOUT_S)
-
-    def reset(self, task: str, seed: int) -> dict[str, Any]:
-        """Start a scene; return its goal as a dict of image and objects."""
-        before = self._goal.newest('image', 'objects')
-        after_ns = -1 if before is None else to_nanoseconds(before['image'].header.stamp)
-        self._camera.begin()
-        answer = call(self._reset, ResetScene.Request(task=task, seed=seed), CALL_TIMEOUT_S,
-                      server=self._alive['sim_node'])
-        if not answer.success:
-            raise TapError(f'sim/reset: {answer.message}')
-        goal = self._goal.wait(('image', 'objects'), CALL_TIMEOUT_S, after_ns)
-        if goal is not None:  # of the same stamp as the first picture of the scene
-            self._camera.first_ns = to_nanoseconds(goal['image'].header.stamp)
-        deadline = time.monotonic() + CALL_TIMEOUT_S
-        while goal is not None and not self._camera.seen()[0] and time.monotonic() < deadline:
-            time.sleep(0.01)
-        if goal is None or not self._camera.seen()[0]:
-            raise TapError(f'no camera or goal picture came within {CALL_TIMEOUT_S:g} s')
-        return goal
-
-    def start(self) -> tuple[Image, ObjectStates]:
-        """Return the first picture of the scene and the objects in it."""
-        images, objects = self._camera.seen()
-        return images[0], objects[0]
-
-    def predict(self) -> Subgoal:
-        """Ask for a subgoal as a person would by hand: with an empty request."""
-        deadline = time.monotonic() + CALL_TIMEOUT_S
-        while True:
-            answer = call(self._predict, PredictSubgoal.Request(), CALL_TIMEOUT_S,
-                          server=self._alive['predictor_node'])
-            if answer.success and answer.subgoals[0].object_maps:
-                return answer.subgoals[0]
-            # Right after the start the predictor may not have heard of the simulator yet.
-            if time.monotonic() > deadline:
-                raise TapError(f'predict_subgoal: {answer.message}')
-            time.sleep(0.2)
-
-    def push(self, mode: str, seed: int, step_budget: int, goal: dict[str, Any]) -> Run:
-        """
-        Have the arm push until the goal is reached or the budget spent.
-
-        :return: Run.
-        """
-        planning_ms = []
-        with tqdm(total=step_budget, desc=f'    {mode:<8}', unit='step', leave=False) as bar:
-            def on_feedback(feedback: Any) -> None:
-                planning_ms.append(feedback.planning_ms)
-                bar.set_postfix_str(
-                    f'to the {feedback.stage}, {feedback.expected_distance:.1f} px expected')
-                bar.update(feedback.step - bar.n)
-            request = ReachGoal.Goal(mode=mode, step_budget=step_budget, seed=seed)
-            planner = self._alive['visual_mpc_node']
-            handle = send_goal(self._reach, request, CALL_TIMEOUT_S, on_feedback, planner)
-            status, result = wait_for_result(
-                handle, CALL_TIMEOUT_S + STEP_TIMEOUT_S * step_budget, planner)
-        if status != GoalStatus.STATUS_SUCCEEDED:
-            raise TapError(f'reach_goal ({mode}): {result.message}')
-        self._processes.check()
-        images, objects = self._camera.seen()
-        goals = positions(goal['objects'])
-        return Run(
-            frames=[decode_image(image, 'camera/image_raw') for image in images],
-            distances=np.array([np.linalg.norm(positions(o) - goals, axis=1) for o in objects]),
-            message=result.message, planning_ms=float(np.median(planning_ms or [np.nan])),
-            side=[decode_image(image, 'observer/image_raw')
-                  for image in self._camera.shown('side')],
-            plans=[decode_image(image, 'plan/overlay') for image in self._camera.shown('plan')])
+                raise
+        time.sleep(0.2)
 
 
-def positions(message: ObjectStates) -> np.ndarray:
-    """Return (K, 3) metres of a tap_msgs/ObjectStates."""
-    points = [state.pose.position for state in message.objects]
-    return np.array([(p.x, p.y, p.z) for p in points])
+def push(client: Client, watch: Watch, mode: str, seed: int, step_budget: int,
+         goal: View) -> Run:
+    """Have the arm push until the goal is reached or the budget spent; return the Run."""
+    planning_ms = [math.nan]
+    reaching = client.reach(mode=mode, step_budget=step_budget, seed=seed,
+                            timeout_s=client.timeout_s + STEP_TIMEOUT_S * step_budget)
+    with tqdm(total=step_budget, desc=f'    {mode:<8}', unit='step', leave=False) as bar:
+        for feedback in reaching:
+            planning_ms.append(feedback.planning_ms)
+            bar.set_postfix_str(
+                f'to the {feedback.stage}, {feedback.expected_distance:.1f} px expected')
+            bar.update(feedback.step - bar.n)
+    result = reaching.result()
+    if result.end != 'succeeded':
+        raise TapError(f'reach_goal ({mode}): {result.message}')
+    seen = watch.since(goal.stamp_ns, 'camera/image_raw', 'objects')
+    return Run(
+        frames=[decode_image(image, 'camera/image_raw') for image, _ in seen],
+        distances=np.array([np.linalg.norm(positions_of(objects) - goal.positions, axis=1)
+                            for _, objects in seen]),
+        message=result.message, planning_ms=float(np.nanmedian(planning_ms)),
+        side=watch.pictures(goal.stamp_ns, 'observer/image_raw'),
+        plans=watch.pictures(goal.stamp_ns, 'plan/overlay'))
 
 
-def pixels(message: ObjectStates) -> np.ndarray:
-    """Return (K, 2) (u, v) of a tap_msgs/ObjectStates."""
-    return np.array([(state.u, state.v) for state in message.objects])
-
-
-def run_scene(client: DemoClient, task: str, seed: int, step_budget: int,
+def run_scene(client: Client, watch: Watch, task: str, seed: int, step_budget: int,
               look: str) -> SceneRuns:
     """
     Predict a subgoal of one scene; push it in every mode, or show how the expert does it.
@@ -236,23 +136,20 @@ def run_scene(client: DemoClient, task: str, seed: int, step_budget: int,
     :return: SceneRuns.
     """
     runs: dict[str, Run] = {}
-    goal = client.reset(task, seed)
-    subgoal, (image, objects) = client.predict(), client.start()
+    start, goal = client.reset(task, seed)
+    subgoal = predict(client)
     for mode in () if get_task(task).gripping else MODES:
         if runs:
-            goal = client.reset(task, seed)
+            _, goal = client.reset(task, seed)
         begin = time.monotonic()
-        runs[mode] = client.push(mode, seed, step_budget, goal)
-        run = runs[mode]
+        run = runs[mode] = push(client, watch, mode, seed, step_budget, goal)
         print(f'    {mode:<8} {100 * run.distances[0].mean():5.1f} -> '
               f'{100 * run.distances[-1].mean():5.1f} cm in {len(run.frames) - 1} steps, '
               f'{time.monotonic() - begin:.0f} s ({run.planning_ms:.0f} ms a plan)', flush=True)
     return SceneRuns(
-        task=task, seed=seed, start=decode_image(image, 'camera/image_raw'),
-        goal=decode_image(goal['image'], 'goal/image'), start_pixels=pixels(objects),
-        goal_pixels=pixels(goal['objects']), subgoal=decode_image(subgoal.image, 'subgoal'),
-        object_maps=np.stack([decode_map(m, 'object_maps') for m in subgoal.object_maps]),
-        runs=runs, side_goal_pixels=OBSERVER.project(positions(goal['objects'])),
+        task=task, seed=seed, start=start.image, goal=goal.image, start_pixels=start.pixels,
+        goal_pixels=goal.pixels, subgoal=subgoal.image, object_maps=subgoal.object_maps,
+        runs=runs, side_goal_pixels=OBSERVER.project(goal.positions),
         expert=() if runs else film_expert(task, seed, look))
 
 
@@ -317,12 +214,8 @@ def run(args: Options) -> int:
     if len(set(tasks)) < len(tasks):
         raise ConfigError(f'tasks: {" ".join(tasks)}: name each once')
     folder = new_folder(args.out)
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     begin = time.monotonic()
-    try:
-        scenes = [scene for task in tasks for scene in run_task(args, task, folder)]
-    finally:
-        rclpy.try_shutdown()
+    scenes = [scene for task in tasks for scene in run_task(args, task, folder)]
     seconds = time.monotonic() - begin
     pushed = [scene for scene in scenes if scene.runs]
     write_overview(folder / 'subgoals.png', scenes)
@@ -355,27 +248,26 @@ def _facts() -> dict[str, str]:
 
 def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
     """Run the scenes of one task with nodes of its own, or with those that run already."""
-    client = None
-    try:
-        with NodeProcesses(folder / 'logs' / task) as processes:
-            client = DemoClient(processes, task)
-            with Spinner(client.node):
-                if args.attach:
-                    print(f'{task}: waiting for the nodes that run already', flush=True)
-                else:
-                    print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
-                          flush=True)
-                    start_nodes(processes, folder, task, args.look)
-                client.wait_until_ready()
-                scenes = []
-                for i in range(args.scenes):
-                    print(f'  scene {args.seed + i} ({i + 1} of {args.scenes})', flush=True)
-                    scenes.append(run_scene(
-                        client, task, args.seed + i, _budget(args, task), args.look))
-                return scenes
-    finally:
-        if client is not None:
-            client.node.destroy_node()
+    nodes = ['sim_node', 'predictor_node']
+    nodes += [] if get_task(task).gripping else ['visual_mpc_node']
+    with NodeProcesses(folder / 'logs' / task) as processes, Client() as client:
+        watch = Watch(client.node)
+        if args.attach:
+            print(f'{task}: waiting for the nodes that run already', flush=True)
+        else:
+            print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
+                  flush=True)
+            start_nodes(processes, folder, task, args.look)
+        for name in nodes:
+            client.wait_until_ready(name, check=processes.check)
+            print(f'  {name} is ready', flush=True)
+        scenes = []
+        for i in range(args.scenes):
+            print(f'  scene {args.seed + i} ({i + 1} of {args.scenes})', flush=True)
+            scenes.append(run_scene(
+                client, watch, task, args.seed + i, _budget(args, task), args.look))
+            processes.check()
+        return scenes
 
 
 def _budget(args: Options, task: str) -> int:

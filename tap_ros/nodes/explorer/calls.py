@@ -1,46 +1,83 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What explorer_node asks the other nodes for, on behalf of browsers."""
+"""What browsers may ask for, as JSON checked field by field, and how the other nodes do it."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+import json
 import threading
 import time
 import traceback
 from typing import Any, TYPE_CHECKING
 
-from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import Pose
-from rclpy.action import ActionClient
-from rclpy.callback_groups import ReentrantCallbackGroup
-from tap_msgs.action import ReachGoal
-from tap_msgs.msg import ObjectState, ObjectStates
-from tap_msgs.srv import PredictSubgoal, ResetScene, SetGoal
 from tap_ros.errors import TapError
-from tap_ros.nodes.clients import call, CallError, cancel_goal, send_goal, wait_for_result
-from tap_ros.nodes.explorer.commands import (
-    Cancel,
-    Command,
-    CommandError,
-    Move,
-    parse_command,
-    Photograph,
-    Predict,
-    Reach,
-    Reset,
-)
-from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.topics import SERVICE_QOS
+from tap_ros.nodes.client import Client, Reaching
+from tap_ros.nodes.clients import CallError
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:
-    from rclpy.action.client import ClientGoalHandle
     from rclpy.node import Node
+    from tap_msgs.action import ReachGoal
+    from tap_msgs.srv import PredictSubgoal
 
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
 END_S = 2.0  # that a cancel may take when the node ends
 WAITING = 8  # commands that may wait; more are refused
+MAX_SAMPLES, MAX_LEVELS = 16, 4  # of the page's sliders; the services allow more
+MAX_NAME = 100  # characters
+LARGEST = 1e6  # of a pixel
+
+
+class CommandError(TapError):
+    """A browser asked for what cannot be done."""
+
+
+def _whole(low: int, high: int) -> tuple[str, Callable[[Any], bool]]:
+    return (f'a whole number from {low} to {high}',
+            lambda value: type(value) is int and low <= value <= high)
+
+
+_TEXT = (f'a text of at most {MAX_NAME} characters',
+         lambda value: isinstance(value, str) and len(value) <= MAX_NAME)
+_PIXEL = ('a number', lambda value: type(value) in (int, float) and abs(value) < LARGEST)
+_SEED = _whole(0, 2**62)
+_NUMBERS = {
+    'samples': _whole(1, MAX_SAMPLES), 'levels': _whole(1, MAX_LEVELS), 'seed': _SEED}
+COMMANDS: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {  # do: {field: what is valid}
+    'reset': {'task': _TEXT, 'seed': _SEED},  # an empty task is that of now
+    'predict': _NUMBERS,
+    'reach': {'mode': ("'direct' or 'subgoal'", lambda value: value in ('direct', 'subgoal')),
+              **_NUMBERS},
+    'cancel': {},
+    'move': {'name': _TEXT, 'u': _PIXEL, 'v': _PIXEL},  # of an object in the goal picture
+    'photograph': {}}  # take the camera's newest picture as the goal
+
+
+def parse_command(text: str | bytes) -> tuple[str, dict[str, Any]]:
+    """
+    Read what a browser sent.
+
+    :param text: JSON such as {"do": "reach", "mode": "direct", "samples": 1, "levels": 1,
+        "seed": 0}.
+    :return: one of COMMANDS and its fields.
+    :raises CommandError: if it is none; the message names the field and what would be right.
+    """
+    try:
+        sent = json.loads(text)
+    except (ValueError, RecursionError):
+        sent = None
+    if not isinstance(sent, dict):
+        raise CommandError('a command is a JSON object')
+    do = sent.get('do')
+    if not isinstance(do, str) or do not in COMMANDS:
+        raise CommandError(
+            f'do: expected one of {", ".join(COMMANDS)}, got {escaped(do, 40)!r}')
+    for field, (expected, valid) in COMMANDS[do].items():
+        if not valid(sent.get(field)):
+            raise CommandError(
+                f'{field}: expected {expected}, got {escaped(sent.get(field), 40)!r}')
+    return do, {field: sent[field] for field in COMMANDS[do]}
 
 
 class ExplorerCalls:
@@ -57,23 +94,14 @@ class ExplorerCalls:
 
     def __init__(self, node: 'Node', told: Callable[[str], object],
                  failed: Callable[[str], object],
-                 answered: Callable[[PredictSubgoal.Response], object],
+                 answered: 'Callable[[PredictSubgoal.Response], object]',
                  photographed: Callable[[], object]) -> None:
         self._node, self._told, self._failed = node, told, failed
         self._answered, self._photographed = answered, photographed
-        group = ReentrantCallbackGroup()
-        self._reset = node.create_client(
-            ResetScene, 'sim/reset', qos_profile=SERVICE_QOS, callback_group=group)
-        self._move = node.create_client(
-            SetGoal, 'sim/set_goal', qos_profile=SERVICE_QOS, callback_group=group)
-        self._predict = node.create_client(
-            PredictSubgoal, 'predict_subgoal', qos_profile=SERVICE_QOS, callback_group=group)
-        self._reach = ActionClient(node, ReachGoal, 'reach_goal', callback_group=group)
-        self._alive = {name: Liveness(node, name, group)
-                       for name in ('sim_node', 'predictor_node', 'visual_mpc_node')}
+        self._client = Client(node=node, timeout_s=TIMEOUT_S)
         self._lock = threading.Lock()
         self._waiting = 0
-        self._goal: ClientGoalHandle | None = None
+        self._goal: Reaching | None = None
         self._running = self._cancelled = self._ending = False
         self.stage = ''
         self._pool = ThreadPoolExecutor(4, 'explorer')
@@ -84,15 +112,9 @@ class ExplorerCalls:
         """Whether a goal that a browser asked for is in progress."""
         return self._running
 
-    @property
-    def simulator(self) -> bool:
-        """Whether a simulator is there."""
-        return bool(self._reset.service_is_ready())
-
-    @property
-    def movable(self) -> bool:
-        """Whether the simulator takes another goal."""
-        return bool(self._move.service_is_ready())
+    def offered(self, service: str) -> bool:
+        """Tell whether the simulator offers a service, 'reset' or 'set_goal'."""
+        return self._client.is_ready(service)
 
     def do(self, text: str | bytes) -> None:
         """
@@ -100,26 +122,30 @@ class ExplorerCalls:
 
         :raises CommandError: when it makes no sense, or cannot begin now.
         """
-        command = parse_command(text)
-        if isinstance(command, Cancel):
-            self._cancel()
-            return
+        do, fields = parse_command(text)
         with self._lock:
+            if do == 'cancel':
+                if not self._running:
+                    raise CommandError('there is no goal to cancel')
+                self._cancelled = True  # also one that is about to begin
+                if self._goal is not None:
+                    self._stopper.submit(self._send_cancel, self._goal)
+                return
             if self._waiting >= WAITING:
                 raise CommandError('busy: earlier commands wait for their answers; try again')
-            if isinstance(command, Reach):
+            if do == 'reach':
                 if self._running:
                     raise CommandError('a goal is in progress; cancel it or wait for its end')
                 self._running, self._cancelled = True, False
             self._waiting += 1
-        self._pool.submit(self._carry_out, command)
+        self._pool.submit(self._carry_out, do, fields)
 
     def close(self) -> None:
         """Cancel the goal that a browser began, and end; in the thread that spins the node."""
         self._ending = self._cancelled = True
         goal, executor = self._goal, self._node.executor
         if goal is not None:
-            goal.cancel_goal_async()
+            goal.handle.cancel_goal_async()
         deadline = time.monotonic() + END_S
         while self._running and executor is not None and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)  # nobody else does any more
@@ -128,9 +154,9 @@ class ExplorerCalls:
 
     # In the threads of the pool
 
-    def _carry_out(self, command: Command) -> None:
+    def _carry_out(self, do: str, fields: dict[str, Any]) -> None:
         try:
-            _DOING[type(command)](self, command)
+            getattr(self, f'_{do}')(**fields)
         except TapError as error:
             self._failed(escaped(error, 1000))
         except Exception as error:
@@ -141,82 +167,57 @@ class ExplorerCalls:
         finally:
             with self._lock:
                 self._waiting -= 1
-                if isinstance(command, Reach):
+                if do == 'reach':
                     self._running, self._goal, self.stage = False, None, ''
 
-    def _do_reset(self, command: Reset) -> None:
-        response = self._ask(self._reset, ResetScene.Request(
-            task=command.task, seed=command.seed), 'sim_node')
+    def _reset(self, task: str, seed: int) -> None:
+        response = self._client.call('reset', give_up=self._is_ending, task=task, seed=seed)
         self._told(f'reset: {escaped(response.message)}')
 
-    def _do_move(self, command: Move) -> None:
-        objects = ObjectStates(source=ObjectStates.SOURCE_TRACKED, objects=[
-            ObjectState(name=command.name, u=command.u, v=command.v, pose=Pose())])
-        self._ask(self._move, SetGoal.Request(objects=objects), 'sim_node')
-        self._told(f'goal: {escaped(command.name)} to pixel '
-                   f'{command.u:.1f}, {command.v:.1f}')
+    def _move(self, name: str, u: float, v: float) -> None:
+        self._client.set_goal({name: (u, v)})
+        self._told(f'goal: {escaped(name)} to pixel {u:.1f}, {v:.1f}')
 
-    def _do_photograph(self, _: Photograph) -> None:
+    def _photograph(self) -> None:
         self._photographed()
         self._told('goal: what the camera sees now')
 
-    def _do_predict(self, command: Predict) -> None:
-        response = self._ask(self._predict, PredictSubgoal.Request(
-            num_samples=command.samples, recursion_depth=command.levels,
-            seed=command.seed), 'predictor_node')
+    def _predict(self, samples: int, levels: int, seed: int) -> None:
+        response = self._client.call('predict', give_up=self._is_ending, num_samples=samples,
+                                     recursion_depth=levels, seed=seed)
         self._answered(response)
         self._told(f'predicted in {response.model_time_ms:.0f} ms: '
                    f'{escaped(response.message, 300)}')
 
-    def _do_reach(self, command: Reach) -> None:
-        goal = ReachGoal.Goal(mode=command.mode, num_samples=command.samples,
-                              recursion_depth=command.levels, seed=command.seed)
-        words = 'via subgoal' if command.mode == 'subgoal' else 'direct'
+    def _reach(self, mode: str, samples: int, levels: int, seed: int) -> None:
+        words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self.stage = f'{words}: waiting for the planner'
-        alive = self._alive['visual_mpc_node']
         if self._is_cancelled():
             raise CallError(f'{words}: cancelled before it began')
-        handle = send_goal(self._reach, goal, TIMEOUT_S, self._on_feedback, alive)
-        self._goal = handle
+        goal = self._client.reach(
+            mode=mode, num_samples=samples, recursion_depth=levels, seed=seed,
+            on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
+        with self._lock:
+            self._goal = goal
         if self._is_cancelled():  # meanwhile
-            cancel_goal(handle)
+            goal.cancel()
         self._told(f'{words}: begun')
-        status, result = wait_for_result(handle, GOAL_TIMEOUT_S, alive)
-        end = {GoalStatus.STATUS_CANCELED: 'cancelled'}.get(status, escaped(result.message, 1000))
+        result = goal.result()
+        end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
         self._told(f'{words}: {end} ({result.steps} steps)')
 
-    def _cancel(self) -> None:
-        """End the goal in progress, also one that is about to begin."""
-        with self._lock:
-            if not self._running:
-                raise CommandError('there is no goal to cancel')
-            self._cancelled = True
-        goal = self._goal
-        if goal is not None:
-            self._stopper.submit(self._send_cancel, goal)
-
-    def _send_cancel(self, goal: 'ClientGoalHandle') -> None:
+    def _send_cancel(self, goal: Reaching) -> None:
         try:
-            cancel_goal(goal)
+            goal.cancel()
         except CallError as error:
             self._failed(f'cancel: {escaped(error)}')
 
     def _is_cancelled(self) -> bool:
         return self._cancelled
 
-    def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
+    def _is_ending(self) -> bool:
+        return self._ending
+
+    def _on_feedback(self, feedback: 'ReachGoal.Feedback') -> None:
         self.stage = (f'step {feedback.step}, to the {escaped(feedback.stage, 60)}, plan in '
                       f'{feedback.planning_ms:.0f} ms')
-
-    def _ask(self, client: Any, request: Any, name: str) -> Any:
-        """Call a service; a refusal is raised, too."""
-        response = call(client, request, TIMEOUT_S, lambda: self._ending, self._alive[name])
-        if not response.success:
-            raise CallError(f'{client.service_name}: {response.message}')
-        return response
-
-
-_DOING: dict[type, Callable[[ExplorerCalls, Any], None]] = {
-    Reset: ExplorerCalls._do_reset, Move: ExplorerCalls._do_move,
-    Photograph: ExplorerCalls._do_photograph, Predict: ExplorerCalls._do_predict,
-    Reach: ExplorerCalls._do_reach}

@@ -169,7 +169,7 @@ class ExplorerNode(Node):
 
         :raises CallError: when there is none, or none with objects where there are some.
         """
-        if self._calls.simulator:
+        if self._calls.offered('reset'):
             raise CallError('photograph: the simulator takes its goal pictures itself')
         with self._lock:
             pictures, objects = (dict(self._recent[name]) for name in ('camera', 'objects'))
@@ -240,10 +240,10 @@ class ExplorerNode(Node):
                     self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
         now = time.monotonic()
         ages = {kind: now - came for kind, (_, came) in newest.items()}
-        movable = self._calls.movable
         self._board.put('state', json.dumps({
             'kind': 'state', 'task': self._task, 'tasks': list(EPISODE_FRAMES),
-            'simulator': self._calls.simulator, 'movable': movable and bool(goals) and not running,
+            'simulator': self._calls.offered('reset'),
+            'movable': self._calls.offered('set_goal') and bool(goals) and not running,
             'camera': {**self._size('camera'), 'objects': _listed(objects),
                        'targets': _listed({n: goals[n] for n in objects if n in goals}),
                        'note': _silence(ages.get('camera'))},
