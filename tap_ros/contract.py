@@ -36,11 +36,6 @@ OBSERVER_FRAME = 'observer_optical_frame'  # of the view from the side
 # Names of the gripper's state in joint states: metres, and the opening from 0 to 1.
 GRIPPER_JOINTS = ('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening')
 
-# Encodings of sensor_msgs/Image that can be read: bytes per pixel, and which of them are red,
-# green and blue.
-ENCODINGS = {
-    'rgb8': (3, (0, 1, 2)), 'bgr8': (3, (2, 1, 0)),
-    'rgba8': (4, (0, 1, 2)), 'bgra8': (4, (2, 1, 0)), 'mono8': (1, (0, 0, 0))}
 MAX_PICTURE_BYTES = 32 * 2**20  # of one picture: rgb8 of 3840x2160 pixels has 24 MiB
 PICTURE_ENCODING = 'rgb8'  # in which pictures are sent and recorded
 MAP_ENCODING = '32FC1'  # of object maps

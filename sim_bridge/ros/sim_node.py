@@ -34,20 +34,22 @@ from tap_ros.contract import (
     WORLD_FRAME,
 )
 from tap_ros.errors import TapError
+from tap_ros.messages.objects import decode_objects
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.image_messages import encode_image, encode_mask
-from tap_ros.nodes.object_messages import (
-    decode_objects,
-    encode_camera_info,
-    encode_joints,
-    encode_objects,
-)
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.ros_messages import (
+    encode_camera_info,
+    encode_image,
+    encode_joints,
+    encode_mask,
+    encode_objects,
+)
 from tap_ros.nodes.run import answering, run_node
 from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.tf_publisher import TransformPublisher
-from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.plugins import names
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)

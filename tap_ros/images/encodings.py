@@ -1,70 +1,105 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of cameras in whatever encoding to rgb: of sensor_msgs/Image and of CompressedImage."""
+"""
+Encodings of cameras to rgb: those of sensor_msgs/Image, and files in sensor_msgs/CompressedImage.
 
+A new encoding is a row of ENCODINGS; recordings and nodes read it then.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
 import io
 import re
 
 import numpy as np
-from tap_ros.contract import ENCODINGS, MAX_PICTURE_BYTES
+from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import ImageError
 from tap_ros.text import escaped
 
-# Names of cv2, which is imported late: --help of training comes without.
-_YUV = {'yuv422': 'COLOR_YUV2RGB_UYVY', 'uyvy': 'COLOR_YUV2RGB_UYVY',
-        'yuv422_yuy2': 'COLOR_YUV2RGB_YUY2', 'yuyv': 'COLOR_YUV2RGB_YUY2'}
-# It calls patterns by the second and third pixel of the second row.
-_BAYER = {'bayer_rggb8': 'COLOR_BayerBG2RGB', 'bayer_bggr8': 'COLOR_BayerRG2RGB',
-          'bayer_gbrg8': 'COLOR_BayerGR2RGB', 'bayer_grbg8': 'COLOR_BayerGB2RGB'}
-READABLE = (*ENCODINGS, *_YUV, *_BAYER)
+
+@dataclass(frozen=True)
+class Encoding:
+    """
+    How the pixels of an encoding become rgb.
+
+    :param pixel_bytes: bytes of a pixel.
+    :param to_rgb: takes uint8 (H, W, pixel_bytes), contiguous; returns uint8 (H, W, 3).
+    :param block: (height, width) in pixels; a picture has whole blocks.
+    :param least: pixels that a side has at least.
+    """
+
+    pixel_bytes: int
+    to_rgb: Callable[[np.ndarray], np.ndarray]
+    block: tuple[int, int] = (1, 1)
+    least: int = 1
+
+
+def _channels(size: int, *order: int) -> Encoding:
+    """Return an encoding whose bytes number `order` of `size` are red, green and blue."""
+    def to_rgb(pixels: np.ndarray) -> np.ndarray:
+        return pixels if order == tuple(range(size)) else pixels[..., list(order)]
+    return Encoding(size, to_rgb)
+
+
+def _yuv(code: str) -> Encoding:
+    """Return an encoding of two pixels that share their colour, by its code in cv2."""
+    def to_rgb(pixels: np.ndarray) -> np.ndarray:
+        import cv2  # here, as --help of training does without
+        return cv2.cvtColor(pixels, getattr(cv2, f'COLOR_YUV2RGB_{code}'))
+    return Encoding(2, to_rgb, (1, 2))
+
+
+def _bayer(code: str) -> Encoding:
+    """Return a mosaic; cv2 calls it by the second and third pixel of the second row."""
+    def to_rgb(pixels: np.ndarray) -> np.ndarray:
+        import cv2  # as above
+        return cv2.demosaicing(pixels[..., 0], getattr(cv2, f'COLOR_Bayer{code}2RGB'))
+    return Encoding(1, to_rgb, (2, 2), 4)
+
+
+ENCODINGS = {
+    'rgb8': _channels(3, 0, 1, 2), 'bgr8': _channels(3, 2, 1, 0),
+    'rgba8': _channels(4, 0, 1, 2), 'bgra8': _channels(4, 2, 1, 0),
+    'mono8': _channels(1, 0, 0, 0),
+    'yuv422': _yuv('UYVY'), 'uyvy': _yuv('UYVY'),
+    'yuv422_yuy2': _yuv('YUY2'), 'yuyv': _yuv('YUY2'),
+    'bayer_rggb8': _bayer('BG'), 'bayer_bggr8': _bayer('RG'), 'bayer_gbrg8': _bayer('GR'),
+    'bayer_grbg8': _bayer('GB')}
 _DEEP = re.compile(r'(mono|rgb|bgr|rgba|bgra|bayer_[rgb]{4})16|(16|32|64)[US FC]+\d*')
 _COMPRESSED = ('JPEG', 'PNG', 'WEBP')
 
 
-def pixel_bytes(encoding: str) -> int:
+def find_encoding(name: str) -> Encoding:
     """
-    Return the bytes of a pixel.
+    Return the Encoding of this name, as in sensor_msgs/Image.
 
-    :param encoding: of sensor_msgs/Image.
     :raises ImageError: for one that cannot be read; it says why.
     """
-    if encoding in ENCODINGS:
-        return ENCODINGS[encoding][0]
-    if encoding in _YUV:
-        return 2
-    if encoding in _BAYER:
-        return 1
+    if name in ENCODINGS:
+        return ENCODINGS[name]
     why = ''
-    if _DEEP.fullmatch(encoding):
+    if _DEEP.fullmatch(name):
         why = (' (it has more than 8 bits a channel, as depth cameras have; record the colour '
                'camera, or let its driver send 8 bits)')
-    raise ImageError(f"encoding '{escaped(encoding, 40)}' cannot be used{why}; valid encodings: "
-                     f'{", ".join(READABLE)}')
+    raise ImageError(f"encoding '{escaped(name, 40)}' cannot be used{why}; valid encodings: "
+                     f'{", ".join(ENCODINGS)}')
 
 
-def to_rgb(pixels: np.ndarray, encoding: str) -> np.ndarray:
+def to_rgb(pixels: np.ndarray, name: str) -> np.ndarray:
     """
     Turn raw pixels into a picture.
 
-    :param pixels: uint8 (H, W, pixel_bytes(encoding)).
-    :param encoding: one of READABLE.
+    :param pixels: uint8 (H, W, pixel_bytes of the encoding).
+    :param name: one of ENCODINGS.
     :return: uint8 (H, W, 3) rgb, contiguous.
     :raises ImageError: for a size that the encoding does not allow.
     """
-    if encoding in ENCODINGS:
-        channels, order = ENCODINGS[encoding]
-        if order != tuple(range(channels)):
-            pixels = pixels[..., list(order)]
-        return np.ascontiguousarray(pixels)
-    height, width = pixels.shape[:2]
-    if width % 2 or (encoding in _BAYER and (height % 2 or min(height, width) < 4)):
-        raise ImageError(f'{width}x{height} pixels of encoding {encoding}; it comes in blocks of '
+    encoding, (height, width) = ENCODINGS[name], pixels.shape[:2]
+    if (height % encoding.block[0] or width % encoding.block[1]
+            or min(height, width) < encoding.least):
+        raise ImageError(f'{width}x{height} pixels of encoding {name}; it comes in blocks of '
                          'two')
-    import cv2
-    pixels = np.ascontiguousarray(pixels)
-    if encoding in _YUV:
-        return cv2.cvtColor(pixels, getattr(cv2, _YUV[encoding]))
-    return cv2.demosaicing(pixels[..., 0], getattr(cv2, _BAYER[encoding]))
+    return np.ascontiguousarray(encoding.to_rgb(np.ascontiguousarray(pixels)))
 
 
 def decompress(data: bytes | memoryview | np.ndarray, description: str) -> np.ndarray:
@@ -86,8 +121,8 @@ def decompress(data: bytes | memoryview | np.ndarray, description: str) -> np.nd
                 raise ImageError(f'{width}x{height} pixels are more than {MAX_PICTURE_BYTES} '
                                  'bytes of rgb; send a smaller picture')
             encoding = description.split(';')[0].strip()
-            if file.mode == 'L' and encoding in _BAYER:  # the raw mosaic
-                return to_rgb(np.array(file)[..., None], encoding)
+            if file.mode == 'L' and encoding.startswith('bayer_') and encoding in ENCODINGS:
+                return to_rgb(np.array(file)[..., None], encoding)  # the raw mosaic
             raw = file.tile[0][3] if file.tile else ''  # such as RGB;16B
             if file.mode[:1] in 'IF' or (isinstance(raw, str) and ';16' in raw):
                 raise ImageError('a compressed picture with more than 8 bits a channel; send 8')

@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import ImageError
 
 if TYPE_CHECKING:
     import torch
+
+_IS_MASK_VALUE = np.isin(np.arange(256), (ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM))
 
 
 def to_float(images: 'np.ndarray | torch.Tensor') -> 'torch.Tensor':
@@ -63,6 +66,21 @@ def check_image(image: object, name: str, size: Sequence[int] | None = None) -> 
             f'{name}: expected {size[1]}x{size[0]} pixels (width x height), '
             f'got {image.shape[1]}x{image.shape[0]}; resize it or use weights for that size')
     return image
+
+
+def check_mask(mask: np.ndarray) -> np.ndarray:
+    """
+    Return a robot mask if all its values are those of one.
+
+    :param mask: uint8, any shape.
+    :raises ImageError: for another value.
+    """
+    right = _IS_MASK_VALUE[mask]
+    if not right.all():
+        raise ImageError(
+            f'a robot mask with the value {mask[~right][0]}; expected {ROBOT_MASK_FREE} (free), '
+            f'{ROBOT_MASK_HAND} (hand) or {ROBOT_MASK_ARM} (arm)')
+    return mask
 
 
 def check_pixels(pixels: ArrayLike | None, name: str) -> np.ndarray:

@@ -26,6 +26,10 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal, ResetScene, SetGoal, StepScene
 from tap_ros.contract import CAMERA_FRAME
 from tap_ros.errors import ConfigError
+from tap_ros.messages.images import decode_image
+from tap_ros.messages.objects import decode_objects
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.clients import (
     call,
     CallError,
@@ -35,17 +39,15 @@ from tap_ros.nodes.clients import (
     wait_for_result,
 )
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.image_messages import decode_image, encode_image
 from tap_ros.nodes.middleware import configure_fast_dds
-from tap_ros.nodes.object_messages import decode_objects, encode_objects
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.subgoal_messages import decode_subgoals
-from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.ros_messages import encode_image, encode_objects
+from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:
     from rclpy.action.client import ClientGoalHandle
-    from tap_ros.prediction.predictor import Subgoal
+    from tap_ros.messages.subgoals import Subgoal
 
 SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offers it
     'predict': (PredictSubgoal, 'predict_subgoal', 'predictor_node'),

@@ -12,8 +12,8 @@ from types import MappingProxyType
 from typing import Any, TYPE_CHECKING
 
 from rclpy.clock import Clock, ClockType
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD, named_with_reason
-from tap_ros.nodes.topics import to_nanoseconds
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup

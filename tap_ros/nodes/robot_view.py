@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 from sensor_msgs.msg import Image
 from tap_ros.contract import ROBOT_MASKS
-from tap_ros.nodes.image_messages import decode_image, decode_mask, encode_image
-from tap_ros.nodes.topics import to_nanoseconds
+from tap_ros.messages.images import decode_image, decode_mask
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.training.robot_mask import FreeView
 
 if TYPE_CHECKING:

@@ -27,7 +27,7 @@ from tap_ros.planning.visual_mpc import Memory, VisualMPC
 MOVED = 1.0  # px; an object that is nearer to where it was has not moved
 
 if TYPE_CHECKING:
-    from tap_ros.prediction.predictor import Subgoal
+    from tap_ros.messages.subgoals import Subgoal
 
 
 @dataclass(frozen=True)

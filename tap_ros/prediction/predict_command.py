@@ -20,7 +20,7 @@ from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tyro import conf
 
 if TYPE_CHECKING:
-    from tap_ros.prediction.predictor import Subgoal
+    from tap_ros.messages.subgoals import Subgoal
 
 PANEL = 2.6  # inches, side of a picture
 DPI = 100

@@ -11,6 +11,7 @@ import numpy as np
 from tap_ros.errors import ConfigError, ImageError, WeightsError
 from tap_ros.images.crop import trained_crop
 from tap_ros.images.pixels import check_image, check_pixels, to_float, to_uint8
+from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps, WarpedMaps
 from tap_ros.text import escaped
@@ -18,28 +19,6 @@ from tap_ros.training.devices import placed
 from tap_ros.training.weights import load_weights, make_network
 from tap_ros.weights import find_predictor
 import torch
-
-
-@dataclass(frozen=True)
-class Subgoal:
-    """
-    A predicted frame: on the way to the goal, or going forward from the start.
-
-    :param image: uint8 (H, W, 3).
-    :param object_maps: float32 (K, H, W), each sums to 1: where each object should then be.
-    :param expected_pixels: float32 (K, 2), the mean (u, v) under each map.
-    :param mass: float32 (K,), what each map summed to before normalising; far from 1 the map
-        is doubtful (warp.WarpedMaps).
-    :param sample: which sample it belongs to, from 0.
-    :param level: level of recursion, from 1, the one that is predicted from the request.
-    """
-
-    image: np.ndarray
-    object_maps: np.ndarray
-    expected_pixels: np.ndarray
-    mass: np.ndarray
-    sample: int
-    level: int
 
 
 @dataclass(frozen=True)

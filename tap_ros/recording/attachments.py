@@ -15,9 +15,9 @@ import zlib
 
 from mcap.records import Attachment
 from tap_ros.contract import MAX_PICTURE_BYTES
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ImageError, RecordingError
 from tap_ros.files import storage_errors
-from tap_ros.images.picture_files import read_pixels
+from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.recording import topics
 from tap_ros.recording.damage import describe
 from tap_ros.recording.mcap_file import McapFile, read_record
@@ -145,7 +145,7 @@ class NewAttachments:
                 content = decode(CARD_TYPE, data).data.encode()
             else:
                 return None
-        except RecordingError:  # whoever reads the recording is told
+        except (RecordingError, ImageError):  # whoever reads the recording is told
             return None
         most = min(self._room, MAX_CARD_BYTES if name.endswith('.md') else self._room)
         if not 0 < len(content) <= most or self._newest.get(name) == content:
@@ -160,9 +160,9 @@ def _goal(data: bytes) -> tuple[bytes, int]:
     message = decode(topics.TYPES[topics.GOAL_IMAGE], data)
     if len(message.data) > MAX_PICTURE_BYTES or max(message.height, message.width) > MAX_SIDE:
         return b'', 0
-    picture = read_pixels(message)
-    if not picture.size:
+    if is_empty(message):
         return b'', 0
+    picture = decode_image(message)
     from tap_ros.images.drawing import png_bytes  # cv2 takes a moment, and few files have a goal
     stamp = message.header.stamp
     return png_bytes(picture), max(stamp.sec * 10**9 + stamp.nanosec, 0)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ImageError, RecordingError
-from tap_ros.images.picture_files import read_compressed, read_mask, read_pixels
+from tap_ros.messages.images import decode_image, decode_mask, is_empty
 from tap_ros.recording import topics
 from tap_ros.recording.damage import describe, EVERYTHING, FAR, FRAMES, gaps, Loss, NOTHING
 from tap_ros.recording.mcap_file import McapFile
@@ -130,11 +130,10 @@ def first_size(paths: Iterable[str | Path], found: dict[str, str]) -> tuple[int,
     for file in map(McapFile, paths):
         for *_, data in file.messages({found[topics.IMAGE]}):
             compressed = _is_compressed(file, found)
-            with suppress(RecordingError):
-                pixels = read_compressed(decode(topics.COMPRESSED, data)) if compressed else (
-                    read_pixels(decode(topics.TYPES[topics.IMAGE], data)))
-                if pixels.size:
-                    return pixels.shape[0], pixels.shape[1]
+            with suppress(RecordingError, ImageError):
+                kind = topics.COMPRESSED if compressed else topics.TYPES[topics.IMAGE]
+                height, width, _ = decode_image(decode(kind, data)).shape
+                return height, width
     return None
 
 
@@ -174,9 +173,9 @@ class _Decoder:
         decoders = {
             topics.IMAGE: self._image, topics.ROBOT_MASK: self._mask,
             topics.GOAL_IMAGE: lambda *a: self._goal_picture(
-                'goal', read_pixels, reading.cut.image, *a),
+                'goal', decode_image, reading.cut.image, *a),
             topics.GOAL_ROBOT_MASK: lambda *a: self._goal_picture(
-                'goal_mask', read_mask, reading.cut.mask, *a),
+                'goal_mask', decode_mask, reading.cut.mask, *a),
             topics.TWIST: self._twist, topics.GRIPPER_COMMAND: self._command,
             topics.JOINT_STATES: self._joints, topics.EPISODE: self._mark,
             topics.OBJECTS: lambda *a: self._objects('object', *a),
@@ -302,10 +301,8 @@ class _Decoder:
     def _image(self, log: int, message: Any) -> None:
         if not self._is_due(_stamp(message) or log):
             return
-        pixels = read_compressed(message) if self.compressed else read_pixels(message)
+        pixels = decode_image(message)
         columns, size = self.columns, pixels.shape[:2]
-        if 0 in size:
-            raise RecordingError('an empty picture')
         cut = self.reading.cut.image(pixels)
         self.sizes[size] += 1
         if columns.camera_size is None:
@@ -327,9 +324,7 @@ class _Decoder:
         return True
 
     def _mask(self, log: int, message: Any) -> None:
-        mask = read_mask(message)
-        if 0 in mask.shape:
-            raise RecordingError('an empty robot mask')
+        mask = decode_mask(message)
         # A mask may come before the first picture; its size is judged at the end.
         size = self.columns.camera_size or self.mask_size or mask.shape
         if mask.shape != size:
@@ -342,10 +337,10 @@ class _Decoder:
 
     def _goal_picture(self, name: str, read: Callable[[Any], np.ndarray],
                       cut: Callable[[np.ndarray], np.ndarray], log: int, message: Any) -> None:
-        pixels = read(message)
-        if 0 in pixels.shape:
+        if is_empty(message):
             self._add(name, log, stamp=_stamp(message), index=-1)
         else:
+            pixels = read(message)
             picture = np.array(cut(pixels)), pixels.shape[:2]
             self._add(name, log, stamp=_stamp(message), index=len(self.goals[name]))
             self.goals[name].append(picture)

@@ -10,8 +10,8 @@ dx, dy, dz in metres per control period and the gripper opening, 0 closed to 1 o
 from dataclasses import dataclass
 
 import numpy as np
-from tap_ros.errors import RecordingError
-from tap_ros.images.picture_files import wrong_mask_value
+from tap_ros.errors import ImageError, RecordingError
+from tap_ros.images.pixels import check_mask
 
 OUTCOMES = ('success', 'failure', 'interrupted', '')
 
@@ -72,9 +72,11 @@ def check_episode(episode: Episode) -> None:
                 f'Episode.{field}: expected shape {shape} and type {np.dtype(dtype)}, '
                 f'got {array.shape} and {array.dtype}')
     for field in ('robot_masks', 'goal_mask'):
-        mask = getattr(episode, field)
-        if mask is not None and (wrong := wrong_mask_value(mask)) is not None:
-            raise RecordingError(f'Episode.{field}: {wrong}')
+        try:
+            if getattr(episode, field) is not None:
+                check_mask(getattr(episode, field))
+        except ImageError as error:
+            raise RecordingError(f'Episode.{field}: {error}') from error
     if episode.goal_mask is not None and episode.goal_frame is None:
         raise RecordingError('Episode.goal_mask: expected None, as there is no goal_frame')
     if T == 0 or 0 in size:

@@ -11,8 +11,7 @@ from sensor_msgs.msg import Image, JointState
 from sim_bridge.simulator import Simulator
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
-from tap_ros.nodes.image_messages import encode_image
-from tap_ros.nodes.object_messages import encode_joints, encode_objects
+from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
 from tap_ros.nodes.topics import STREAM, to_stamp
 
 TOPICS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),

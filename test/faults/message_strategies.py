@@ -12,7 +12,6 @@ from fault_world import first_pictures
 from hypothesis import strategies as st
 from sim_bridge.world.robot_description import robot_description
 from tap_ros.contract import (
-    ENCODINGS,
     GRIPPER_JOINTS,
     MAP_ENCODING,
     MASK_ENCODING,
@@ -21,6 +20,7 @@ from tap_ros.contract import (
     ROBOT_MASK_FREE,
     ROBOT_MASK_HAND,
 )
+from tap_ros.images.encodings import ENCODINGS
 from tap_ros.robots.ur10e import JOINTS
 
 MASK = 'sensor_msgs/msg/Image mask'  # what comes after a blank tells strategies apart

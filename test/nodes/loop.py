@@ -23,9 +23,10 @@ from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import FORWARD_MODEL

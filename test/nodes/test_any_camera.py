@@ -17,15 +17,16 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ConfigError, ImageError
 from tap_ros.images.crop import Crop, TrainedCrop
+from tap_ros.messages.images import decode_image
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call
-from tap_ros.nodes.image_messages import decode_image, encode_image
-from tap_ros.nodes.object_messages import encode_joints, encode_objects
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.on_demand import PulledObservations
 from tap_ros.nodes.planner.planner_inputs import Sight
 from tap_ros.nodes.planner.settings import declare_parameters
+from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
 from tap_ros.nodes.subscriptions import Heard, subscribe
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
@@ -258,7 +259,7 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
         sight.begin(time.monotonic())
         other = encode_image(np.ascontiguousarray(START[:240, :320]), to_stamp(9 * 10**9), 'eye')
         sight.sensors.put('image', other), sight.sensors.put('objects', stamped(objects, 9))
-        sight.sensors.put('joints', stamped(joints, 9))
+        sight.sensors.attach('joints', 9 * 10**9, np.zeros(4, np.float32), time.monotonic())
         with pytest.raises(ImageError, match='320x240 pixels; the forward model was trained on '
                                              'those of 640x480'):
             sight.look(sight.topics())

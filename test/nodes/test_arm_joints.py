@@ -13,8 +13,9 @@ from rclpy.action import ActionClient
 from sensor_msgs.msg import JointState
 from sim_bridge.simulator import Simulator
 from tap_msgs.action import ReachGoal
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import send_goal, wait_for_result
-from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.topics import STREAM, to_stamp
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.robots import ur10e

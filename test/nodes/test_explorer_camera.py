@@ -12,8 +12,7 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.nodes.clients import Newest
-from tap_ros.nodes.image_messages import encode_image
-from tap_ros.nodes.object_messages import encode_objects
+from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from websockets.sync.client import connect
 

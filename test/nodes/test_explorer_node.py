@@ -17,8 +17,8 @@ import pytest
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.images.drawing import overlay
+from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.nodes.clients import Newest
-from tap_ros.nodes.subgoal_messages import decode_subgoal
 from tap_ros.nodes.topics import LATCHED, STREAM
 from websockets.sync.client import connect
 

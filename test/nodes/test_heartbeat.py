@@ -10,10 +10,10 @@ from processes import Client, NodeProcess
 import pytest
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, CallError, Newest
 from tap_ros.nodes.heartbeat import Liveness, QOS
 from tap_ros.nodes.middleware import configure_fast_dds, LOCALHOST, SUBNET
-from tap_ros.nodes.topics import to_nanoseconds
 
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 

@@ -18,11 +18,13 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import NODE_MODULES
 from tap_ros.images.drawing import OBJECT_COLOURS
+from tap_ros.messages.images import decode_image, decode_map
+from tap_ros.messages.objects import decode_objects
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, Newest, send_goal
-from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image
-from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.predictor.node import OVERLAY_SCALE
-from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.ros_messages import encode_image
+from tap_ros.nodes.topics import STREAM, to_stamp
 from tap_ros.planning.plan_picture import CHOSEN
 from tap_ros.recording.attachments import read_attachments
 from tap_ros.recording.reader import iter_episodes

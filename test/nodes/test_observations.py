@@ -8,8 +8,9 @@ import time
 
 import pytest
 from sensor_msgs.msg import Image, JointState
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
-from tap_ros.nodes.topics import STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.topics import STREAM, to_stamp
 
 
 def stamped(kind, nanoseconds):

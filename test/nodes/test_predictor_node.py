@@ -11,9 +11,9 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import ROBOT_MASK_ARM
+from tap_ros.messages.images import decode_image
 from tap_ros.nodes.clients import call, Newest, wait_for_future
-from tap_ros.nodes.image_messages import decode_image, encode_image
-from tap_ros.nodes.object_messages import encode_objects
+from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.training.weights import save_weights
 

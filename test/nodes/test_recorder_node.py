@@ -20,8 +20,8 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 from tap_ros.nodes.clients import call
-from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.recorder.node import RecorderNode
+from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.attachments import read_attachments
 from tap_ros.recording.messages import decode

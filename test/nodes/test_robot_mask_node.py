@@ -8,9 +8,9 @@ import pytest
 from sensor_msgs.msg import CameraInfo, Image
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import ImageError
+from tap_ros.messages.images import decode_camera_info, decode_mask
 from tap_ros.nodes.clients import Newest
-from tap_ros.nodes.image_messages import decode_mask
-from tap_ros.nodes.object_messages import decode_camera_info, encode_camera_info
+from tap_ros.nodes.ros_messages import encode_camera_info
 from tap_ros.nodes.topics import STREAM, to_stamp
 
 CAMERA = {  # of the simulator with its arm: 0.84 rad from straight down

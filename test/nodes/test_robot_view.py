@@ -7,8 +7,9 @@ import pytest
 from sensor_msgs.msg import Image
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.errors import ImageError
-from tap_ros.nodes.image_messages import decode_image, decode_mask, encode_image
+from tap_ros.messages.images import decode_image, decode_mask
 from tap_ros.nodes.robot_view import RobotView
+from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.topics import to_stamp
 
 SCENE = np.random.default_rng(0).integers(0, 256, (6, 9, 3), np.uint8)

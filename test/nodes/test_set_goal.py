@@ -14,9 +14,9 @@ from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectState, ObjectStates
 from tap_msgs.srv import SetGoal
+from tap_ros.messages.objects import decode_objects
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, send_goal, wait_for_result
-from tap_ros.nodes.object_messages import decode_objects
-from tap_ros.nodes.topics import to_nanoseconds
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.recording.reader import iter_episodes

@@ -10,9 +10,10 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import String
 from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from tap_ros.messages.joints import decode_gripper
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import Newest
-from tap_ros.nodes.object_messages import decode_gripper
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.robots import ur10e
 
 

@@ -17,10 +17,11 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectState, ObjectStates
 from tap_msgs.srv import ResetScene, SetGoal, StepScene
+from tap_ros.messages.images import decode_image
+from tap_ros.messages.joints import decode_gripper
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, Newest
-from tap_ros.nodes.image_messages import decode_image
-from tap_ros.nodes.object_messages import decode_gripper
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import LATCHED, STREAM
 
 PERIOD_NS = 250_000_000
 

@@ -18,6 +18,8 @@ from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
 from tap_ros.contract import CONTROL_PERIOD
+from tap_ros.messages.joints import decode_gripper
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import (
     call,
     cancel_goal,
@@ -26,8 +28,7 @@ from tap_ros.nodes.clients import (
     wait_for_future,
     wait_for_result,
 )
-from tap_ros.nodes.object_messages import decode_gripper
-from tap_ros.nodes.topics import STREAM, to_nanoseconds
+from tap_ros.nodes.topics import STREAM
 
 srv = pytest.importorskip('simulation_interfaces.srv', reason='no simulation_interfaces here')
 from simulation_interfaces.action import SimulateSteps  # noqa: E402

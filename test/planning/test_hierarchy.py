@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
+from tap_ros.messages.subgoals import Subgoal
 from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import (
@@ -18,7 +19,6 @@ from tap_ros.planning.hierarchy import (
 from tap_ros.planning.mpc_config import STALL, VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
-from tap_ros.prediction.predictor import Subgoal
 from tap_ros.prediction.warp import one_hot_maps
 import torch
 

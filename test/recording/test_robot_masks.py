@@ -150,8 +150,8 @@ def test_repeated_masks_and_pictures_count_once(tmp_path):
 @pytest.mark.parametrize('wrong, words', [
     (np.full((8, 12), 1, np.uint8), 'value 1; expected 0 .free., 128 .hand. or 255 .arm.'),
     (np.zeros((4, 6), np.uint8), '6x4 pixels among pictures of 12x8'),
-    (np.zeros((8, 12, 3), np.uint8), "encoding 'rgb8' is not that of a robot mask"),
-    (np.zeros((0, 0), np.uint8), 'an empty robot mask')],
+    (np.zeros((8, 12, 3), np.uint8), "encoding 'rgb8' cannot be used; valid encodings: mono8"),
+    (np.zeros((0, 0), np.uint8), 'is empty')],
     ids=['value', 'size', 'encoding', 'empty'])
 @pytest.mark.parametrize('at', [0, 3])
 def test_a_bad_mask_is_named_and_costs_the_masks_of_its_episode(tmp_path, wrong, words, at):

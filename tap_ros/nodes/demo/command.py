@@ -30,6 +30,8 @@ from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError, TapError
+from tap_ros.messages.images import decode_image
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.client import Client, positions_of, View
 from tap_ros.nodes.clients import CallError
 from tap_ros.nodes.demo.film import write_film
@@ -40,9 +42,8 @@ from tap_ros.nodes.demo.report import (
     write_overview,
     write_report,
 )
-from tap_ros.nodes.image_messages import decode_image
 from tap_ros.nodes.node_processes import NodeProcesses
-from tap_ros.nodes.topics import STREAM, to_nanoseconds
+from tap_ros.nodes.topics import STREAM
 from tap_ros.options import Flag, Folder, one_of
 from tap_ros.planning.scenes import FIRST_SCENE
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
@@ -51,7 +52,7 @@ from tyro import conf
 
 if TYPE_CHECKING:
     from rclpy.node import Node
-    from tap_ros.prediction.predictor import Subgoal
+    from tap_ros.messages.subgoals import Subgoal
 
 USUAL_TASKS = ('push2', 'order2', 'stack2')
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects

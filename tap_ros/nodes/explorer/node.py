@@ -22,6 +22,10 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.errors import TapError
 from tap_ros.images.drawing import grid, overlay, png_bytes
+from tap_ros.messages.images import decode_image
+from tap_ros.messages.objects import decode_objects
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.subgoals import decode_subgoal, decode_subgoals
 from tap_ros.nodes.camera_topic import camera_topic, declare_transport
 from tap_ros.nodes.clients import CallError
 from tap_ros.nodes.diagnostics import Diagnostics
@@ -29,14 +33,11 @@ from tap_ros.nodes.explorer.board import Board
 from tap_ros.nodes.explorer.calls import ExplorerCalls
 from tap_ros.nodes.explorer.distances import Distances
 from tap_ros.nodes.explorer.server import ExplorerServer
-from tap_ros.nodes.image_messages import decode_image
-from tap_ros.nodes.object_messages import decode_objects
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.subgoal_messages import decode_subgoal, decode_subgoals
 from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.text import escaped
 
 PERIOD_S = 0.1  # between two looks at what is to be shown

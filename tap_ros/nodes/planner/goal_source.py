@@ -8,10 +8,11 @@ from typing import Any, TYPE_CHECKING
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.errors import PlanningError
-from tap_ros.nodes.image_messages import is_empty
+from tap_ros.messages.images import is_empty
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.robot_view import GOAL_MASK
-from tap_ros.nodes.topics import LATCHED, to_nanoseconds
+from tap_ros.nodes.topics import LATCHED
 
 if TYPE_CHECKING:
     from rclpy.node import Node

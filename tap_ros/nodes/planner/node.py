@@ -23,12 +23,14 @@ from tap_msgs.msg import CommandRefused, ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import WORLD_FRAME
 from tap_ros.errors import PlanningError, TapError
+from tap_ros.messages.images import is_empty
+from tap_ros.messages.objects import match_objects
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.subgoals import decode_subgoals
 from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.image_messages import encode_image, is_empty
 from tap_ros.nodes.lifecycle import ManagedNode
-from tap_ros.nodes.object_messages import encode_objects, match_objects
 from tap_ros.nodes.planner.arm import Arm
 from tap_ros.nodes.planner.goal_source import goal_topics, GoalSource, needed_topics
 from tap_ros.nodes.planner.plan_markers import encode_plan
@@ -39,10 +41,10 @@ from tap_ros.nodes.planner.settings import (
     load_planner,
     unlike_training,
 )
+from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.subgoal_messages import decode_subgoals
 from tap_ros.nodes.subscriptions import subscribe
-from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_nanoseconds, to_stamp
+from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.hierarchy import choose_sample, targets_by
@@ -54,10 +56,10 @@ from visualization_msgs.msg import MarkerArray
 
 if TYPE_CHECKING:
     from rclpy.action.server import ServerGoalHandle
+    from tap_ros.messages.subgoals import Subgoal
     from tap_ros.planning.hierarchy import Target
     from tap_ros.planning.reach import Seen
     from tap_ros.planning.visual_mpc import VisualMPC
-    from tap_ros.prediction.predictor import Subgoal
 
 ENDING = 'the node is ending'
 STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long

@@ -5,6 +5,7 @@
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import replace
+import math
 import time
 from typing import Any, TYPE_CHECKING
 
@@ -14,14 +15,17 @@ from tap_msgs.msg import Episode, ObjectStates
 from tap_ros.errors import ImageError, KinematicsError, PlanningError, TapError
 from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image
+from tap_ros.messages.images import decode_image
+from tap_ros.messages.joints import GripperHistory
+from tap_ros.messages.objects import decode_cut_objects, match_objects
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.camera_topic import camera_topic
-from tap_ros.nodes.image_messages import decode_image, encode_image
-from tap_ros.nodes.object_messages import decode_cut_objects, decode_gripper, match_objects
 from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
-from tap_ros.nodes.planner.arm_joints import ArmJoints, tells_gripper
+from tap_ros.nodes.planner.arm_joints import declared_mount
 from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
+from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.subscriptions import subscribe
-from tap_ros.nodes.topics import STREAM, to_nanoseconds
+from tap_ros.nodes.topics import STREAM
 from tap_ros.planning.reach import Seen
 
 if TYPE_CHECKING:
@@ -40,9 +44,8 @@ class Sight:
     The newest picture with its objects and joints, for one goal at a time.
 
     With the parameter robot_mask the picture is without the robot, all that is seen; a picture
-    whose mask has not come is not seen. Joint states that do not say where the gripper is, but
-    where the joints of the arm are, have times of their own: the gripper of a picture is found
-    between the states before and after it.
+    whose mask has not come is not seen. Joint states have times of their own: the gripper of a
+    picture is found between the states before and after it.
 
     :param node: rclpy Node.
     :param params: its Parameters.
@@ -63,7 +66,8 @@ class Sight:
         self._types = sensor_topics(params)
         self._tell = on_message
         self.sensors = Observations(*self._types)
-        self._arm = ArmJoints(params)
+        self._gripper = GripperHistory(
+            declared_mount(params), params['joint_prefix'], params['fixed_opening'])
         self._useless = ''  # why the joint states cannot be used
         self.begin(0.0)
         self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
@@ -159,7 +163,7 @@ class Sight:
         :param name: how errors call it.
         :param picture: the picture; None: the one that was seen last.
         :return: names, and pixels (K, 2) float32.
-        :raises TapError: see object_messages.decode_objects; also outside of the part that is
+        :raises TapError: see objects.decode_objects; also outside of the part that is
             used.
         """
         size = (self._camera_size or self._crop.size if picture is None
@@ -170,33 +174,33 @@ class Sight:
         """Take joint states; they may be the gripper's, the arm's, or another driver's."""
         received, name = reception_time(info), self._types['joints'][1]
         self._tell(name)
-        if tells_gripper(message):
-            self.sensors.put('joints', message, received)
-            return
         try:
-            new = self._arm.take(message, received)
+            new = self._gripper.take(message, received)
         except TapError as error:
             self._useless = f'{self._names(["joints"])}: {error}'
             return
         if new:
             self._useless = ''
-        if self._arm.used:
-            self.sensors.heard('joints', self._arm.received, new)
-            for stamp_ns in self.sensors.without('joints', 'image'):
+        if self._gripper.received > -math.inf:
+            self.sensors.heard('joints', self._gripper.received, new)
+            newest = self.sensors.moment(('image',))  # again, as joints that come again are newer
+            for stamp_ns in {*self.sensors.without('joints', 'image'),
+                             *([newest.stamp_ns] if newest else [])}:
                 self._match_joints(stamp_ns)
 
     def _match_joints(self, stamp_ns: int) -> None:
         """Add the gripper's state at the time of a picture, once the arm's joints are known."""
         with suppress(KinematicsError):  # who looks at it is told
-            self.sensors.attach('joints', stamp_ns, *self._arm.state(stamp_ns))
+            self.sensors.attach('joints', stamp_ns, *self._gripper.at(
+                stamp_ns, self._params['max_silence']))
 
     def _unmatched_joints(self) -> str:
         """Say why the newest picture has no joints, where it should have those of an arm."""
         newest = self.sensors.moment(('image',))
-        if not self._arm.used or newest is None:
+        if self._gripper.received == -math.inf or newest is None:
             return ''
         try:
-            self._arm.state(newest.stamp_ns)
+            self._gripper.at(newest.stamp_ns, self._params['max_silence'])
         except KinematicsError as error:
             return f'{self._names(["joints"])}: {error}'
         return ''
@@ -204,7 +208,7 @@ class Sight:
     def _on_message(self, name: str) -> None:
         """Take notice of what the camera sees between the goals, too."""
         self._tell(name)
-        if self._arm.used and name == self._types['image'][1]:
+        if name == self._types['image'][1]:
             newest = self.sensors.moment(('image',))
             if newest is not None:
                 self._match_joints(newest.stamp_ns)  # again, if the picture was sent again
@@ -235,7 +239,7 @@ class Sight:
                 names = found
         image = check_image(
             crop.of(self._camera_size, name).image(picture), name, crop.size)
-        gripper = decode_gripper(moment.messages['joints'])
+        gripper = moment.messages['joints']
         return Seen(image, gripper, names, pixels, moment.stamp_ns, **times)
 
     def _lacking(self, topics: Collection[str]) -> str:

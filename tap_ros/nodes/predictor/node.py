@@ -22,7 +22,6 @@ from tap_ros.errors import ConfigError, TapError
 from tap_ros.images.drawing import overlay
 from tap_ros.nodes.deferred_service import create_late_service, take_waiting
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.image_messages import encode_image
 from tap_ros.nodes.lifecycle import ManagedNode
 from tap_ros.nodes.predictor.requests import encode_answer, request_topics, RequestReader, Task
 from tap_ros.nodes.predictor.settings import (
@@ -33,6 +32,7 @@ from tap_ros.nodes.predictor.settings import (
     MAX_WAITING,
     unlike_training,
 )
+from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.topics import LATCHED
 from tap_ros.prediction.request_queue import Busy, RequestQueue, THREAD_NAME
@@ -40,7 +40,7 @@ from tap_ros.text import escaped
 from tap_ros.weights import find_predictor
 
 if TYPE_CHECKING:
-    from tap_ros.prediction.predictor import Subgoal as PredictedSubgoal
+    from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
     from tap_ros.prediction.predictor import SubgoalPredictor
 
 Found = tuple[list['PredictedSubgoal'], float]  # of one request, and ms that the network took

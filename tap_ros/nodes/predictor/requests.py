@@ -16,9 +16,11 @@ from tap_ros.contract import CAMERA_FRAME
 from tap_ros.errors import ImageError, TapError
 from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image, resize_image, resize_pixels
+from tap_ros.messages.images import decode_image, is_empty
+from tap_ros.messages.objects import decode_cut_objects, match_objects
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.subgoals import Subgoal
 from tap_ros.nodes.camera_topic import camera_topic
-from tap_ros.nodes.image_messages import decode_image, is_empty
-from tap_ros.nodes.object_messages import decode_cut_objects, match_objects
 from tap_ros.nodes.on_demand import PulledObservations
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.predictor.settings import (
@@ -29,9 +31,9 @@ from tap_ros.nodes.predictor.settings import (
     MAX_SAMPLES,
 )
 from tap_ros.nodes.robot_view import CAMERA_MASK, GOAL_MASK, RobotView
-from tap_ros.nodes.subgoal_messages import encode_subgoal
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
-from tap_ros.prediction.predictor import Question, Subgoal, SubgoalPredictor
+from tap_ros.nodes.ros_messages import encode_subgoal
+from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.prediction.predictor import Question, SubgoalPredictor
 from tap_ros.text import listing
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING
 
 from tap_ros.errors import ConfigError
+from tap_ros.messages.images import is_empty
 from tap_ros.nodes.camera_topic import declare_transport
-from tap_ros.nodes.image_messages import is_empty
 from tap_ros.nodes.lifecycle import declare_autostart
 from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask

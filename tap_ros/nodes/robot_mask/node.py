@@ -16,10 +16,10 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.errors import KinematicsError, TapError
+from tap_ros.messages.images import decode_camera_info
+from tap_ros.messages.joints import JointHistory
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.image_messages import encode_mask
-from tap_ros.nodes.joint_history import JointHistory
-from tap_ros.nodes.object_messages import decode_camera_info
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.robot_mask.settings import (
     CameraPlace,
@@ -28,9 +28,10 @@ from tap_ros.nodes.robot_mask.settings import (
     hand_link,
     named_robot,
 )
+from tap_ros.nodes.ros_messages import encode_mask
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD
-from tap_ros.nodes.topics import LATCHED, STREAM, to_nanoseconds
+from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.robots.silhouette import Body, draw_mask, View
 from tap_ros.robots.urdf import read_urdf, Robot
 from tap_ros.text import escaped

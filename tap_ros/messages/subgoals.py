@@ -3,43 +3,58 @@
 """Predicted subgoals to messages and back."""
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Any
 
-from geometry_msgs.msg import Point
 import numpy as np
-from tap_msgs.msg import Subgoal as SubgoalMessage
 from tap_ros.errors import PlanningError
-from tap_ros.nodes.image_messages import decode_image, decode_map, encode_image, encode_map
-from tap_ros.nodes.object_messages import match_objects
-from tap_ros.prediction.predictor import Subgoal
+from tap_ros.messages.images import decode_image, decode_map, image_fields, map_fields
+from tap_ros.messages.objects import match_objects
+from tap_ros.messages.stamps import header_fields, Stamp
 from tap_ros.text import escaped
 
-if TYPE_CHECKING:
-    from builtin_interfaces.msg import Time
-    from tap_msgs.srv import PredictSubgoal
 
-
-def encode_subgoal(subgoal: Subgoal, names: Iterable[str], stamp: 'Time',
-                   frame_id: str) -> SubgoalMessage:
+@dataclass(frozen=True)
+class Subgoal:
     """
-    Turn a Subgoal of the predictor into a message.
+    A predicted frame: on the way to the goal, or going forward from the start.
 
-    :param subgoal: prediction.predictor.Subgoal with K objects.
+    :param image: uint8 (H, W, 3).
+    :param object_maps: float32 (K, H, W), each sums to 1: where each object should then be.
+    :param expected_pixels: float32 (K, 2), the mean (u, v) under each map.
+    :param mass: float32 (K,), what each map summed to before normalising; far from 1 the map
+        is doubtful (warp.WarpedMaps).
+    :param sample: which sample it belongs to, from 0.
+    :param level: level of recursion, from 1, the one that is predicted from the request.
+    """
+
+    image: np.ndarray
+    object_maps: np.ndarray
+    expected_pixels: np.ndarray
+    mass: np.ndarray
+    sample: int
+    level: int
+
+
+def subgoal_fields(subgoal: Subgoal, names: Iterable[str], stamp: Stamp | int,
+                   frame_id: str) -> dict[str, Any]:
+    """
+    Return the fields of a tap_msgs/Subgoal.
+
+    :param subgoal: Subgoal with K objects.
     :param names: K strings.
-    :param stamp: builtin_interfaces/Time of the image that the prediction started from.
+    :param stamp: of the image that the prediction started from, a Stamp or ns.
     :param frame_id: frame of the camera.
-    :return: tap_msgs/Subgoal.
     """
-    message = SubgoalMessage(
-        image=encode_image(subgoal.image, stamp, frame_id), object_names=list(names),
-        object_maps=[encode_map(values, stamp, frame_id) for values in subgoal.object_maps],
-        expected_pixels=[Point(x=float(u), y=float(v)) for u, v in subgoal.expected_pixels])
-    message.header.stamp = stamp
-    message.header.frame_id = frame_id
-    return message
+    return {
+        'header': header_fields(stamp, frame_id),
+        'image': image_fields(subgoal.image, stamp, frame_id), 'object_names': list(names),
+        'object_maps': [map_fields(values, stamp, frame_id) for values in subgoal.object_maps],
+        'expected_pixels': [
+            {'x': float(u), 'y': float(v)} for u, v in subgoal.expected_pixels]}
 
 
-def decode_subgoals(response: 'PredictSubgoal.Response', names: Sequence[str],
+def decode_subgoals(response: Any, names: Sequence[str],
                     size: Sequence[int]) -> list[Subgoal]:
     """
     Turn an answer of predict_subgoal into Subgoals.
@@ -47,7 +62,7 @@ def decode_subgoals(response: 'PredictSubgoal.Response', names: Sequence[str],
     :param response: of tap_msgs/PredictSubgoal, a success.
     :param names: K strings, the order wanted of the objects.
     :param size: the (height, width) that pictures must have.
-    :return: list of prediction.predictor.Subgoal, in the order of the answer; their mass, which
+    :return: list of Subgoal, in the order of the answer; their mass, which
         the messages lack, is NaN.
     :raises PlanningError: when subgoals, objects or what tells them apart are missing.
     :raises ImageError: for a picture or map that cannot be used.
@@ -62,7 +77,7 @@ def decode_subgoals(response: 'PredictSubgoal.Response', names: Sequence[str],
                 response.subgoals, response.sample, response.level)]
 
 
-def decode_subgoal(message: SubgoalMessage, names: Sequence[str], size: Sequence[int],
+def decode_subgoal(message: Any, names: Sequence[str], size: Sequence[int],
                    sample: int = 0, level: int = 1) -> Subgoal:
     """
     Turn one tap_msgs/Subgoal into a Subgoal; names, size and errors are as above.
@@ -70,7 +85,7 @@ def decode_subgoal(message: SubgoalMessage, names: Sequence[str], size: Sequence
     :param message: tap_msgs/Subgoal.
     :param sample: which sample it belongs to, from 0.
     :param level: level of recursion, from 1.
-    :return: prediction.predictor.Subgoal.
+    :return: Subgoal.
     """
     found = tuple(message.object_names)
     if not len(found) == len(message.object_maps) == len(message.expected_pixels):

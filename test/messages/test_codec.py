@@ -11,8 +11,10 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import ImageError, PlanningError
-from tap_ros.nodes import image_messages, object_messages
+from tap_ros.messages import images, objects
+from tap_ros.nodes import ros_messages
 
+pytestmark = pytest.mark.ros
 STAMP = Time(sec=3, nanosec=7)
 
 
@@ -28,10 +30,10 @@ def message_of(rows, encoding, width):
 
 
 def test_a_picture_survives_the_round_trip():
-    message = image_messages.encode_image(picture(), STAMP, 'camera')
+    message = ros_messages.encode_image(picture(), STAMP, 'camera')
     assert (message.encoding, message.step, message.header.frame_id) == ('rgb8', 21, 'camera')
     assert message.header.stamp == STAMP
-    assert np.array_equal(image_messages.decode_image(message, 'start', (5, 7)), picture())
+    assert np.array_equal(images.decode_image(message, 'start', (5, 7)), picture())
 
 
 @pytest.mark.parametrize('encoding, channels', [
@@ -41,14 +43,14 @@ def test_every_encoding_and_padding_gives_the_same_picture(encoding, channels, p
     pixels = picture()[..., channels].reshape(5, -1)
     rows = np.hstack([pixels, np.full((5, padding), 99, np.uint8)])
     message = message_of(rows, encoding, 7)
-    assert np.array_equal(image_messages.decode_image(message, 'start'), picture())
+    assert np.array_equal(images.decode_image(message, 'start'), picture())
     message.is_bigendian = 1  # means nothing for bytes
-    assert np.array_equal(image_messages.decode_image(message, 'start'), picture())
+    assert np.array_equal(images.decode_image(message, 'start'), picture())
 
 
 def test_grey_becomes_three_equal_channels():
     grey = picture()[..., 0]
-    decoded = image_messages.decode_image(message_of(grey, 'mono8', 7), 'start')
+    decoded = images.decode_image(message_of(grey, 'mono8', 7), 'start')
     assert all(np.array_equal(decoded[..., channel], grey) for channel in range(3))
 
 
@@ -66,55 +68,55 @@ def test_grey_becomes_three_equal_channels():
     ({'height': 2**22, 'data': array.array('B', bytes(2**25 + 1))}, ['33554433', '33554432']),
 ])
 def test_a_bad_picture_is_refused_with_the_reason(change, words):
-    message = image_messages.encode_image(picture(), STAMP, 'camera')
+    message = ros_messages.encode_image(picture(), STAMP, 'camera')
     for field, value in change.items():
         setattr(message, field, value)
     with pytest.raises(ImageError) as error:
-        image_messages.decode_image(message, 'goal')
+        images.decode_image(message, 'goal')
     for word in ['goal', *words]:
         assert word in str(error.value)
     assert str(error.value).isprintable() and len(str(error.value)) < 300
 
 
 def test_a_frame_id_without_end_is_refused():
-    message = image_messages.encode_image(picture(), STAMP, 101 * 'x')
+    message = ros_messages.encode_image(picture(), STAMP, 101 * 'x')
     with pytest.raises(ImageError, match='goal: frame_id has 101 characters; at most 100'):
-        image_messages.decode_image(message, 'goal')
+        images.decode_image(message, 'goal')
 
 
 def test_what_is_just_within_the_limits_is_taken():
-    message = image_messages.encode_image(picture(), STAMP, image_messages.MAX_FRAME_ID * 'x')
-    assert np.array_equal(image_messages.decode_image(message, 'goal'), picture())
+    message = ros_messages.encode_image(picture(), STAMP, images.MAX_FRAME_ID * 'x')
+    assert np.array_equal(images.decode_image(message, 'goal'), picture())
     step = MAX_PICTURE_BYTES
     message = Image(height=1, width=1, step=step, encoding='rgb8')
     message.data = array.array('B', bytes([1, 2, 3]) + bytes(step - 3))
-    assert image_messages.decode_image(message, 'goal').tolist() == [[[1, 2, 3]]]
-    names = [str(k) for k in range(object_messages.MAX_OBJECTS - 1)]
-    names.append(object_messages.MAX_NAME * 'x')
-    message = objects(len(names) * [[1, 2]], names)
-    assert object_messages.decode_objects(message, 'objects')[0] == tuple(names)
+    assert images.decode_image(message, 'goal').tolist() == [[[1, 2, 3]]]
+    names = [str(k) for k in range(objects.MAX_OBJECTS - 1)]
+    names.append(objects.MAX_NAME * 'x')
+    message = some_objects(len(names) * [[1, 2]], names)
+    assert objects.decode_objects(message, 'objects')[0] == tuple(names)
 
 
 @pytest.mark.parametrize('change, empty', [
     ({}, True), ({'step': 3, 'encoding': 'rgb8'}, True), ({'width': 1}, False),
     ({'height': 1}, False), ({'data': array.array('B', [0])}, False)])
 def test_only_a_picture_without_size_and_data_is_empty(change, empty):
-    assert image_messages.is_empty(Image(**change)) == empty
+    assert images.is_empty(Image(**change)) == empty
 
 
 def test_everything_says_when_and_where_it_was_seen():
-    for message in (image_messages.encode_image(picture(), STAMP, 'here'),
-                    image_messages.encode_map(np.zeros((5, 7)), STAMP, 'here'),
-                    object_messages.encode_objects(
+    for message in (ros_messages.encode_image(picture(), STAMP, 'here'),
+                    ros_messages.encode_map(np.zeros((5, 7)), STAMP, 'here'),
+                    ros_messages.encode_objects(
                         ['red'], [[1, 2]], np.zeros((1, 7)), STAMP, 'here', 1),
-                    object_messages.encode_joints([0, 0, 0, 1], STAMP, 'here'),
-                    object_messages.encode_camera_info(np.eye(3), (5, 7), STAMP, 'here')):
+                    ros_messages.encode_joints([0, 0, 0, 1], STAMP, 'here'),
+                    ros_messages.encode_camera_info(np.eye(3), (5, 7), STAMP, 'here')):
         assert message.header.stamp == STAMP and message.header.frame_id == 'here'
 
 
 def test_the_camera_is_described_by_its_intrinsics_and_size():
     K = [[50.0, 0, 3.5], [0, 60, 2.5], [0, 0, 1]]
-    info = object_messages.encode_camera_info(np.array(K), (5, 7), STAMP, 'eye')
+    info = ros_messages.encode_camera_info(np.array(K), (5, 7), STAMP, 'eye')
     assert (info.height, info.width, info.distortion_model) == (5, 7, 'plumb_bob')
     assert np.reshape(info.k, (3, 3)).tolist() == K
     assert np.reshape(info.p, (3, 4)).tolist() == [[*row, 0] for row in K]
@@ -123,22 +125,22 @@ def test_the_camera_is_described_by_its_intrinsics_and_size():
 
 
 def test_another_size_is_refused_unless_resizing_is_allowed():
-    message = image_messages.encode_image(picture(6, 8), STAMP, 'camera')
+    message = ros_messages.encode_image(picture(6, 8), STAMP, 'camera')
     with pytest.raises(ImageError, match='expected 4x3 .* got 8x6'):
-        image_messages.decode_image(message, 'start', (3, 4))
-    resized = image_messages.decode_image(message, 'start', (3, 4), resize=True)
+        images.decode_image(message, 'start', (3, 4))
+    resized = images.decode_image(message, 'start', (3, 4), resize=True)
     assert resized.shape == (3, 4, 3)
     assert resized.mean() == pytest.approx(picture(6, 8).mean(), abs=12)
 
 
 def test_a_map_survives_the_round_trip_in_either_byte_order():
     values = np.random.default_rng(1).random((5, 7), np.float32)
-    message = image_messages.encode_map(values, STAMP, 'camera')
+    message = ros_messages.encode_map(values, STAMP, 'camera')
     assert message.encoding == '32FC1'
-    assert np.array_equal(image_messages.decode_map(message, 'map'), values)
+    assert np.array_equal(images.decode_map(message, 'map'), values)
     message.data = array.array('B', values.astype('>f4').tobytes())
     message.is_bigendian = 1
-    assert np.array_equal(image_messages.decode_map(message, 'map'), values)
+    assert np.array_equal(images.decode_map(message, 'map'), values)
 
 
 @pytest.mark.parametrize('value', [np.nan, np.inf])
@@ -146,33 +148,33 @@ def test_a_map_with_nan_is_refused(value):
     values = np.zeros((5, 7), np.float32)
     values[2, 3] = value
     with pytest.raises(ImageError, match='map of red: .*finite'):
-        image_messages.decode_map(
-            image_messages.encode_map(values, STAMP, 'camera'), 'map of red')
+        images.decode_map(
+            ros_messages.encode_map(values, STAMP, 'camera'), 'map of red')
     with pytest.raises(ImageError, match='32FC1'):
-        image_messages.decode_map(image_messages.encode_image(picture(), STAMP, ''), 'map')
+        images.decode_map(ros_messages.encode_image(picture(), STAMP, ''), 'map')
 
 
-def objects(pixels, names=('red', 'blue')):
+def some_objects(pixels, names=('red', 'blue')):
     poses = np.arange(7 * len(names)).reshape(-1, 7)
-    return object_messages.encode_objects(
+    return ros_messages.encode_objects(
         names, pixels, poses, STAMP, 'world', ObjectStates.SOURCE_TRACKED)
 
 
 def test_objects_survive_the_round_trip_and_are_matched_by_name():
     pixels = np.array([[1.25, 2.5], [3, -4]], np.float32)
-    message = objects(pixels)
+    message = some_objects(pixels)
     pose = message.objects[1].pose
     assert (pose.position.x, pose.position.y, pose.position.z) == (7, 8, 9)
     turned = pose.orientation
     assert (turned.x, turned.y, turned.z, turned.w) == (10, 11, 12, 13)
     assert message.source == ObjectStates.SOURCE_TRACKED
-    names, decoded = object_messages.decode_objects(message, 'objects')
+    names, decoded = objects.decode_objects(message, 'objects')
     assert names == ('red', 'blue') and np.array_equal(decoded, pixels)
-    matched = object_messages.match_objects(('blue',), names, decoded, 'start', 'goal')
+    matched = objects.match_objects(('blue',), names, decoded, 'start', 'goal')
     assert np.array_equal(matched, pixels[1:])
     with pytest.raises(PlanningError, match='goal: lacks green of start; it has red, blue'):
-        object_messages.match_objects(('green', 'red'), names, decoded, 'start', 'goal')
-    assert object_messages.decode_objects(ObjectStates(), 'objects')[1].shape == (0, 2)
+        objects.match_objects(('green', 'red'), names, decoded, 'start', 'goal')
+    assert objects.decode_objects(ObjectStates(), 'objects')[1].shape == (0, 2)
 
 
 @pytest.mark.parametrize('pixels, names, words', [
@@ -188,7 +190,7 @@ def test_objects_survive_the_round_trip_and_are_matched_by_name():
 ])
 def test_unusable_objects_are_refused_with_the_reason(pixels, names, words):
     with pytest.raises(PlanningError) as error:
-        object_messages.decode_objects(objects(pixels, names), 'goal_objects')
+        objects.decode_objects(some_objects(pixels, names), 'goal_objects')
     for word in ['goal_objects', *words]:
         assert word in str(error.value)
     assert str(error.value).isprintable()
@@ -197,26 +199,11 @@ def test_unusable_objects_are_refused_with_the_reason(pixels, names, words):
 @pytest.mark.parametrize('pixel', [
     (63.6, 5), (-0.6, 5), (5, 47.6), (5, -0.6), (5.4e8, 5), (5000, -7000)])
 def test_pixels_outside_the_picture_are_refused_with_the_bounds(pixel):
-    message = objects([[1, 2], pixel])
-    object_messages.decode_objects(message, 'objects')  # of no known picture
+    message = some_objects([[1, 2], pixel])
+    objects.decode_objects(message, 'objects')  # of no known picture
     with pytest.raises(PlanningError) as error:
-        object_messages.decode_objects(message, 'objects', (48, 64))
+        objects.decode_objects(message, 'objects', (48, 64))
     for word in ('objects: blue', f'({float(pixel[0])}, ', '-0.5 to 63.5', '-0.5 to 47.5'):
         assert word in str(error.value)
-    border = objects([[-0.5, 47.5], [63.5, -0.5]])
-    assert len(object_messages.decode_objects(border, 'objects', (48, 64))[0]) == 2
-
-
-def test_the_gripper_is_found_among_other_joints():
-    message = object_messages.encode_joints([0.1, -0.2, 0.05, 1], STAMP, 'world')
-    message.name.insert(0, 'elbow')
-    message.position.insert(0, 9.0)
-    gripper = object_messages.decode_gripper(message)
-    assert gripper.dtype == np.float32 and np.allclose(gripper, [0.1, -0.2, 0.05, 1])
-    message.position[2] = float('nan')
-    with pytest.raises(PlanningError, match='finite'):
-        object_messages.decode_gripper(message)
-    message.name.pop(2)
-    message.position.pop(2)
-    with pytest.raises(PlanningError, match='lacks gripper_y; it has elbow, gripper_x'):
-        object_messages.decode_gripper(message)
+    border = some_objects([[-0.5, 47.5], [63.5, -0.5]])
+    assert len(objects.decode_objects(border, 'objects', (48, 64))[0]) == 2

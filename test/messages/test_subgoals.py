@@ -7,10 +7,11 @@ import pytest
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.images.pixels import resize_pixels
-from tap_ros.nodes.subgoal_messages import decode_subgoals, encode_subgoal
+from tap_ros.messages.subgoals import decode_subgoals, Subgoal
+from tap_ros.nodes.ros_messages import encode_subgoal
 from tap_ros.nodes.topics import to_stamp
-from tap_ros.prediction.predictor import Subgoal
 
+pytestmark = pytest.mark.ros
 RNG = np.random.default_rng(0)
 NAMES, SIZE = ('cup', 'box'), (8, 8)
 

@@ -1,0 +1,181 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of finding joints, and by them the gripper, at the moment of a picture."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from tap_ros.errors import KinematicsError, PlanningError
+from tap_ros.messages.joints import (
+    decode_gripper,
+    GripperHistory,
+    joint_fields,
+    JointHistory,
+    positions_at,
+)
+from tap_ros.messages.stamps import MAX_GAP, stamp_fields
+from tap_ros.robots import ur10e
+
+MS = 10**6
+
+
+def joints(stamp_ns, **positions):
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=SimpleNamespace(**stamp_fields(stamp_ns))),
+        name=list(positions), position=list(positions.values()))
+
+
+def history(*states, names='ab'):
+    """Return a JointHistory of (ms, positions); each is received at its time in ms."""
+    found = JointHistory(names)
+    for ms, positions in states:
+        found.add(joints(ms * MS, **positions), ms)
+    return found
+
+
+def test_joints_are_found_between_the_states_before_and_after():
+    known = JointHistory(['a', 'b'])
+    for ms, a, b in ((100, 1, 5), (110, 2, 3), (120, 4, 3)):
+        known.add(joints(ms * MS, a=a, other=9.0), ms)
+        known.add(joints(ms * MS, b=b), ms + 1)  # another driver
+    found = known.at(104 * MS, 1)
+    np.testing.assert_allclose(found.positions, [1.4, 4.2])
+    assert found.received == 100  # of the oldest that it comes from
+    np.testing.assert_array_equal(known.at(120 * MS, 1).positions, [4, 3])
+    assert known.at(120 * MS, 1).received == 120
+    assert known.received == 120
+
+
+def test_recorded_joints_are_found_by_the_same_rule():
+    random = np.random.default_rng(0)
+    times = np.sort(random.integers(0, 2 * 10**9, 40))
+    times[7] = times[6]  # of states of the same time the last counts
+    values, at = random.normal(size=40), random.integers(0, 2 * 10**9, 300)
+    at[:20] = times[:20]
+    live, expected = history(names='a'), []
+    for time, value in zip(times.tolist(), values.tolist()):
+        live.add(joints(time, a=value), 0)
+    for time in at.tolist():
+        try:
+            expected.append(live.at(time, MAX_GAP).positions[0])
+        except KinematicsError:
+            expected.append(np.nan)
+    np.testing.assert_array_equal(positions_at(times, values, at, -1), expected)
+    assert 0 < np.isnan(expected).sum() < 100
+    held = positions_at(times, values, at, 10**9)
+    unknown = np.isnan(expected)
+    np.testing.assert_array_equal(held[~unknown], np.array(expected)[~unknown])
+    assert np.isin(held[unknown], values[[0, -1]]).all()
+    assert np.isnan(positions_at(times[:0], values[:0], at, 10**9)).all()
+
+
+@pytest.mark.parametrize('ms, words', [
+    (90, 'the first state of a is 0.010 s newer than the picture'),
+    (290, 'the newest state of a is 0.090 s older than the picture'),
+    (140, 'the nearest newer state of a is 0.060 s from the picture; expected at most 0.05 s')])
+def test_a_picture_without_states_around_it_is_refused_with_the_reason(ms, words):
+    known = history(*((at, {'a': 1.0}) for at in (100, 100, 200)), names='a')
+    with pytest.raises(KinematicsError, match=words):
+        known.at(ms * MS, 0.05)
+
+
+def test_a_joint_that_nobody_tells_of_is_named():
+    known = history((100, {'a': 1.0}))
+    assert known.missing() == ['b'] and known.received == -np.inf
+    with pytest.raises(KinematicsError, match='nothing is known of b'):
+        known.at(100 * MS, 1)
+
+
+def test_new_states_are_told_from_those_sent_again():
+    known = JointHistory(['a'])
+    for ms, received, new in ((100, 1, True), (110, 2, True), (110, 3, False), (100, 4, False)):
+        assert known.add(joints(ms * MS, a=1.0), received) == new
+    assert known.at(105 * MS, 1).received == 3
+    assert not known.add(joints(120 * MS, other=1.0), 5)
+
+
+def test_a_clock_that_goes_back_is_believed_when_it_says_so_again():
+    known = history((5000, {'a': 1.0}), names='a')
+    assert not known.add(joints(100 * MS, a=2.0), 1)
+    assert not known.add(joints(110 * MS, a=2.0), 2)
+    assert known.at(5000 * MS, 1).positions == [1]
+    assert known.add(joints(120 * MS, a=2.0), 3)
+    assert known.at(120 * MS, 1).positions == [2]
+
+
+def test_what_is_old_is_forgotten_and_memory_stays_bounded():
+    known = history(*((10 * n, {'a': n / 100}) for n in range(2000)), names='a')
+    with pytest.raises(KinematicsError, match='first state of a is'):
+        known.at(10_000 * MS, 1)
+    assert known.at(15_000 * MS, 1).positions == [15]
+
+
+@pytest.mark.parametrize('position', [np.nan, np.inf, 1e30])
+def test_a_position_that_no_joint_has_is_refused(position):
+    known = JointHistory(['a', 'b'])
+    with pytest.raises(KinematicsError, match='b is at '):
+        known.add(joints(100 * MS, a=1.0, b=position), 0)
+    assert known.missing() == ['a', 'b']
+
+
+MOUNT = ur10e.Mount((0.2, 0.6, -0.05), 0.4, 0.15)
+AT = [-0.1, 0.05, 0.08]
+
+
+def arm_message(angles, stamp_ns, **more):
+    named = {f'left_{name}': angle for name, angle in zip(ur10e.JOINTS, angles)}
+    return joints(stamp_ns, **dict(reversed(named.items())), **more)
+
+
+def test_the_gripper_is_where_the_mounted_arm_holds_it():
+    gripper = GripperHistory(MOUNT, 'left_', 0.25)
+    angles = ur10e.joints_at(AT, MOUNT)
+    assert gripper.received == -np.inf
+    assert gripper.take(arm_message(angles, 98 * MS), 1) and gripper.received == 1
+    gripper.take(arm_message(angles, 102 * MS), 2)
+    found, received = gripper.at(100 * MS, 0.35)
+    np.testing.assert_allclose(found, [*AT, 0.25], atol=1e-6)
+    assert found.dtype == np.float32 and received == 1
+    assert not gripper.take(joints(100 * MS, gripper_opening=0.7), 3)
+    assert gripper.at(101 * MS, 0.35)[0][3] == np.float32(0.7)  # the newest holds
+    gripper.take(joints(102 * MS, gripper_opening=0.9), 3)
+    assert gripper.at(101 * MS, 0.35)[0][3] == np.float32(0.8)
+    with pytest.raises(KinematicsError, match='left_shoulder_pan_joint is 0.098 s older'):
+        gripper.at(200 * MS, 0.35)
+
+
+def test_a_gripper_that_is_told_counts_and_arm_joints_beside_it_do_not():
+    gripper = GripperHistory(MOUNT, 'left_', 0.25)
+    for stamp, x in ((100, 0.1), (110, 0.3)):
+        told = dict(zip(('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening'),
+                        (x, -0.2, 0.05, 10 * x - 1)))
+        assert gripper.take(arm_message([0.0] * 6, stamp * MS, **told), stamp)
+    found, received = gripper.at(105 * MS, 0.35)
+    np.testing.assert_allclose(found, [0.2, -0.2, 0.05, 1], rtol=1e-6)
+    assert received == 100
+    unopened = GripperHistory(MOUNT, '', 0.25)
+    unopened.take(joints(100 * MS, gripper_x=0.1, gripper_y=0.2, gripper_z=0.3), 0)
+    with pytest.raises(KinematicsError, match='nothing is known of gripper_opening'):
+        unopened.at(100 * MS, 0.35)
+
+
+def test_joint_states_of_neither_gripper_nor_arm_are_named():
+    gripper = GripperHistory(MOUNT, 'left_', 0.25)
+    with pytest.raises(PlanningError, match=r'neither gripper_x.* nor left_shoulder_.* has wheel'):
+        gripper.take(joints(1, wheel=0.5), 0)
+    assert gripper.received == -np.inf
+    gripper.take(arm_message([0.0] * 6, 1), 1)
+    assert not gripper.take(joints(1, wheel=0.5), 2)
+
+
+def test_the_gripper_is_found_among_other_joints():
+    fields = joint_fields([0.1, -0.2, 0.05, 1], 7, 'world')
+    known = dict(zip(fields['name'], fields['position']))
+    gripper = decode_gripper(joints(7, elbow=9.0, **known))
+    assert gripper.dtype == np.float32 and np.allclose(gripper, [0.1, -0.2, 0.05, 1])
+    with pytest.raises(PlanningError, match='finite'):
+        decode_gripper(joints(7, **known | {'gripper_y': float('nan')}))
+    del known['gripper_y']
+    with pytest.raises(PlanningError, match='lacks gripper_y; it has elbow, gripper_x'):
+        decode_gripper(joints(7, elbow=9.0, **known))
