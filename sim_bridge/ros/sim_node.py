@@ -46,7 +46,8 @@ from tap_ros.nodes.ros_messages import (
     encode_mask,
     encode_objects,
 )
-from tap_ros.nodes.run import answering, run_node
+from tap_ros.nodes.run import run_node
+from tap_ros.nodes.services import answering
 from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.tf_publisher import TransformPublisher
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp

@@ -8,7 +8,7 @@ from typing import Any, TYPE_CHECKING
 
 from simulation_interfaces.msg import Result
 from tap_ros.errors import TapError
-from tap_ros.nodes.run import answering
+from tap_ros.nodes.services import answering
 from tap_ros.nodes.topics import SERVICE_QOS
 
 if TYPE_CHECKING:

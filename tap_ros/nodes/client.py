@@ -39,9 +39,9 @@ from tap_ros.nodes.clients import (
     wait_for_result,
 )
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.middleware import configure_fast_dds
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
+from tap_ros.nodes.run import configure_fast_dds
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.text import escaped
 
@@ -388,8 +388,8 @@ class Client:
         topics = {each: topic for each, (_, topic) in VIEWS[name].items()}
         if found is None:
             silent = 'objects' if views.newest('image', after_ns=after_ns) else 'image'
-            topic = views.explained(silent, self.node.resolve_topic_name(topics[silent]))
-            raise CallError(f'{topic}: nothing new came within {timeout_s:g} s')
+            raise CallError(f'{views.names([silent], explained=True)}: '
+                            f'nothing new came within {timeout_s:g} s')
         listed = found.get('objects', ObjectStates())
         names, pixels = decode_objects(listed, topics['objects'])
         return View(decode_image(found['image'], topics['image']), names, pixels,

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How a node is, once a second on /diagnostics, where rqt and Foxglove look for it."""
+"""The state of a node, once a second on /diagnostics, where rqt and Foxglove read it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -10,9 +10,9 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
-from tap_ros.nodes.rolling_stats import percentiles, rate, Window
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:
@@ -26,22 +26,66 @@ WORK_LIMIT = 10_000
 ERROR_SECONDS = 10.0  # that the level is ERROR after an error
 
 
+class RollingWindow:
+    """
+    Numbers with the times at which they were added; old ones are forgotten.
+
+    :param seconds: how long a number counts.
+    :param limit: most numbers kept, the newest ones; bounds the memory whatever their rate.
+    """
+
+    def __init__(self, seconds: float, limit: int) -> None:
+        self._seconds = seconds
+        self._times, self._values = np.empty(limit), np.empty(limit)  # rings: fast to summarise
+        self._count = 0
+
+    def add(self, now: float, value: float = 0.0) -> None:
+        """Add a number at time `now`, in seconds of a monotonic clock."""
+        place = self._count % len(self._times)
+        self._times[place], self._values[place] = now, value
+        self._count += 1
+
+    def newest(self, now: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return times and values, each float64 (N,), oldest first."""
+        limit = len(self._times)
+        places = np.arange(max(self._count - limit, 0), self._count) % limit
+        places = places[np.searchsorted(self._times[places], now - self._seconds):]
+        return self._times[places], self._values[places]
+
+
+def rate(times: np.ndarray) -> float:
+    """
+    Return the mean number of events per second; 0 for fewer than two.
+
+    :param times: (N,) seconds, oldest first.
+    """
+    span = times[-1] - times[0] if len(times) else 0.0
+    return (len(times) - 1) / span if span > 0 else 0.0
+
+
+def percentiles(values: np.ndarray) -> np.ndarray:
+    """Return the 50th and the 99th percentile; NaN without values."""
+    return np.percentile(values, (50, 99)) if len(values) else np.full(2, np.nan)
+
+
 @dataclass
 class Input:
-    """What is known of a topic; times in seconds of the monotonic clock."""
+    """State of an input topic; times in seconds of the monotonic clock."""
 
     max_age_s: float
     count: int = 0
     newest: float = -math.inf
-    arrivals: Window = field(default_factory=lambda: Window(RATE_SECONDS, RATE_LIMIT))
+    arrivals: RollingWindow = field(
+        default_factory=lambda: RollingWindow(RATE_SECONDS, RATE_LIMIT))
 
 
 @dataclass
 class Work:
-    """What is known of one kind of work."""
+    """Statistics of one kind of work."""
 
     count: int = 0
-    durations: Window = field(default_factory=lambda: Window(WORK_SECONDS, WORK_LIMIT))
+    durations: RollingWindow = field(
+        default_factory=lambda: RollingWindow(WORK_SECONDS, WORK_LIMIT))
 
 
 class Diagnostics:
@@ -78,7 +122,7 @@ class Diagnostics:
 
     def received(self, topic: str) -> None:
         """
-        Note a message.
+        Count a message.
 
         :param topic: one of the inputs, by the name given or by the resolved one.
         """
@@ -91,7 +135,7 @@ class Diagnostics:
 
     def took(self, ms: float, what: str) -> None:
         """
-        Note how long a piece of work took.
+        Add the duration of a piece of work.
 
         :param ms: milliseconds.
         :param what: name of this kind of work, for example 'predict_subgoal'.
@@ -104,7 +148,7 @@ class Diagnostics:
 
     def error(self, text: object) -> None:
         """
-        Note what went wrong.
+        Report an error.
 
         :param text: the error or its text; shown in one line.
         """

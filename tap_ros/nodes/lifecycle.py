@@ -1,21 +1,23 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Managed (lifecycle) nodes whose weights can be changed while they are inactive."""
+"""Lifecycle (managed) nodes that load weights, and the model cards of these weights."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
-import traceback
 from typing import Any, ClassVar, TYPE_CHECKING
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from std_msgs.msg import String
-from tap_ros.errors import TapError
-from tap_ros.nodes.model_card import describe_weights
+from tap_ros.errors import WeightsError
+from tap_ros.nodes.services import log_error
 from tap_ros.nodes.topics import LATCHED
+from tap_ros.recording.attachments import MAX_CARD_BYTES
 from tap_ros.text import escaped, listing
+from tap_ros.training.weights import stored_digest
 
 if TYPE_CHECKING:
     from rclpy.parameter import Parameter
@@ -23,69 +25,61 @@ if TYPE_CHECKING:
 
 
 def declare_autostart(parameters: 'Parameters') -> None:
-    """Declare the parameter autostart of a managed node."""
+    """Declare the parameter autostart of a lifecycle node."""
     parameters.declare(
         'autostart', True,
         'Load the weights and be active at once; false: wait for the transitions configure and '
         'activate.')
 
 
-class ManagedNode(LifecycleNode):
+class LifecycleBase(LifecycleNode):
     """
     Loads its weights in the transition configure, and works while it is active.
 
-    Heartbeat, diagnostics, topics and services are there in every state, so that who asks is told
-    why nothing is done. What the weights are is published on <node>/model_card. A subclass defines
-    what to load, and calls autostart('configure') and autostart('activate') while it is made;
-    weights that cannot be used are fatal then.
+    Heartbeat, diagnostics, topics and services exist in every state, so that a request is refused
+    with the reason. The model cards of the weights are published on <node>/model_card. A subclass
+    implements `load` and its like, and calls autostart('configure') and autostart('activate') in
+    its constructor; weights that cannot be used are fatal then.
 
-    :cvar reloaded: names of the parameters that can be changed while the node is not active;
-        unless it is unconfigured they are tried at once, and refused when they cannot be used.
-    :ivar active: whether it works.
+    :param options: of rclpy's Node.
+    :cvar loaded_by: names of the parameters that configure reads; they can be changed while the
+        node is unconfigured.
+    :ivar active: whether the node works.
     """
 
-    reloaded: ClassVar[tuple[str, ...]] = ()
+    loaded_by: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
         self.active = False
-        self._failure: Exception | None = None  # of the transition that was tried last
-        self._starting = False  # by itself: a failure is raised, and logged by who starts nodes
-        self._loaded: tuple[Any, str] | None = None  # for parameters that are about to change
-        self._card = ''  # what the weights are
+        self._failure: Exception | None = None  # of the last transition
+        self._starting = False  # a failure of autostart is raised, and logged by run_node
+        self._card = ''
         self._cards = self.create_publisher(String, '~/model_card', LATCHED)
-        # First, as rclpy calls the newest callback first: what others refuse is not loaded.
-        self.add_on_set_parameters_callback(self._before_set)
-        self.add_post_set_parameters_callback(self._after_set)
+        self.add_on_set_parameters_callback(self._check_loaded)
         self._service_change_state.callback = self._answering(self._service_change_state.callback)
 
-    # What a subclass defines
+    # What a subclass implements
 
     @abstractmethod
-    def load(self, changed: Mapping[str, Any]) -> Any:
+    def load(self) -> None:
         """
-        Load weights; the node goes on with those that it has.
+        Load the weights.
 
-        :param changed: {parameter: value} that are not set yet, of those in `reloaded`.
-        :return: what `use` takes.
         :raises TapError: when they cannot be used.
         """
 
     @abstractmethod
-    def use(self, loaded: Any) -> None:
-        """Go on with what `load` returned."""
-
-    @abstractmethod
     def unload(self) -> None:
-        """Let go what `use` was given."""
+        """Release the weights."""
 
     @abstractmethod
     def described(self) -> str:
-        """Say what the node works with, for the log."""
+        """Return what the node works with, for the log."""
 
     @abstractmethod
-    def files(self, changed: Mapping[str, Any]) -> list[Path]:
-        """Return the files of the weights; changed: as for load."""
+    def files(self) -> list[Path]:
+        """Return the files of the weights."""
 
     def resume(self) -> None:
         """
@@ -95,47 +89,49 @@ class ManagedNode(LifecycleNode):
         """
 
     def pause(self) -> None:
-        """End what is being done."""
+        """End the work in progress."""
 
     # For subclasses
 
     def autostart(self, transition: str) -> None:
         """
-        Do a transition, if the node is to start by itself.
+        Trigger a transition if the parameter autostart is set.
 
         :param transition: 'configure' or 'activate'.
-        :raises Exception: why it could not be done.
+        :raises Exception: why the transition failed.
         """
         if not self.get_parameter('autostart').value:
             if transition == 'activate':
                 self.get_logger().info(f'waiting: {self.why_not()}')
             return
-        trigger = {'configure': self.trigger_configure, 'activate': self.trigger_activate}
         self._starting = True
-        done = trigger[transition]()
+        done = (self.trigger_configure if transition == 'configure' else self.trigger_activate)()
         self._starting = False
         if done != TransitionCallbackReturn.SUCCESS:
             assert self._failure is not None
             raise self._failure
 
     def why_not(self) -> str:
-        """Say why the node does not work and what to do; '' while it is active."""
+        """Return why the node does not work and the remedy; '' while it is active."""
         if self.active:
             return ''
         state, command = self._state(), f'ros2 lifecycle set {self.get_fully_qualified_name()}'
-        if state == 'finalized':
-            return 'the node is shut down; start it again'
-        if state == 'inactive':
-            return f'the node is inactive; activate it: {command} activate'
-        if state == 'unconfigured':
-            return f'the node has no weights yet; {command} configure, then activate'
-        return f'the node is {state}; ask again'
+        return {
+            'finalized': 'the node is shut down; start it again',
+            'inactive': f'the node is inactive; activate it: {command} activate',
+            'unconfigured': f'the node has no weights yet; {command} configure, then activate',
+        }.get(state, f'the node is {state}; ask again')
 
     # Transitions
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load the weights."""
-        return self._try('configure', lambda: self._use(self._load({})))
+        def load() -> None:
+            card = '\n'.join(map(model_card, self.files()))
+            self.load()
+            self._card = card
+
+        return self._try('configure', load)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to work."""
@@ -149,61 +145,35 @@ class ManagedNode(LifecycleNode):
         return self._try('activate', begin)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """End what is being done, and do nothing more."""
-        self._stop()
-        self.get_logger().info('inactive; weights can be changed by parameters')
+        """End the work in progress; a failure is logged, and the node is inactive anyway."""
+        if self.active:
+            self.active = False
+            self._try('deactivate', self.pause)
+        self.get_logger().info('inactive')
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Let the weights go."""
+        """Release the weights."""
         return self._try('cleanup', self.unload)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """End what is being done, and let the weights go, for good."""
-        self._stop()
+        """End the work in progress and release the weights, for good."""
+        self.on_deactivate(state)
         return self._try('shutdown', self.unload)
 
-    def _stop(self) -> None:
-        """Do nothing more; what `pause` raises is logged, and the node is inactive anyway."""
-        if not self.active:
-            return
-        self.active = False
-        try:
-            self.pause()
-        except Exception as error:
-            self._log(error, 'deactivate')
-
-    def _load(self, changed: Mapping[str, Any]) -> tuple[Any, str]:
-        """Load weights; return them and what they are, which a file may not be for long."""
-        card = describe_weights(self.files(changed))
-        return self.load(changed), card
-
-    def _use(self, loaded: tuple[Any, str]) -> None:
-        """Go on with what _load returned."""
-        self.use(loaded[0])
-        self._card = loaded[1]
-
     def _try(self, transition: str, do: Callable[[], object]) -> TransitionCallbackReturn:
-        """Do what a transition does; when it fails, the node stays in the state that it has."""
+        """Perform a transition; when it fails, the node keeps its state."""
         try:
             do()
         except Exception as error:
             self._failure = error
             if not self._starting:
-                self._log(error, transition)
+                log_error(self, transition, error)
             return TransitionCallbackReturn.FAILURE
         return TransitionCallbackReturn.SUCCESS
 
-    def _log(self, error: Exception, what: str) -> None:
-        """Log why something failed; for what is no error of ours, with where it came from."""
-        if isinstance(error, TapError):
-            self.get_logger().error(f'{what}: {escaped(error, 1000)}')
-        else:
-            for line in ''.join(traceback.format_exception(error)).splitlines():
-                self.get_logger().error(f'{what}: {escaped(line)}')
-
     def _answering(self, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Let the service answer where rclpy raises: when the state has no such transition."""
+        """Wrap change_state: rclpy raises, and answers nothing, for a transition not available."""
         def answer(request: Any, response: Any) -> Any:
             try:
                 return callback(request, response)
@@ -221,34 +191,29 @@ class ManagedNode(LifecycleNode):
         label: str = self._state_machine.current_state[1]
         return label
 
-    # Parameters
-
-    def _before_set(self, parameters: Iterable['Parameter']) -> SetParametersResult:
-        """Try the weights that are to be used from now on."""
-        self._loaded = None
-        changed = {parameter.name: parameter.value for parameter in parameters
-                   if parameter.name in self.reloaded}
-        if not changed or self._state() in ('unconfigured', 'configuring', 'finalized'):
+    def _check_loaded(self, parameters: Iterable['Parameter']) -> SetParametersResult:
+        """Refuse to change what is loaded unless the node is unconfigured."""
+        changed = [parameter.name for parameter in parameters if parameter.name in self.loaded_by
+                   and self.has_parameter(parameter.name)
+                   and self.get_parameter(parameter.name).value != parameter.value]
+        if not changed or self._state() in ('unconfigured', 'finalized'):
             return SetParametersResult(successful=True)
-        if self.active:
-            if all(self.get_parameter(name).value == value for name, value in changed.items()):
-                return SetParametersResult(successful=True)
-            return SetParametersResult(successful=False, reason=(
-                f'{listing(changed)} cannot be changed while the node is active; deactivate it '
-                f'first: ros2 lifecycle set {self.get_fully_qualified_name()} deactivate'))
-        try:
-            self._loaded = self._load(changed)
-        except TapError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        except Exception as error:
-            self._log(error, 'parameters')
-            return SetParametersResult(
-                successful=False, reason=f'{type(error).__name__}: {escaped(error)}')
-        return SetParametersResult(successful=True)
+        steps = ['deactivate'] * self.active + ['cleanup']
+        return SetParametersResult(successful=False, reason=(
+            f'{listing(changed)} cannot be changed while weights are loaded; first: '
+            + ', then '.join(f'ros2 lifecycle set {self.get_fully_qualified_name()} {step}'
+                             for step in steps)))
 
-    def _after_set(self, parameters: Iterable['Parameter']) -> None:
-        """Use what was tried."""
-        if self._loaded is not None:
-            loaded, self._loaded = self._loaded, None
-            self._use(loaded)
-            self.get_logger().info(f'loaded: {self.described()}')
+
+def model_card(weights: Path) -> str:
+    """Return the model card beside a file of weights, and a line with the file's digest."""
+    name = escaped(weights.name)
+    text = f'# {name}\n\nNo model card is beside this file.\n'
+    card = weights.with_suffix('.md')
+    with suppress(OSError, ValueError):  # ValueError: it is no text
+        if card.is_file() and card.stat().st_size <= MAX_CARD_BYTES // 4:
+            text = card.read_text(encoding='utf-8')
+    digest = 'unknown'
+    with suppress(WeightsError):  # loading raises it
+        digest = stored_digest(weights)
+    return f'{text.rstrip()}\n\nLoaded: `{name}`, SHA-256 of its content `{digest}`.\n'

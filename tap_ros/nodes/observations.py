@@ -1,9 +1,9 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of several topics put together by their stamp, with the time of their reception."""
+"""Messages of several topics, grouped by their stamp, with the time of their reception."""
 
 from collections import deque, OrderedDict
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 import math
 import threading
@@ -11,9 +11,13 @@ import time
 from types import MappingProxyType
 from typing import Any, TYPE_CHECKING
 
-from rclpy.clock import Clock, ClockType
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD, named_with_reason
+from tap_ros.nodes.subscriptions import (
+    ADAPT_PERIOD,
+    adapt_regularly,
+    AdaptiveSubscription,
+    PollOnlyGroup,
+)
 
 if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
@@ -21,9 +25,11 @@ if TYPE_CHECKING:
     from rclpy.qos import QoSProfile
 
 DEPTH = 10  # stamps remembered
-JUMP_NS = 10 * 10**9  # a stamp so far ahead of all others is not believed at once
-REMEMBERED = 100  # messages of a latched topic by which those that come again are known
-PROOF = 3  # messages in a row that show that the clock of a topic has jumped
+JUMP_NS = 10 * 10**9  # a stamp that far ahead of all others is not believed at once
+REMEMBERED = 100  # messages of a latched topic by which repetitions are recognised
+PROOF = 3  # messages in a row that prove that the clock of a topic has jumped
+POLL_LIMIT = 100  # messages of a topic taken by one poll; the rest comes with the next
+POLL_PERIOD = 0.005  # s between two polls while waiting
 
 
 @dataclass(frozen=True)
@@ -37,16 +43,16 @@ class Moment:
 
 class Observations:
     """
-    Collect messages that carry the same stamp; safe to use from several threads.
+    Groups messages that carry the same stamp; thread-safe.
 
     A stamp that goes back, or that is more than JUMP_NS ahead, is believed only when PROOF
-    messages in a row say the same: a single one is a stray publisher's, several are another
-    simulator or a bag that loops. Then all that came before is forgotten, and `jumps` counts it.
-    A stray that is less ahead is dropped when the next message goes on from the one before.
+    messages in a row agree: a single one is from a stray publisher, several are from another
+    simulator or a bag that loops. Then everything earlier is forgotten, and `jumps` counts it.
+    A stray that is less far ahead is dropped when the next message continues from the one before.
 
     :param topics: short names, for example 'image', 'objects'; the first is the one whose stamp
         counts, the others describe it.
-    :param latched: these come now and then and may have any stamp: the newest is what came last.
+    :param latched: messages are rare and may have any stamp: the newest is the last one received.
     :ivar count: grows with every message and every call of wake.
     :ivar jumps: how often the clock has jumped.
     """
@@ -65,7 +71,7 @@ class Observations:
         self._suspects: dict[str, list[int]] = {topic: [] for topic in topics}
         self._sent: dict[str, deque[int]] = {topic: deque(maxlen=REMEMBERED) for topic in topics}
         self.count, self.jumps = 0, 0
-        self._heard: dict[str, Heard] = {}
+        self._subscriptions: dict[str, AdaptiveSubscription] = {}
 
     def subscribe(self, node: 'Node', types: Mapping[str, tuple[type, str]], qos: 'QoSProfile',
                   callback_group: 'CallbackGroup | None' = None,
@@ -74,12 +80,11 @@ class Observations:
         """
         Subscribe to the topics.
 
-        :param node: rclpy Node.
         :param types: {short name: (message type, topic name)}.
         :param qos: QoSProfile of all of them.
         :param callback_group: callback group, None for the node's own.
         :param on_message: called with the topic name after each message, or None.
-        :param others: {short name: what is called with message and info instead}.
+        :param others: {short name: callback that takes message and info instead of `put`}.
         """
         for topic, (message_type, name) in types.items():
             def receive(message: Any, info: dict[str, Any], topic: str = topic,
@@ -88,19 +93,18 @@ class Observations:
                 if on_message is not None:
                     on_message(name)
 
-            self._heard[topic] = Heard(
+            self._subscriptions[topic] = AdaptiveSubscription(
                 node, message_type, name, others.get(topic, receive), qos, callback_group)
+        adapt_regularly(node, self._subscriptions.values(), callback_group)
 
-        def look_after() -> None:
-            for heard in self._heard.values():
-                heard.look_after()
-
-        node.create_timer(LOOK_PERIOD, look_after, callback_group=callback_group,
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
-
-    def explained(self, topic: str, name: str) -> str:
-        """Return the name of a topic, and why nothing comes on it where that is known."""
-        return named_with_reason(self._heard.get(topic), name)
+    def names(self, topics: Iterable[str], explained: bool = False) -> str:
+        """Return the full names of topics; explained: with why nothing arrives, where known."""
+        words = []
+        for topic in topics:
+            subscription = self._subscriptions[topic]
+            why = subscription.why_silent() if explained else ''
+            words.append(f'{subscription.topic} ({why})' if why else subscription.topic)
+        return ', '.join(words)
 
     def put(self, topic: str, message: Any, received: float | None = None,
             sent_ns: int = 0) -> None:
@@ -108,8 +112,8 @@ class Observations:
         Add a message with a header.
 
         :param received: monotonic time in seconds of its reception; None: now.
-        :param sent_ns: when its publisher sent it, by its clock; 0: unknown. What is latched comes
-            once more when it is subscribed to anew; then it counts for nothing.
+        :param sent_ns: when its publisher sent it, by its clock; 0: unknown. A latched message
+            arrives again with each new subscription; repetitions are ignored.
         """
         stamp = to_nanoseconds(message.header.stamp)
         received = time.monotonic() if received is None else received
@@ -134,7 +138,7 @@ class Observations:
 
     def attach(self, topic: str, stamp: int, message: Any, received: float) -> None:
         """
-        Add what was derived for a stamp that others have; it says nothing of how old a topic is.
+        Add a derived message for a known stamp; the age of its topic does not change.
 
         :param received: monotonic time at which what it was derived from was received.
         """
@@ -145,11 +149,11 @@ class Observations:
                 self.count += 1
                 self._changed.notify_all()
 
-    def heard(self, topic: str, received: float, renewed: bool) -> None:
+    def note(self, topic: str, received: float, renewed: bool) -> None:
         """
-        Note that something came from which messages of a topic are derived.
+        Note the reception of something from which messages of a topic are derived.
 
-        :param renewed: it did not repeat what came before.
+        :param renewed: it did not repeat the one before.
         """
         with self._changed:
             self._received[topic] = received
@@ -203,7 +207,7 @@ class Observations:
 
     def moment(self, topics: Collection[str], after_ns: int = -1,
                since: float = -math.inf) -> Moment | None:
-        """Return the same with its stamp and time of reception, as a Moment."""
+        """Return the same as a Moment, with its stamp and time of reception."""
         with self._changed:
             found = [stamp for stamp, parts in self._by_stamp.items() if stamp > after_ns and all(
                 topic in parts and parts[topic][1] >= since for topic in topics)]
@@ -241,19 +245,19 @@ class Observations:
             self._changed.wait_for(lambda: self.count != count, timeout_s)
 
     def wake(self) -> None:
-        """Make all that wait look again."""
+        """Make all waiting threads check again."""
         with self._changed:
             self.count += 1
             self._changed.notify_all()
 
     def missing(self, topics: Collection[str]) -> list[str]:
-        """Return those of `topics` of which nothing has come since the start."""
+        """Return those of `topics` on which nothing has been received yet."""
         with self._changed:
             return [topic for topic in topics if topic not in self._received]
 
     def ages(self, topics: Collection[str], now: float, renewed: bool = False) -> dict[str, float]:
         """
-        Return how long ago each topic was heard, {topic: seconds}, infinity for never.
+        Return the age of the last message of each topic, {topic: seconds}, infinity for none.
 
         :param now: monotonic time.
         :param renewed: messages that repeat the stamp of the one before do not count.
@@ -263,11 +267,71 @@ class Observations:
             return {topic: now - times.get(topic, -math.inf) for topic in topics}
 
 
+class OnDemandObservations(Observations):
+    """
+    Observations of topics that are received often and needed seldom: messages are polled.
+
+    With a callback for each message, every one would interrupt a running network.
+
+    :param types: {short name: (message type, topic name)}, the one whose stamp counts first.
+    :param qos: QoSProfile of all of them; its depth is how many messages wait to be taken.
+    :param latched: as in Observations.
+    :param on_message: called with the topic name for each message that is taken, or None.
+    """
+
+    def __init__(self, node: 'Node', types: Mapping[str, tuple[type, str]], qos: 'QoSProfile',
+                 latched: bool = False, on_message: Callable[[str], object] | None = None) -> None:
+        super().__init__(*types, latched=latched)
+        self._polling = threading.Lock()
+        self._on_message, self._types = on_message, types
+        group = PollOnlyGroup()
+        self._subscriptions = {
+            topic: AdaptiveSubscription(node, message_type, name, lambda message: None, qos, group)
+            for topic, (message_type, name) in types.items()}
+        self._adapted = -math.inf  # monotonic time
+
+    def moment(self, topics: Collection[str], after_ns: int = -1,
+               since: float = -math.inf) -> Moment | None:
+        """Return the newest Moment, after taking what has arrived."""
+        self.poll()
+        return super().moment(topics, after_ns, since)
+
+    def wait(self, topics: Collection[str], timeout_s: float, after_ns: int = -1,
+             give_up: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
+        """Wait for an observation, polling."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            found = self.newest(*topics, after_ns=after_ns)
+            if found is not None or time.monotonic() >= deadline or give_up():
+                return found
+            time.sleep(POLL_PERIOD)
+
+    def missing(self, topics: Collection[str]) -> list[str]:
+        """Return those of `topics` on which nothing has been received yet."""
+        self.poll()
+        return super().missing(topics)
+
+    def poll(self) -> None:
+        """Take what has arrived, all topics together in the order of reception."""
+        with self._polling:
+            taken = [(reception_time(info), topic, message, info.get('source_timestamp', 0))
+                     for topic, subscription in self._subscriptions.items()
+                     for message, info in subscription.take(POLL_LIMIT)]
+            if time.monotonic() - self._adapted > ADAPT_PERIOD:
+                self._adapted = time.monotonic()
+                for subscription in self._subscriptions.values():  # nothing waits in it now
+                    subscription.adapt()
+            for received, topic, message, sent_ns in sorted(taken, key=lambda one: one[0]):
+                self.put(topic, message, received, sent_ns)
+                if self._on_message is not None:
+                    self._on_message(self._types[topic][1])
+
+
 def reception_time(info: Mapping[str, Any]) -> float:
     """
     Return the monotonic time at which the middleware received a message.
 
-    It may have waited in a queue since then; an executor that lags makes nothing look fresh.
+    It may have waited in a queue since then, so a slow executor makes no message look fresh.
 
     :param info: what rclpy hands to a callback beside the message.
     """

@@ -79,12 +79,17 @@ class Parameters:
         return SetParametersResult(successful=True)
 
 
+def declare_device(parameters: Parameters) -> None:
+    """Declare the parameter device."""
+    parameters.declare('device', 'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
+                       choices=['cpu', 'cuda'])
+
+
 def check_device(device: str) -> None:
     """
-    Accept a device or say that it is not there.
+    Raise ConfigError for a device that is not available.
 
     :param device: 'cpu' or 'cuda'.
-    :raises ConfigError: for cuda without a GPU that torch can use.
     """
     import torch  # here, since it takes seconds, and not every node has a device
     if device == 'cuda' and not torch.cuda.is_available():

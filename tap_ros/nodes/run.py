@@ -1,12 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Starting and ending a node process."""
+"""Starting and ending a node process, and how Fast DDS is set up for it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
+import os
+from pathlib import Path
 import signal
 import sys
 import threading
-import traceback
 from typing import Any, TYPE_CHECKING
 
 import rclpy
@@ -18,12 +19,20 @@ from rclpy.executors import (
 from rclpy.signals import SignalHandlerOptions
 from tap_ros.errors import TapError
 from tap_ros.nodes.heartbeat import Heartbeat
-from tap_ros.nodes.middleware import configure_fast_dds
+from tap_ros.nodes.services import log_error
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
     from rclpy.node import Node
+
+SUBNET = Path(__file__).with_name('fastdds_subnet.xml')
+LOCALHOST = Path(__file__).with_name('fastdds_localhost.xml')
+PROFILE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+CHOICES = (PROFILE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS')
+FAST_DDS = (None, '', 'rmw_fastrtps_cpp', 'rmw_fastrtps_dynamic_cpp')
+RANGE = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+LOCALHOST_ONLY = 'ROS_LOCALHOST_ONLY'  # older than RANGE, and takes precedence
 
 
 class _Ended(BaseException):
@@ -35,16 +44,16 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
     """
     Run one node until SIGINT, SIGTERM, or its terminal is closed.
 
-    On a signal the callback in progress is finished and `node.close()` is called before ROS shuts
+    On a signal the running callback is finished and `node.close()` is called before ROS shuts
     down: rclpy's own signal handlers would end the context first, and neither a last command nor a
-    last episode mark could be sent. `close` is called whatever ends the node. What a callback
-    raises is logged, and the node goes on.
+    last episode mark could be sent. `close` is called whatever ends the node. An exception in a
+    callback is logged, and the node goes on.
 
     :param make_node: called without arguments after rclpy.init; a TapError from it is fatal.
     :param name: name for the log until the node has one.
     :param args: command-line arguments, None for those of the process.
     :param num_threads: threads for callbacks; with 1 all of them run in the calling thread.
-    :return: exit code: 1 when the node could not be started, or close says so by returning 1.
+    :return: exit code: 1 when the node could not be started, or when close returns 1.
     """
     stop = threading.Event()
 
@@ -70,17 +79,15 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
             _spin_once(executor, node)
     except (_Ended, KeyboardInterrupt, ExternalShutdownException):
         pass
-    except TapError as error:
-        if not stop.is_set():  # else it is what the signal has broken
-            rclpy.logging.get_logger(name).fatal(escaped(error, 1000))
+    except (TapError, RuntimeError) as error:
+        if not stop.is_set():  # else it is a consequence of the signal
             code = 1
-    except RuntimeError as error:
-        if not stop.is_set():
-            if node is not None or rclpy.ok():
+            if isinstance(error, TapError):
+                rclpy.logging.get_logger(name).fatal(escaped(error, 1000))
+            elif node is not None or rclpy.ok():
                 raise
-            # What follows --ros-args cannot be parsed.
-            print(f'{name}: {escaped(error, 1000)}', file=sys.stderr)
-            code = 1
+            else:  # what follows --ros-args cannot be parsed
+                print(f'{name}: {escaped(error, 1000)}', file=sys.stderr)
     finally:
         _handle_signals(lambda *_: None)  # it is ending already
         if node is not None:
@@ -95,30 +102,35 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
     return code
 
 
-def refusal(kind: type, message: str) -> Any:
-    """Return a response of this type, with the fields success and message, that refuses."""
-    return kind(success=False, message=message)
-
-
-def answering(node: 'Node', callback: Callable[[Any, Any], Any],
-              refuse: Callable[[type, str], Any] = refusal) -> Callable[[Any, Any], Any]:
+def configure_fast_dds(environ: MutableMapping[str, str] = os.environ) -> None:
     """
-    Let a service answer whatever its callback raises.
+    Let Fast DDS drop this process 3 s after its death, and use UDP alone.
 
-    :param node: rclpy Node, for its log.
-    :param callback: of a service.
-    :param refuse: makes a response of a type and a message.
-    :return: a callback that raises nothing.
+    By default it waits for 20 s, and until then others send calls of its services to it. Much
+    less than 3 s is too little on a loaded machine: a node that is dropped and comes back can
+    lose what is sent to it for a while. Shared memory is left out as Fast DDS 2.14 loses what a
+    process sends to one that was killed and started again (its pull request 4728).
+
+    To be called before rclpy.init. Another middleware, and profiles or transports that the user
+    has chosen, are left alone; so is LOCALHOST with ROS_STATIC_PEERS, where rmw_fastrtps adds
+    shared memory.
+
+    :param environ: the variables of this process, which rclpy.init reads.
     """
-    def answer(request: Any, response: Any) -> Any:
-        try:
-            return callback(request, response)
-        except Exception as error:
-            node.get_logger().error(traceback.format_exc())
-            return refuse(
-                type(response), f'internal error: {type(error).__name__}: {escaped(error)}')
-
-    return answer
+    if environ.get('RMW_IMPLEMENTATION') not in FAST_DDS or any(
+            name in environ for name in CHOICES):
+        return
+    profile = SUBNET
+    alone = environ.get(LOCALHOST_ONLY) == '1'
+    local = alone or environ.get(RANGE, '').upper() == 'LOCALHOST'
+    if local and (alone or not environ.get('ROS_STATIC_PEERS')):
+        profile = LOCALHOST
+    if not profile.is_file():  # without it the range must stay as it is
+        return
+    environ[PROFILE] = str(profile)
+    if profile is LOCALHOST:  # rmw_fastrtps leaves the system's default alone
+        environ.pop(LOCALHOST_ONLY, None)
+        environ[RANGE] = 'SYSTEM_DEFAULT'
 
 
 def _handle_signals(handler: Callable[[int, Any], Any]) -> None:
@@ -136,15 +148,13 @@ def _spin_once(executor: 'Executor', node: 'Node') -> None:
     except (KeyboardInterrupt, ExternalShutdownException):
         raise
     except Exception as error:
-        node.get_logger().error(
-            f'a callback failed with {type(error).__name__}: {escaped(error)}; going on\n'
-            + traceback.format_exc())
+        log_error(node, 'a callback failed; the node goes on', error)
 
 
 def _close(node: Any) -> int:
     """Let the node end what it does; return its exit code."""
     try:
         return node.close() or 0
-    except Exception:
-        node.get_logger().error(f'the node did not end cleanly:\n{traceback.format_exc()}')
+    except Exception as error:
+        log_error(node, 'the node did not end cleanly', error)
         return 1

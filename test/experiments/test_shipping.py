@@ -61,7 +61,7 @@ def test_a_card_says_what_samples_are_worth_and_that_no_goal_is_given(
         train='--method genmin-vae --mode forward --steps 2 --batch-size 2 --base-width 4'))
     assert command.run(command.Options(only=(TINY.name,), **places)) == 0
     card = Path(places['out'], 'predictor_tiny.md').read_text()
-    for text in ('a later picture from a start picture alone', 'forward_weights:=tiny',
+    for text in ('a later picture from a start picture alone', ' weights:=tiny',
                  'The best of 100 samples', 'Samples place an object', 'prediction (z = 0)',
                  'goal picture none', '| none | copy-start |'):
         assert text in card, text

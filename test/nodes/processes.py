@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Real nodes as real processes, and a client node of the test's own, all over DDS."""
+"""Nodes as processes or in this process, and a client node of the test's own, all over DDS."""
 
 import os
 from pathlib import Path
@@ -8,12 +8,16 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 from rclpy.context import Context
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from tap_ros.contract import NODE_MODULES
 from tap_ros.nodes.clients import Spinner
+from tap_ros.nodes.heartbeat import Heartbeat
 
 ROOT = Path(__file__).parents[2]
 
@@ -82,6 +86,56 @@ class Client:
         self.spinner.__exit__()
         self.node.destroy_node()
         self.context.try_shutdown()
+
+
+class LocalNode:
+    """
+    A node in a thread of this process: it starts in a fraction of the time of a process.
+
+    :param make: class of the node.
+    :param num_threads: of its executor.
+    :param remaps: {name: new name} of topics and services.
+    :param parameters: its ROS parameters.
+    """
+
+    def __init__(self, make, namespace='', num_threads=1, remaps=None, **parameters):
+        self.context = Context()
+        self.context.init(args=[])
+        self.running = True
+        try:
+            rules = [word for pair in (remaps or {}).items() for word in ('-r', ':='.join(pair))]
+            self.node = make(
+                context=self.context, namespace=namespace,
+                cli_args=['--ros-args', *rules] if rules else None, parameter_overrides=[
+                    Parameter(name, value=str(value) if isinstance(value, Path) else value)
+                    for name, value in parameters.items()])
+        except BaseException:
+            self.context.try_shutdown()
+            raise
+        self.executor = (
+            SingleThreadedExecutor(context=self.context) if num_threads == 1
+            else MultiThreadedExecutor(num_threads, context=self.context))
+        self.executor.add_node(self.node)
+        self.heartbeat = Heartbeat(self.node)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self):
+        while not self._stop.is_set():
+            self.executor.spin_once(timeout_sec=0.1)
+
+    def end(self):
+        """End the node as run_node does; return what its close() returns."""
+        self.running = False
+        self._stop.set()
+        self._thread.join(20)
+        code = self.node.close()
+        self.heartbeat.end()
+        self.executor.shutdown(timeout_sec=2.0)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+        return code or 0
 
 
 def page_address(process):

@@ -20,12 +20,11 @@ from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call
-from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.on_demand import PulledObservations
-from tap_ros.nodes.planner.planner_inputs import Sight
+from tap_ros.nodes.observations import Observations, OnDemandObservations
+from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import declare_parameters
 from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
-from tap_ros.nodes.subscriptions import Heard, subscribe
+from tap_ros.nodes.subscriptions import AdaptiveSubscription, subscribe
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.messages import encode
@@ -147,9 +146,10 @@ def test_what_was_latched_before_does_not_come_back(client):
                                'world', ObjectStates.SOURCE_TRACKED) for u in (3, 5))
     kept = client.create_publisher(ObjectStates, 'goal/objects', LATCHED)
     kept.publish(old)
-    pulled = PulledObservations(client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED, True)
+    types = {'objects': (ObjectStates, 'goal/objects')}
+    pulled = OnDemandObservations(client, types, LATCHED, True)
     observed = Observations('objects', latched=True)
-    observed.subscribe(client, {'objects': (ObjectStates, 'goal/objects')}, LATCHED)
+    observed.subscribe(client, types, LATCHED)
 
     def newest():
         return [found['objects'].objects[0].u if (found := each.newest('objects')) else None
@@ -180,7 +180,7 @@ def test_overrides_change_that_subscription_alone_and_wrong_ones_are_named(clien
     with Client('overridden', parameter_overrides=[Parameter(name, value='best_effort')]) as node:
         made = subscribe(node, Image, 'camera/image_raw', print, STREAM)
         assert made.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-        heard = Heard(node, Image, 'camera/image_raw', print, STREAM)
+        heard = AdaptiveSubscription(node, Image, 'camera/image_raw', print, STREAM)
         assert heard.subscription.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
     assert STREAM.reliability == ReliabilityPolicy.RELIABLE, 'others share it'
     for wrong in ('besteffort', 7):
@@ -224,7 +224,7 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
     with Client('planner', parameter_overrides=[
             Parameter('image_transport', value=transport)]) as node:
         params = declare_parameters(node)
-        sight = Sight(node, params, lambda: crop, lambda name: None)
+        sight = PlannerInputs(node, params, lambda: crop, lambda name: None)
         message = jpeg(START) if transport == 'compressed' else encode_image(START, STAMP, 'eye')
         name = sight._types['image'][1]
         objects = encode_objects(('cup', 'box'), PIXELS, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP,
@@ -259,7 +259,7 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
         sight.begin(time.monotonic())
         other = encode_image(np.ascontiguousarray(START[:240, :320]), to_stamp(9 * 10**9), 'eye')
         sight.sensors.put('image', other), sight.sensors.put('objects', stamped(objects, 9))
-        sight.sensors.attach('joints', 9 * 10**9, np.zeros(4, np.float32), time.monotonic())
+        sight.sensors.put('joints', stamped(joints, 9))
         with pytest.raises(ImageError, match='320x240 pixels; the forward model was trained on '
                                              'those of 640x480'):
             sight.look(sight.topics())

@@ -13,7 +13,7 @@ from std_srvs.srv import SetBool
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, CallError, Newest
 from tap_ros.nodes.heartbeat import Liveness, QOS
-from tap_ros.nodes.middleware import configure_fast_dds, LOCALHOST, SUBNET
+from tap_ros.nodes.run import configure_fast_dds, LOCALHOST, SUBNET
 
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 

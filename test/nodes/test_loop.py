@@ -10,18 +10,17 @@ from diagnostic_msgs.msg import DiagnosticArray
 from loop import SEED
 from mcap.reader import make_reader
 import numpy as np
-from processes import Client, NodeProcess
+from processes import NodeProcess
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
-from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import NODE_MODULES
 from tap_ros.images.drawing import OBJECT_COLOURS
 from tap_ros.messages.images import decode_image, decode_map
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call, Newest, send_goal
+from tap_ros.nodes.clients import Newest, send_goal
 from tap_ros.nodes.predictor.node import OVERLAY_SCALE
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.topics import STREAM, to_stamp
@@ -220,31 +219,6 @@ def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
     assert np.allclose(whole.actions[:2, :3], moves)
     assert whole.frames.std() > 5 and np.isfinite(whole.object_pixels).all()
     assert whole.goal_frame is not None
-
-
-def test_a_predictor_alone_says_what_is_missing_and_may_resize(tmp_path):
-    process = NodeProcess('predictor_node', tmp_path / 'log.txt',
-                          {'resize_images': 'true'}, ['-r __ns:=/alone'])
-    try:
-        with Client() as node:
-            client = node.create_client(PredictSubgoal, '/alone/predict_subgoal')
-            process.wait_for('ready', 120)
-            response = call(client, PredictSubgoal.Request(), 30)
-            assert not response.success
-            assert 'start' in response.message and '/alone/camera/image_raw' in response.message
-            large = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
-            image = encode_image(large, to_stamp(0), 'eye')
-            response = call(client, PredictSubgoal.Request(start=image), 30)
-            assert not response.success
-            assert 'goal' in response.message and '/alone/goal/image' in response.message
-            response = call(client, PredictSubgoal.Request(start=image, goal=image), 30)
-            assert response.success, response.message
-            subgoal, = response.subgoals
-            assert (subgoal.image.width, subgoal.image.height) == (64, 64)
-            assert subgoal.image.header.frame_id == 'eye'
-            assert process.end() == 0, process.text
-    finally:
-        process.kill()
 
 
 @pytest.mark.parametrize('name', ['predictor_node', 'visual_mpc_node'])

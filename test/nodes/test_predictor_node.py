@@ -1,23 +1,28 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""predict_subgoal in all its modes, asked over DDS of real nodes with small untrained networks."""
+"""predict_subgoal and the states of its node, asked over DDS, with small untrained networks."""
 
+import signal
 
+from lifecycle import Lifecycle
+from lifecycle_msgs.msg import State, Transition
 from lively import lively_network
 import numpy as np
-from processes import Client, NodeProcess
+from processes import Client, LocalNode, NodeProcess
 import pytest
 from sensor_msgs.msg import Image
+from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.messages.images import decode_image
 from tap_ros.nodes.clients import call, Newest, wait_for_future
+from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
-from tap_ros.training.weights import save_weights
+from tap_ros.training.weights import save_weights, stored_digest
+from tap_ros.weights import PREDICTORS
 
-pytestmark = pytest.mark.slow
 NAMES = ('cup', 'box')
 STAMP = to_stamp(2_500_000_000)
 PICTURES = np.random.default_rng(0).integers(0, 256, (2, 32, 32, 3), np.uint8)
@@ -42,15 +47,16 @@ def weights_file(path, **config):
     return path
 
 
-class Service:
+class Service(LocalNode):
     """A node in a namespace of its own, so that several can live side by side, and its client."""
 
-    def __init__(self, node, name, folder, **parameters):
-        self.name, self.node = name, node
-        self.process = NodeProcess('predictor_node', folder / f'{name}.log', parameters,
-                                   ['-r', f'__ns:=/{name}'])
-        self.client = node.create_client(PredictSubgoal, f'/{name}/predict_subgoal')
-        self.subgoal = Newest(node, Subgoal, f'/{name}/subgoal', LATCHED)
+    def __init__(self, client, name, **parameters):
+        super().__init__(PredictorNode, f'/{name}', **parameters)
+        self.name, self.client_node = name, client
+        self.client = client.create_client(
+            PredictSubgoal, f'/{name}/predict_subgoal', qos_profile=SERVICE_QOS)
+        self.subgoal = Newest(client, Subgoal, f'/{name}/subgoal', LATCHED)
+        assert self.client.wait_for_service(30)
 
     def ask(self, **fields):
         return call(self.client, PredictSubgoal.Request(**fields), 60)
@@ -69,36 +75,42 @@ class Service:
         assert not len(response.sample) and not len(response.level)
         return response.message
 
-    def publish(self, topic, message):
-        publisher = self.node.create_publisher(type(message), f'/{self.name}/{topic}', LATCHED)
-        publisher.publish(message)
-        return publisher
+    def until(self, words, sends=(), **fields):
+        """Publish (publisher, message) and ask until the answer has these words; return it."""
+        for _ in range(200):
+            for publisher, message in sends:
+                publisher.publish(message)
+            response = self.ask(**fields)
+            if words in response.message:
+                return response
+        raise AssertionError(f'no {words!r}, but: {response.message}')
+
+    def publisher(self, kind, topic, qos):
+        return self.client_node.create_publisher(kind, f'/{self.name}/{topic}', qos)
 
 
 @pytest.fixture(scope='module')
-def services(tmp_path_factory):
-    """Start nodes with both modes, forward only, and without z."""
-    folder = tmp_path_factory.mktemp('predictors')
-    between = weights_file(folder / 'between.safetensors', latent_size=8)
-    forward = weights_file(folder / 'forward.safetensors', num_context=1, latent_size=8)
-    plain = weights_file(folder / 'plain.safetensors')
-    started = {}
+def client():
     with Client() as node:
-        try:
-            for name, files in (('both', {'weights': between, 'forward_weights': forward}),
-                                ('forward', {'weights': forward}), ('plain', {'weights': plain}),
-                                ('masked', {'weights': plain, 'robot_mask': 'all'})):
-                started[name] = Service(node, name, folder, **files)
-            for service in started.values():
-                service.process.wait_for('ready', 120)
-                assert service.client.wait_for_service(30)
-            yield started
-            for service in started.values():
-                assert service.process.end() == 0, service.process.text
-                assert 'Traceback' not in service.process.text
-        finally:
-            for service in started.values():
-                service.process.kill()
+        yield node
+
+
+@pytest.fixture(scope='module')
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('predictors')
+    return {'latent': weights_file(folder / 'latent.safetensors', latent_size=8),
+            'forward': weights_file(folder / 'forward.safetensors', num_context=1, latent_size=8),
+            'plain': weights_file(folder / 'plain.safetensors')}
+
+
+@pytest.fixture(scope='module')
+def services(client, files):
+    """Start nodes for each kind of weights, and one that uses a robot mask."""
+    started = {name: Service(client, name, weights=path) for name, path in files.items()}
+    started['masked'] = Service(client, 'masked', weights=files['plain'], robot_mask='all')
+    yield started
+    for service in started.values():
+        assert service.end() == 0
 
 
 def pictures(response):
@@ -110,60 +122,43 @@ def differ(a, b):
     return np.abs(a - b).mean()
 
 
-@pytest.mark.parametrize('mode', ['bidirectional', 'forward'])
-def test_samples_and_levels_are_told_apart(services, mode):
-    both = services['both']
-    response = both.answer(mode=mode, num_samples=3, recursion_depth=2, seed=4, **WITH_GOAL)
-    assert list(response.sample) == [0, 0, 1, 1, 2, 2]
-    assert list(response.level) == ([2, 1] if mode == 'bidirectional' else [1, 2]) * 3
-    seen = pictures(response)
-    assert all(differ(seen[i], seen[j]) > 3 for i in range(6) for j in range(i))
-    assert response.message.startswith(f'{mode}, 6 subgoals, maps of cup, box')
-    for subgoal in response.subgoals:
-        assert subgoal.header.stamp == STAMP and subgoal.header.frame_id == 'eye'
-        assert tuple(subgoal.object_names) == NAMES
-        assert len(subgoal.object_maps) == len(subgoal.expected_pixels) == 2
-    again = both.answer(mode=mode, num_samples=3, recursion_depth=2, seed=4, **WITH_GOAL)
-    assert again.subgoals == response.subgoals
-    other = both.answer(mode=mode, num_samples=3, recursion_depth=2, seed=5, **WITH_GOAL)
-    assert differ(pictures(other), seen) > 3
-    published = both.subgoal.wait(10, lambda m: m == other.subgoals[0])
-    assert published.image == other.subgoals[0].image  # the first sample's earliest
+def test_samples_and_levels_are_told_apart_and_repeat_from_the_seed(services):
+    for name, mode, levels, fields in (('latent', 'bidirectional', [2, 1], WITH_GOAL),
+                                       ('forward', 'forward', [1, 2], ALONE)):
+        service = services[name]
+        response = service.answer(num_samples=3, recursion_depth=2, seed=4, **fields)
+        assert list(response.sample) == [0, 0, 1, 1, 2, 2]
+        assert list(response.level) == levels * 3
+        seen = pictures(response)
+        assert all(differ(seen[i], seen[j]) > 3 for i in range(6) for j in range(i))
+        assert response.message.startswith(f'{mode}, 6 subgoals, maps of cup, box')
+        for subgoal in response.subgoals:
+            assert subgoal.header.stamp == STAMP and subgoal.header.frame_id == 'eye'
+            assert tuple(subgoal.object_names) == NAMES
+            assert len(subgoal.object_maps) == len(subgoal.expected_pixels) == 2
+        again = service.answer(num_samples=3, recursion_depth=2, seed=4, mode=mode, **fields)
+        assert again.subgoals == response.subgoals
+        other = service.answer(num_samples=3, recursion_depth=2, seed=5, **fields)
+        assert differ(pictures(other), seen) > 3
+        # Published for planners: the first sample's earliest.
+        service.subgoal.wait(10, lambda m, first=other.subgoals[0]: m == first)
 
 
-def test_an_empty_mode_is_what_the_weights_are_for(services):
-    both, forward = services['both'], services['forward']
-    asked = both.answer(mode='bidirectional', **WITH_GOAL)
-    assert both.answer(**WITH_GOAL).subgoals == asked.subgoals
-    assert asked.message.startswith('bidirectional, 1 subgoal,')
-    ahead = both.answer(mode='forward', **ALONE)
-    assert forward.answer(**ALONE).subgoals == ahead.subgoals  # the same weights
-    assert forward.answer(mode='forward', **ALONE).subgoals == ahead.subgoals
-    assert differ(pictures(ahead), pictures(asked)) > 3
-
-
-def test_going_forward_needs_no_goal_and_uses_none(services):
-    both = services['both']
-    ahead = both.answer(mode='forward', **ALONE)
-    assert both.answer(mode='forward', **WITH_GOAL).subgoals == ahead.subgoals
-    no_objects = both.answer(mode='forward', start=START)
+def test_a_mode_is_that_of_the_weights_or_refused(services):
+    latent, forward = services['latent'], services['forward']
+    ahead = forward.answer(**ALONE)
+    assert forward.answer(mode='forward', **WITH_GOAL).subgoals == ahead.subgoals
+    no_objects = forward.answer(start=START)
     assert 'no object maps: start_objects are empty' in no_objects.message
     assert (pictures(no_objects) == pictures(ahead)).all()
-    message = both.refusal(**ALONE)
-    for words in ('goal', '/both/goal/image', 'mode forward'):
-        assert words in message
-    # A sender of a goal expects it to matter.
-    message = services['forward'].refusal(**WITH_GOAL)
-    for words in ('goal', 'forward weights only', 'weights:=', 'leave goal'):
-        assert words in message
-
-
-def test_a_mode_without_weights_says_how_to_get_it(services):
-    assert '-p forward_weights:=' in services['plain'].refusal(mode='forward', **ALONE)
-    assert '-p weights:=' in services['forward'].refusal(mode='bidirectional', **WITH_GOAL)
-    message = services['both'].refusal(mode='backward', **WITH_GOAL)
-    for words in ('mode', 'backward', 'bidirectional, forward'):
-        assert words in message
+    for service, fields, words in (
+            (latent, ALONE, ['goal', '/latent/goal/image']),
+            (forward, WITH_GOAL, ['goal', 'forward', 'weights:=', 'leave goal']),
+            (latent, ALONE | {'mode': 'forward'}, ['-p weights:=FILE, trained for forward']),
+            (forward, WITH_GOAL | {'mode': 'bidirectional'}, ['trained for bidirectional']),
+            (latent, WITH_GOAL | {'mode': 'backward'}, ['backward', 'bidirectional, forward'])):
+        message = service.refusal(**fields)
+        assert all(word in message for word in words), message
 
 
 def test_weights_without_z_give_one_sample_and_say_so(services):
@@ -171,10 +166,9 @@ def test_weights_without_z_give_one_sample_and_say_so(services):
     response = plain.answer(num_samples=5, recursion_depth=2, **WITH_GOAL)
     assert list(response.sample) == [0, 0] and list(response.level) == [2, 1]
     assert 'one sample instead of 5' in response.message
-    assert 'latent variable' in response.message
     single = plain.answer(recursion_depth=2, **WITH_GOAL)
     assert single.subgoals == response.subgoals and 'latent' not in single.message
-    many = services['both'].answer(num_samples=5, **WITH_GOAL)
+    many = services['latent'].answer(num_samples=5, **WITH_GOAL)
     assert len(many.subgoals) == 5 and 'latent' not in many.message
 
 
@@ -182,33 +176,22 @@ def test_why_there_are_no_maps_is_said_of_each_picture(services):
     plain = services['plain']
     response = plain.answer(start=START, goal=GOAL, start_objects=START_OBJECTS)
     assert response.message.endswith('no object maps: goal_objects are empty')
-    publishers = [plain.publish('goal/image', GOAL)]
-
-    def reason(words):
-        """Ask until what was published has come."""
-        for _ in range(50):
-            response = plain.ask(**ALONE)
-            if words in response.message:
-                break
-        assert words in response.message
-        assert response.success
-        return response
-
-    reason('no object maps: nothing has come on /plain/goal/objects')
-    publishers += [plain.publish('goal/objects', objects(
-        [(12, 13), (24, 17)], stamp=to_stamp(1_250_000_000)))]
-    response = reason('/plain/goal/objects has the stamp 1.250000000 s')
+    image = plain.publisher(Image, 'goal/image', LATCHED)
+    image.publish(GOAL)
+    plain.until('no object maps: nothing has come on /plain/goal/objects', **ALONE)
+    goal_objects = plain.publisher(ObjectStates, 'goal/objects', LATCHED)
+    goal_objects.publish(objects([(12, 13), (24, 17)], stamp=to_stamp(1_250_000_000)))
+    response = plain.until('/plain/goal/objects has the stamp 1.250000000 s', **ALONE)
     assert 'the picture on /plain/goal/image 2.500000000 s' in response.message
     assert 'start' not in response.message
-    publishers += [plain.publish('goal/objects', GOAL_OBJECTS)]
-    response = reason('maps of cup, box')
+    goal_objects.publish(GOAL_OBJECTS)
+    response = plain.until('maps of cup, box', **ALONE)
     assert response.subgoals == plain.answer(**WITH_GOAL).subgoals
 
 
 def test_the_robot_is_taken_out_of_the_newest_picture(services):
     masked = services['masked']
-    assert 'robot_mask is all, but the bidirectional weights' in masked.process.text
-    scene, goal = PICTURES
+    scene, _ = PICTURES
     mask = np.zeros((32, 32), np.uint8)
     mask[5:20, 8:24] = ROBOT_MASK_ARM
     robot = np.where(mask[..., None] > 0, 255 - scene, scene)
@@ -216,8 +199,8 @@ def test_the_robot_is_taken_out_of_the_newest_picture(services):
         pictures(masked.answer(start=encode_image(picture, STAMP, 'eye'), goal=GOAL))
         for picture in (scene, robot))  # what a request brings along stays as it is
     assert differ(expected, differing) > 1
-    images = masked.node.create_publisher(Image, '/masked/camera/image_raw', STREAM)
-    masks = masked.node.create_publisher(Image, '/masked/camera/robot_mask', STREAM)
+    images = masked.publisher(Image, 'camera/image_raw', STREAM)
+    masks = masked.publisher(Image, 'camera/robot_mask', STREAM)
 
     def publish(picture, hidden, stamp):
         images.publish(encode_image(picture, to_stamp(stamp), 'eye'))
@@ -226,66 +209,52 @@ def test_the_robot_is_taken_out_of_the_newest_picture(services):
             message.header.stamp = to_stamp(stamp)
             masks.publish(message)
 
+    def ask_until(accept):
+        for _ in range(200):
+            response = masked.ask(goal=GOAL)
+            if accept(response):
+                return response
+        raise AssertionError(response.message)
+
     stamp, response = 10**9, None
-    for _ in range(100):  # until it is discovered
+    while response is None or not response.success:  # until it is discovered
         stamp += 10**8
+        assert stamp < 10**11, response.message
         publish(scene, mask * 0, stamp)
         response = masked.ask(goal=GOAL)
-        if response.success:
-            break
-    assert response.success, response.message
     assert (pictures(response) == expected).all()
     publish(robot, mask, stamp + 10**8)
     publish(robot, mask, stamp + 2 * 10**8)
-    for _ in range(100):
-        response = masked.answer(goal=GOAL)
-        if response.subgoals[0].header.stamp == to_stamp(stamp + 2 * 10**8):
-            break
+    response = ask_until(lambda answer: answer.success and answer.subgoals[
+        0].header.stamp == to_stamp(stamp + 2 * 10**8))
     assert (pictures(response) == expected).all()
     publish(robot, None, stamp + 3 * 10**8)
-    for _ in range(100):
-        response = masked.ask(goal=GOAL)
-        if not response.success:
-            break
+    response = ask_until(lambda answer: not answer.success)
     assert '/masked/camera/robot_mask' in response.message
     assert f'{(stamp + 3 * 10**8) / 1e9:.9f} s' in response.message
 
 
-def test_many_requests_at_once_all_get_their_own_answer(services):
-    both = services['both']
-    client = both.node.create_client(
-        PredictSubgoal, '/both/predict_subgoal', qos_profile=SERVICE_QOS)
-    assert client.wait_for_service(30)
-    modes = ('bidirectional', 'forward')
-    alone = [pictures(both.answer(mode=mode, seed=seed, **WITH_GOAL))
-             for seed in range(8) for mode in modes]
-    futures = [client.call_async(PredictSubgoal.Request(mode=mode, seed=seed, **WITH_GOAL))
-               for seed in range(8) for mode in modes]
+def test_many_requests_at_once_get_their_own_answer_and_beyond_the_queue_busy(services):
+    latent = services['latent']
+    alone = [pictures(latent.answer(seed=seed, **WITH_GOAL)) for seed in range(8)]
+    futures = [latent.client.call_async(PredictSubgoal.Request(seed=seed, **WITH_GOAL))
+               for seed in range(8)]
     for future, expected in zip(futures, alone, strict=True):
         assert wait_for_future(future, 60)
         assert future.result().success, future.result().message
         assert differ(pictures(future.result()), expected) < 0.1
-
-
-def test_beyond_the_queue_requests_are_told_that_the_node_is_busy(services):
-    both = services['both']
-    client = both.node.create_client(
-        PredictSubgoal, '/both/predict_subgoal', qos_profile=SERVICE_QOS)
-    assert client.wait_for_service(30)
-    request = PredictSubgoal.Request(
-        mode='forward', num_samples=6, recursion_depth=8, **WITH_GOAL)
-    futures = [client.call_async(request) for _ in range(150)]
+    request = PredictSubgoal.Request(num_samples=6, recursion_depth=8, **WITH_GOAL)
+    futures = [latent.client.call_async(request) for _ in range(150)]
     assert all(wait_for_future(future, 120) for future in futures)
     refused = [f.result().message for f in futures if not f.result().success]
     assert 0 < len(refused) <= 150 - 64
-    assert set(refused) == {
-        'busy: 64 requests are waiting, which is the most that may; ask again'}
-    both.answer(**WITH_GOAL)
+    assert set(refused) == {'busy: 64 requests are waiting, which is the most that may; ask again'}
+    latent.answer(**WITH_GOAL)
 
 
-def test_each_bound_is_named_and_what_is_refused_touches_nothing(services):
-    both = services['both']
-    before = both.answer(**WITH_GOAL).subgoals
+def test_each_bound_is_named_and_what_is_refused_touches_nothing(services, capfd):
+    latent = services['latent']
+    before = latent.answer(**WITH_GOAL).subgoals
     crowd = [f'cup {n}' for n in range(10_000)]
     thirty = objects(30 * [(8, 9)], crowd[:30])
     forged = 'cup\n[INFO] [0.0] [predictor_node]: all is well\x1b[2J'
@@ -293,6 +262,7 @@ def test_each_bound_is_named_and_what_is_refused_touches_nothing(services):
     for fields, words in (
             ({'start_objects': objects(10_000 * [(8, 9)], crowd), 'recursion_depth': 8},
              ['start_objects', '10000 objects', '32']),
+            ({'num_samples': 101}, ['num_samples is 101', '1 to 100']),
             ({'num_samples': 51, 'recursion_depth': 4},
              ['num_samples x recursion_depth', '51 x 4 = 204', '200']),
             ({'num_samples': 50, 'recursion_depth': 4, 'start_objects': thirty,
@@ -305,25 +275,119 @@ def test_each_bound_is_named_and_what_is_refused_touches_nothing(services):
             ({'start_objects': objects([(8, 9), (8, 9)], [forged, forged])}, ['cup\\n[INFO]']),
             ({'start_objects': objects([(8, 9)], [forged])}, ['lacks cup\\n[INFO]']),
             ({'mode': forged}, ['cup\\n[INFO]'])):
-        message = both.refusal(**{**WITH_GOAL, **fields})
-        for word in words:
-            assert word in message
+        message = latent.refusal(**{**WITH_GOAL, **fields})
+        assert all(word in message for word in words), message
         assert message.isprintable()
-        assert both.answer(**WITH_GOAL).subgoals == before
-    assert '\n[INFO] [0.0]' not in both.process.text and '\x1b[2J' not in both.process.text
+        assert latent.answer(**WITH_GOAL).subgoals == before
+    text = ''.join(capfd.readouterr())
+    assert '\n[INFO] [0.0]' not in text and '\x1b[2J' not in text
 
 
-@pytest.mark.parametrize('swapped', [False, True])
-def test_forward_weights_must_be_that_and_given_once(tmp_path, swapped):
-    between = weights_file(tmp_path / 'between.safetensors')
-    forward = weights_file(tmp_path / 'forward.safetensors', num_context=1)
-    given = {'weights': forward if swapped else between,
-             'forward_weights': forward if swapped else between}
-    process = NodeProcess('predictor_node', tmp_path / 'log.txt', given)
+@pytest.fixture
+def managed(client, files, tmp_path):
+    """Return a node that starts by itself or not, and its states."""
+    started = []
+
+    def start(**parameters):
+        name = f'managed{len(started)}'
+        mine = tmp_path / 'mine.safetensors'
+        mine.write_bytes(files['plain'].read_bytes())
+        started.append(Service(client, name, **{'weights': mine} | parameters))
+        return started[-1], Lifecycle(client, f'/{name}/predictor_node')
+
+    yield start
+    for service in started:
+        assert service.end() == 0
+
+
+def test_a_node_answers_while_it_is_active_alone(managed, tmp_path):
+    service, states = managed(autostart=False)
+    assert states.now() == State.PRIMARY_STATE_UNCONFIGURED
+    assert 'configure, then activate' in service.refusal(**WITH_GOAL)
+    assert not states.to('activate'), 'a transition that the state does not have is answered'
+    assert states.set('weights', tmp_path / 'none.safetensors') == ''
+    assert not states.to('configure')
+    assert states.now() == State.PRIMARY_STATE_UNCONFIGURED
+    assert states.set('weights', tmp_path / 'mine.safetensors') == ''
+    assert states.to('configure') and states.now() == State.PRIMARY_STATE_INACTIVE
+    assert ('ros2 lifecycle set /managed0/predictor_node activate'
+            in service.refusal(**WITH_GOAL))
+    assert states.to('activate')
+    before = pictures(service.answer(**WITH_GOAL))
+    assert states.to('deactivate') and 'inactive' in service.refusal(**WITH_GOAL)
+    assert states.to('activate')
+    assert np.array_equal(before, pictures(service.answer(**WITH_GOAL)))
+    assert states.to('deactivate') and states.to('cleanup')
+    assert 'no weights' in service.refusal(**WITH_GOAL)
+    assert states.to('configure') and states.to('activate')
+    assert np.array_equal(before, pictures(service.answer(**WITH_GOAL)))
+    assert states.to(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert states.now() == State.PRIMARY_STATE_FINALIZED
+    assert 'start it again' in service.refusal(**WITH_GOAL)
+
+
+def test_weights_change_while_a_node_is_unconfigured_alone(managed, files):
+    service, states = managed()
+    reason = states.set('weights', files['latent'])
+    assert 'weights' in reason and 'deactivate, then' in reason and 'cleanup' in reason
+    assert len(service.answer(num_samples=3, **WITH_GOAL).subgoals) == 1, 'still the first ones'
+    assert states.to('deactivate')
+    assert 'predictor_node cleanup' in states.set('weights', files['latent'])
+    assert states.to('cleanup') and states.set('weights', files['latent']) == ''
+    assert states.to('configure') and states.to('activate')
+    assert len(service.answer(num_samples=3, **WITH_GOAL).subgoals) == 3, 'these have z'
+
+
+def test_who_waits_is_answered_when_the_node_is_deactivated(managed):
+    service, states = managed()
+    request = PredictSubgoal.Request(recursion_depth=8, **WITH_GOAL)
+    waiting = [service.client.call_async(request) for _ in range(40)]
+    assert wait_for_future(waiting[0], 60)
+    assert states.to('deactivate')
+    assert all(wait_for_future(future, 60) for future in waiting)
+    refused = [future.result().message for future in waiting if not future.result().success]
+    assert waiting[0].result().success
+    assert all('activate it' in message for message in refused)
+    assert states.to('activate')
+    service.answer(**WITH_GOAL)
+
+
+def test_the_model_card_is_that_of_the_weights_in_use(client, managed, tmp_path):
+    card = Newest(client, String, '/managed0/predictor_node/model_card', LATCHED)
+    _, states = managed(autostart=False)
+    assert states.to('configure')
+    mine = tmp_path / 'mine.safetensors'
+    digest = stored_digest(mine)
+    weights_file(mine, latent_size=8)  # a newer file is not what was loaded
+    assert stored_digest(mine) != digest and states.to('activate')
+    text = card.wait(20).data
+    assert text.startswith('# mine.safetensors') and 'No model card' in text and digest in text
+    assert str(tmp_path) not in text
+    shipped = PREDICTORS['pick_place_vae']
+    card = Newest(client, String, '/managed1/predictor_node/model_card', LATCHED)
+    managed(weights='pick_place_vae')
+    text = card.wait(20).data
+    assert text.startswith(shipped.with_suffix('.md').read_text().rstrip())
+    assert stored_digest(shipped) in text
+
+
+@pytest.mark.slow
+def test_a_process_ends_well_at_work_and_wrong_weights_end_the_start(client, files, tmp_path):
+    process = NodeProcess('predictor_node', tmp_path / 'log.txt', {'weights': files['latent']},
+                          ['-r __ns:=/ending'])
+    wrong = NodeProcess('predictor_node', tmp_path / 'wrong.txt', {'weights': tmp_path / 'no.w'})
     try:
-        assert process.process.wait(120) == 1
-        line, = [line for line in process.text.splitlines() if line.strip()]
-        assert '[FATAL]' in line and 'forward_weights' in line
-        assert str(forward if swapped else between) in line
+        asked = client.create_client(
+            PredictSubgoal, '/ending/predict_subgoal', qos_profile=SERVICE_QOS)
+        assert asked.wait_for_service(60)
+        request = PredictSubgoal.Request(num_samples=6, recursion_depth=8, **WITH_GOAL)
+        futures = [asked.call_async(request) for _ in range(40)]
+        assert wait_for_future(futures[0], 60)
+        assert process.end(signal.SIGINT) == 0, process.text
+        assert all(wait_for_future(future, 20) for future in futures)
+        assert 'Traceback' not in process.text
+        assert wrong.process.wait(60) == 1
+        line, = [line for line in wrong.text.splitlines() if line.strip()]
+        assert '[FATAL]' in line and 'no.w' in line
     finally:
-        process.kill()
+        process.kill(), wrong.kill()

@@ -2,78 +2,81 @@
 # SPDX-License-Identifier: Apache-2.0
 """robot_mask_node beside the simulator: masks with the stamps of the pictures, or the reason."""
 
+from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
-from processes import Client, NodeProcess
+from processes import Client, LocalNode, NodeProcess
 import pytest
 from sensor_msgs.msg import CameraInfo, Image
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.errors import ImageError
+from tap_ros.errors import ImageError, TapError
 from tap_ros.messages.images import decode_camera_info, decode_mask
 from tap_ros.nodes.clients import Newest
+from tap_ros.nodes.robot_mask.node import RobotMaskNode
 from tap_ros.nodes.ros_messages import encode_camera_info
 from tap_ros.nodes.topics import STREAM, to_stamp
 
 CAMERA = {  # of the simulator with its arm: 0.84 rad from straight down
     'camera_y': -1.36, 'camera_z': 1.33,
     'camera_qx': np.cos(0.42), 'camera_qy': 0.0, 'camera_qz': 0.0, 'camera_qw': -np.sin(0.42)}
-SIM = {'lock_step': 'true', 'seed': 3, 'look': 'ur10e'}
-OWN_TOPIC = ['-r camera/robot_mask:=own_mask']
 
 
-@pytest.mark.parametrize('shape', [
-    {}, {'urdf': 'ur10e', 'hand_radius': 0.04}], ids=['topic', 'own'])
-def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path, shape):
-    sim = NodeProcess('sim_node', tmp_path / 'sim.txt', SIM)
-    node = NodeProcess('robot_mask_node', tmp_path / 'mask.txt',
-                       {**CAMERA, **shape, 'shadow': 'true', 'light_x': 0.45, 'light_y': 0.28},
-                       OWN_TOPIC)
+def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path):
+    sim = NodeProcess('sim_node', tmp_path / 'sim.txt',
+                      {'lock_step': 'true', 'seed': 3, 'look': 'ur10e'})
+    nodes = []
     try:
-        for process in (sim, node):
-            process.wait_for('ready')
-        with Client() as client:
-            true, own = (Newest(client, Image, topic, STREAM)
-                         for topic in ('camera/robot_mask', 'own_mask'))
-            message = own.wait(30)
-            simulated = true.wait(10, lambda m: m.header.stamp == message.header.stamp)
-        assert message.header == simulated.header
-        mask, wanted = (decode_mask(m, 'mask', (64, 64)) for m in (message, simulated))
-        arm = wanted == ROBOT_MASK_ARM
-        assert (mask[arm] != ROBOT_MASK_FREE).mean() > 0.97
-        assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.88
-        assert (mask == ROBOT_MASK_HAND).any() == bool(shape)
-        assert node.end() == 0
+        sim.wait_for('ready')
+        for shape in ({}, {'urdf': 'ur10e', 'hand_radius': 0.04}):  # by topic, our own
+            own_topic = f'own_mask{len(nodes)}'
+            nodes.append(LocalNode(
+                RobotMaskNode, remaps={'camera/robot_mask': own_topic}, **CAMERA, **shape,
+                shadow=True, light_x=0.45, light_y=0.28))
+            with Client() as client:
+                true, own = (Newest(client, Image, topic, STREAM)
+                             for topic in ('camera/robot_mask', own_topic))
+                message = own.wait(30)
+                simulated = true.wait(
+                    10, lambda m, stamp=message.header.stamp: m.header.stamp == stamp)
+            assert message.header == simulated.header
+            mask, wanted = (decode_mask(m, 'mask', (64, 64)) for m in (message, simulated))
+            arm = wanted == ROBOT_MASK_ARM
+            assert (mask[arm] != ROBOT_MASK_FREE).mean() > 0.97
+            assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.88
+            assert (mask == ROBOT_MASK_HAND).any() == bool(shape)
     finally:
-        for process in (sim, node):
-            process.kill()
+        sim.kill()
+        for node in nodes:
+            node.end()
 
 
-def test_without_a_robot_there_is_no_mask_and_the_reason(tmp_path):
-    sim = NodeProcess('sim_node', tmp_path / 'sim.txt', {'lock_step': 'true'}, [
-        '-r robot_description:=elsewhere', '-r joint_states:=elsewhere_too'])
-    node = NodeProcess('robot_mask_node', tmp_path / 'mask.txt', CAMERA, OWN_TOPIC)
-    own = NodeProcess('robot_mask_node', tmp_path / 'own.txt', CAMERA | {'urdf': 'ur10e'},
-                      [*OWN_TOPIC, '-r __node:=other'])
-    try:
-        node.wait_for('no robot mask: nothing that can be used has come on robot_description')
-        own.wait_for('no robot mask: nothing is known of shoulder_pan_joint')
-    finally:
-        for process in (sim, node, own):
-            process.kill()
+def test_without_a_robot_or_its_joints_there_is_no_mask_and_the_reason(client):
+    cameras = client.create_publisher(CameraInfo, 'alone/camera/camera_info', STREAM)
+    diagnostics = Newest(client, DiagnosticArray, '/diagnostics', 10)
+    camera = encode_camera_info(np.eye(3), (64, 64), to_stamp(10**9), 'eye')
+    for parameters, words in (
+            ({}, 'nothing that can be used has come on robot_description'),
+            ({'urdf': 'ur10e'}, 'nothing is known of shoulder_pan_joint')):
+        node = LocalNode(RobotMaskNode, '/alone', **CAMERA, **parameters)
+
+        def tells_why(message, words=words):
+            cameras.publish(camera)
+            return any(words in pair.value for status in message.status for pair in status.values)
+
+        try:
+            diagnostics.wait(30, tells_why)
+        finally:
+            node.end()
 
 
-@pytest.mark.parametrize('parameters, words', [
-    ({'urdf': '/nowhere.urdf'}, '/nowhere.urdf is no file'),
-    ({'urdf': 'ur10e', 'base_frame': 'nowhere'}, 'no link nowhere; it has world, base'),
-    ({'shadow': 'true', 'light_z': 1.0}, 'light_z: is 1; expected less than 0'),
-    ({'camera_qx': 0.0}, 'a quaternion of no direction'),
-    ({'camera_pose': 'guess'}, 'valid choices: parameters, tf')])
-def test_a_bad_start_ends_with_one_clear_line(tmp_path, parameters, words):
-    node = NodeProcess('robot_mask_node', tmp_path / 'mask.txt', parameters)
-    try:
-        assert node.process.wait(60) == 1
-        assert words in node.text and 'Traceback' not in node.text
-    finally:
-        node.kill()
+def test_a_bad_start_names_the_parameter():
+    for parameters, words in (
+            ({'urdf': '/nowhere.urdf'}, '/nowhere.urdf is no file'),
+            ({'urdf': 'ur10e', 'base_frame': 'nowhere'}, 'no link nowhere; it has world, base'),
+            ({'shadow': True, 'light_z': 1.0}, 'light_z: is 1; expected less than 0'),
+            ({'camera_qx': 0.0}, 'a quaternion of no direction'),
+            ({'dilation': -1.0}, 'dilation')):
+        with pytest.raises(TapError, match=words):
+            LocalNode(RobotMaskNode, **parameters)
 
 
 def test_intrinsics_are_those_of_the_pictures_that_are_sent():

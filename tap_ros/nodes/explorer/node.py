@@ -36,7 +36,7 @@ from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD
+from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.text import escaped
 
@@ -90,15 +90,16 @@ class ExplorerNode(Node):
             self._hear(Subgoal, 'subgoal', 'subgoal', LATCHED),
             self._hear(ObjectStates, 'objects', 'objects', STREAM),
             self._hear(ObjectStates, 'goal/objects', 'goal_objects', LATCHED),
-            Heard(self, Episode, 'episode', self._on_episode, STREAM),
-            Heard(self, DiagnosticArray, '/diagnostics', self._on_diagnostics, STREAM)]
-        self._plan: Heard | None = None  # drawn only while somebody listens
+            AdaptiveSubscription(self, Episode, 'episode', self._on_episode, STREAM),
+            AdaptiveSubscription(
+                self, DiagnosticArray, '/diagnostics', self._on_diagnostics, STREAM)]
+        self._plan: AdaptiveSubscription | None = None  # drawn only while somebody listens
         self._server = ExplorerServer(
             self._board, self._calls.do, self.params['host'], self.params['port'],
             self.params['token'])
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, self._show, clock=clock)
-        self.create_timer(LOOK_PERIOD, self._look_after, clock=clock)
+        self.create_timer(ADAPT_PERIOD, self._look_after, clock=clock)
         self.get_logger().info(f'ready: open {self._server.url}')
 
     def close(self) -> None:
@@ -108,7 +109,7 @@ class ExplorerNode(Node):
 
     # What comes
 
-    def _hear(self, kind: type, topic: str, name: str, qos: Any) -> Heard:
+    def _hear(self, kind: type, topic: str, name: str, qos: Any) -> AdaptiveSubscription:
         """Keep the newest message of a topic."""
         def keep(message: Any, info: Mapping[str, Any]) -> None:
             with self._lock:
@@ -121,11 +122,11 @@ class ExplorerNode(Node):
                         recent.popitem(last=False)
             if name in KEPT:
                 self._service.received(topic)
-        return Heard(self, kind, topic, keep, qos)
+        return AdaptiveSubscription(self, kind, topic, keep, qos)
 
     def _look_after(self) -> None:
         for heard in self._heard:
-            heard.look_after()
+            heard.adapt()
         if self._board.watched and self._plan is None:
             self._plan = self._hear(Image, 'plan/overlay', 'plan', STREAM)
         elif not self._board.watched and self._plan is not None:

@@ -39,7 +39,7 @@ def sensor_topics(params: 'Parameters') -> dict[str, tuple[type, str]]:
     return topics | (CAMERA_MASK if params['robot_mask'] != 'none' else {})
 
 
-class Sight:
+class PlannerInputs:
     """
     The newest picture with its objects and joints, for one goal at a time.
 
@@ -104,8 +104,8 @@ class Sight:
         lacking = self._lacking(topics)
         if moment is None:
             return None, lacking or self._unmatched_joints() or (
-                f'no messages of the same stamp on {self._names(topics)} since the goal was '
-                'accepted')
+                f'no messages of the same stamp on {self.sensors.names(topics)} since the goal '
+                'was accepted')
         times: dict[str, Any] = {
             'received': moment.received, 'scene_ns': self._scene_ns(moment.stamp_ns),
             'jumps': self.sensors.jumps}
@@ -177,12 +177,12 @@ class Sight:
         try:
             new = self._gripper.take(message, received)
         except TapError as error:
-            self._useless = f'{self._names(["joints"])}: {error}'
+            self._useless = f'{self.sensors.names(["joints"])}: {error}'
             return
         if new:
             self._useless = ''
         if self._gripper.received > -math.inf:
-            self.sensors.heard('joints', self._gripper.received, new)
+            self.sensors.note('joints', self._gripper.received, new)
             newest = self.sensors.moment(('image',))  # again, as joints that come again are newer
             for stamp_ns in {*self.sensors.without('joints', 'image'),
                              *([newest.stamp_ns] if newest else [])}:
@@ -202,7 +202,7 @@ class Sight:
         try:
             self._gripper.at(newest.stamp_ns, self._params['max_silence'])
         except KinematicsError as error:
-            return f'{self._names(["joints"])}: {error}'
+            return f'{self.sensors.names(["joints"])}: {error}'
         return ''
 
     def _on_message(self, name: str) -> None:
@@ -247,12 +247,13 @@ class Sight:
         if 'joints' in missing and self._useless:
             return self._useless
         if missing:
-            return f'nothing has come on {self._names(missing, explained=True)}'
+            return f'nothing has come on {self.sensors.names(missing, explained=True)}'
         ages = self.sensors.ages(topics, time.monotonic())
         silent = [topic for topic in topics if ages[topic] > self._params['max_silence']]
         if 'joints' in silent and self._useless:
             return self._useless
-        return f'nothing new has come on {self._names(silent, explained=True)}' if silent else ''
+        return (f'nothing new has come on {self.sensors.names(silent, explained=True)}'
+                if silent else '')
 
     def _count_publishers(self) -> dict[str, int]:
         return {topic: self._node.count_publishers(name)
@@ -263,13 +264,9 @@ class Sight:
         for topic, count in self._count_publishers().items():
             if count > max(self._publishers[topic], 1):
                 raise PlanningError(
-                    f'the scene has changed: {count} nodes publish on {self._names([topic])} '
-                    'now; leave one, and send the goal again')
-
-    def _names(self, topics: Collection[str], explained: bool = False) -> str:
-        names = {topic: self._node.resolve_topic_name(self._types[topic][1]) for topic in topics}
-        return ', '.join(self.sensors.explained(*pair) if explained else pair[1]
-                         for pair in names.items())
+                    'the scene has changed: '
+                    f'{count} nodes publish on {self.sensors.names([topic])} now; '
+                    'leave one, and send the goal again')
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:

@@ -16,12 +16,14 @@ from tap_ros.contract import (
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.camera_topic import declare_transport
 from tap_ros.nodes.lifecycle import declare_autostart
-from tap_ros.nodes.parameters import check_device, Parameters
+from tap_ros.nodes.parameters import check_device, declare_device, Parameters
 from tap_ros.nodes.planner.arm_joints import declare_mount, declare_opening
 from tap_ros.nodes.robot_view import declare_robot_mask
+from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import ForwardModel
 from tap_ros.planning.mpc_config import PRESETS, STALL, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.reach import ReachConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.text import escaped
 from tap_ros.weights import FORWARD_MODEL
@@ -42,9 +44,8 @@ def declare_parameters(node: 'Node') -> Parameters:
     declare_autostart(parameters)
     parameters.declare('weights', str(FORWARD_MODEL),
                        'File of weights (.safetensors) of a forward model. Can be changed while '
-                       'the node is inactive.', read_only=False)
-    parameters.declare('device', 'cpu', 'Where the model runs, as torch names it: cpu, cuda.',
-                       choices=['cpu', 'cuda'])
+                       'the node is unconfigured.', read_only=False)
+    declare_device(parameters)
     parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
                        'with more samples, or what the paper says.', choices=list(PRESETS))
     parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
@@ -106,21 +107,19 @@ def declare_parameters(node: 'Node') -> Parameters:
     return parameters
 
 
-def load_planner(parameters: Parameters, weights: str) -> VisualMPC:
+def load_planner(parameters: Parameters) -> VisualMPC:
     """
     Load weights, and plan once, so that the first command comes as fast as the others.
 
     :param parameters: of the node.
-    :param weights: file of a forward model.
-    :return: VisualMPC.
     :raises WeightsError: when the file cannot be used.
-    :raises ConfigError: when the device is not there.
+    :raises ConfigError: when the device is not available.
     """
     check_device(parameters['device'])
     config = with_preset(
         parameters['preset'],
         arm_hidden=parameters['arm_hidden'] or parameters['robot_mask'] == 'all')
-    mpc = VisualMPC.load(weights, config, parameters['device'])
+    mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
     mpc.plan(Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels),
@@ -128,18 +127,27 @@ def load_planner(parameters: Parameters, weights: str) -> VisualMPC:
     return mpc
 
 
-def unlike_training(mpc: VisualMPC, robot_mask: str) -> str:
+def unlike_training(model: ForwardModel, robot_mask: str) -> str:
     """
-    Say whether the pictures are unlike those that the model was trained on, '' if they are not.
+    Return how the pictures differ from those of the training, '' if they do not.
 
-    :param mpc: of load_planner; robot_mask: parameter of the node.
+    :param robot_mask: parameter of the node.
     """
-    assert isinstance(mpc.model, ForwardModel)
-    trained = mpc.model.config.robot_mask
+    trained = model.config.robot_mask
     if robot_mask == trained:
         return ''
     return (f'parameter robot_mask is {robot_mask}, but the forward model was trained on pictures '
             f'as with {trained}; plans may be worse')
+
+
+def reach_config(parameters: Parameters, request: 'ReachGoal.Goal',
+                 model: ForwardModel) -> ReachConfig:
+    """Return the settings of the control loop for one goal."""
+    return ReachConfig(
+        request.step_budget, parameters['switch'], parameters['goal_tolerance'],
+        model if parameters['tracking'] == 'carried' else None,
+        Limits(parameters['max_step_xy'], parameters['max_step_z']),
+        parameters['max_age'], parameters['image_timeout'], rounds=parameters['subgoal_rounds'])
 
 
 def check_request(request: 'ReachGoal.Goal') -> str:

@@ -3,7 +3,7 @@
 """Serves predict_subgoal: decode, predict what waits together, encode."""
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 import math
 import os
@@ -11,8 +11,7 @@ from pathlib import Path
 import sys
 import threading
 import time
-import traceback
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import Image
@@ -20,13 +19,12 @@ from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.images.drawing import overlay
-from tap_ros.nodes.deferred_service import create_late_service, take_waiting
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.lifecycle import ManagedNode
+from tap_ros.nodes.lifecycle import LifecycleBase
+from tap_ros.nodes.parameters import check_device
 from tap_ros.nodes.predictor.requests import encode_answer, request_topics, RequestReader, Task
 from tap_ros.nodes.predictor.settings import (
     declare_parameters,
-    load_predictors,
     MAX_ROWS,
     MAX_TOGETHER,
     MAX_WAITING,
@@ -34,25 +32,29 @@ from tap_ros.nodes.predictor.settings import (
 )
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.run import run_node
+from tap_ros.nodes.services import (
+    create_deferred_service,
+    internal_error,
+    log_error,
+    refusal,
+    take_pending_requests,
+)
 from tap_ros.nodes.topics import LATCHED
+from tap_ros.prediction.predictor import Subgoal as PredictedSubgoal
+from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.request_queue import Busy, RequestQueue, THREAD_NAME
-from tap_ros.text import escaped
 from tap_ros.weights import find_predictor
 
-if TYPE_CHECKING:
-    from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
-    from tap_ros.prediction.predictor import SubgoalPredictor
-
-Found = tuple[list['PredictedSubgoal'], float]  # of one request, and ms that the network took
-Predictors = dict[str, 'SubgoalPredictor']  # by mode
+Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
+Send = Callable[[PredictSubgoal.Response], object]
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
-SHOW_PERIOD = 0.1  # s between two looks for a subgoal to publish
-STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
-CLOSE_TIMEOUT = 5.0  # s that the batch in progress has to end
+SHOW_PERIOD = 0.1  # s between two checks for a subgoal to publish
+STALE_S = 2.0  # s without a message after which diagnostics call an input stale
+CLOSE_TIMEOUT = 5.0  # s that the running batch has to end
 
 
-class PredictorNode(ManagedNode):
+class PredictorNode(LifecycleBase):
     """
     Offers the service only once the weights are loaded, checked and warmed up.
 
@@ -61,106 +63,92 @@ class PredictorNode(ManagedNode):
     answers.
     """
 
-    reloaded = 'weights', 'forward_weights'
+    loaded_by = 'weights',
 
-    def __init__(self) -> None:
-        super().__init__('predictor_node')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('predictor_node', **options)
         self.params = declare_parameters(self)
+        self._predictor: SubgoalPredictor | None = None
         self._queue: RequestQueue[Task, Found] | None = None
-        self._predictors: Predictors = {}
         self.autostart('configure')
         topics = request_topics(self.params)
-        self._diagnostics = Diagnostics(self, {
-            **dict.fromkeys((name for _, name in topics['start'].values()), STALE_S),
-            **dict.fromkeys((name for _, name in topics['goal'].values()), math.inf)},
+        self._diagnostics = Diagnostics(
+            self, {name: STALE_S if group == 'start' else math.inf
+                   for group in topics for _, name in topics[group].values()},
             queue=lambda: len(self._queue or ()), idle=self.why_not)
-        self._reader = RequestReader(
-            self, self.params, self._predictors, self._diagnostics.received)
+        self._reader = RequestReader(self, self.params, self._diagnostics.received)
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
-        # Until it is published.
+        # The newest subgoal until it is published, by a timer: the answer does not wait for it.
         self._unshown: deque[tuple[Task, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
-        # Apart from the answers, which need not wait for it.
-        self.create_timer(SHOW_PERIOD, self._look_around,
-                          clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._service = create_late_service(
+        self.create_timer(
+            SHOW_PERIOD, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._service = create_deferred_service(
             self, PredictSubgoal, 'predict_subgoal', self._on_request)
         self.autostart('activate')
 
     def close(self) -> None:
-        """Answer all that wait, and let the batch in progress end."""
+        """Answer all waiting requests, and let the running batch end."""
         if self._queue is not None:
             self._queue.close(CLOSE_TIMEOUT)
-        take_waiting(self._service)  # they are told that the node is ending
+        take_pending_requests(self._service)  # they are told that the node is ending
         self._show()
 
-    # Weights
+    # Lifecycle
 
-    def load(self, changed: Mapping[str, Any]) -> tuple['RequestQueue[Task, Found]', Predictors]:
-        """Load weights; return what answers with them."""
-        weights, forward = self._names(changed)
-        predictors: Predictors = {}
-
+    def load(self) -> None:
+        """Load the weights, in the thread that will use them."""
         def prepare() -> Callable[[list[Task]], list[Found]]:
-            # Here, since OpenMP is slow where two threads have begun parallel work on few cores.
-            predictors.update(load_predictors(weights, forward, self.params['device']))
-            return partial(predict, predictors)
+            # OpenMP is slow where two threads have begun parallel work on few cores.
+            check_device(self.params['device'])
+            self._predictor = SubgoalPredictor.load(self.params['weights'], self.params['device'])
+            return partial(predict, self._predictor)
 
-        queue = RequestQueue(
+        self._queue = RequestQueue(
             prepare, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
-        return queue, predictors
-
-    def use(self, loaded: tuple['RequestQueue[Task, Found]', Predictors]) -> None:
-        """Answer with other weights."""
-        self.unload()
-        self._queue, predictors = loaded
-        self._predictors.update(predictors)
-        unlike = unlike_training(self._predictors, self.params['robot_mask'])
+        assert self._predictor is not None
+        unlike = unlike_training(self._predictor, self.params['robot_mask'])
         if unlike:
             self.get_logger().warning(unlike)
 
     def unload(self) -> None:
-        """Let the weights go, once the batch in progress has ended."""
+        """Release the weights, once the running batch has ended."""
         if self._queue is not None:
             self._queue.close(CLOSE_TIMEOUT, 'the weights are no longer in use; ask again')
-        self._queue = None
-        self._predictors.clear()
+        self._queue = self._predictor = None
 
     def described(self) -> str:
-        """Name the modes, the sizes of pictures, the device and the files."""
-        sizes = [f'{mode} {predictor.image_size[1]}x{predictor.image_size[0]} pixels'
-                 for mode, predictor in self._predictors.items()]
-        return ', '.join([*sizes, self.params['device'], *filter(None, self._names({}))])
+        """Return mode, size of pictures, device and file."""
+        assert self._predictor is not None
+        height, width = self._predictor.image_size
+        return (f'{self._predictor.mode} {width}x{height} pixels, {self.params["device"]}, '
+                f'{self.params["weights"]}')
 
-    def files(self, changed: Mapping[str, Any]) -> list[Path]:
-        """Return the files of the weights."""
-        return [find_predictor(name) for name in self._names(changed) if name]
+    def files(self) -> list[Path]:
+        """Return the file of the weights."""
+        return [find_predictor(self.params['weights'])]
 
-    def _names(self, changed: Mapping[str, Any]) -> list[str]:
-        """Return the weights as the parameters name them, '' for forward ones that are none."""
-        return [changed.get(name, self.params[name]) for name in self.reloaded]
+    # In the executor
 
-    # In the executor: what comes, and what people see
-
-    def _on_request(self, request: PredictSubgoal.Request, send: Callable[[Any], object]) -> None:
-        """Check a request, and let it wait or refuse it."""
+    def _on_request(self, request: PredictSubgoal.Request, send: Send) -> None:
+        """Check a request and put it into the queue, or refuse it."""
         begin = time.perf_counter()
         try:
-            if not self.active or self._queue is None:
+            if not self.active or self._queue is None or self._predictor is None:
                 raise ConfigError(self.why_not())
-            task = self._reader.read(request)
+            task = self._reader.read(request, self._predictor)
             self._queue.put(task, lambda found: self._answer(task, found, send, begin))
         except Exception as error:
             self._send(send, self._refusal(error))
 
-    def _look_around(self) -> None:
-        """Show what is new, and take what has come, whose age and rate diagnostics tell."""
+    def _on_timer(self) -> None:
+        """Publish what is new, and take messages: diagnostics tell their age and rate."""
         self._show()
-        self._reader.pull()
+        self._reader.poll()
 
     def _show(self) -> None:
-        """Publish the newest subgoal for planners and people, if there is one that is not yet."""
+        """Publish the newest subgoal, for planners and people, if it is not published yet."""
         if not self._unshown:
             return
         task, subgoal, message = self._unshown.pop()
@@ -172,13 +160,13 @@ class PredictorNode(ManagedNode):
                               question.start_pixels, question.goal_pixels)
             self._overlay.publish(encode_image(picture, task.stamp, task.frame_id))
         except Exception as error:
-            self._log_unexpected(error, 'subgoal')
+            self._diagnostics.error(error)
+            log_error(self, 'subgoal', error)
 
     # In the thread of the queue
 
-    def _answer(self, task: Task, found: Found | Exception, send: Callable[[Any], object],
-                begin: float) -> None:
-        """Send the answer to a task that came at `begin`: found by _predict, or an exception."""
+    def _answer(self, task: Task, found: Found | Exception, send: Send, begin: float) -> None:
+        """Send the response to a task that was received at time `begin`."""
         try:
             if isinstance(found, Exception):
                 raise found
@@ -194,51 +182,32 @@ class PredictorNode(ManagedNode):
 
     # In either
 
-    def _refusal(self, error: Exception) -> PredictSubgoal.Response:
-        """Return the response that says what was wrong, and log it."""
+    def _refusal(self, error: Exception) -> Any:
+        """Return the response that names an error, and log it."""
         if isinstance(error, Busy):
             self.get_logger().warning(f'predict_subgoal: {error}', throttle_duration_sec=1.0)
         elif isinstance(error, TapError):
             self.get_logger().warning(f'predict_subgoal refused: {error}')
         else:
-            self._log_unexpected(error, 'predict_subgoal')
-            error = f'internal error: {type(error).__name__}: {escaped(error)}'
-        return PredictSubgoal.Response(success=False, message=str(error))
+            self._diagnostics.error(error)
+            log_error(self, 'predict_subgoal', error)
+            return refusal(PredictSubgoal.Response, internal_error(error))
+        return refusal(PredictSubgoal.Response, str(error))
 
-    def _log_unexpected(self, error: Exception, what: str) -> None:
-        """Log an error that is none of ours, with where it came from."""
-        self._diagnostics.error(error)
-        for line in ''.join(traceback.format_exception(error)).splitlines():
-            self.get_logger().error(f'{what}: {escaped(line)}')
-
-    def _send(self, send: Callable[[Any], object], response: PredictSubgoal.Response) -> None:
+    def _send(self, send: Send, response: PredictSubgoal.Response) -> None:
         """Send a response; its client may have gone."""
         try:
             send(response)
         except Exception as error:
-            self.get_logger().error(
-                f'predict_subgoal: an answer cannot be sent: {escaped(error)}')
+            log_error(self, 'predict_subgoal: a response cannot be sent', error)
 
 
-def predict(predictors: Predictors, tasks: list[Task]) -> list[Found]:
-    """
-    Predict Tasks together.
-
-    :param predictors: {mode: SubgoalPredictor}, with every mode of the tasks.
-    :param tasks: N Tasks.
-    :return: N times (subgoals, ms that the network took).
-    """
-    answers: list[Found] = [([], 0.0)] * len(tasks)
-    for mode, predictor in predictors.items():
-        chosen = [index for index, task in enumerate(tasks) if task.mode == mode]
-        if not chosen:
-            continue
-        begin = time.perf_counter()
-        found = predictor.predict_together([tasks[index].question for index in chosen])
-        elapsed_ms = (time.perf_counter() - begin) * 1e3
-        for index, subgoals in zip(chosen, found):
-            answers[index] = subgoals, elapsed_ms
-    return answers
+def predict(predictor: SubgoalPredictor, tasks: list[Task]) -> list[Found]:
+    """Predict a batch; return subgoals and ms for each Task."""
+    begin = time.perf_counter()
+    found = predictor.predict_together([task.question for task in tasks])
+    elapsed_ms = (time.perf_counter() - begin) * 1e3
+    return [(subgoals, elapsed_ms) for subgoals in found]
 
 
 def main(args: list[str] | None = None) -> int:

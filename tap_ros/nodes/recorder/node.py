@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records topics into an MCAP bag, as they come off the wire."""
 
-from dataclasses import dataclass
 from importlib import import_module
 import math
 from pathlib import Path
@@ -11,16 +10,15 @@ import time
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError, RecordingError, StorageError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.planner.arm_joints import declare_mount, declare_opening, declared_mount
 from tap_ros.nodes.run import run_node
+from tap_ros.nodes.subscriptions import AdaptiveSubscription
 from tap_ros.nodes.topics import SERVICE_QOS
 from tap_ros.recording import topics
 from tap_ros.recording.attachments import CARD_TYPE
@@ -44,15 +42,6 @@ MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls 
 LONG = 1000  # characters of an answer
 
 
-@dataclass
-class Source:
-    """A topic that is recorded."""
-
-    type_name: str
-    qos: QoSProfile
-    subscription: Subscription
-
-
 class RecorderNode(Node):
     """
     Writes serialized messages as they are; ends the bag properly on a signal.
@@ -61,18 +50,16 @@ class RecorderNode(Node):
     keeps what was written readable, and stays up.
     """
 
-    def __init__(self) -> None:
-        super().__init__('recorder_node')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('recorder_node', **options)
         self.params = declare_parameters(self)
         self._writer: BagWriter | None = None
         # Why what was asked for last is not recorded, or not whole.
         self._failure: str | None = None
         self._count = self._unflushed = 0
-        self._sources: dict[str, Source] = {}  # resolved topic -> Source
+        self._recorded: dict[str, AdaptiveSubscription] = {}  # by full name of the topic
         # Latched topic -> what write_raw takes, for bags that start later.
         self._last: dict[str, tuple[str, bytes, topics.Qos]] = {}
-        # Resolved topic and policy to subscribe to anew.
-        self._mismatched: list[tuple[str, Any]] = []
         self._wanted = list(self.params['topics'])
         if not self._wanted:
             raise ConfigError('parameter topics: is empty; name at least one topic')
@@ -225,82 +212,54 @@ class RecorderNode(Node):
     def _subscribe(self, topic: str, type_name: str, qos: QoSProfile) -> None:
         def on_message(data: bytes, info: dict[str, Any]) -> None:
             try:
-                self._on_message(topic, data, info)
+                self._on_message(topic, type_name, data, info)
             except Exception as error:  # no message ends the node
                 self._tell(f'{escaped(topic)}: a message was not recorded', error)
 
-        def on_mismatch(info: Any) -> None:
-            self._mismatched.append((topic, info.last_policy_kind))
+        self._recorded[topic] = AdaptiveSubscription(
+            self, message_class(type_name), topic, on_message, qos, raw=True)
 
-        subscription = self.create_subscription(
-            message_class(type_name), topic, on_message,  # type: ignore[arg-type]  # with the info
-            qos, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=on_mismatch, use_default_callbacks=False))
-        self._sources[topic] = Source(type_name, qos, subscription)
-
-    def _on_message(self, topic: str, data: bytes, info: dict[str, Any]) -> None:
+    def _on_message(self, topic: str, type_name: str, data: bytes, info: dict[str, Any]) -> None:
         self._diagnostics.received(topic)
-        source = self._sources[topic]
-        latched = source.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        asked = self._recorded[topic].qos
+        latched = asked.durability == DurabilityPolicy.TRANSIENT_LOCAL
         qos = topics.Qos(
             depth=1 if latched else 10,
             durability='transient_local' if latched else 'volatile',
-            reliability='reliable' if source.qos.reliability == ReliabilityPolicy.RELIABLE
+            reliability='reliable' if asked.reliability == ReliabilityPolicy.RELIABLE
             else 'best_effort')
         if latched:
-            self._last[topic] = (source.type_name, data, qos)
+            self._last[topic] = (type_name, data, qos)
         if self._writer is not None:
             received = info['received_timestamp'] or time.time_ns()
-            self._write(topic, source.type_name, data, received,
+            self._write(topic, type_name, data, received,
                         info['source_timestamp'] or received, qos)
 
     def _take_waiting(self) -> None:
         """Record what has arrived and waits for its callback, such as the end of an episode."""
         try:
-            for source in self._sources.values():
-                subscription = source.subscription
-                for _ in range(DEPTH):
-                    with subscription.handle:
-                        taken = subscription.handle.take_message(subscription.msg_type, True)
-                    if taken is None:
-                        break
-                    subscription.callback(*taken)
+            for subscription in self._recorded.values():
+                for taken in subscription.take(DEPTH):
+                    subscription.subscription.callback(*taken)
         except Exception as error:  # the bag is finished all the same
             self._tell('the last messages were not recorded', error)
 
     def _on_timer(self) -> None:
+        """Bring what was written to the disk, and subscribe to topics that appear or change."""
         try:
-            self._look_after()
+            if self._writer is not None and self._unflushed:
+                self._flush()
+            for subscription in self._recorded.values():
+                subscription.adapt()
+            if self._wanted:
+                self._subscribe_known()
         except Exception as error:
-            self._tell('the topics could not be looked after', error)
+            self._tell('the topics could not be updated', error)
 
     def _tell(self, what: str, error: Exception) -> None:
         """Log what a callback raised; not each time, for it may come with every message."""
         self.get_logger().error(
             f'{what}: {type(error).__name__}: {escaped(error)}', throttle_duration_sec=1.0)
-
-    def _look_after(self) -> None:
-        """Bring what was written to the disk, and look after topics."""
-        if self._writer is not None and self._unflushed:
-            self._flush()
-        while self._mismatched:  # a publisher offers less than was asked for: ask for less
-            topic, policy = self._mismatched.pop()
-            source = self._sources[topic]
-            if policy == QoSPolicyKind.RELIABILITY:
-                source.qos.reliability, offered = ReliabilityPolicy.BEST_EFFORT, 'best effort'
-            elif policy == QoSPolicyKind.DURABILITY:
-                source.qos.durability, offered = DurabilityPolicy.VOLATILE, 'volatile'
-            else:
-                self.get_logger().error(
-                    f'{escaped(topic)}: its publisher offers an unfit {escaped(policy)}')
-                continue
-            self.get_logger().info(
-                f'{escaped(topic)}: recorded as {offered}, like it is published')
-            self.destroy_subscription(source.subscription)
-            self._subscribe(topic, source.type_name, source.qos)
-        if self._wanted:
-            self._subscribe_known()
 
 
 def declare_parameters(node: Node) -> Parameters:

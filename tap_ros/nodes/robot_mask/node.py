@@ -30,7 +30,7 @@ from tap_ros.nodes.robot_mask.settings import (
 )
 from tap_ros.nodes.ros_messages import encode_mask
 from tap_ros.nodes.run import run_node
-from tap_ros.nodes.subscriptions import Heard, LOOK_PERIOD
+from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.robots.silhouette import Body, draw_mask, View
 from tap_ros.robots.urdf import read_urdf, Robot
@@ -57,8 +57,8 @@ class RobotMaskNode(Node):
     log and diagnostics say why: who uses masks then does not use the picture.
     """
 
-    def __init__(self) -> None:
-        super().__init__('robot_mask_node')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('robot_mask_node', **options)
         self.params = declare_parameters(self)
         self._light = declared_light(self.params)
         self._camera = CameraPlace(self, self.params)
@@ -69,18 +69,17 @@ class RobotMaskNode(Node):
             'camera/camera_info': STALE_S, 'joint_states': STALE_S,
             'robot_description': math.inf})
         self._masks = self.create_publisher(Image, 'camera/robot_mask', STREAM)
-        self._heard: list[Heard] = []
+        subscriptions = [
+            AdaptiveSubscription(self, JointState, 'joint_states', self._on_joints, STREAM),
+            AdaptiveSubscription(
+                self, CameraInfo, 'camera/camera_info', self._on_camera_info, STREAM)]
         robot = named_robot(self.params)
-        if robot is None:
-            self._heard.append(Heard(
-                self, String, 'robot_description', self._on_description, LATCHED))
-        else:
+        if robot is not None:
             self._use(robot)
-        self._heard += [
-            Heard(self, JointState, 'joint_states', self._on_joints, STREAM),
-            Heard(self, CameraInfo, 'camera/camera_info', self._on_camera_info, STREAM)]
-        self.create_timer(
-            LOOK_PERIOD, self._look_after, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        else:
+            subscriptions.append(AdaptiveSubscription(
+                self, String, 'robot_description', self._on_description, LATCHED))
+        adapt_regularly(self, subscriptions)
         self.create_timer(
             0.2, self._give_up_waiting, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f'ready: {self.params["urdf"] or "waits for robot_description"}')
@@ -139,11 +138,6 @@ class RobotMaskNode(Node):
                 header = picture.info.header
                 self._masks.publish(encode_mask(mask, header.stamp, header.frame_id))
             self._waiting.remove(picture)
-
-    def _look_after(self) -> None:
-        """Ask for what is offered."""
-        for heard in self._heard:
-            heard.look_after()
 
     def _give_up_waiting(self) -> None:
         """Say why pictures that have waited for too long get no mask."""

@@ -5,7 +5,7 @@
 from types import SimpleNamespace
 
 import numpy as np
-from tap_ros.nodes.planner.plan_markers import encode_plan
+from tap_ros.nodes.planner.plan_view import encode_plan
 from tap_ros.nodes.topics import to_stamp
 from tap_ros.planning.plan_picture import way
 from visualization_msgs.msg import Marker
