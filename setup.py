@@ -30,7 +30,11 @@ setup(
         (f'share/{NAME}/launch', glob('launch/*.launch.py')),
     ],
     install_requires=['setuptools'],
-    extras_require={'test': ['pytest']},  # so that `colcon test` runs pytest
+    extras_require={  # what only some commands need; `colcon test` runs pytest because of the last
+        'bair': ['google-crc32c', 'protobuf'],
+        'lerobot': ['pyarrow'],
+        'test': ['pytest'],
+    },
     zip_safe=False,
     entry_points={
         'console_scripts': [f'{name} = {module}:main' for name, module in NODE_MODULES.items()],

@@ -29,10 +29,10 @@ Run: TypeAlias = Callable[[Any], int | None]
 
 COMMANDS: dict[str, tuple[str, Module]] = {
     'collect': ('simulate the expert and record it', 'sim_bridge.collect_command'),
-    'import-bair': ('import the BAIR robot pushing data set', 'tap_ros.recording.bair'),
-    'import-lerobot': ('import a LeRobot data set', 'tap_ros.recording.lerobot_import'),
+    'import-bair': ('import the BAIR robot pushing data set', 'tap_ros.recording.formats.bair'),
+    'import-lerobot': ('import a LeRobot data set', 'tap_ros.recording.formats.lerobot'),
     'export-lerobot': ('export recordings as a LeRobot data set',
-                       'tap_ros.recording.lerobot_export'),
+                       'tap_ros.recording.formats.lerobot_export'),
     'train': ('train on recordings', 'tap_ros.prediction.train_command'),
     'evaluate': ('score trained weights', {
         'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.prediction'),
@@ -65,9 +65,10 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }
-EXTRAS = {  # what only some commands need, and where it stands
-    'huggingface_hub': 'requirements-hub.txt', 'jinja2': 'requirements-experiments.txt',
-    'pandas': 'requirements-experiments.txt', 'pyarrow': 'requirements-lerobot.txt'}
+EXTRAS = {  # what only some commands need, and what pip installs for it
+    'google': "'.[bair]'", 'google_crc32c': "'.[bair]'", 'huggingface_hub':
+    '-r requirements-hub.txt', 'jinja2': '-r requirements-experiments.txt',
+    'pandas': '-r requirements-experiments.txt', 'pyarrow': "'.[lerobot]'"}
 TRAIN_FORWARD = 'tap_ros.planning.train_command'  # what trains with --model forward
 PROG = 'python -m tap_ros'
 _COMPLETION = ('--tyro-print-completion', '--tyro-write-completion')
@@ -102,8 +103,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
-        print(f'error: {error.name} is not installed; type `pip install -r '
-              f'{EXTRAS[error.name]}` (`make build` has done it)', file=sys.stderr)
+        print(f'error: {error.name} is not installed; type `pip install {EXTRAS[error.name]}` in '
+              'a checkout (`make build` has done it)', file=sys.stderr)
         return 1
     except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush

@@ -127,7 +127,7 @@ def undeclared(folders, *files):
 
 def test_everything_imported_is_declared_with_ros_or_with_pip():
     assert not undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
-                          'requirements-lerobot.txt', 'requirements-hub.txt')
+                          'requirements-extras.txt', 'requirements-hub.txt')
     assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt',
                           'requirements-dev.txt')
 
@@ -146,17 +146,25 @@ def test_nothing_is_required_that_nobody_imports():
         used |= distributions_of(name)
     assert set(requirements('requirements.txt')) <= used
     assert set(requirements('requirements-experiments.txt')) <= used
-    assert set(requirements('requirements-lerobot.txt')) <= used
+    assert set(requirements('requirements-extras.txt')) <= used
     assert set(requirements('requirements-hub.txt')) <= used
 
 
 def test_requirements_and_constraints_agree():
     pinned = requirements('constraints.txt')
     for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-experiments.txt',
-                 'requirements-hub.txt', 'requirements-lerobot.txt', 'requirements-ray.txt',
+                 'requirements-hub.txt', 'requirements-extras.txt', 'requirements-ray.txt',
                  'requirements-ros.txt', 'requirements-ros2.txt'):
         for distribution, version in requirements(name).items():
             assert pinned[distribution] == version, f'{name}: {distribution}'
+
+
+def test_extras_are_those_of_the_commands(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    extras = dict(run_setup('setup.py', stop_after='commandline').extras_require)
+    assert extras.pop('test') == ['pytest']
+    assert {normalized(each) for extra in extras.values() for each in extra} == set(
+        requirements('requirements-extras.txt'))
 
 
 def test_every_interface_is_built():

@@ -13,9 +13,9 @@ from tap_ros.evaluation.prediction import evaluate
 from tap_ros.options import parse
 from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.networks import Predictor, PredictorConfig
-from tap_ros.recording.bair import find_shards, import_bair, Options
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.tfrecord import parse_example, read_records
+from tap_ros.recording.formats.bair import find_shards, import_bair, Options
+from tap_ros.recording.formats.tfrecord import parse_example, read_records
 from tap_ros.training.split import split_episodes
 
 

@@ -7,10 +7,12 @@ With LEROBOT_PYTHON=/path/to/python of an environment that has lerobot (it needs
 another torch), its own loader reads what was exported, too.
 """
 
+import io
 import json
 import os
 from pathlib import Path
 import re
+import shutil
 import subprocess
 import sys
 
@@ -19,8 +21,8 @@ import pyarrow
 from pyarrow import parquet
 import pytest
 from tap_ros.cli import main
-from tap_ros.recording.lerobot import ACTION, CAMERA, OBJECTS, STATE
-from tap_ros.recording.lerobot_import import video_frames
+from tap_ros.recording.formats import lerobot_export
+from tap_ros.recording.formats.lerobot import ACTION, CAMERA, OBJECTS, STATE, video_frames
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import Reading
 
@@ -42,13 +44,25 @@ def truth():
     return list(iter_episodes(SAMPLE))
 
 
+def export(folder, *options):
+    """Export in several files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lerobot_export, 'EPISODES_PER_FILE', 12)
+        assert not main(['export-lerobot', '--recordings', SAMPLE, '--out', str(folder), *options])
+    return folder
+
+
+@pytest.fixture(scope='module')
+def lossless(tmp_path_factory):
+    return export(tmp_path_factory.mktemp('sets') / 'png', '--lossless')
+
+
 @pytest.fixture(scope='module', params=['png', 'video'])
-def exported(request, tmp_path_factory):
+def exported(request, lossless, tmp_path_factory):
     """Return (folder of a data set, largest mean error of its pictures)."""
-    folder = tmp_path_factory.mktemp('sets') / request.param
-    lossless = ['--lossless'] if request.param == 'png' else []
-    assert main(['export-lerobot', '--recordings', SAMPLE, '--out', str(folder), *lossless]) == 0
-    return folder, 0 if lossless else 5
+    if request.param == 'png':
+        return lossless, 0
+    return export(tmp_path_factory.mktemp('sets') / 'video'), 5
 
 
 def test_what_is_exported_comes_back(exported, truth, tmp_path, capsys):
@@ -135,11 +149,9 @@ def test_pictures_are_cut_on_the_way_in(exported, truth, tmp_path):
     np.testing.assert_allclose(found.object_pixels, expected.object_pixels, atol=1e-3)
 
 
-@pytest.fixture
-def foreign(tmp_path):
+def make_foreign(source, folder):
     """Write a set as of another robot: 7 numbers an action, two cameras, files by their names."""
-    folder = tmp_path / 'foreign'
-    main(['export-lerobot', '--recordings', SAMPLE, '--out', str(folder), '--lossless'])
+    shutil.copytree(source, folder)
     path = folder / 'meta' / 'info.json'
     info = json.loads(path.read_text())
     info['features'][ACTION] = {'dtype': 'float32', 'shape': [7], 'names': None}
@@ -156,11 +168,12 @@ def foreign(tmp_path):
     rows = folder / 'meta' / 'episodes' / 'chunk-000' / 'file-000.parquet'
     parquet.write_table(parquet.read_table(rows).drop_columns(
         ['tap_ros/seed', 'tap_ros/outcome']), rows)
-    return folder
 
 
 def test_of_another_robot_pictures_are_taken_and_the_rest_is_named(
-        foreign, truth, tmp_path, capsys):
+        lossless, truth, tmp_path, capsys):
+    foreign = tmp_path / 'foreign'
+    make_foreign(lossless, foreign)
     assert main(['import-lerobot', str(foreign), '--out', str(tmp_path / 'bag')]) == 1
     assert f'--camera: expected one of {CAMERA}, observation.images.wrist' in (
         capsys.readouterr().err)
@@ -174,47 +187,34 @@ def test_of_another_robot_pictures_are_taken_and_the_rest_is_named(
         assert (new.object_names, new.seed, new.outcome) == ((), i, '')
 
 
-def spoil(folder, what):
-    """Damage a set in one way."""
-    data = folder / 'data' / 'chunk-000' / 'file-000.parquet'
-    info = folder / 'meta' / 'info.json'
-    if what == 'nothing there':
-        info.unlink()
-    elif what == 'no json':
-        info.write_text('{')
-    elif what == 'old version':
-        info.write_text(info.read_text().replace('v3.0', 'v2.1'))
-    elif what == 'no features':
-        info.write_text(info.read_text().replace('"features"', '"other"'))
-    elif what == 'no data':
-        data.unlink()
-    elif what == 'damaged data':
-        data.write_bytes(data.read_bytes()[:5000])
-    elif what == 'a bad picture':
-        table = parquet.read_table(data)
-        cells = table[CAMERA].to_pylist()
-        cells[3]['bytes'] = b'no picture'
-        parquet.write_table(table.set_column(
-            table.column_names.index(CAMERA), CAMERA,
-            pyarrow.array(cells, table.schema.field(CAMERA).type)), data)
-
-
-@pytest.mark.parametrize('what, words', [
-    ('nothing there', 'info.json: not the description of a LeRobot data set: No such file'),
-    ('no json', 'not the description'), ('old version', 'expected v3 .*convert_dataset_v21'),
-    ('no features', "info.json: lacks or garbles 'features'"),
-    ('no data', 'file-000.parquet: cannot be read'),
-    ('damaged data', 'file-000.parquet: cannot be read'),
-    ('a bad picture', 'episode 0 cannot be read: a picture that cannot be read')])
-def test_damage_is_named_in_one_line_and_leaves_no_half_file(what, words, tmp_path, capsys):
-    folder = tmp_path / 'set'
-    main(['export-lerobot', '--recordings', SAMPLE, '--out', str(folder), '--lossless'])
-    spoil(folder, what)
-    capsys.readouterr()
-    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 1
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert re.search(words, error), error
-    assert not list(Path(tmp_path, 'bag').glob('*.mcap*'))
+def test_damage_is_named_in_one_line_and_leaves_no_half_file(lossless, tmp_path, capsys):
+    data, info = 'data/chunk-000/file-000.parquet', 'meta/info.json'
+    table = parquet.read_table(lossless / data)
+    cells = table[CAMERA].to_pylist()
+    cells[3]['bytes'] = b'no picture'
+    spoiled = io.BytesIO()
+    parquet.write_table(table.set_column(
+        table.column_names.index(CAMERA), CAMERA,
+        pyarrow.array(cells, table.schema.field(CAMERA).type)), spoiled)
+    text = (lossless / info).read_text()
+    for path, content, words in (
+            (info, None, 'info.json: cannot be read, so this is no LeRobot data set: No such'),
+            (info, b'{', 'not the description'),
+            (info, text.replace('v3.0', 'v2.1').encode(), 'expected v3 .*convert_dataset_v21'),
+            (info, text.replace('"features"', '"other"').encode(), "garbles 'features'"),
+            (data, None, 'file-000.parquet: cannot be read'),
+            (data, (lossless / data).read_bytes()[:5000], 'file-000.parquet: cannot be read'),
+            (data, spoiled.getvalue(), "episode 0 cannot be read: format 'unknown'")):
+        folder = tmp_path / 'set'
+        shutil.copytree(lossless, folder)
+        (folder / path).unlink()
+        if content is not None:
+            (folder / path).write_bytes(content)
+        assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 1
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert re.search(words, error), error
+        assert not list(Path(tmp_path, 'bag').glob('*.mcap*'))
+        shutil.rmtree(folder)
 
 
 def test_a_folder_that_is_there_is_not_touched(tmp_path, capsys):

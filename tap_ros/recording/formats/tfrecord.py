@@ -5,13 +5,43 @@
 from collections.abc import Iterator
 from pathlib import Path
 import struct
-from typing import Any
 
-from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
+from google.protobuf import (
+    descriptor_pb2,
+    descriptor_pool,
+    message,
+    message_factory,
+    text_format,
+)
 import google_crc32c
 import numpy as np
 from tap_ros.errors import RecordingError
 
+# The messages of tensorflow/core/example/{example,feature}.proto.
+_PROTO = """
+name: "tap_ros/example.proto" package: "tap_ros" syntax: "proto3"
+message_type { name: "BytesList"
+  field { name: "value" number: 1 type: TYPE_BYTES label: LABEL_REPEATED } }
+message_type { name: "FloatList"
+  field { name: "value" number: 1 type: TYPE_FLOAT label: LABEL_REPEATED } }
+message_type { name: "Int64List"
+  field { name: "value" number: 1 type: TYPE_INT64 label: LABEL_REPEATED } }
+message_type { name: "Feature" oneof_decl { name: "kind" }
+  field { name: "bytes_list" number: 1 type_name: ".tap_ros.BytesList" oneof_index: 0 }
+  field { name: "float_list" number: 2 type_name: ".tap_ros.FloatList" oneof_index: 0 }
+  field { name: "int64_list" number: 3 type_name: ".tap_ros.Int64List" oneof_index: 0 } }
+message_type { name: "Features"
+  nested_type { name: "FeatureEntry" options { map_entry: true }
+    field { name: "key" number: 1 type: TYPE_STRING label: LABEL_OPTIONAL }
+    field { name: "value" number: 2 type_name: ".tap_ros.Feature" label: LABEL_OPTIONAL } }
+  field { name: "feature" number: 1 type_name: ".tap_ros.Features.FeatureEntry"
+          label: LABEL_REPEATED } }
+message_type { name: "Example"
+  field { name: "features" number: 1 type_name: ".tap_ros.Features" } }
+"""
+_POOL = descriptor_pool.DescriptorPool()  # its own, so that TensorFlow may be loaded beside it
+_POOL.Add(text_format.Parse(_PROTO, descriptor_pb2.FileDescriptorProto()))
+_Example = message_factory.GetMessageClass(_POOL.FindMessageTypeByName('tap_ros.Example'))
 _REMEDY = 'fetch the file again or leave it out'
 
 
@@ -31,14 +61,14 @@ def read_records(path: str | Path) -> Iterator[bytes]:
                 where = f'{path}: record {number}'
                 if len(head) < 12:
                     raise RecordingError(f'{where} is cut off; {_REMEDY}')
-                if _masked_crc(head[:8]) != struct.unpack_from('<I', head, 8)[0]:
+                length, crc = struct.unpack('<QI', head)
+                if _masked_crc(head[:8]) != crc:
                     raise RecordingError(
                         f'{where} is damaged, or this is no uncompressed TFRecord file; {_REMEDY}')
-                length = struct.unpack_from('<Q', head)[0]
                 data, tail = stream.read(length), stream.read(4)
                 if len(data) + len(tail) < length + 4:
                     raise RecordingError(f'{where} is cut off; {_REMEDY}')
-                if _masked_crc(data) != struct.unpack('<I', tail)[0]:
+                if _masked_crc(data) != int.from_bytes(tail, 'little'):
                     raise RecordingError(f'{where} is damaged: its CRC does not match; {_REMEDY}')
                 yield data
                 number += 1
@@ -71,38 +101,3 @@ def _masked_crc(data: bytes) -> int:
     """Return the CRC-32C as TFRecord files store it."""
     crc = google_crc32c.value(data)
     return ((crc >> 15 | crc << 17) + 0xa282ead8) & 0xffffffff
-
-
-def _example_class() -> Any:
-    """Declare the messages of tensorflow/core/example/{example,feature}.proto."""
-    file = descriptor_pb2.FileDescriptorProto(
-        name='tap_ros/example.proto', package='tap_ros', syntax='proto3')
-    kinds = {'bytes_list': ('BytesList', 'TYPE_BYTES'), 'float_list': ('FloatList', 'TYPE_FLOAT'),
-             'int64_list': ('Int64List', 'TYPE_INT64')}
-    for name, kind in kinds.values():
-        file.message_type.add(name=name).field.add(
-            name='value', number=1, type=kind, label='LABEL_REPEATED')
-    feature = file.message_type.add(name='Feature')
-    feature.oneof_decl.add(name='kind')
-    for number, (field, (name, _)) in enumerate(kinds.items(), 1):
-        _add_message(feature, field, number, name, oneof_index=0)
-    features = file.message_type.add(name='Features')
-    entry = features.nested_type.add(name='FeatureEntry')
-    entry.options.map_entry = True
-    entry.field.add(name='key', number=1, type='TYPE_STRING', label='LABEL_OPTIONAL')
-    _add_message(entry, 'value', 2, 'Feature')
-    _add_message(features, 'feature', 1, 'Features.FeatureEntry', label='LABEL_REPEATED')
-    _add_message(file.message_type.add(name='Example'), 'features', 1, 'Features')
-    pool = descriptor_pool.DescriptorPool()  # its own, so that TensorFlow may be loaded beside it
-    pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName('tap_ros.Example'))
-
-
-def _add_message(owner: descriptor_pb2.DescriptorProto, name: str, number: int, kind: str,
-                 label: str = 'LABEL_OPTIONAL', **options: Any) -> None:
-    """Add a field that holds a message."""
-    owner.field.add(name=name, number=number, type='TYPE_MESSAGE', label=label,
-                    type_name=f'.tap_ros.{kind}', **options)
-
-
-_Example = _example_class()

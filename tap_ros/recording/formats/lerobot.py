@@ -6,24 +6,25 @@ Import a LeRobotDataset v3.0 as recordings.
 Pictures of one camera, and the task as text. Actions, states and objects only of sets that have
 ours: four numbers called dx, dy, dz and opening, and so on; of other robots they would be an arm's
 command with another meaning.
+
+In such a set meta/info.json, stats.json and tasks.parquet describe it, meta/episodes has a row an
+episode, data a row a frame. Pictures are files in the rows, or videos of several episodes.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-import io
 import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
 import numpy as np
-from PIL import Image, UnidentifiedImageError
-from tap_ros.contract import MAX_PICTURE_BYTES
+from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.files import only_writer
 from tap_ros.images.crop import Crop
+from tap_ros.images.encodings import decompress
 from tap_ros.options import Folder
-from tap_ros.recording import lerobot
 from tap_ros.recording.episode import Episode, OUTCOMES
 from tap_ros.recording.reading_options import Part
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
@@ -31,6 +32,12 @@ from tap_ros.text import escaped, listing
 from tqdm import tqdm
 from tyro import conf
 
+INFO = 'meta/info.json'
+CAMERA = 'observation.images.camera'
+STATE, OBJECTS, ACTION = 'observation.state', 'observation.environment_state', 'action'
+NAMES = {ACTION: ['dx', 'dy', 'dz', 'opening'], STATE: list(GRIPPER_JOINTS)}  # of our numbers
+INDICES = ('frame_index', 'episode_index', 'index', 'task_index')  # columns that all sets have
+SEED, OUTCOME = 'tap_ros/seed', 'tap_ros/outcome'  # columns of ours beside LeRobot's
 EPISODES_PER_FILE = 25
 EPISODE_SPACING_NS = 60 * 10**9  # between the end of an episode and the start of the next
 _INFO_BYTES = 2**24
@@ -65,7 +72,6 @@ def run(args: Options) -> None:
     data, out, crop = DataSet(args.path, args.camera), Path(args.out), Crop(args.crop, args.size)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f'--out {escaped(out)}: is not empty; name a new folder')
-    out.mkdir(parents=True, exist_ok=True)
     with only_writer(out):
         episodes = iter(tqdm(data.episodes(crop), 'importing', len(data.rows), unit='episode',
                              delay=1))
@@ -95,16 +101,21 @@ class DataSet:
 
     def __init__(self, folder: str | Path, camera: str = '') -> None:
         self.folder = Path(folder)
-        info = _read_json(self.folder / lerobot.INFO)
+        place = escaped(self.folder / INFO)
         try:
+            with open(self.folder / INFO, 'rb') as stream:
+                info = json.loads(stream.read(_INFO_BYTES))
             version, self.fps = str(info['codebase_version']), float(info['fps'])
             self.features = dict(info['features'])
             self._data_path, self._video_path = str(info['data_path']), info.get('video_path')
             cameras = [name for name, feature in self.features.items()
                        if feature['dtype'] in ('image', 'video')]
+        except OSError as error:
+            raise RecordingError(f'{place}: cannot be read, so this is no LeRobot data set: '
+                                 f'{error.strerror}') from error
         except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise RecordingError(f'{escaped(self.folder / lerobot.INFO)}: lacks or garbles '
-                                 f'{escaped(error)}') from error
+            raise RecordingError(f'{place}: not the description of a LeRobot data set; it lacks '
+                                 f'or garbles {escaped(error)}') from error
         if not version.startswith('v3.') or not 0 < self.fps <= 1e6:
             raise RecordingError(
                 f'{escaped(self.folder)}: version {escaped(version, 20)}, {self.fps} frames a '
@@ -115,17 +126,11 @@ class DataSet:
         if camera not in cameras and (camera or len(cameras) > 1):
             raise ConfigError(f'--camera: expected one of {", ".join(map(escaped, cameras))}')
         self.camera = camera or cameras[0]
-        self._is_video = self.features[self.camera]['dtype'] == 'video'
-        names = {key: lerobot.flat_names(self.features[key]) if key in self.features else []
-                 for key in (lerobot.ACTION, lerobot.STATE, lerobot.OBJECTS)}
-        self._acts = names[lerobot.ACTION] == list(lerobot.ACTION_NAMES)
-        self._states = names[lerobot.STATE] == list(lerobot.STATE_NAMES)
-        self._objects = lerobot.object_names(names[lerobot.OBJECTS]) or ()
-        taken = {self.camera, 'timestamp', 'frame_index', 'episode_index', 'index', 'task_index',
-                 *([lerobot.ACTION] if self._acts else []),
-                 *([lerobot.STATE] if self._states else []),
-                 *([lerobot.OBJECTS] if self._objects else [])}
-        self.unused = sorted(set(self.features) - taken)
+        self._objects = self._object_names()
+        taken = {self.camera, 'timestamp', *INDICES, *filter(self._is_ours, NAMES)}
+        if self._objects:
+            taken.add(OBJECTS)
+        self.unused = sorted(self.features.keys() - taken)
         self.rows = self._read_rows()
         self._file: tuple[Path, Any] | None = None  # data file in memory
         # Path, frames and number of the next one of a video.
@@ -140,15 +145,37 @@ class DataSet:
         """
         begin = 10**9
         for row in self.rows:
-            episode = self._episode(row, crop, begin)
+            try:
+                episode = self._episode(row, crop, begin)
+            except (KeyError, TypeError, ValueError, IndexError, ImageError, OSError) as error:
+                raise RecordingError(
+                    f'{escaped(self.folder)}: episode {escaped(row["episode_index"], 20)} cannot '
+                    f'be read: {escaped(error, 200)}') from error
             begin = int(episode.stamps[-1]) + EPISODE_SPACING_NS
             yield episode
 
+    def _flat_names(self, key: str) -> list[Any]:
+        """Return the names of a feature's numbers; some sets have them in a dict, or none."""
+        names = self.features.get(key, {}).get('names')
+        if isinstance(names, dict):
+            return [name for part in names.values()
+                    for name in (part if isinstance(part, list) else [part])]
+        return names if isinstance(names, list) else []
+
+    def _is_ours(self, key: str) -> bool:
+        """Tell whether the numbers of a feature mean what they do in our recordings."""
+        return self._flat_names(key) == NAMES[key]
+
+    def _object_names(self) -> tuple[str, ...]:
+        """Return the objects whose pixels the set has as we export them."""
+        columns = list(map(str, self._flat_names(OBJECTS)))
+        names = tuple(column.removesuffix('_u') for column in columns[::2])
+        return names if object_columns(names) == columns else ()
+
     def _read_rows(self) -> list[dict[str, Any]]:
         """Return the rows of meta/episodes."""
-        files = sorted((self.folder / 'meta' / 'episodes').glob('*/*.parquet'))
         rows: list[dict[str, Any]] = []
-        for file in files:
+        for file in sorted((self.folder / 'meta' / 'episodes').glob('*/*.parquet')):
             table = _read_parquet(file)
             rows += table.select(
                 [name for name in table.column_names if not name.startswith('stats/')]).to_pylist()
@@ -158,50 +185,44 @@ class DataSet:
 
     def _episode(self, row: dict[str, Any], crop: Crop, begin: int) -> Episode:
         """Return the episode of a row, its stamps from `begin` on."""
-        index = row['episode_index']
-        try:
-            path = self.folder / self._data_path.format(
-                chunk_index=row['data/chunk_index'], file_index=row['data/file_index'])
-            table = self._table(path)
-            offset = row['dataset_from_index'] - table['index'][0].as_py()
-            part = table.slice(offset, row['length'])
-            if len(part) != row['length'] or set(
-                    part['episode_index'].to_pylist()) != {index}:
-                raise ValueError('its rows are not where meta/episodes says')
-            frames = self._frames(row, part, crop)
-            T, K = len(frames), len(self._objects)
-            tasks = row.get('tasks') or ['']
-            outcome = row.get(lerobot.OUTCOME, '')
-            unknown = np.full((T, K, 7), np.nan)
-            return Episode(
-                frames=frames,
-                stamps=begin + (np.arange(T) * (1e9 / self.fps)).astype(np.int64),
-                actions=self._actions(part), grippers=self._numbers(
-                    part, lerobot.STATE, 4) if self._states else np.full(
-                        (T, 4), np.nan, np.float32),
-                object_names=self._objects,
-                object_pixels=self._pixels(part, crop),
-                object_poses=unknown, goal_frame=None,
-                goal_pixels=np.full((K, 2), np.nan, np.float32), goal_poses=unknown[0],
-                task=str(tasks[0]), seed=int(row.get(lerobot.SEED, index)),
-                outcome=outcome if outcome in OUTCOMES else '')
-        except (KeyError, TypeError, ValueError, IndexError, ImageError, OSError) as error:
-            raise RecordingError(f'{escaped(self.folder)}: episode {escaped(index, 20)} cannot be '
-                                 f'read: {escaped(error, 200)}') from error
-
-    def _table(self, path: Path) -> Any:
-        """Return the rows of a data file; the last one is kept."""
+        path = self.folder / self._data_path.format(
+            chunk_index=row['data/chunk_index'], file_index=row['data/file_index'])
         if self._file is None or self._file[0] != path:
             self._file = path, _read_parquet(path)
-        return self._file[1]
+        table, index, T = self._file[1], row['episode_index'], row['length']
+        part = table.slice(row['dataset_from_index'] - table['index'][0].as_py(), T)
+        if len(part) != T or set(part['episode_index'].to_pylist()) != {index}:
+            raise ValueError('its rows are not where meta/episodes says')
+        is_video = self.features[self.camera]['dtype'] == 'video'
+        pictures = self._decode(row, T) if is_video else map(
+            self._picture, part[self.camera].to_pylist())
+        frames = np.stack([crop.image(picture) for picture in pictures])
 
-    def _frames(self, row: dict[str, Any], part: Any, crop: Crop) -> np.ndarray:
-        """Return the pictures of an episode, (T, H, W, 3)."""
-        if self._is_video:
-            found = self._decode(row, len(part))
-        else:
-            found = (_picture(cell, self.folder) for cell in part[self.camera].to_pylist())
-        return np.stack([crop.image(frame) for frame in found])
+        def numbers(key: str, width: int) -> np.ndarray:
+            return np.array(part[key].to_pylist(), np.float32).reshape(T, width)
+
+        K = len(self._objects)
+        pixels = numbers(OBJECTS, 2 * K) if K else np.empty((T, 0), np.float32)
+        height, width = self.features[self.camera]['shape'][:2]
+        actions = np.zeros((T, 4), np.float32)
+        if self._is_ours(ACTION):  # nothing leads on from the last frame
+            actions[:-1] = numbers(ACTION, 4)[:-1]
+        poses, outcome = np.full((T, K, 7), np.nan), row.get(OUTCOME, '')
+        return Episode(
+            frames=frames, stamps=begin + (np.arange(T) * (1e9 / self.fps)).astype(np.int64),
+            actions=actions, grippers=numbers(STATE, 4) if self._is_ours(STATE) else np.full(
+                (T, 4), np.nan, np.float32),
+            object_names=self._objects,
+            object_pixels=crop.pixels(pixels.reshape(T, K, 2), (height, width)),
+            object_poses=poses, goal_frame=None,
+            goal_pixels=np.full((K, 2), np.nan, np.float32), goal_poses=poses[0],
+            task=str((row.get('tasks') or [''])[0]), seed=int(row.get(SEED, index)),
+            outcome=outcome if outcome in OUTCOMES else '')
+
+    def _picture(self, cell: Any) -> np.ndarray:
+        """Return a picture of a row, uint8 (H, W, 3): bytes of a file, or the name of one."""
+        data = cell.get('bytes') if isinstance(cell, dict) else None
+        return decompress(data or (self.folder / str(cell['path'])).read_bytes(), 'unknown')
 
     def _decode(self, row: dict[str, Any], count: int) -> Iterator[np.ndarray]:
         """Yield frames of a video; episodes follow each other, so that none is searched for."""
@@ -221,27 +242,10 @@ class DataSet:
                 yield frame
         self._video = path, frames, first + count
 
-    def _numbers(self, part: Any, key: str, width: int) -> np.ndarray:
-        """Return the numbers of a column, (T, width) float32."""
-        values = np.array(part[key].to_pylist(), np.float32).reshape(len(part), -1)
-        if values.shape[1] != width:
-            raise ValueError(f'{key} has {values.shape[1]} numbers, not {width}')
-        return values
 
-    def _actions(self, part: Any) -> np.ndarray:
-        """Return the actions, (T, 4); nothing leads on from the last frame."""
-        if not self._acts:
-            return np.zeros((len(part), 4), np.float32)
-        actions = self._numbers(part, lerobot.ACTION, 4)
-        actions[-1] = 0
-        return actions
-
-    def _pixels(self, part: Any, crop: Crop) -> np.ndarray:
-        """Return the pixels of the objects, (T, K, 2), in the part of the picture that is kept."""
-        T, K = len(part), len(self._objects)
-        pixels = self._numbers(part, lerobot.OBJECTS, 2 * K) if K else np.empty((T, 0), np.float32)
-        height, width = self.features[self.camera]['shape'][:2]
-        return crop.pixels(pixels.reshape(T, K, 2), (height, width))
+def object_columns(names: tuple[str, ...]) -> list[str]:
+    """Return the names of the numbers in OBJECTS: u and v of each object."""
+    return [f'{name}_{axis}' for name in names for axis in 'uv']
 
 
 def video_frames(path: Path) -> Iterator[np.ndarray]:
@@ -271,34 +275,6 @@ def video_frames(path: Path) -> Iterator[np.ndarray]:
     with av.open(str(path)) as container:
         for picture in container.decode(video=0):
             yield picture.to_ndarray(format='rgb24')
-
-
-def _picture(cell: Any, folder: Path) -> np.ndarray:
-    """Return a picture of a row, uint8 (H, W, 3): bytes of a file, or the name of one."""
-    data = cell.get('bytes') if isinstance(cell, dict) else None
-    source: Any = io.BytesIO(data) if data else folder / str(cell['path'])
-    try:
-        with Image.open(source, formats=('PNG', 'JPEG', 'WEBP')) as file:
-            if file.size[0] * file.size[1] * 3 > MAX_PICTURE_BYTES:
-                raise ValueError('a picture of {}x{} pixels is too large'.format(*file.size))
-            return np.array(file.convert('RGB'))
-    except (UnidentifiedImageError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(f'a picture that cannot be read: {error}') from error
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    """Read info.json."""
-    try:
-        with open(path, 'rb') as stream:
-            found = json.loads(stream.read(_INFO_BYTES))
-        if isinstance(found, dict):
-            return found
-        reason = 'it holds no object'
-    except OSError as error:
-        reason = str(error.strerror)
-    except ValueError as error:
-        reason = escaped(error)
-    raise RecordingError(f'{escaped(path)}: not the description of a LeRobot data set: {reason}')
 
 
 def _read_parquet(path: Path) -> Any:

@@ -19,19 +19,19 @@ and no goal pictures. What the records do not say, and how the recordings fill i
 """
 
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
+import math
 from pathlib import Path
 import re
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
-from tap_ros.errors import RecordingError, TapError
+from tap_ros.errors import ImageError, RecordingError
 from tap_ros.files import only_writer, storage_errors
+from tap_ros.images.encodings import decompress
 from tap_ros.options import Folder
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.tfrecord import parse_example, read_records
+from tap_ros.recording.formats.tfrecord import parse_example, read_records
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 from tqdm import tqdm
 from tyro import conf
@@ -93,35 +93,21 @@ def import_bair(paths: Iterable[str | Path], folder: str | Path, progress: bool 
     :param progress: show a progress bar.
     :return: number of episodes imported by this call.
     :raises RecordingError: at the first file that cannot be read or lacks something. What was
-        imported before it stays, as complete bags.
+        imported before it stays, in complete bags.
     :raises StorageError: when the disk is full, or another process is importing there.
     """
-    shards = find_shards(paths)
-    bags = sorted({shard.target(folder).parent for shard in shards})
     done = 0
     with only_writer(folder), storage_errors(folder):
-        for left in (part for bag in bags for part in bag.glob('*.part')):
-            left.unlink()  # by a process that was killed
-        missing = [shard for shard in shards if not shard.target(folder).exists()]
-        total = sum(len(shard.numbers) for shard in missing)
-        with tqdm(total=total, unit='episode', disable=not progress) as bar:
-            try:
-                for shard in missing:
-                    _import_shard(shard, shard.target(folder), bar)
-                    done += len(shard.numbers)
-            except BaseException:
-                with suppress(TapError):  # the first error is the one to tell
-                    _describe(bags)
-                raise
-        _describe(bags)
+        missing = [each for each in find_shards(paths) if not each.target(folder).exists()]
+        with tqdm(total=sum(len(shard.numbers) for shard in missing), unit='episode',
+                  disable=not progress) as bar:
+            for shard in missing:
+                target = shard.target(folder)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                _import_shard(shard, target, bar)
+                write_metadata(target.parent)
+                done += len(shard.numbers)
     return done
-
-
-def _describe(bags: Iterable[Path]) -> None:
-    """Write metadata.yaml of the bags that have files."""
-    for bag in bags:
-        if any(bag.glob('*.mcap')):
-            write_metadata(bag)
 
 
 def read_episode(data: bytes, seed: int) -> Episode:
@@ -190,21 +176,20 @@ def _shard(path: Path) -> Shard:
 
 def _import_shard(shard: Shard, target: Path, bar: tqdm) -> None:
     """Import one file, wholly or not at all."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    count = 0
+    count, expected = 0, len(shard.numbers)
     with EpisodeWriter(target) as writer:
         for count, data in enumerate(read_records(shard.path), 1):
-            if count > len(shard.numbers):
+            if count > expected:
                 break
             try:
                 writer.write(read_episode(data, SEEDS[shard.split] + shard.numbers[count - 1]))
             except RecordingError as error:
                 raise RecordingError(f'{shard.path}: record {count - 1}: {error}') from error
             bar.update()
-        if count != len(shard.numbers):
+        if count != expected:
             raise RecordingError(
-                f'{shard.path}: by its name it holds {len(shard.numbers)} records, but there are '
-                f'{"more" if count > len(shard.numbers) else count}; fetch the file again')
+                f'{shard.path}: by its name it holds {expected} records, but there are '
+                f'{"more" if count > expected else count}; fetch the file again')
 
 
 def _picture(features: Mapping[str, Any], name: str) -> np.ndarray:
@@ -212,16 +197,15 @@ def _picture(features: Mapping[str, Any], name: str) -> np.ndarray:
     value = features.get(name)
     if not isinstance(value, list) or len(value) != 1:
         raise RecordingError(f'lacks {name}; expected {FRAMES} frames of {" or ".join(CAMERAS)}')
-    data = np.frombuffer(value[0], np.uint8)
-    if value[0].startswith((b'\xff\xd8\xff', b'\x89PNG')) and data.size != np.prod(SIZE):
-        decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)  # copies of the data set are compressed
-        if decoded is None:
-            raise RecordingError(f'{name} is a picture that cannot be decoded')
-        frame = decoded[..., ::-1]
-    elif data.size == np.prod(SIZE):
-        frame = data.reshape(SIZE)
-    else:
-        raise RecordingError(f'{name} has {data.size} bytes; expected 64 x 64 x 3')
+    data, = value
+    if len(data) == math.prod(SIZE):
+        return np.frombuffer(data, np.uint8).reshape(SIZE)
+    if not data.startswith((b'\xff\xd8\xff', b'\x89PNG')):
+        raise RecordingError(f'{name} has {len(data)} bytes; expected 64 x 64 x 3')
+    try:
+        frame = decompress(data, 'unknown')  # copies of the data set are compressed
+    except ImageError as error:
+        raise RecordingError(f'{name} cannot be decoded: {error}') from error
     if frame.shape != SIZE:
         raise RecordingError(f'{name} is a picture of {frame.shape[1]}x{frame.shape[0]} pixels; '
                              'expected 64x64')

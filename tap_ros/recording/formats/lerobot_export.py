@@ -1,0 +1,272 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Export recordings as a LeRobotDataset v3.0.
+
+What it holds: the camera's pictures, actions, the gripper's state and the pixels of objects where
+every frame knows them, the task, and, in columns of ours, seed and outcome. Goal pictures, poses
+and robot masks have no place there.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import json
+from pathlib import Path
+import shutil
+from typing import Any
+
+import cv2
+import numpy as np
+from tap_ros.errors import ConfigError, RecordingError, StorageError
+from tap_ros.files import storage_errors
+from tap_ros.images.drawing import png_bytes
+from tap_ros.options import Bags, Flag, Folder
+from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.formats.lerobot import (
+    ACTION,
+    CAMERA,
+    INDICES,
+    INFO,
+    NAMES,
+    object_columns,
+    OBJECTS,
+    OUTCOME,
+    SEED,
+    STATE,
+)
+from tap_ros.recording.reading import reading_of
+from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.text import escaped
+from tqdm import tqdm
+
+EPISODES_PER_FILE = 100  # of data, and of a video
+FILES_PER_CHUNK = 1000
+_FILE = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
+DATA, VIDEO = f'data/{_FILE}.parquet', f'videos/{{video_key}}/{_FILE}.mp4'
+_QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+_SAMPLED_PIXELS = 2**22  # of all pictures, for their statistics
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param recordings: bag folders, folders of bag folders, or .mcap files.
+    :param out: folder of the data set; must not exist.
+    :param lossless: keep pictures as PNG, bit for bit, instead of videos (VP9).
+    :param fps: frames a second; 0: as the stamps say, rounded.
+    """
+
+    recordings: Bags
+    out: Folder
+    lossless: Flag = False
+    fps: int = 0
+    reading: ReadingOptions = ReadingOptions()
+
+
+def run(args: Options) -> None:
+    """
+    Export, and print what the set holds.
+
+    :raises TapError: for recordings that cannot be read, and a folder that is there already.
+    """
+    if not 0 <= args.fps <= 1000:
+        raise ConfigError(f'--fps {args.fps}: expected 1 to 1000, or 0')
+    out = Path(args.out)
+    if out.exists():
+        raise ConfigError(f'--out {escaped(out)}: is there already; name a new folder')
+    store = open_recordings(list(args.recordings), reading=reading_of(args.reading))
+    part = out.with_name(out.name + '.part')
+    with storage_errors(part):
+        shutil.rmtree(part, ignore_errors=True)
+        try:
+            features = export(store, part, args.lossless, args.fps)
+            part.rename(out)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    print(f'{escaped(out)}: {len(store)} episodes, {store.num_frames} frames, '
+          f'{", ".join(name for name in features if "." in name or name == ACTION)}')
+
+
+def export(store: EpisodeStore, folder: Path, lossless: bool = False,
+           fps: int = 0) -> dict[str, Any]:
+    """
+    Write a data set.
+
+    :param store: EpisodeStore.
+    :param folder: a new one.
+    :param lossless: pictures as PNG instead of videos.
+    :param fps: frames a second; 0: as the stamps say.
+    :return: its features, as in info.json.
+    :raises RecordingError: when frames lack what LeRobot needs.
+    """
+    if not fps:
+        steps = np.concatenate([np.diff(store[i].stamps) for i in range(len(store))])
+        fps = max(round(1e9 / float(np.median(steps))), 1) if len(steps) else 1
+    vectors = _vectors(store)
+    tasks = {task: number for number, task in enumerate(dict.fromkeys(
+        store[i].task or 'unknown' for i in range(len(store))))}
+    episode = np.repeat(np.arange(len(store)), store.lengths)
+    frame = np.concatenate([np.arange(count) for count in store.lengths])
+    numbers = {
+        **vectors, 'timestamp': frame.astype(np.float32) / np.float32(fps), 'frame_index': frame,
+        'episode_index': episode, 'index': np.arange(len(frame)),
+        'task_index': np.repeat([tasks[store[i].task or 'unknown'] for i in range(len(store))],
+                                store.lengths)}
+    features = _features(store, vectors, lossless, fps)
+    rows = list(tqdm(_write_files(store, folder, numbers, lossless, fps), 'exporting', len(store),
+                     unit='episode', delay=1))
+    _write_meta(folder, features, tasks, rows, fps)
+    _write_json(folder / 'meta/stats.json', {
+        CAMERA: _picture_summary(store),
+        **{name: _summary(values.reshape(len(frame), -1)) for name, values in numbers.items()}})
+    return features
+
+
+def _vectors(store: EpisodeStore) -> dict[str, np.ndarray]:
+    """Return what every frame knows, (frames, numbers) float32 by name."""
+    episodes = [store[i] for i in range(len(store))]
+    found = {ACTION: np.concatenate([e.actions for e in episodes])}
+    states = np.concatenate([e.grippers for e in episodes])
+    if np.isfinite(states).all():
+        found[STATE] = states
+    names = {e.object_names for e in episodes}
+    if len(names) == 1 and names != {()}:
+        pixels = np.concatenate([e.object_pixels.reshape(len(e), -1) for e in episodes])
+        if np.isfinite(pixels).all():
+            found[OBJECTS] = pixels
+    if not np.isfinite(found[ACTION]).all():
+        raise RecordingError('recordings: actions hold NaN or infinity')
+    return {name: np.ascontiguousarray(values, np.float32) for name, values in found.items()}
+
+
+def _features(store: EpisodeStore, vectors: dict[str, np.ndarray], lossless: bool,
+              fps: int) -> dict[str, Any]:
+    """Describe the columns, as info.json has it."""
+    height, width = store.image_size
+    camera: dict[str, Any] = {'dtype': 'image' if lossless else 'video',
+                              'shape': [height, width, 3],
+                              'names': ['height', 'width', 'channels']}
+    if not lossless:
+        camera['info'] = {'video.height': height, 'video.width': width, 'video.channels': 3,
+                          'video.codec': 'vp9', 'video.pix_fmt': 'yuv420p', 'video.fps': fps,
+                          'video.is_depth_map': False, 'has_audio': False}
+    names = {**NAMES, OBJECTS: object_columns(store[0].object_names)}
+    return {
+        CAMERA: camera,
+        **{name: {'dtype': 'float32', 'shape': [values.shape[1]], 'names': names[name]}
+           for name, values in vectors.items()},
+        'timestamp': {'dtype': 'float32', 'shape': [1], 'names': None},
+        **{name: {'dtype': 'int64', 'shape': [1], 'names': None} for name in INDICES}}
+
+
+def _write_files(store: EpisodeStore, folder: Path, numbers: dict[str, np.ndarray],
+                 lossless: bool, fps: int) -> Iterator[dict[str, Any]]:
+    """Write data and videos, a row group an episode; yield the rows of meta/episodes."""
+    from pyarrow import parquet
+    index = 0  # of the first frame of an episode
+    for number in range(-(-len(store) // EPISODES_PER_FILE)):
+        place = {'chunk_index': number // FILES_PER_CHUNK, 'file_index': number % FILES_PER_CHUNK}
+        path = folder / DATA.format(**place)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        video = None if lossless else _open_video(
+            folder / VIDEO.format(video_key=CAMERA, **place), store.image_size, fps)
+        writer, in_video = None, 0
+        first = number * EPISODES_PER_FILE
+        for i in range(first, min(first + EPISODES_PER_FILE, len(store))):
+            episode, count = store[i], int(store.lengths[i])
+            row = {'episode_index': i, 'tasks': [episode.task or 'unknown'], 'length': count,
+                   'dataset_from_index': index, 'dataset_to_index': index + count,
+                   SEED: int(episode.seed), OUTCOME: episode.outcome,
+                   'meta/episodes/chunk_index': 0, 'meta/episodes/file_index': 0,
+                   **{f'data/{key}': value for key, value in place.items()}}
+            if video is not None:
+                for frame in episode.frames:
+                    video.write(np.ascontiguousarray(frame[..., ::-1]))
+                row |= {f'videos/{CAMERA}/{key}': value for key, value in {
+                    **place, 'from_timestamp': in_video / fps,
+                    'to_timestamp': (in_video + count) / fps}.items()}
+            table = _table({name: values[index:index + count] for name, values in numbers.items()},
+                           episode.frames if lossless else None)
+            writer = writer or parquet.ParquetWriter(path, table.schema)
+            writer.write_table(table)
+            index, in_video = index + count, in_video + count
+            yield row
+        if writer:
+            writer.close()
+        if video is not None:
+            video.release()
+
+
+def _open_video(path: Path, size: tuple[int, int], fps: int) -> cv2.VideoWriter:
+    """Begin a video of pictures of a size (H, W)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'vp09'), fps, size[::-1])
+    if not video.isOpened():
+        raise StorageError(f'{path}: OpenCV cannot write this video; use --lossless')
+    return video
+
+
+def _table(numbers: dict[str, np.ndarray], frames: np.ndarray | None) -> Any:
+    """Return the rows of an episode, with frames (T, H, W, 3) as PNG files unless None."""
+    import pyarrow
+    columns = {
+        name: pyarrow.array(values) if values.ndim == 1 else
+        pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(values.ravel()), values.shape[1])
+        for name, values in numbers.items()}
+    if frames is not None:
+        columns = {CAMERA: pyarrow.array(
+            [{'bytes': png_bytes(frame), 'path': f'frame-{t:06d}.png'}
+             for t, frame in enumerate(frames)],
+            pyarrow.struct([('bytes', pyarrow.binary()), ('path', pyarrow.string())])), **columns}
+    return pyarrow.table(columns)
+
+
+def _picture_summary(store: EpisodeStore) -> dict[str, Any]:
+    """Return statistics of pictures per channel on [0, 1], of pixels spread over all of them."""
+    step = store.num_frames * int(np.prod(store.image_size)) // _SAMPLED_PIXELS | 1  # odd: no grid
+    pixels = np.concatenate([store.frames(i).reshape(-1, 3)[::step] for i in range(len(store))])
+    found = {name: np.reshape(each, (3, 1, 1)).tolist()
+             for name, each in _summary(pixels / 255).items() if name != 'count'}
+    return {**found, 'count': [store.num_frames]}
+
+
+def _summary(values: np.ndarray) -> dict[str, Any]:
+    """Return statistics of numbers (frames, numbers)."""
+    values = values.astype(np.float64)
+    found = {'min': values.min(0), 'max': values.max(0), 'mean': values.mean(0),
+             'std': values.std(0)}
+    found |= {f'q{round(100 * q):02d}': np.quantile(values, q, 0) for q in _QUANTILES}
+    return {name: each.tolist() for name, each in found.items()} | {'count': [len(values)]}
+
+
+def _write_meta(folder: Path, features: dict[str, Any], tasks: dict[str, int],
+                rows: list[dict[str, Any]], fps: int) -> None:
+    """Write what describes the set."""
+    import pyarrow
+    from pyarrow import parquet
+    _write_json(folder / INFO, {
+        'codebase_version': 'v3.0', 'robot_type': 'ur10e', 'fps': fps,
+        'total_episodes': len(rows), 'total_frames': rows[-1]['dataset_to_index'],
+        'total_tasks': len(tasks), 'chunks_size': FILES_PER_CHUNK, 'data_files_size_in_mb': 100,
+        'video_files_size_in_mb': 200, 'splits': {'train': f'0:{len(rows)}'}, 'data_path': DATA,
+        'video_path': VIDEO if features[CAMERA]['dtype'] == 'video' else None,
+        'features': features})
+    episodes = folder / 'meta' / 'episodes' / 'chunk-000' / 'file-000.parquet'
+    episodes.parent.mkdir(parents=True)
+    parquet.write_table(pyarrow.Table.from_pylist(rows), episodes)
+    table = pyarrow.table({'task_index': list(tasks.values()), 'task': list(tasks)})
+    # As pandas writes a table whose index are the tasks: LeRobot reads it with pandas.
+    described = {'index_columns': ['task'], 'column_indexes': [], 'columns': [
+        {'name': 'task_index', 'field_name': 'task_index', 'pandas_type': 'int64',
+         'numpy_type': 'int64', 'metadata': None},
+        {'name': 'task', 'field_name': 'task', 'pandas_type': 'unicode', 'numpy_type': 'object',
+         'metadata': None}]}
+    parquet.write_table(table.replace_schema_metadata({'pandas': json.dumps(described)}),
+                        folder / 'meta' / 'tasks.parquet')
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=4) + '\n')
