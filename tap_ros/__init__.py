@@ -18,9 +18,11 @@ if 'OMP_WAIT_POLICY' not in os.environ:
 _EXPORTS = {
     'Client': 'tap_ros.nodes.client',
     'EpisodeWriter': 'tap_ros.recording.writer',
+    'ForwardModel': 'tap_ros.planning.protocols',
     'iter_episodes': 'tap_ros.recording.reader',
     'open_recordings': 'tap_ros.recording.cache',
     'Simulator': 'sim_bridge.simulator',
+    'Solver': 'tap_ros.planning.protocols',
     'SubgoalPredictor': 'tap_ros.prediction.predictor',
     'TapError': 'tap_ros.errors',
     'VisualMPC': 'tap_ros.planning.visual_mpc',

@@ -6,6 +6,8 @@ from sim_bridge.simulator import Simulator as Simulator
 from sim_bridge.world_protocol import World as World
 from tap_ros.errors import TapError as TapError
 from tap_ros.nodes.client import Client as Client
+from tap_ros.planning.protocols import ForwardModel as ForwardModel
+from tap_ros.planning.protocols import Solver as Solver
 from tap_ros.planning.visual_mpc import VisualMPC as VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor as SubgoalPredictor
 from tap_ros.recording.cache import open_recordings as open_recordings

@@ -37,10 +37,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'evaluate': ('score trained weights', {
         'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.prediction'),
         'forward': ('score a forward model on recordings', 'tap_ros.evaluation.forward'),
-        'planning': ('plan scenes and score where the objects end (Table 2)',
+        'planning': ('push or stack objects and score where they end (Table 2)',
                      'experiments.planning.command'),
-        'stacking': ('stack objects via predicted subgoals and score the towers',
-                     'experiments.stacking.command'),
     }),
     'predict': ('predict subgoals from picture files', 'tap_ros.prediction.predict_command'),
     'call': ('ask a running predictor node', 'tap_ros.nodes.call_command'),

@@ -19,9 +19,12 @@ from tap_ros.errors import ConfigError
 # By group: name -> 'module:attribute'.
 BUILT_IN: dict[str, dict[str, str]] = {
     'tap_ros.arms': {},
-    'tap_ros.forward_models': {},
+    'tap_ros.forward_models': {
+        'learned': 'tap_ros.planning.forward_model:LearnedForwardModel',
+        'true': 'tap_ros.planning.true_model:TrueModel'},
     'tap_ros.predictors': {},
-    'tap_ros.solvers': {},
+    'tap_ros.solvers': {'cem': 'tap_ros.planning.solvers.cem:cem',
+                        'icem': 'tap_ros.planning.solvers.icem:icem'},
     'tap_ros.worlds': {'metaworld': 'sim_bridge.gym_world:metaworld',
                        'mujoco_table': 'sim_bridge.simulator:Simulator'},
 }

@@ -14,10 +14,9 @@ from sim_bridge.tasks.expert import run_episode
 from sim_bridge.tasks.tasks import TASKS
 from sim_bridge.world.scene import HALF_HEIGHT
 from tap_ros import contract
-from tap_ros.planning.action_sequences import Limits
-from tap_ros.planning.forward_model import load_forward_model
-from tap_ros.planning.mpc_config import PRESETS
-from tap_ros.planning.scenes import PLANNING_TASKS
+from tap_ros.planning.action_sequences import Limits, SequenceShape
+from tap_ros.planning.forward_model import LearnedForwardModel
+from tap_ros.planning.mpc_config import PLANNING_TASKS
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 import torch
@@ -63,7 +62,7 @@ def test_parameter_file_shows_the_defaults_of_every_node(name):
 
 
 def test_the_forward_model_moves_the_gripper_as_the_simulator_does():
-    model = load_forward_model(FORWARD_MODEL)
+    model = LearnedForwardModel.load(FORWARD_MODEL)
     assert model.config.workspace_low == contract.WORKSPACE_LOW
     assert model.config.workspace_high == contract.WORKSPACE_HIGH
     actions = np.random.default_rng(0).normal(0, 0.1, (200, 4))
@@ -121,10 +120,9 @@ def test_what_an_expert_commands_is_what_the_arm_does(simulator):
     assert len(observations) <= contract.EPISODE_FRAMES[simulator.task.name]
 
 
-@pytest.mark.parametrize('preset', PRESETS)
-def test_no_preset_plans_more_than_the_arm_does(preset):
+def test_no_plan_asks_for_more_than_the_arm_does():
     for limits in (Limits(), Limits(1.0, 1.0)):
-        shape = PRESETS[preset].shape(limits, 0)
+        shape = SequenceShape(limits)
         assert shape.push_limit <= shape.move_limit == contract.MOVE_LIMIT
         assert shape.climb_limit == contract.CLIMB_LIMIT
 

@@ -23,7 +23,6 @@ from experiments.bench.speed import matrix_rate
 from experiments.bench.training import time_step
 from experiments.pages import number, render
 from experiments.paper.figures import new_figure, to_png
-from experiments.planning.methods import with_samples
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
@@ -31,8 +30,7 @@ from sim_bridge.simulator import Simulator
 from tap_ros.engines.task import Engine
 from tap_ros.files import write_atomically, write_rows
 from tap_ros.options import Flag
-from tap_ros.planning.mpc_config import with_preset
-from tap_ros.planning.scenes import FIRST_SCENE
+from tap_ros.planning.mpc_config import FIRST_SCENE, with_preset, with_samples
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.prediction.training_config import TrainingConfig

@@ -21,9 +21,8 @@ from tap_ros.errors import PlanningError
 from tap_ros.images.pixels import to_float
 from tap_ros.options import ShippedFile
 from tap_ros.planning.action_sequences import FIRST_STD, HORIZON
-from tap_ros.planning.mpc_config import PRESETS, with_preset
+from tap_ros.planning.mpc_config import FIRST_SCENE, PRESETS, with_preset
 from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.scenes import FIRST_SCENE
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.weights import FORWARD_MODEL
 import torch
@@ -132,7 +131,7 @@ def time_naively(mpc, seen, count):
     times = []
     for sample in actions[:, None]:  # (1, horizon, 4)
         begin = time.perf_counter()
-        maps = model.seed_maps(torch.from_numpy(seen.object_pixels).to(image.device))[None]
+        maps = model.table.seed_maps(torch.from_numpy(seen.object_pixels).to(image.device))[None]
         arm = model.draw_arm(gripper)
         scene = model.look(image, arm[:, 3:])
         flow, hand = model.still(1), gripper
@@ -153,7 +152,7 @@ def count_operations(mpc, seen):
     :return: of convolutions, matrix products and bilinear reading; a product and a sum are two.
     """
     image, gripper = _inputs(mpc, seen)
-    maps = mpc.model.seed_maps(torch.from_numpy(seen.object_pixels).to(image.device))
+    maps = mpc.model.table.seed_maps(torch.from_numpy(seen.object_pixels).to(image.device))
     actions = random_actions(mpc, mpc.rollouts.batch_size)
 
     def bilinear(*_, out_shape=None, **__):
@@ -175,11 +174,11 @@ def random_actions(mpc, count):
     rng = np.random.default_rng(0)
     actions = np.zeros((count, HORIZON, 4), np.float32)
     actions[..., :2] = rng.normal(0, FIRST_STD / 2, (*actions.shape[:2], 2))
-    return torch.from_numpy(actions).to(mpc.model.device)
+    return torch.from_numpy(actions).to(mpc.model.table.device)
 
 
 def _inputs(mpc, seen):
     """Return the picture (1, 3, H, W), and the gripper (1, 4) brought down to push."""
-    device = mpc.model.device
+    device = mpc.model.table.device
     gripper = torch.from_numpy(np.append(seen.gripper[:2], [LOW, 0]).astype(np.float32))
     return to_float(seen.image)[None].to(device), gripper[None].to(device)

@@ -8,18 +8,14 @@ same.
 """
 
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import NamedTuple
 
-from experiments.planning.true_model import TrueModel
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
-from tap_ros.planning.visual_mpc import VisualMPC
-from tap_ros.recording.episode import Episode
 from tap_ros.training.robot_mask import FreeView, trained_robot_mask
 
 
@@ -48,19 +44,18 @@ class PlannedEpisode:
         return float(np.linalg.norm(self.tracked - true, axis=-1).mean())
 
 
-def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reached=GOAL_TOLERANCE,
-                objects=None):
+def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
+                reached=GOAL_TOLERANCE):
     """
     Push the objects of one scene.
 
     :param simulator: Simulator; reset here.
-    :param mpc: VisualMPC with a learned model; the method may put the simulator in its place.
+    :param mpc: VisualMPC, with the forward model that the method names.
     :param method: methods.Method.
     :param step_budget: control periods at most.
     :param seed: of the scene, the planner and the predictor.
     :param predictor: SubgoalPredictor, for methods that predict.
     :param reached: px, mean over objects; nearer than this is there. 0: never.
-    :param objects: indices of the objects that are planned for; None: all.
     :return: PlannedEpisode.
     :raises ConfigError: when the predictor is missing.
     """
@@ -68,15 +63,11 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     start = seen = simulator.reset(seed)
     goal = simulator.goal()
-    view, asked = View(mpc.model.config.robot_mask), View(_mask_of(method, predictor))
-    targets, subgoals = [Target(goal.object_pixels)], []
-    if objects is not None:
-        objects = tuple(objects)
-        targets = [Target(goal.object_pixels[list(objects)])]
+    view = View(getattr(mpc.model, 'robot_mask', 'none'))
+    asked = View(shown_mask(predictor) if method.predicted else 'none')
+    subgoals = []
     follower = mpc.model if method.tracking == 'carried' else None
-    if method.model == 'true':
-        mpc = VisualMPC(TrueModel(mpc.model, simulator, objects), mpc.config)
-    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, follower, objects=objects,
+    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, follower,
                                    rounds=method.rounds), seed)
     observations, distances, actions, times = [seen], [simulator.distances()], [], []
     tracked = []
@@ -84,12 +75,11 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
         shown, start_picture = view.see(seen), asked.see(seen).image
         answer = reach.step(as_seen(shown))
         while isinstance(answer, Aim):
-            if objects is None:
-                pictures = Pictures(start_picture, asked.fill(goal).image, shown.image)
-                targets, found = make_targets(
-                    simulator, mpc, method, replace(seen, object_pixels=answer.seen.pixels),
-                    goal, predictor, seed, pictures)
-                subgoals += found
+            pictures = Pictures(start_picture, asked.fill(goal).image, shown.image)
+            targets, found = make_targets(
+                simulator, mpc, method, replace(seen, object_pixels=answer.seen.pixels),
+                goal, predictor, seed, pictures)
+            subgoals += found
             reach.head_for(targets)
             answer = reach.step(as_seen(shown))
         tracked.append(reach.pixels)
@@ -103,7 +93,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None, reach
         times.append(answer.plan.planning_ms)
     return PlannedEpisode(
         np.array(distances), observations, np.array(actions).reshape(-1, 4), np.array(times),
-        goal, reach.targets or targets, reach.switches,
+        goal, reach.targets or [Target(goal.object_pixels)], reach.switches,
         np.array(tracked or [start.object_pixels]), subgoals)
 
 
@@ -137,9 +127,9 @@ def as_seen(observation):
                 observation.object_pixels, observation.stamp_ns)
 
 
-def _mask_of(method, predictor):
-    """Return what robot_mask the pictures for the predictor are filled with."""
-    robot_mask, share = trained_robot_mask(predictor.training) if method.predicted else ('none', 0)
+def shown_mask(predictor):
+    """Return what robot_mask the pictures for a predictor are filled with."""
+    robot_mask, share = trained_robot_mask(predictor.training)
     return robot_mask if share else 'none'
 
 
@@ -168,9 +158,6 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=N
             recursion_depth=method.recursion, seed=seed)
         subgoals = choose_sample(
             mpc, Scene(pictures.planned_from, seen.gripper, start), end, found, seed)
-        if method.maps == 'true':
-            return [*(Target(true_configuration(simulator, s.image, seen, goal))
-                      for s in subgoals), last], subgoals
         return targets_by(subgoals, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []
@@ -182,39 +169,3 @@ def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=N
     moved = [order[:max(1, i * K // (n + 1))] for i in range(1, n + 1)]
     return [*(Target(np.where(np.isin(np.arange(K), done)[:, None], end, start))
               for done in moved), last], []
-
-
-def true_configuration(simulator, picture, seen, goal):
-    """
-    Find where objects are in the true configuration that looks most like a predicted picture.
-
-    :param picture: uint8 (H, W, 3), predicted.
-    :param seen: Observation of the start; goal: of the goal.
-    :return: (K, 2) pixels: some objects at their goals, but not all, the others at their starts.
-    """
-    errors = []
-    for moved in list(product((False, True), repeat=len(seen.object_pixels)))[1:-1]:
-        poses = np.where(np.array(moved)[:, None], goal.object_poses, seen.object_poses)
-        shown = simulator.photograph(poses, hide_arm=True)
-        error = np.abs(shown.image.astype(float) - picture).mean()
-        errors.append((error, shown.object_pixels))
-    return min(errors, key=lambda found: found[0])[1]
-
-
-def as_recording(run, task, seed, outcome):
-    """Return a PlannedEpisode as the Episode of a recording."""
-    seen, goal = run.observations, run.goal
-
-    def stack(name, dtype):
-        return np.array([getattr(o, name) for o in seen], dtype)
-
-    return Episode(
-        frames=stack('image', np.uint8), stamps=stack('stamp_ns', np.int64),
-        actions=np.concatenate([run.actions, np.zeros((1, 4))]).astype(np.float32),
-        grippers=stack('gripper', np.float32), object_names=tuple(seen[0].object_names),
-        object_pixels=stack('object_pixels', np.float32),
-        object_poses=stack('object_poses', np.float64), goal_frame=goal.image,
-        goal_pixels=np.asarray(goal.object_pixels, np.float32),
-        goal_poses=np.asarray(goal.object_poses, np.float64), task=task, seed=seed,
-        outcome=outcome, robot_masks=stack('robot_mask', np.uint8),
-        goal_mask=goal.robot_mask)

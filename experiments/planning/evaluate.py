@@ -3,148 +3,127 @@
 """Runs what `python -m tap_ros evaluate planning` asks for, and writes its results."""
 
 from dataclasses import replace
-import json
 from pathlib import Path
 import shlex
 
-from experiments.planning.command import RUNS, TRAINED
-from experiments.planning.films import read_caption, write_films
-from experiments.planning.methods import parse_method, with_samples
-from experiments.planning.page import make_page
-from experiments.planning.results import load_results, make_rows
-from experiments.planning.runs import Job, run_jobs
+from experiments.planning.films import write_film
+from experiments.planning.methods import FIRST_SCENES, parse_method, STACKING_TASKS, USUAL
+from experiments.planning.results import make_rows, make_stack_rows
+from experiments.planning.runs import Job, load_results, run_jobs
 from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.errors import ConfigError
-from tap_ros.evaluation import forward
-from tap_ros.files import write_atomically, write_rows
-from tap_ros.planning.mpc_config import with_preset
-from tap_ros.planning.scenes import FIRST_SCENE
+from tap_ros.files import write_rows
+from tap_ros.planning.mpc_config import with_preset, with_samples
 from tap_ros.weights import find_predictor, FORWARD_MODEL
+
+# What the command paper calls the predictors that methods stand for.
+_NAMES = {'fix': 'fix-wo-gan+skips', 'genmin': 'genmin-wo-gan+skips',
+          'genmin+progress': 'genmin-wo-gan+progress+skips',
+          'genmin+relative': 'genmin-wo-gan+relative+skips'}
+RUNS = {base + suffix: name + text for base, name in _NAMES.items() for suffix, text in (
+    ('', ''), ('+rounds', '+rounds'), ('+scratch', '+scratch'), ('-r2', '-r2'))}
+TRAINED = 'runs/paper/small/{task}-bidirectional-{name}{warp}-s0/predictor.safetensors'
+# Options that change numbers, for the command that makes them again, with what is usual.
+TOLD = (('look', DEFAULT_LOOK), ('seed', 0), ('preset', 'default'), ('solver', 'cem'),
+        ('plan_samples', 0), ('plan_iterations', 0), ('forward_weights', str(FORWARD_MODEL)),
+        ('device', 'cpu'))
 
 
 def evaluate(args):
-    """Run what is missing; write the numbers, the page and the films."""
+    """Run what is missing; write the numbers and the films."""
     if args.scenes < 1:
         raise ConfigError('scenes must be at least 1')
     out = Path(args.out)
     if not args.results_only:
-        jobs = make_jobs(args)
-        seeds = range(args.seed, args.seed + args.scenes)
-        files = run_jobs(jobs, seeds, out / 'planning', args.engine)
-        _write_results(out)  # first: whatever happens to the films, these stay
-        for job, file in zip(jobs, files):
-            name = f'{job.task}-{job.method.file_name}'
-            if not args.no_films and job.method.base != 'nothing':
-                write_films(job, file.scenes, out / 'planning' / f'{name}.png',
-                            Path(args.recordings) / f'{name}.mcap')
-    rows = _write_results(out)
-    for row in rows:
-        if row['metric'] == 'final_distance_cm':
-            print(f'  {row["task"]} {row["method"]:24} {row["value"]:5.1f} cm '
-                  f'[{row["ci_low"]:.1f}, {row["ci_high"]:.1f}], {row["n"]} scenes')
-    print(f'written: {out / "planning.json"}, {out / "planning.md"}')
+        for first, jobs in make_jobs(args).items():
+            files = run_jobs(jobs, range(first, first + args.scenes), out, args.engine)
+            write_results(out)  # first: whatever happens to the films, these stay
+            for job, file in zip(jobs, files):
+                if not args.no_films and job.method.base != 'nothing':
+                    write_film(job, file.scenes, out / f'{job.file_name}.png')
+    for row in write_results(out):
+        if row['metric'] in ('success', 'success_5cm', 'final_distance_cm'):
+            print(f'  {row["task"]:10} {row["method"]:29} {row["metric"]:17} {row["value"]:6.2f} '
+                  f'[{row["ci_low"]:.2f}, {row["ci_high"]:.2f}], {row["n"]} scenes')
 
 
-def _write_results(out):
-    """Write planning.json and planning.md from the scenes that were run; return the rows."""
-    rows = make_rows(load_results(out / 'planning'))
+def write_results(out):
+    """Write planning.json and stacking.json from the scenes that were run; return the rows."""
+    rows = []
+    for name, make in (('planning', make_rows), ('stacking', make_stack_rows)):
+        if found := make(load_results(out / name)):
+            write_rows(out / f'{name}.json', found)
+            rows += found
     if not rows:
-        raise ConfigError(f'{out / "planning"}: holds no results; run without --results-only')
-    write_rows(out / 'planning.json', rows)
-    maps, findings = out / forward.FILE, out / 'planning_findings.md'
-    write_atomically(out / 'planning.md', make_page(
-        rows, find_films(out, rows),
-        json.loads(maps.read_text()) if maps.exists() else (),
-        findings.read_text() if findings.exists() else ''))
+        raise ConfigError(f'{out}: planning/ and stacking/ hold no results; run without '
+                          '--results-only')
     return rows
 
 
 def make_jobs(args):
     """
-    Return a Job for each task and method.
+    Return the Jobs of each task and method, by the seed of their first scene.
 
-    :raises ConfigError: for a method or predictor that cannot be used.
+    :raises ConfigError: for a method or predictor that cannot be used. The usual methods of
+        stacking are left out where there are no weights of them.
     """
-    planner = with_preset(args.preset)
-    if args.plan_samples or args.plan_iterations or args.replan_every:
-        planner = changed(planner, args.plan_samples, args.plan_iterations, args.replan_every)
-    named = named_weights(args.predictor)
-    defaults = {'switch': args.switch, 'recursion': args.recursion, 'samples': args.samples,
-                'tracking': args.tracking, 'step_budget': args.step_budget}
-    methods = list(dict.fromkeys(parse_method(text, **defaults) for text in args.methods))
-    jobs = []
+    planner = with_preset(args.preset, solver=args.solver)
+    if args.plan_samples:
+        planner = with_samples(planner, args.plan_samples)
+    if args.plan_iterations:
+        planner = replace(planner, search=replace(
+            planner.search, num_iterations=args.plan_iterations))
+    named, jobs = {'shipped': '{task}'}, {}
+    for text in args.predictor:
+        name, found, named[name] = text.partition('=')
+        if not found:
+            raise ConfigError(f'--predictor {text}: expected NAME=FILE')
     for task in args.tasks:
-        for method in methods:
+        stacks = task in STACKING_TASKS
+        defaults = {name: getattr(args, name) for name in (
+            ('recursion',) if stacks else (
+                'switch', 'recursion', 'samples', 'tracking', 'step_budget'))}
+        texts = args.methods or USUAL[task]
+        for method in dict.fromkeys(parse_method(text, **defaults) for text in texts):
             file = ''
             if method.predicted:
-                file = find_weights(method, task, named, RUNS, TRAINED)
-            jobs.append(Job(task, method, planner, args.forward_weights, file, args.device,
-                            args.preset, _command(args, task, method), args.look))
+                try:
+                    file = find_weights(method, task, named)
+                except ConfigError as error:
+                    if args.methods or not stacks:
+                        raise
+                    print(f'  {task}: left out: {error}')
+                    continue
+            jobs.setdefault(args.seed or FIRST_SCENES[task], []).append(Job(
+                task, method, planner, args.forward_weights, file, args.device, args.preset,
+                _command(args, task, method), args.look))
     return jobs
 
 
-def named_weights(texts):
-    """
-    Read --predictor.
-
-    :param texts: NAME=FILE each.
-    :return: dict from names, also 'shipped', to files, with {task} for the task.
-    :raises ConfigError: for what is none.
-    """
-    weights = {'shipped': '{task}'}
-    for text in texts:
-        name, found, file = text.partition('=')
-        if not found:
-            raise ConfigError(f'--predictor {text}: expected NAME=FILE')
-        weights[name] = file
-    return weights
-
-
-def find_weights(method, task, named, runs, trained):
+def find_weights(method, task, named):
     """
     Find the weights of a method that predicts.
 
-    :param method: with a base and a name.
-    :param task: name.
-    :param named: of named_weights.
-    :param runs: what the command paper calls predictors that have a shorter name here.
-    :param trained: where it leaves them, with {task} and {name}.
+    :param named: dict from names to files, with {task} for the task.
     :return: str, a file that is there.
     :raises ConfigError: where there is none.
     """
-    usual = trained.replace('{name}', runs.get(method.base, method.base))
+    name, warp = RUNS.get(method.base, method.base), '' if task in STACKING_TASKS else '-warp'
+    usual = TRAINED.format(task=task, name=name, warp=warp)
     file = str(find_predictor(named.get(method.base, usual).replace('{task}', task)))
     if not Path(file).is_file():
         raise ConfigError(
             f'method {method.name!r}: no weights {file}; train them with `python -m tap_ros paper '
-            f'--only "{Path(usual.replace("{task}", task)).parent.name}"`, name them with '
-            f'--predictor {method.base}=FILE, or leave the method out with --methods')
+            f'--only "{Path(usual).parent.name}"`, name them with --predictor '
+            f'{method.base}=FILE, or leave the method out with --methods')
     return file
-
-
-def changed(planner, samples, iterations, replan_every):
-    """Return a VisualMPCConfig with what is not 0 changed; see methods.with_samples."""
-    if samples:
-        planner = with_samples(planner, samples)
-    search = replace(planner.search, num_iterations=iterations or planner.search.num_iterations)
-    return replace(planner, search=search, replan_every=replan_every or planner.replan_every)
-
-
-def find_films(out, rows):
-    """Return the film strips that are there: {(task, method): (file name in out, caption)}."""
-    keys = dict.fromkeys((row['task'], row['method']) for row in rows)
-    names = {key: f'planning/{key[0]}-{parse_method(key[1]).file_name}.png' for key in keys}
-    return {key: (name, read_caption(out / name)) for key, name in names.items()
-            if (out / name).exists()}
 
 
 def _command(args, task, method):
     """Return the command that makes the numbers of one method again."""
     words = ['python -m tap_ros evaluate planning --tasks', task, '--methods', method.name,
              '--scenes', str(args.scenes)]
-    for option, usual in (('look', DEFAULT_LOOK), ('seed', FIRST_SCENE), ('preset', 'default'),
-                          ('plan_samples', 0), ('plan_iterations', 0), ('replan_every', 0),
-                          ('forward_weights', str(FORWARD_MODEL)), ('device', 'cpu')):
+    for option, usual in TOLD:
         value = getattr(args, option)
         if value != usual:
             words += ['--' + option.replace('_', '-'), shlex.quote(str(value))]

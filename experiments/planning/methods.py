@@ -1,53 +1,63 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-What is compared: methods of planning, written as a base and options, 'genmin:true_model'.
+What is compared: methods, written as a base and options, such as 'genmin:recursion2:half'.
 
-Bases: 'nothing', 'direct', the name of a predictor ('genmin', 'fix', 'shipped'), and bounds that
-know more than a robot would: 'one_object', 'oracle_order', 'true_subgoal'. Options replace one
-part of the chain by another, or by its true counterpart; see OPTIONS.
+Of pushing: 'nothing'; 'direct', to the goal; the name of a predictor ('shipped', 'fix', 'genmin'),
+by its subgoals; and bounds that know more than a robot would: 'oracle_order', one object after
+another in the right order, and 'true_subgoal', the true places with the right object moved.
+
+Of stacking: which pictures are brought about, and in which order. 'nothing'; 'direct', the goal
+picture alone; 'lowest_first', likewise, what is lowest in it first; a predictor: its subgoals,
+then the goal. Bounds: 'true_subgoals' are frames of the expert, 'oracle_order' knows which object
+has to be moved first, and 'true_places' also where to, from no picture.
 """
 
 from dataclasses import dataclass, fields, replace
 import re
 
 from tap_ros.errors import ConfigError
-from tap_ros.planning.mpc_config import LARGE, PAPER
+from tap_ros.planning.mpc_config import FIRST_SCENE, PLANNING_TASKS, with_samples
+from tap_ros.plugins import names
 
-BASES = ('nothing', 'direct', 'one_object', 'oracle_order', 'true_subgoal')
-BOUNDS = ('one_object', 'oracle_order', 'true_subgoal', 'true_model')
+STACKING_TASKS = ('stack3', 'stack2', 'pick_place')
+TASKS = (*PLANNING_TASKS, *STACKING_TASKS)
+FIRST_SCENES = {**dict.fromkeys(PLANNING_TASKS, FIRST_SCENE),
+                **dict.fromkeys(STACKING_TASKS, 1_200_000)}  # how to read was tried in others
+BOUNDS = ('oracle_order', 'true_subgoal', 'true_subgoals', 'true_places')
+BASES = ('nothing', 'direct', 'lowest_first', *BOUNDS)
+USUAL = {
+    **dict.fromkeys(PLANNING_TASKS, (
+        'nothing', 'direct', 'direct:twice', 'fix', 'genmin', 'genmin+progress',
+        'genmin+relative', 'shipped', 'oracle_order', 'true_subgoal', 'true_model')),
+    **dict.fromkeys(STACKING_TASKS, (
+        'nothing', 'direct', 'lowest_first', 'fix', 'genmin', 'genmin+progress', 'shipped',
+        'shipped:recursion2', 'genmin+progress-r2:recursion2', 'true_subgoals', 'oracle_order',
+        'true_places'))}
 OPTIONS = {  # option: (field, value; None: the number behind it)
-    'half': ('switch', 'half'), 'stalled': ('switch', 'stalled'),
-    'reached': ('switch', 'reached'),
+    'half': ('switch', 'half'), 'stalled': ('switch', 'stalled'),  # results have it, plans not
     'recursion': ('recursion', None), 'rounds': ('rounds', None), 'samples': ('samples', None),
-    'carried': ('tracking', 'carried'), 'true_maps': ('maps', 'true'),
-    'true_model': ('model', 'true'), 'more_search': ('search', 'more'),
-    'twice': ('search', 'twice'), 'paper': ('search', 'paper'), 'plain_cost': ('cost', 'plain'),
-    'every': ('replan_every', None), 'steps': ('step_budget', None)}
-SUBGOALS_ONLY = ('switch', 'recursion', 'rounds', 'samples', 'maps')
+    'carried': ('tracking', 'carried'), 'twice': ('search', 'twice'),
+    'steps': ('step_budget', None),
+    **{f'{name}_model': ('model', name) for name in names('tap_ros.forward_models')}}
+SUBGOALS_ONLY = ('switch', 'recursion', 'rounds', 'samples')
+USED = {'true_subgoal': ('switch', 'recursion'), 'oracle_order': ('switch',)}  # of these
 
 
 @dataclass(frozen=True)
 class Method:
     """
-    A way to plan.
+    A way to plan or to stack.
 
     :param base: one of BASES, or the name of a predictor.
-    :param switch: 'reached', 'stalled' or 'half', see planning.hierarchy.Itinerary.
+    :param switch: 'reached' or 'half', see planning.hierarchy.Itinerary.
     :param recursion: subgoals in a row.
     :param rounds: how often subgoals are predicted, see planning.reach.ReachConfig.
     :param samples: subgoals to choose from by the planner's own cost.
-    :param maps: 'predicted'; 'true': where the objects are in that true configuration (some at
-        their goals, the others at their starts) whose picture is nearest to the predicted one.
     :param tracking: 'ground_truth': object pixels from the simulator at every step; 'carried':
         only in the first picture, then followed by planning.tracking.
-    :param model: 'learned' or 'true', the simulator itself.
-    :param search: 'preset'; 'twice': twice the samples, elites and proposals; 'more': samples,
-        iterations and proposals of LARGE; 'paper': the paper's planner, mpc_config.PAPER, whatever
-        else is set.
-    :param cost: 'preset'; 'plain': the sum of distances alone, as in the paper, nothing that
-        prefers to bring one object home before the next (VisualMPCConfig.unfinished).
-    :param replan_every: see VisualMPCConfig; 0: as the preset has it.
+    :param model: name of a forward model, such as 'true', the simulator itself.
+    :param search: 'preset'; 'twice': twice the samples, elites and proposals.
     :param step_budget: control periods at most; 0: the task's, see contract.step_budget.
     """
 
@@ -56,12 +66,9 @@ class Method:
     recursion: int = 1
     rounds: int = 1
     samples: int = 1
-    maps: str = 'predicted'
     tracking: str = 'ground_truth'
     model: str = 'learned'
     search: str = 'preset'
-    cost: str = 'preset'
-    replan_every: int = 0
     step_budget: int = 0
 
     @property
@@ -88,28 +95,11 @@ class Method:
 
     def planner(self, config):
         """Return a VisualMPCConfig changed as this method wants it."""
-        if self.search == 'paper':
-            config = PAPER
         if self.search == 'twice':
             config = with_samples(config, 2 * config.search.num_samples)
-        if self.search == 'more':
-            config = replace(config, search=LARGE.search, proposals=LARGE.proposals,
-                             batch_size=LARGE.batch_size)
-        if self.cost == 'plain':
-            config = replace(config, unfinished=0.0)
-        if self.replan_every:
-            config = replace(config, replan_every=self.replan_every)
         if self.model == 'true':  # the simulator rolls out all samples by itself
             config = replace(config, batch_size=config.search.num_samples, threads=1)
         return config
-
-
-def with_samples(config, num_samples):
-    """Return a VisualMPCConfig with so many samples, elites and proposals in proportion."""
-    share = num_samples / config.search.num_samples
-    search = replace(config.search, num_samples=num_samples,
-                     num_elites=max(2, round(share * config.search.num_elites)))
-    return replace(config, search=search, proposals=int(share * config.proposals))
 
 
 DEFAULTS = {field.name: field.default for field in fields(Method)}
@@ -138,18 +128,13 @@ def parse_method(text, **defaults):
                               + ', '.join(w + ('' if v else '<n>')
                                           for w, (_, v) in OPTIONS.items()))
         values[field] = value or int(number)
-    unused = []
-    if base in BASES:
-        unused = [f for f in SUBGOALS_ONLY if base != 'true_subgoal' or f in (
-            'rounds', 'samples', 'maps')]
-    if base in ('oracle_order',):
-        unused.remove('switch')
+    unused = set(SUBGOALS_ONLY) - set(USED.get(base, ())) if base in BASES else ()
     if base == 'nothing':
-        unused = [f for f in DEFAULTS if f != 'base']
+        unused = set(DEFAULTS) - {'base'}
     method = Method(**(values | {field: DEFAULTS[field] for field in unused}))
     if min(method.recursion, method.rounds, method.samples) < 1:
         raise ConfigError(f'method {text!r}: recursion, rounds and samples are at least 1')
-    if method.samples > 1 and method.model == 'true':
-        raise ConfigError(f'method {text!r}: the simulator cannot start from a predicted picture, '
-                          'so samples cannot be chosen by it; leave out one of the two')
+    if method.model != 'learned' and (method.samples > 1 or method.tracking == 'carried'):
+        raise ConfigError(f'method {text!r}: samples are chosen and objects carried by the '
+                          'learned model alone; leave out one of the options')
     return method

@@ -3,12 +3,17 @@
 """Run methods on scenes, a result file for each task and method."""
 
 from dataclasses import asdict, dataclass, replace
+from datetime import date
 from functools import lru_cache
 import json
+import os
 from pathlib import Path
+import platform
+import time
 
 from experiments.planning.episode import run_episode
-from experiments.planning.methods import Method
+from experiments.planning.methods import Method, STACKING_TASKS
+from experiments.planning.stacking import stack
 import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task
@@ -18,11 +23,13 @@ from tap_ros.engines.run import run_tasks
 from tap_ros.engines.task import LOCAL, Task
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.files import write_atomically
-from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.plugins import load_plugin
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.training.weights import stored_digest
+from tap_ros.weights import FORWARD_MODEL
 import torch
 from tqdm import tqdm
 
@@ -35,13 +42,24 @@ class Job:
 
     task: str
     method: Method
-    planner: VisualMPCConfig
-    forward_weights: str
+    planner: VisualMPCConfig = VisualMPCConfig()
+    forward_weights: str = str(FORWARD_MODEL)
     predictor: str = ''  # weights file; '' when nothing is predicted
     device: str = 'cpu'
     preset: str = ''  # name of the planner's settings
     command: str = ''  # that makes the numbers again
     look: str = DEFAULT_LOOK  # of the world
+
+    @property
+    def stacks(self):
+        """Whether pictures are brought about by picking up and placing, not by pushing."""
+        return self.task in STACKING_TASKS
+
+    @property
+    def file_name(self):
+        """Return the name, without suffix, of its files in the folder of all results."""
+        folder = 'stacking' if self.stacks else 'planning'
+        return f'{folder}/{self.task}-{self.method.file_name}'
 
     def steps(self):
         """Return the step budget."""
@@ -50,22 +68,28 @@ class Job:
     @property
     def about(self):
         """Return as a dict what is stored beside the settings and changes no result."""
-        return {'command': self.command}
+        return {'command': self.command, 'date': date.today().isoformat(),
+                'machine': f'{platform.machine()}, {os.cpu_count()} CPUs',
+                'version': f'torch {torch.__version__}'}
 
     def settings(self):
         """Return as a dict all that changes results; weights by what is in them."""
-        planner = asdict(self.method.planner(self.planner))
         settings = {
             'task': self.task, 'look': self.look, 'method': self.method.name,
-            'step_budget': self.steps(),
-            'reached_px': GOAL_TOLERANCE, 'object_pixels': self.method.tracking,
-            'planner': {k: v for k, v in planner.items() if k not in SPEED_ONLY},
-            'preset': self.preset, 'device': self.device,
-            'precision': str(next(_model(
-                self.forward_weights, self.device).push.parameters()).dtype),
-            'forward_weights': digest(self.forward_weights),
+            'device': self.device,
             'predictor_weights': digest(self.predictor) if self.predictor else None}
-        return json.loads(json.dumps(settings))
+        if self.stacks:
+            return settings | {'object_places': 'ground_truth'}
+        planner = asdict(self.method.planner(self.planner))
+        if planner['solver'] == 'cem':  # results of before there were others do not tell
+            del planner['solver']
+        precision = next(_learned(self.forward_weights, self.device).push.parameters()).dtype
+        return json.loads(json.dumps(settings | {
+            'step_budget': self.steps(), 'reached_px': GOAL_TOLERANCE,
+            'object_pixels': self.method.tracking,
+            'planner': {k: v for k, v in planner.items() if k not in SPEED_ONLY},
+            'preset': self.preset, 'precision': str(precision),
+            'forward_weights': digest(self.forward_weights)}))
 
 
 @lru_cache
@@ -82,12 +106,12 @@ class ResultFile:
     """
     What one job found in the scenes so far.
 
-    :param folder: of the results; job: Job.
+    :param folder: of all results; job: Job.
     :raises ConfigError: if the file there is damaged, or was made with other settings.
     """
 
     def __init__(self, folder, job):
-        self.path = Path(folder) / f'{job.task}-{job.method.file_name}.json'
+        self.path = Path(folder, job.file_name + '.json')
         self.settings, self.scenes, self._about = job.settings(), {}, job.about
         if self.path.exists():
             stored, self.scenes = read_results(self.path)
@@ -134,14 +158,28 @@ def known(stored, names):
             for name, value in stored.items() if name in names}
 
 
-def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True, run=None):
+def load_results(folder):
+    """
+    Read all result files of a folder.
+
+    :return: dict (task, method name) -> (settings, scenes by seed).
+    :raises ConfigError: if one is damaged.
+    """
+    found = {}
+    for path in sorted(Path(folder).glob('*.json')):
+        settings, scenes = read_results(path)
+        if scenes:
+            found[settings['task'], settings['method']] = settings, scenes
+    return found
+
+
+def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True):
     """
     Run all jobs on all scenes, and go on where an interrupted evaluation stopped.
 
-    :param jobs: list of Job; seeds: of the scenes.
+    :param jobs: list of Job; seeds: of the scenes of each, in turn.
     :param folder: of the result files.
     :param engine: Engine; each scene is planned in one thread.
-    :param run: function of a job and a seed that gives what run_scene does; None: that.
     :return: list of ResultFile, one for each job.
     :raises ConfigError: for result files that are damaged or made with other settings.
     """
@@ -149,7 +187,7 @@ def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True, run=None):
     # scene by scene, so that what was run so far can be compared
     todo = [(i, seed) for seed in seeds for i, file in enumerate(files)
             if seed not in file.scenes]
-    tasks = {Task(f'{jobs[i].task}, {jobs[i].method.name}, scene {seed}', run or run_scene,
+    tasks = {Task(f'{jobs[i].task}, {jobs[i].method.name}, scene {seed}', run_scene,
                   (jobs[i], seed)): i for i, seed in todo}
     with tqdm(total=len(todo), desc='scenes x methods', disable=not progress) as bar:
         for task, get in run_tasks(tasks, engine):
@@ -164,66 +202,55 @@ def run_scene(job, seed):
     """
     Run a job on one scene.
 
-    :return: dict of seed, final_cm (mean over objects), objects_cm, steps, switches, plan_ms
-        (median) and, with carried object pixels, tracking_error_px.
+    :return: dict of seed, final_cm (mean over objects), objects_cm and steps; of pushing also
+        switches, plan_ms (median) and, with carried object pixels, tracking_error_px; of stacking
+        success, first_right, moves and seconds.
     :raises PlanningError: if it cannot be planned; the message names task, method and scene.
     """
+    begin = time.perf_counter()
     try:
-        runs, final = plan_scene(job, seed)
+        run = make_episode(job, seed)
     except PlanningError as error:
         raise PlanningError(f'{job.task}, {job.method.name}, scene {seed}: {error}') from error
-    times = np.concatenate([run.planning_ms for run in runs])
-    scene = {
-        'seed': int(seed), 'final_cm': round(float(100 * final.mean()), 3),
-        'objects_cm': (100 * final).round(3).tolist(),
-        'steps': int(np.mean([len(run.actions) for run in runs])),
-        'switches': [int(step) for step in runs[0].switches],
-        'plan_ms': round(float(np.median(times)), 1) if len(times) else None}
+    centimetres = 100 * (run.distances if job.stacks else run.distances[-1])
+    scene = {'seed': int(seed), 'final_cm': round(float(centimetres.mean()), 3),
+             'objects_cm': centimetres.round(3).tolist(), 'steps': len(run.frames) - 1}
+    if job.stacks:
+        return scene | {'success': run.success, 'first_right': run.first_right,
+                        'moves': len(run.moves), 'seconds': round(time.perf_counter() - begin, 2)}
+    scene['switches'] = [int(step) for step in run.switches]
+    scene['plan_ms'] = (round(float(np.median(run.planning_ms)), 1) if len(run.planning_ms)
+                        else None)
     if job.method.tracking == 'carried':
-        scene['tracking_error_px'] = round(float(np.mean([r.tracking_error() for r in runs])), 3)
+        scene['tracking_error_px'] = round(run.tracking_error(), 3)
     return scene
 
 
-def plan_scene(job, seed):
-    """
-    Run a job on one scene.
-
-    :return: list of PlannedEpisodes, one or, each object alone, K; final distances (K,) metres.
-    """
+def make_episode(job, seed):
+    """Run a job on one scene; return the PlannedEpisode or StackedEpisode."""
     torch.set_num_threads(1)  # with more, the predictor's last digits differ
-    simulator, predictor = load_simulator(job.task, job.look), None
-    if job.predictor:
-        predictor = load_predictor(job.predictor, job.device)
-    subsets = [None]
-    if job.method.base == 'one_object':
-        subsets = [[k] for k in range(simulator.task.num_objects)]
-    runs = []
-    mpc = _planner(job.forward_weights, job.device, job.method.planner(job.planner))
-    for objects in subsets:
-        runs.append(run_episode(simulator, mpc, job.method, job.steps(), seed, predictor,
-                                objects=objects))
-    if subsets == [None]:
-        return runs, runs[0].distances[-1]
-    return runs, np.array([run.distances[-1][k] for k, run in enumerate(runs)])
+    simulator = _simulator(job.task, job.look)
+    predictor = _predictor(job.predictor, job.device) if job.predictor else None
+    if job.stacks:
+        return stack(simulator, job.method, seed, predictor)
+    model = _learned(job.forward_weights, job.device)
+    if job.method.model != 'learned':
+        model = load_plugin('tap_ros.forward_models', job.method.model).load(
+            job.forward_weights, job.device, simulator)
+    mpc = VisualMPC(model, replace(job.method.planner(job.planner), threads=1))
+    return run_episode(simulator, mpc, job.method, job.steps(), seed, predictor)
 
 
 @lru_cache
-def load_simulator(task, look):
-    """Return the Simulator of a task and a look, made once in a process."""
+def _simulator(task, look):
     return Simulator(task, look=look)
 
 
 @lru_cache
-def load_predictor(path, device):
-    """Return the SubgoalPredictor of a file, loaded once in a process."""
+def _predictor(path, device):
     return SubgoalPredictor.load(path, device)
 
 
 @lru_cache
-def _model(path, device):
-    return load_forward_model(path, device)
-
-
-@lru_cache(maxsize=8)
-def _planner(weights, device, config):
-    return VisualMPC(_model(weights, device), replace(config, threads=1))
+def _learned(path, device):
+    return LearnedForwardModel.load(path, device)

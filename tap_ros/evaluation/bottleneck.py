@@ -11,7 +11,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.planning.expected_distance import distances_to_pixels
+from tap_ros.planning.cost import distances_to_pixels
 from tap_ros.prediction.batches import fixed_time, uses_recorded_goal
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps, WarpedMaps

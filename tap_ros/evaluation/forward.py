@@ -13,7 +13,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.files import write_rows
 from tap_ros.options import Bags, Folder, ShippedFile, Topic
-from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import open_recordings
@@ -57,7 +57,7 @@ def run(args: Options) -> None:
 
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
-    model = load_forward_model(args.weights, args.device)
+    model = LearnedForwardModel.load(args.weights, args.device)
     _, _, training = load_weights(args.weights, 'forward_model')
     rows = []
     for recording in args.recordings:

@@ -4,7 +4,7 @@
 
 from pathlib import Path
 
-from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.prediction.predictor import load_network
 from tap_ros.training.weights import load_tensors
 
@@ -20,7 +20,7 @@ def check_weights(path: Path) -> dict[str, object]:
     """
     _, about = load_tensors(path)
     if about.get('kind') == 'forward_model':
-        load_forward_model(path)
+        LearnedForwardModel.load(path)
     else:
         load_network(path)
     return about

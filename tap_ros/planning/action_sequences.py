@@ -4,25 +4,39 @@
 What the search varies: a few displacements, each repeated, and for how long the gripper is lifted.
 
 A sequence of HORIZON actions is made of segments of REPEAT control periods. Parameters (D,)
-are x, y of every segment in metres per control period, the number of segments to stay lifted and,
-where it is searched, how much shorter the first segment is: so a way may take any number of
-periods, not just whole segments. Like the expert that was recorded, the arm goes up and down on
-the spot and pushes slowly: what the forward model has never seen, it cannot foresee. A plan that
-is carried over to the next control period starts inside a segment, whose first `phase` periods are
-past; the horizon then reaches into one segment more.
+are x, y of every segment in metres per control period, the number of segments to stay lifted and
+the phase, how much shorter the first segment is: so a way may take any number of periods, and a
+plan goes on inside a segment one period later. Like the expert that was recorded, the arm goes up
+and down on the spot and pushes slowly: what the forward model has never seen, it cannot foresee.
+
+Random displacements seldom touch an object. push_proposals goes behind one as seen from its goal,
+and pushes it through.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import CLIMB_LIMIT, LIFTED, LOW, MOVE_LIMIT
+from tap_ros.contract import (
+    ACTION_LIMIT,
+    CLIMB_LIMIT,
+    LIFTED,
+    LOW,
+    MOVE_LIMIT,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+)
 
 SEGMENTS = 5  # displacements within the horizon
 REPEAT = 3  # control periods of each
 HORIZON = SEGMENTS * REPEAT  # control periods
+MOVES = SEGMENTS + 1  # displacements that the horizon touches
+SIZE = 2 * MOVES + 2  # D
 MAX_LIFT = 4  # segments, at most, that the gripper travels lifted before it goes down
 FIRST_STD = 0.04  # m per control period, of x and y in the first Gaussian
+PUSH_LIMIT = 0.05  # m per control period, of a displacement while the gripper is low
+PACE = 0.9  # of the limits is used by proposals, so that the search can still add to it
 VERTICAL = 0.06  # m, a change of height beyond which the arm does not move sideways meanwhile
 
 
@@ -35,56 +49,26 @@ class Limits:
 
 
 FULL = Limits()
+# The ways to be lifted, as (segments, phase), the shortest first.
+LIFTS = sorted(product(range(1, MAX_LIFT + 1), range(REPEAT)),
+               key=lambda way: REPEAT * way[0] - way[1])
 
 
-@dataclass(frozen=True)
 class SequenceShape:
     """
     How parameters become actions.
 
-    :param phase: periods that the first segment is shorter, 0..REPEAT-1; None: the last parameter
-        of a sequence says it.
-    :param move_limit: m per control period, |x| and |y|.
-    :param push_limit: m per control period, length of a displacement while the gripper is low.
-    :param upright: go up and down without moving sideways.
-    :param climb_limit: m per control period, up and down.
+    :param limits: of the arm.
     """
 
-    phase: int | None = 0
-    move_limit: float = MOVE_LIMIT
-    push_limit: float = 0.05
-    upright: bool = True
-    climb_limit: float = CLIMB_LIMIT
-
-    @property
-    def num_moves(self) -> int:
-        """Number of displacements that the horizon touches."""
-        return SEGMENTS + (self.phase != 0)
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return 2 * self.num_moves + 1 + (self.phase is None)
-
-    def split(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return displacements (N, M, 2), the lifted segments and the phases, ints (N,)."""
-        moves = parameters[:, :2 * self.num_moves].reshape(len(parameters), self.num_moves, 2)
-        counts = np.rint(parameters[:, 2 * self.num_moves:]).astype(int)
-        fixed = self.phase is not None
-        return moves, counts[:, 0], np.full(len(counts), self.phase) if fixed else counts[:, 1]
-
-    def join(self, moves: np.ndarray, lifted: int, phase: int) -> np.ndarray:
-        """Return the parameters (D,) of displacements (M, 2) or fewer, the others standing."""
-        parameters = np.zeros(self.size)
-        kept = moves[:self.num_moves].ravel()
-        parameters[:len(kept)] = kept
-        parameters[2 * self.num_moves:] = [lifted, phase][:1 + (self.phase is None)]
-        return parameters
+    def __init__(self, limits: Limits = FULL) -> None:
+        self.move_limit = min(limits.move, MOVE_LIMIT)
+        self.climb_limit = min(limits.climb, CLIMB_LIMIT)
+        self.push_limit = min(self.move_limit, PUSH_LIMIT)
 
     def first_gaussian(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and deviation (D,) to begin a search with."""
-        counts = np.array([MAX_LIFT, REPEAT - 1][:1 + (self.phase is None)]) / 2
-        still = np.zeros(2 * self.num_moves)
+        counts, still = np.array([MAX_LIFT, REPEAT - 1]) / 2, np.zeros(2 * MOVES)
         return np.append(still, counts), np.append(still + FIRST_STD, counts)
 
     def clip(self, parameters: np.ndarray, least_lift: int = 0) -> np.ndarray:
@@ -93,9 +77,8 @@ class SequenceShape:
 
         :param least_lift: segments to stay lifted at least.
         """
-        moves, counts = np.split(parameters, [2 * self.num_moves], axis=1)
-        lowest, highest = [least_lift, 0], [MAX_LIFT, REPEAT - 1]
-        counts = np.clip(np.rint(counts), lowest[:counts.shape[1]], highest[:counts.shape[1]])
+        moves, counts = np.split(parameters, [2 * MOVES], axis=1)
+        counts = np.clip(np.rint(counts), [least_lift, 0], [MAX_LIFT, REPEAT - 1])
         return np.hstack([np.clip(moves, -self.move_limit, self.move_limit), counts])
 
     def least_lift(self, height: float) -> int:
@@ -105,18 +88,7 @@ class SequenceShape:
         Neither low nor lifted, it stands upon something: then it must go up before it can push.
         Where it takes several periods to come down, it passes these heights every time.
         """
-        return int(self.upright and self.climb_limit >= LIFTED - LOW
-                   and LOW + 0.02 < height < LIFTED - 0.03)
-
-    def lifts(self) -> list[tuple[int, int]]:
-        """Return the ways to be lifted, as (segments, phase), the shortest first."""
-        phases = range(REPEAT) if self.phase is None else [self.phase]
-        ways = [(n, phase) for n in range(1, MAX_LIFT + 1) for phase in phases]
-        return sorted(ways, key=lambda way: REPEAT * way[0] - way[1])
-
-    def segment(self, phase: ArrayLike) -> np.ndarray:
-        """Return the segment (N, HORIZON) of each control period, for phases (N,)."""
-        return (np.arange(HORIZON) + np.asarray(phase)[:, None]) // REPEAT
+        return int(self.climb_limit >= LIFTED - LOW and LOW + 0.02 < height < LIFTED - 0.03)
 
     def climbs(self, lifted: np.ndarray, phase: np.ndarray,
                height: float) -> tuple[np.ndarray, np.ndarray]:
@@ -126,7 +98,7 @@ class SequenceShape:
         :param lifted: (N,) segments; phase: (N,); height: of the gripper now, m.
         :return: climb (N, HORIZON) m per control period, and whether the arm may move sideways.
         """
-        heights = np.where(self.segment(phase) < lifted[:, None], LIFTED, LOW)
+        heights = np.where(segments(phase) < lifted[:, None], LIFTED, LOW)
         missing, climb = np.empty(heights.shape), np.empty(heights.shape)
         now = np.full(len(lifted), height, float)
         for t in range(HORIZON):
@@ -134,7 +106,7 @@ class SequenceShape:
             climb[:, t] = np.clip(missing[:, t], -self.climb_limit, self.climb_limit)
             now = now + climb[:, t]
         near = min(VERTICAL, max(self.climb_limit, 0.02))  # slow ones wait until it is done
-        return climb, (np.abs(missing) < near) | (not self.upright)
+        return climb, np.abs(missing) < near
 
     def actions(self, parameters: np.ndarray, height: float) -> np.ndarray:
         """
@@ -143,9 +115,9 @@ class SequenceShape:
         :param parameters: (N, D); height: of the gripper now, m.
         :return: (N, HORIZON, 4) float32: metres per control period, gripper closed (0).
         """
-        moves, lifted, phase = self.split(parameters)
+        moves, lifted, phase = split(parameters)
         climb, sideways = self.climbs(lifted, phase, height)
-        segment = self.segment(phase)
+        segment = segments(phase)
         actions = np.zeros((len(parameters), HORIZON, 4), np.float32)
         actions[..., :2] = moves[np.arange(len(moves))[:, None], segment] * sideways[..., None]
         actions[..., 2] = climb
@@ -155,34 +127,124 @@ class SequenceShape:
         actions[..., :2] *= np.where(low, slow, 1)[..., None]
         return actions
 
-    def landings(self, actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
-        """
-        Find where the gripper comes down: passes LOW + VERTICAL.
 
-        :param actions: (N, HORIZON, 4); gripper: (4,).
-        :return: (N, 2) metres; NaN for sequences that stay up or low.
-        """
-        path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, HORIZON, 3)
-        before = path[..., 2] - actions[..., 2]
-        down = (before > LOW + VERTICAL) & (path[..., 2] <= LOW + VERTICAL)
-        first = down.argmax(1)
-        return np.where(
-            down.any(1)[:, None], path[np.arange(len(path)), first, :2], np.nan)
+def split(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return displacements (N, MOVES, 2), the lifted segments and the phases, ints (N,)."""
+    moves = parameters[:, :2 * MOVES].reshape(len(parameters), MOVES, 2)
+    counts = np.rint(parameters[:, 2 * MOVES:]).astype(int)
+    return moves, counts[:, 0], counts[:, 1]
 
-    def following(self) -> 'SequenceShape':
-        """Return the shape one control period later."""
-        if self.phase is None:
-            return self
-        return replace(self, phase=(self.phase + 1) % REPEAT)
 
-    def shift(self, parameters: np.ndarray) -> np.ndarray:
-        """
-        Carry parameters (D,) over to the next control period.
+def join(moves: np.ndarray, lifted: int, phase: int) -> np.ndarray:
+    """Return the parameters (D,) of displacements (M, 2) or fewer, the others standing."""
+    parameters = np.zeros(SIZE)
+    parameters[:moves.size] = moves.ravel()
+    parameters[2 * MOVES:] = lifted, phase
+    return parameters
 
-        :return: (D',) for `following()`: new segments at the end stand still.
-        """
-        (moves,), (lifted,), (phase,) = self.split(parameters[None])
-        phase = (phase + 1) % REPEAT
-        if phase == 0:  # the first segment is over
-            moves, lifted = moves[1:], max(lifted - 1, 0)
-        return self.following().join(moves, lifted, phase)
+
+def segments(phase: ArrayLike) -> np.ndarray:
+    """Return the segment (N, HORIZON) of each control period, for phases (N,)."""
+    return (np.arange(HORIZON) + np.asarray(phase)[:, None]) // REPEAT
+
+
+def shift(parameters: np.ndarray) -> np.ndarray:
+    """Carry parameters (D,) over to the next control period; new segments stand still."""
+    (moves,), (lifted,), (phase,) = split(parameters[None])
+    phase = (phase + 1) % REPEAT
+    if phase == 0:  # the first segment is over
+        moves, lifted = moves[1:], max(lifted - 1, 0)
+    return join(moves, lifted, phase)
+
+
+def landings(actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
+    """
+    Find where the gripper comes down: passes LOW + VERTICAL.
+
+    :param actions: (N, HORIZON, 4); gripper: (4,).
+    :return: (N, 2) metres; NaN for sequences that stay up or low.
+    """
+    path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, HORIZON, 3)
+    before = path[..., 2] - actions[..., 2]
+    down = (before > LOW + VERTICAL) & (path[..., 2] <= LOW + VERTICAL)
+    first = down.argmax(1)
+    return np.where(down.any(1)[:, None], path[np.arange(len(path)), first, :2], np.nan)
+
+
+def gripper_after(gripper: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """Return where actions (T, 4) leave a gripper (4,), float32, within limits and workspace."""
+    low, high, limit = (np.array(values, np.float32) for values in (
+        [*WORKSPACE_LOW, 0.0], [*WORKSPACE_HIGH, 1.0], ACTION_LIMIT))
+    hand = np.asarray(gripper, np.float32)
+    for action in np.asarray(actions, np.float32):
+        moved = hand[:3] + np.clip(action[:3], -limit, limit)
+        hand = np.clip(np.append(moved, action[3]), low, high)
+    return hand
+
+
+def push_proposals(shape: SequenceShape, gripper: np.ndarray, objects: np.ndarray,
+                   goals: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """
+    Propose pushes.
+
+    :param shape: SequenceShape.
+    :param gripper: (4,) metres.
+    :param objects: (K, 2) metres on the table; goals (K, 2).
+    :param count: P, how many.
+    :param rng: numpy Generator.
+    :return: (P, D) parameters, none when every object is at its goal.
+    """
+    gaps = goals - objects
+    distances = np.linalg.norm(gaps, axis=1)
+    weights = np.where(distances > 0.01, distances, 0)  # how often each object is chosen
+    if not count or weights.sum() <= 0:
+        return np.zeros((0, SIZE))
+    proposals = []
+    for k in rng.choice(len(objects), count, p=weights / weights.sum()):
+        angle = np.arctan2(*gaps[k][::-1]) + rng.normal(0, 0.2)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        aside = rng.normal(0, 0.025) * np.array([-along[1], along[0]])
+        start = objects[k] - rng.uniform(0.12, 0.15) * along + aside
+        # the gripper stops where the object's near side should end
+        end = start + (distances[k] + rng.normal(0.07, 0.03)) * along
+        proposals.append(_go_and_push(shape, gripper, start, end, objects[k], along))
+    return np.stack(proposals)
+
+
+def _go_and_push(shape: SequenceShape, gripper: np.ndarray, start: np.ndarray, end: np.ndarray,
+                 target: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """
+    Return parameters (D,): travel lifted to the start unless already behind, push to the end.
+
+    :param start: (2,) metres; end (2,); target (2,), the object; along (2,), of the push.
+    """
+    here = gripper[:2]
+    ahead = (target - here) @ along
+    beside = np.linalg.norm(target - here - ahead * along)
+    lifted, phase = 0, 0
+    if not (gripper[2] < 0.05 and 0.02 < ahead < 0.2 and beside < 0.05):
+        # as many lifted periods as the way needs at nearly full speed
+        for lifted, phase in LIFTS:
+            periods = _moving_periods(shape, gripper, lifted, phase)
+            if np.abs(start - here).max() <= PACE * shape.move_limit * periods[:lifted].sum():
+                break
+    start = start if lifted else here
+    needed = np.linalg.norm(end - start) / (PACE * shape.push_limit)
+    if not lifted:
+        phase = int(-np.ceil(needed) % REPEAT)  # so that it ends with a segment
+    periods = _moving_periods(shape, gripper, lifted, phase)
+    moves = np.zeros((MOVES, 2))
+    moves[:lifted] = (start - here) / max(1, periods[:lifted].sum())
+    last = lifted + 1
+    while last < MOVES and periods[lifted:last].sum() < needed:
+        last += 1
+    moves[lifted:last] = (end - start) / max(1, periods[lifted:last].sum())
+    moves = np.clip(moves, -shape.move_limit, shape.move_limit)
+    return join(moves, lifted, phase)
+
+
+def _moving_periods(shape: SequenceShape, gripper: np.ndarray, lifted: int,
+                    phase: int) -> np.ndarray:
+    """Return how many control periods of each segment (num_moves,) move sideways."""
+    _, (sideways,) = shape.climbs(np.array([lifted]), np.array([phase]), gripper[2])
+    return np.bincount(segments([phase])[0], sideways, minlength=MOVES)

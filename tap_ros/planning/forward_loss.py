@@ -6,7 +6,7 @@ from collections.abc import Collection
 from typing import Protocol
 
 from tap_ros.planning.forward_data import mirror, recolour, Windows
-from tap_ros.planning.forward_model import ForwardModel
+from tap_ros.planning.forward_model import LearnedForwardModel
 import torch
 from torch.nn import functional as F
 
@@ -29,13 +29,13 @@ class LossSettings(Protocol):
         """Weight of the mean share of the picture that is said to be objects."""
 
 
-def draw_arm_like(model: ForwardModel, grippers: torch.Tensor, mirrored: torch.Tensor,
+def draw_arm_like(model: LearnedForwardModel, grippers: torch.Tensor, mirrored: torch.Tensor,
                   colours: torch.Tensor) -> torch.Tensor:
     """
     Draw the arm as it looks in augmented pictures.
 
     :param grippers: (B, 4) as augmented; mirrored (B,) bool; colours (B, 3) channel orders.
-    :return: (B, 4, H, W), see ForwardModel.draw_arm.
+    :return: (B, 4, H, W), see LearnedForwardModel.draw_arm.
     """
     sign = 1 - 2 * mirrored.float()
     plain = torch.cat([grippers[:, :1] * sign[:, None], grippers[:, 1:]], 1)
@@ -72,7 +72,7 @@ def picture_loss(predicted: torch.Tensor, target: torch.Tensor,
     return total / 3
 
 
-def forward_loss(model: ForwardModel, batch: Windows, picture_steps: Collection[int],
+def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Collection[int],
                  config: LossSettings) -> tuple[torch.Tensor, dict[str, float]]:
     """
     Roll the model along the windows and compare pictures at some of the steps.
@@ -80,7 +80,7 @@ def forward_loss(model: ForwardModel, batch: Windows, picture_steps: Collection[
     What the robot hides in a picture is compared with nothing. Where the model moves something
     counts as much as where something moved, else it would rather see pushes where there are none.
 
-    :param model: ForwardModel.
+    :param model: LearnedForwardModel.
     :param batch: Windows.
     :param picture_steps: indices in 1..T of the pictures compared.
     :param config: with motion_factor, still_weight and object_weight.

@@ -23,8 +23,8 @@ draws none.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
-import numpy as np
 from tap_ros.contract import ACTION_LIMIT, CLEAR, ROBOT_MASKS, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import ConfigError
 from tap_ros.images.crop import Crop, TrainedCrop
@@ -37,7 +37,7 @@ from tap_ros.planning.table import (
     project,
     sample,
     sample_picture,
-    splat_on_table,
+    Table,
 )
 from tap_ros.training.devices import has_bfloat16, placed
 from tap_ros.training.robot_mask import RobotMask
@@ -109,9 +109,9 @@ class Look:
     background: torch.Tensor  # (B, 3, H, W) in [-1, 1]
 
 
-class ForwardModel(nn.Module):
+class LearnedForwardModel(nn.Module):
     """
-    The forward model; see the file's head.
+    A protocols.ForwardModel; see the file's head.
 
     :param config: ForwardModelConfig.
     """
@@ -148,23 +148,47 @@ class ForwardModel(nn.Module):
         constant('limits', torch.stack([low, high]))
         constant('move_limit', torch.tensor(ACTION_LIMIT))
 
+    @classmethod
+    def load(cls, path: str | Path, device: torch.device | str = 'cpu',
+             simulator: object = None, precision: str = 'auto') -> Self:
+        """
+        Load a trained forward model, ready to predict.
+
+        :param path: safetensors file of kind 'forward_model'.
+        :param simulator: is not needed; forward models are all loaded alike.
+        :param precision: of the push net: 'float32', 'bfloat16', or 'auto': bfloat16 where the
+            device has instructions for it.
+        :return: the model in evaluation mode.
+        :raises WeightsError: for a missing or damaged file, or one of another kind.
+        """
+        values, state, _ = load_weights(path, 'forward_model')
+        model = make_network(cls, ForwardModelConfig, values, state, path)
+        model = model.to(device).eval().requires_grad_(False)
+        if precision == 'bfloat16' or (precision == 'auto' and has_bfloat16(device)):
+            fields = model.push.fields  # geometry stays exact
+            model.push.bfloat16()
+            model.push.fields = fields
+        return placed(model, device)
+
     @property
     def camera_crop(self) -> TrainedCrop:
         """What it makes of a camera's pictures."""
         config = self.config
         return TrainedCrop(Crop(config.crop, config.crop_size),
                            config.camera_size if any(config.camera_size) else None,
-                           self.image_size)
+                           self.table.image_size)
 
     @property
-    def image_size(self) -> tuple[int, int]:
-        """Return (height, width) of the pictures it takes."""
-        return self.config.image_size, self.config.image_size
+    def robot_mask(self) -> RobotMask:
+        """Return what the pictures that it takes are without."""
+        return self.config.robot_mask
 
     @property
-    def device(self) -> torch.device:
-        """Return where its tensors are."""
-        return self.grid.device
+    def table(self) -> Table:
+        """Return the grid that it keeps its flow on, and where it is in the pictures."""
+        config = self.config
+        return Table(self.homography, (config.image_size,) * 2, config.table_cells,
+                     config.table_half)
 
     def _constant(self, name: str, value: torch.Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
@@ -178,7 +202,7 @@ class ForwardModel(nn.Module):
             for pictures without the robot.
         """
         if self.config.robot_mask == 'all':
-            return gripper.new_zeros(len(gripper), 4, *self.image_size)
+            return gripper.new_zeros(len(gripper), 4, *self.pixels.shape[:2])
         basis = torch.cat([torch.ones_like(gripper[:, :1]), gripper[:, :3]], 1)  # (B, 4)
         sprites = torch.einsum('bi,icuv->bcuv', basis, self.sprite)
         # a rim of masks near zero, so that nothing is drawn outside the sprite
@@ -202,7 +226,7 @@ class ForwardModel(nn.Module):
         if homography is None:
             homography = self.homography.expand(len(image), 3, 3)
         features, objects, background = self.encoder(image, arm_mask)
-        at = self.table_points().expand(len(image), -1, -1)
+        at = self.table.points().expand(len(image), -1, -1)
         at = project(homography, at).unflatten(1, self.grid.shape[:2])
         return Look(sample_picture(features, at), objects, background)
 
@@ -210,27 +234,11 @@ class ForwardModel(nn.Module):
         """Return the flow (count, n, n, 2) of a scene in which nothing has moved."""
         return torch.zeros_like(self.grid).expand(count, -1, -1, -1)
 
-    def table_points(self) -> torch.Tensor:
-        """Return the table's cells (n n, 2) in metres."""
-        return self.grid.flatten(0, 1) * self.config.table_half
-
     def move_gripper(self, gripper: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Return where the gripper is after an action: clipped to limits and workspace."""
         step = torch.maximum(torch.minimum(action[:, :3], self.move_limit), -self.move_limit)
         moved = torch.cat([gripper[:, :3] + step, action[:, 3:]], 1)
         return torch.maximum(torch.minimum(moved, self.limits[1]), self.limits[0])
-
-    def gripper_after(self, gripper: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """
-        Return where a sequence of actions leaves the gripper.
-
-        :param gripper: (4,) float32; actions (T, 4) float32.
-        :return: (4,) float32.
-        """
-        hand = torch.as_tensor(gripper, device=self.grid.device)[None]
-        for action in torch.as_tensor(actions, device=hand.device)[:, None]:
-            hand = self.move_gripper(hand, action)
-        return hand[0].cpu().numpy()
 
     def advance(self, features: torch.Tensor, flow: torch.Tensor, gripper: torch.Tensor,
                 action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -326,45 +334,6 @@ class ForwardModel(nn.Module):
         picture = arm_mask * arm[:, :3] + object_mask * objects[:, :3] + rest * scene.background
         return picture, torch.stack([arm_mask, object_mask, rest], 1)
 
-    def pixel_table(self) -> torch.Tensor:
-        """Return the pixel (n, n, 2) of every cell of the table grid."""
-        return project(self.homography, self.table_points()).view_as(self.grid)
-
-    def seed_maps(self, pixels: torch.Tensor) -> torch.Tensor:
-        """
-        Put each object's map at its pixel.
-
-        :param pixels: (K, 2) as (u, v).
-        :return: (K, n, n) on the table grid, each sums to 1.
-        """
-        config = self.config
-        return splat_on_table(
-            pixels[:, None], torch.ones_like(pixels[:, :1]), self.homography,
-            config.table_cells, config.table_half)
-
-    def maps_on_table(self, maps: torch.Tensor) -> torch.Tensor:
-        """Bring maps (K, H, W) of the picture onto the table grid: (K, n, n), each sums to 1."""
-        config = self.config
-        return splat_on_table(
-            self.pixels.view(1, -1, 2).expand(len(maps), -1, 2), maps.flatten(1),
-            self.homography, config.table_cells, config.table_half)
-
-    @torch.inference_mode()
-    def rollout(self, image: torch.Tensor, gripper: torch.Tensor, maps: torch.Tensor,
-                actions: torch.Tensor, arm_hidden: bool = False) -> torch.Tensor:
-        """
-        Predict where the objects go under many action sequences.
-
-        :param image: (1, 3, H, W) in [-1, 1]; gripper (1, 4).
-        :param maps: (1, K, H, W), each sums to 1.
-        :param actions: (N, horizon, 4).
-        :return: expected pixels (N, horizon, K, 2).
-        """
-        features = self.begin(image, gripper, arm_hidden)
-        carried = self.carried_maps(features, gripper, self.maps_on_table(maps[0]), actions)
-        table = self.pixel_table().view(-1, 2)
-        return torch.stack([m.flatten(2) @ table for m in carried], 1)
-
     def begin(self, image: torch.Tensor, gripper: torch.Tensor,
               arm_hidden: bool = False) -> torch.Tensor:
         """Look once at the picture (1, 3, H, W): features (1, C, n, n) for carried_maps."""
@@ -396,24 +365,3 @@ class ForwardModel(nn.Module):
             gripper = following
             if t % every == 0:
                 yield self.carry(maps, flow)
-
-
-def load_forward_model(path: str | Path, device: torch.device | str = 'cpu',
-                       precision: str = 'auto') -> ForwardModel:
-    """
-    Load a trained forward model, ready to predict.
-
-    :param path: safetensors file of kind 'forward_model'.
-    :param precision: of the push net: 'float32', 'bfloat16', or 'auto': bfloat16 where the
-        device has instructions for it.
-    :return: ForwardModel in evaluation mode.
-    :raises WeightsError: for a missing or damaged file, or one of another kind.
-    """
-    values, state, _ = load_weights(path, 'forward_model')
-    model = make_network(ForwardModel, ForwardModelConfig, values, state, path)
-    model = model.to(device).eval().requires_grad_(False)
-    if precision == 'bfloat16' or (precision == 'auto' and has_bfloat16(device)):
-        fields = model.push.fields  # geometry stays exact
-        model.push.bfloat16()
-        model.push.fields = fields
-    return placed(model, device)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.images.pixels import to_float
-from tap_ros.planning.forward_model import ForwardModel
+from tap_ros.planning.forward_model import LearnedForwardModel
 import torch
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ SCORED_STEPS = (1, 5, 10, 15)
 MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than this by then
 
 
-def map_errors(model: ForwardModel, store: 'Episodes', episodes: Iterable[int],
+def map_errors(model: LearnedForwardModel, store: 'Episodes', episodes: Iterable[int],
                stride: int = 8, max_windows: int = 400) -> dict[str, float]:
     """
     Score the maps' expected pixels on recorded episodes, see measure_maps.
@@ -35,7 +35,7 @@ def map_errors(model: ForwardModel, store: 'Episodes', episodes: Iterable[int],
 
 
 @torch.no_grad()
-def measure_maps(model: ForwardModel, store: 'Episodes', episodes: Iterable[int],
+def measure_maps(model: LearnedForwardModel, store: 'Episodes', episodes: Iterable[int],
                  stride: int = 8, max_windows: int = 400) -> dict[int, dict[str, np.ndarray]]:
     """
     Measure how far the maps' expected pixels end from where recorded objects went.
@@ -43,7 +43,7 @@ def measure_maps(model: ForwardModel, store: 'Episodes', episodes: Iterable[int]
     Maps start at the recorded object pixels; these ground truths are used here only, never in
     training.
 
-    :param model: ForwardModel.
+    :param model: LearnedForwardModel.
     :param store: EpisodeStore; episodes: indices to score.
     :param stride: frames from one window's start to the next.
     :return: dict from steps t to dicts of arrays (N,) in pixels, for the N objects that moved by
@@ -55,7 +55,7 @@ def measure_maps(model: ForwardModel, store: 'Episodes', episodes: Iterable[int]
     errors: list[np.ndarray] = []
     moves: list[np.ndarray] = []
     exact: list[np.ndarray] = []
-    table = model.pixel_table().flatten(0, 1)
+    table = model.table.pixels().flatten(0, 1)
     device = table.device
     for i in episodes:
         episode = store[int(i)]
@@ -67,7 +67,7 @@ def measure_maps(model: ForwardModel, store: 'Episodes', episodes: Iterable[int]
             gripper = torch.from_numpy(np.array(episode.grippers[start:start + 1])).to(device)
             actions = torch.from_numpy(np.array(episode.actions[None, start:start + horizon]))
             image = to_float(np.array(episode.frames[start]))[None].to(device)
-            maps = model.seed_maps(torch.from_numpy(true[0].copy()).to(device))
+            maps = model.table.seed_maps(torch.from_numpy(true[0].copy()).to(device))
             carried = model.carried_maps(
                 model.begin(image, gripper), gripper, maps, actions.to(device))
             here = torch.from_numpy(true[0].copy()).to(device)
@@ -75,7 +75,8 @@ def measure_maps(model: ForwardModel, store: 'Episodes', episodes: Iterable[int]
                 m[0].flatten(1) @ table + (1 - m[0].sum((-1, -2)))[:, None] * here
                 for m in carried]).cpu().numpy()
             errors.append(np.linalg.norm(expected - true[1:], axis=-1))  # (T, K)
-            ideal = model.seed_maps(torch.from_numpy(true[1:].reshape(-1, 2).copy()).to(device))
+            places = torch.from_numpy(true[1:].reshape(-1, 2).copy()).to(device)
+            ideal = model.table.seed_maps(places)
             ideal = (ideal.flatten(1) @ table).cpu().numpy().reshape(true[1:].shape)
             exact.append(np.linalg.norm(ideal - true[1:], axis=-1))
             moves.append(np.linalg.norm(true[1:] - true[:1], axis=-1))

@@ -18,7 +18,7 @@ from tap_ros.images.drawing import grid
 from tap_ros.images.pixels import to_uint8
 from tap_ros.planning.forward_data import draw_windows, Windows
 from tap_ros.planning.forward_loss import draw_arm_like, forward_loss
-from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
+from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig
 from tap_ros.planning.table import fit_arm, fit_shift, fit_table
@@ -76,7 +76,7 @@ def _train(config: ForwardTrainingConfig, device: torch.device, store: EpisodeSt
     warn_if_none(held_out)
     torch.manual_seed(config.seed)
     state = start(
-        ForwardModel(model_config(config, store, training)), config.learning_rate, device)
+        LearnedForwardModel(model_config(config, store, training)), config.learning_rate, device)
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
     load_checkpoint(checkpoint, state, asdict(config), store.data_hash, DEFAULTS)
     # The picture that is looked at shows what a node would show; see FreeView.
@@ -137,7 +137,7 @@ def model_config(config: ForwardTrainingConfig, store: EpisodeStore,
         camera_size=store.camera_size or (0, 0))
 
 
-def episode_tables(store: EpisodeStore, model: ForwardModel) -> torch.Tensor:
+def episode_tables(store: EpisodeStore, model: LearnedForwardModel) -> torch.Tensor:
     """
     Return where the table is in the pictures of every episode, on the CPU.
 
@@ -167,7 +167,7 @@ def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarr
     return batch, set((rng.permutation(length)[:config.pictures] + 1).tolist())
 
 
-def _report(state: TrainingState[ForwardModel], curves: SummaryWriter,
+def _report(state: TrainingState[LearnedForwardModel], curves: SummaryWriter,
             config: ForwardTrainingConfig, store: EpisodeStore, filled: Episodes,
             training: np.ndarray, held_out: np.ndarray) -> None:
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""
@@ -186,7 +186,7 @@ def _report(state: TrainingState[ForwardModel], curves: SummaryWriter,
 
 
 @torch.no_grad()
-def sample_grid(model: ForwardModel, store: Episodes, episodes: np.ndarray,
+def sample_grid(model: LearnedForwardModel, store: Episodes, episodes: np.ndarray,
                 config: ForwardTrainingConfig, rows: int = 6, seed: int = 0) -> np.ndarray:
     """
     Show windows: first picture, its objects' mask and background, then true beside predicted.

@@ -4,8 +4,7 @@
 Hierarchical planning: one target after another, the goal last (App. F of the paper).
 
 The paper has one subgoal and switches at half the budget ('half'). Switching as soon as the
-subgoal is reached ('reached') wastes no steps. 'stalled' also gives up one to which nothing moves
-any more, which gained nothing significant. Several subgoals share the budget equally.
+subgoal is reached ('reached') wastes no steps. Several subgoals share the budget equally.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,13 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError
-from tap_ros.planning.action_sequences import FULL, Limits
-from tap_ros.planning.expected_distance import distances_to_all_pixels
-from tap_ros.planning.mpc_config import STALL, SWITCHES
+from tap_ros.planning.action_sequences import FULL, gripper_after, Limits
+from tap_ros.planning.cost import distances_to_all_pixels
+from tap_ros.planning.mpc_config import SWITCHES
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
-
-MOVED = 1.0  # px; an object that is nearer to where it was has not moved
 
 if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
@@ -77,9 +74,6 @@ class Target:
         return {'pixels': np.where(self.free[:, None], pixels, self.pixels)}
 
 
-ItineraryMemory = tuple[tuple[int, ...], tuple[int, np.ndarray] | None]
-
-
 class Itinerary:
     """
     Say at every step what to plan to.
@@ -89,10 +83,9 @@ class Itinerary:
     :param targets: list of Target, the last one is the goal.
     :param step_budget: B.
     :param switch: 'half': a target gets its whole share of the budget; 'reached': goes on to the
-        next one as soon as it is reached; 'stalled': then, or when an object has moved and
-        none does any more for STALL control periods.
+        next one as soon as it is reached.
     :param reached: px of Target.distance; nearer than this is there. 0: never.
-    :ivar switches: steps at which the second, third ... target began.
+    :ivar switches: steps at which the second, third ... target began; may be set back.
     """
 
     def __init__(self, targets: Iterable[Target], step_budget: int, switch: str = 'reached',
@@ -101,18 +94,7 @@ class Itinerary:
             raise ConfigError(f'switch {switch!r} is unknown; expected one of {SWITCHES}')
         self._targets, self._budget = list(targets), step_budget
         self._switch, self._reached = switch, reached
-        self.switches: list[int] = []
-        self._moved: tuple[int, np.ndarray] | None = None  # when an object did last, all places
-
-    @property
-    def memory(self) -> ItineraryMemory:
-        """Return what `target` changes; may be set back."""
-        return tuple(self.switches), self._moved
-
-    @memory.setter
-    def memory(self, memory: ItineraryMemory) -> None:
-        switches, self._moved = memory
-        self.switches = list(switches)
+        self.switches: tuple[int, ...] = ()
 
     def target(self, step: int, pixels: np.ndarray) -> Target:
         """
@@ -121,25 +103,14 @@ class Itinerary:
         :param step: control periods that have passed.
         :param pixels: (K, 2), where the objects are.
         """
-        if self._moved is None or _farthest(pixels, self._moved[1]) > MOVED:
-            self._moved = step, np.array(pixels)
-        while len(self.switches) < len(self._targets) - 1:
-            stage = len(self.switches)
+        while (stage := len(self.switches)) < len(self._targets) - 1:
             late = step >= (stage + 1) * self._budget // len(self._targets)
             there = (self._switch != 'half'
                      and self._targets[stage].distance(pixels) <= self._reached)
-            began = self.switches[-1] if self.switches else 0
-            stalled = (self._switch == 'stalled' and self._moved[0] > began
-                       and step - self._moved[0] >= STALL)
-            if not late and not there and not stalled:
+            if not late and not there:
                 break
-            self.switches.append(step)
+            self.switches += step,
         return self._targets[len(self.switches)]
-
-
-def _farthest(pixels: np.ndarray, before: np.ndarray) -> float:
-    """Return by how many pixels the object moved that moved most."""
-    return float(np.linalg.norm(np.subtract(pixels, before), axis=-1).max())
 
 
 def targets_by(subgoals: Iterable['Subgoal'], goal_pixels: np.ndarray) -> list[Target]:
@@ -200,7 +171,7 @@ def choose_subgoals(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
             plan = mpc.plan(seen, target, Memory(seed), limits)
             total += plan.cost
             if subgoal is not None:
-                hand = mpc.model.gripper_after(np.asarray(seen.gripper, np.float32), plan.actions)
+                hand = gripper_after(seen.gripper, plan.actions)
                 seen = Scene(subgoal.image, hand, subgoal.expected_pixels)
         costs.append(total)
     return int(np.argmin(costs)), np.array(costs)

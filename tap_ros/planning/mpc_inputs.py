@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the planner is given: checks that name what is wrong."""
+"""What the planner is given, a scene and a goal: checks that name what is wrong."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.images.pixels import check_image, check_pixels, in_picture
+from tap_ros.planning.cost import distances_to_places
+from tap_ros.planning.table import Table
+import torch
 
 # What a gripper over the table can be: x, y, z in metres, opening. Anything else is another unit,
 # another frame or nonsense; learned models would answer it with a move all the same.
@@ -53,13 +56,44 @@ def check_scene(scene: Scene, size: Sequence[int]) -> Scene:
     return Scene(scene.image, gripper, pixels)
 
 
-def check_goal_pixels(pixels: ArrayLike, size: Sequence[int]) -> np.ndarray:
-    """
-    Check goal pixels (K, 2); return them as float32.
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """Where K objects should be."""
 
-    :param size: (height, width) of the picture that they have to lie in.
-    :raises PlanningError: for another shape, or positions that are unknown or outside.
+    distances: torch.Tensor  # (K, n n) px, of every table cell from each object's goal
+    places: np.ndarray  # (K, 2) m, the table cells nearest to the goals
+
+    def __len__(self) -> int:
+        return len(self.distances)
+
+
+def tabulate(table: Table, pixels: ArrayLike | None = None,
+             maps: ArrayLike | None = None) -> Goal:
     """
+    Tabulate a goal once: how far each place on the table is from it.
+
+    For a goal map q the distance is the expected one, so that an object map p costs that between
+    the two, E_{p,q}|x - y|.
+
+    :param table: of the forward model.
+    :param pixels: (K, 2) as (u, v), in the picture; or
+    :param maps: (K, H, W), each of positive mass. Exactly one of the two.
+    :raises PlanningError: for goals that cannot be planned to.
+    """
+    if (maps is None) == (pixels is None):
+        raise PlanningError('goal: give exactly one of pixels and maps')
+    cells = table.pixels().flatten(0, 1)  # (n n, 2)
+    if pixels is not None:
+        goals = _check_goal_pixels(pixels, table.image_size)
+        distances = torch.cdist(torch.from_numpy(goals).to(cells.device), cells)
+    if maps is not None:
+        goals = _check_goal_maps(maps, table.image_size)
+        distances = distances_to_places(torch.from_numpy(goals).to(cells.device), cells)
+    return Goal(distances, table.points()[distances.argmin(1)].cpu().numpy())
+
+
+def _check_goal_pixels(pixels: ArrayLike, size: Sequence[int]) -> np.ndarray:
+    """Return goal pixels (K, 2) as float32; raise PlanningError for unknown or outside ones."""
     with _as_planning_error():
         pixels = check_pixels(pixels, 'goal_pixels')
     outside = pixels[~in_picture(pixels, size)].tolist()
@@ -68,12 +102,8 @@ def check_goal_pixels(pixels: ArrayLike, size: Sequence[int]) -> np.ndarray:
     return pixels
 
 
-def check_goal_maps(maps: ArrayLike, size: Sequence[int]) -> np.ndarray:
-    """
-    Check goal maps (K, H, W); return them as float32.
-
-    :raises PlanningError: for a wrong shape, negative or not finite values, or an empty map.
-    """
+def _check_goal_maps(maps: ArrayLike, size: Sequence[int]) -> np.ndarray:
+    """Return goal maps (K, H, W) as float32; raise PlanningError for what is no map."""
     maps = np.ascontiguousarray(maps, np.float32)
     if maps.ndim != 3 or maps.shape[1:] != tuple(size):
         raise PlanningError(f'goal_maps: expected shape (K, {size[0]}, {size[1]}), one map for '

@@ -22,10 +22,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.planning.action_sequences import FULL, Limits
-from tap_ros.planning.forward_model import ForwardModel
-from tap_ros.planning.goals import Goal
-from tap_ros.planning.hierarchy import Itinerary, ItineraryMemory, Target
-from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.forward_model import LearnedForwardModel
+from tap_ros.planning.hierarchy import Itinerary, Target
+from tap_ros.planning.mpc_inputs import Goal, Scene
 from tap_ros.planning.tracking import ObjectTracker
 from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
 from tap_ros.text import listing
@@ -53,12 +52,11 @@ class ReachConfig:
     :param step_budget: commands at most; 0: contract.step_budget.
     :param switch: when to go on from a subgoal, see hierarchy.Itinerary.
     :param reached: px, mean distance of the objects; nearer than this is there. 0: never.
-    :param follower: ForwardModel that follows the objects (tracking.ObjectTracker) from where they
-        are first seen; None: Seen.pixels at every step.
+    :param follower: LearnedForwardModel that follows the objects (tracking.ObjectTracker) from
+        where they are first seen; None: Seen.pixels at every step.
     :param limits: action_sequences.Limits of the actions.
     :param max_age: s; nothing is planned from what was received longer ago.
     :param timeout: s without a command, planning apart, after which the goal ends.
-    :param objects: indices of the objects that are planned for; None: all.
     :param rounds: how often to ask where to go, at least 1: again when the subgoals of a round are
         passed and a command was sent since it began, and not after the last round.
     """
@@ -66,11 +64,10 @@ class ReachConfig:
     step_budget: int = 0
     switch: str = 'reached'
     reached: float = GOAL_TOLERANCE
-    follower: ForwardModel | None = None
+    follower: LearnedForwardModel | None = None
     limits: Limits = FULL
     max_age: float = float('inf')
     timeout: float = float('inf')
-    objects: tuple[int, ...] | None = None
     rounds: int = 1
 
 
@@ -117,8 +114,8 @@ class _Round:
     itinerary: Itinerary
 
 
-# What a plan changes: the planner's Memory, the round, memories of Itinerary and ObjectTracker.
-_Kept = tuple[Memory, _Round, ItineraryMemory, tuple[np.ndarray, np.ndarray] | None]
+# What a plan changes: the planner's Memory, the round, its switches, memory of ObjectTracker.
+_Kept = tuple[Memory, _Round, tuple[int, ...], tuple[np.ndarray, np.ndarray] | None]
 
 
 class Reach:
@@ -301,21 +298,20 @@ class Reach:
         assert self._first is not None and self._kept is not None
         memory, current = self._recall(self._kept)
         self.pixels = pixels = self._find_objects(seen)
-        chosen = pixels if config.objects is None else pixels[list(config.objects)]
-        self.distance = current.targets[-1].distance(chosen)
+        self.distance = current.targets[-1].distance(pixels)
         if self.distance <= config.reached:
             return End('reached', f'{self.distance:.1f} px from the goal, reached')
         if self.steps >= self._budget:
             return End('spent', f'{self.distance:.1f} px from the goal, '
                                 f'step budget of {self._budget} spent')
-        target = current.itinerary.target(self.steps - current.first_step, chosen)
+        target = current.itinerary.target(self.steps - current.first_step, pixels)
         if (target is current.targets[-1] and len(current.targets) > 1
                 and current.number < config.rounds and self.steps > current.first_step):
             return Aim(replace(seen, names=self._first.names, pixels=pixels))
         limit = np.array(seen.image.shape[1::-1]) - 1
-        goal = self._goal(target, np.clip(chosen, 0, limit))
+        goal = self._goal(target, np.clip(pixels, 0, limit))
         plan = self._mpc.plan(
-            Scene(seen.image, seen.gripper, chosen), goal, memory, config.limits)
+            Scene(seen.image, seen.gripper, pixels), goal, memory, config.limits)
         return Command(plan, len(self.switches), seen)
 
     def _goal(self, target: Target, pixels: np.ndarray) -> Goal:
@@ -339,13 +335,13 @@ class Reach:
     def _memory(self, planned: Memory) -> _Kept:
         """Return all that a plan changes: the planner's Memory, and what is set back."""
         assert self._round is not None
-        return (planned, self._round, self._round.itinerary.memory,
+        return (planned, self._round, self._round.itinerary.switches,
                 None if self._tracker is None else self._tracker.memory)
 
     def _recall(self, memory: _Kept) -> tuple[Memory, _Round]:
         """Set back what a plan has changed; return the planner's Memory and the round."""
         planned, self._round, passed, tracked = memory
-        self._round.itinerary.memory = passed
+        self._round.itinerary.switches = passed
         if self._tracker is not None and tracked is not None:
             self._tracker.memory = tracked
         return planned, self._round

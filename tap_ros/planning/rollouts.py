@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from tap_ros.contract import LOW
-from tap_ros.planning.map_model import MapModel
-from tap_ros.planning.plan_cost import cost_of_maps
+from tap_ros.planning.cost import PlanCost
+from tap_ros.planning.protocols import ForwardModel
 import torch
 
 
@@ -17,25 +17,26 @@ class Rollouts:
     """
     Carries object maps along action sequences and says what these cost.
 
-    :param model: MapModel.
+    :param model: ForwardModel; cost: PlanCost.
     :param batch_size: sequences predicted at once, at most.
     :param threads: on the CPU; 0: as many as there are cores.
     """
 
-    def __init__(self, model: MapModel, batch_size: int, threads: int = 0) -> None:
-        self.model, self.batch_size = model, batch_size
+    def __init__(self, model: ForwardModel, cost: PlanCost, batch_size: int,
+                 threads: int = 0) -> None:
+        self.model, self.cost, self.batch_size = model, cost, batch_size
         # Each thread predicts whole batches: operators split among threads would wait for each
         # other at every one of some thousand small steps, and for anything else that runs.
         self._pool = ThreadPoolExecutor(
-            (threads or len(os.sched_getaffinity(0))) if model.device.type == 'cpu' else 1,
+            (threads or len(os.sched_getaffinity(0))) if model.table.device.type == 'cpu' else 1,
             initializer=torch.set_num_threads, initargs=(1,))
 
     def judge(self, start: Any, maps: torch.Tensor, prices: torch.Tensor, actions: np.ndarray,
               grippers: np.ndarray, every: int) -> tuple[np.ndarray, np.ndarray]:
         """
-        Judge action sequences by plan_cost.cost_of_maps.
+        Judge action sequences by PlanCost.of_maps.
 
-        :param start: from MapModel.begin; maps (K, n, n) of the objects now.
+        :param start: from ForwardModel.begin; maps (K, n, n) of the objects now.
         :param prices: (K, n n) px, of an object in each table cell.
         :param actions: numpy (N, HORIZON, 4); grippers (N, 4), where each sequence begins.
         :param every: look at the maps after every so many steps.
@@ -50,7 +51,7 @@ class Rollouts:
             actions, grippers = (torch.cat([t, t[-1:].expand(size - count, *t.shape[1:])])
                                  for t in (actions, grippers))
             carried = self.model.carried_maps(start, grippers, maps, actions, every)
-            costs, ends = cost_of_maps(carried, prices)
+            costs, ends = self.cost.of_maps(carried, prices)
             return costs[:count], ends[:count]
 
         # together with others that come down as late: up there, nothing needs to be predicted

@@ -9,6 +9,7 @@ a homography. Both are fitted from recordings, see fit_table and fit_arm.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,34 @@ from torch.nn import functional as F
 
 if TYPE_CHECKING:
     from tap_ros.recording.episode import Episode
+
+
+@dataclass(frozen=True)
+class Table:
+    """A square grid on the table, of n x n cells, and where it is in pictures."""
+
+    homography: torch.Tensor  # (3, 3) table metres to pixels
+    image_size: tuple[int, int]  # (height, width)
+    cells: int = 44  # n
+    half: float = 0.55  # m, half its side
+
+    @property
+    def device(self) -> torch.device:
+        """Return where its tensors are."""
+        return self.homography.device
+
+    def points(self) -> torch.Tensor:
+        """Return the cells (n n, 2) in metres."""
+        return grid_points(self.cells).to(self.device).flatten(0, 1) * self.half
+
+    def pixels(self) -> torch.Tensor:
+        """Return the pixel (n, n, 2) of every cell, (u, v)."""
+        return project(self.homography, self.points()).view(self.cells, self.cells, 2)
+
+    def seed_maps(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Put each object's map (K, n, n), which sums to 1, at its pixel (K, 2)."""
+        return splat_on_table(pixels[:, None], torch.ones_like(pixels[:, :1]), self.homography,
+                              self.cells, self.half)
 
 
 def project(matrix: torch.Tensor, points: torch.Tensor) -> torch.Tensor:

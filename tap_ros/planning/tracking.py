@@ -11,7 +11,7 @@ and which are hidden by the arm.
 
 import numpy as np
 from tap_ros.images.pixels import to_float
-from tap_ros.planning.forward_model import ForwardModel
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.table import project, sample_picture
 import torch
 
@@ -26,16 +26,16 @@ class ObjectTracker:
     """
     Keep track of K objects.
 
-    :param model: ForwardModel.
+    :param model: LearnedForwardModel.
     :param image: (H, W, 3) uint8, the first picture; gripper (4,) in it.
     :param pixels: (K, 2) where the objects are in it.
     """
 
-    def __init__(self, model: ForwardModel, image: np.ndarray, gripper: np.ndarray,
+    def __init__(self, model: LearnedForwardModel, image: np.ndarray, gripper: np.ndarray,
                  pixels: np.ndarray) -> None:
         self._model = model
         self.pixels = np.asarray(pixels, np.float32).copy()
-        device = model.grid.device
+        device = model.table.device
         line = (torch.arange(CELLS, device=device) - (CELLS - 1) / 2) * CELL
         y, x = torch.meshgrid(line, line, indexing='ij')
         self._cells = torch.stack([x, y], -1).view(-1, 2)  # metres around an object
@@ -71,15 +71,15 @@ class ObjectTracker:
         :return: (K, 2) float32 pixels.
         """
         model = self._model
-        device = model.grid.device
+        device = model.table.device
         # predict: the maps move by the model's own flow
         hand = torch.as_tensor(gripper_before, device=device)[None]
         features = model.begin(to_float(before)[None].to(device), hand)
-        maps = model.seed_maps(torch.from_numpy(self.pixels).to(device))
+        maps = model.table.seed_maps(torch.from_numpy(self.pixels).to(device))
         moves = torch.as_tensor(np.asarray(action, np.float32), device=device)[None, None]
         carried, = model.carried_maps(features, hand, maps, moves)
         # differences only, so that blurring and cells do not add up over the steps
-        table = model.pixel_table().flatten(0, 1)
+        table = model.table.pixels().flatten(0, 1)
         kept = carried[0].sum((-1, -2)) > 0  # else nobody knows where it went
         shift = (carried[0] - maps).flatten(1) @ table * kept[:, None]
         expected = self.pixels + shift.cpu().numpy()
@@ -130,13 +130,13 @@ class ObjectTracker:
     def _prepare(self, image: np.ndarray,
                  gripper: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the picture (1, 3, H, W) in [-1, 1] and the mask (1, 1, H, W) of the arm."""
-        device = self._model.grid.device
+        device = self._model.table.device
         hand = torch.as_tensor(np.asarray(gripper, np.float32), device=device)[None]
         return to_float(image)[None].to(device), self._model.draw_arm(hand)[:, 3:]
 
     def _table(self, pixels: np.ndarray) -> torch.Tensor:
         """Return table metres (K, 2) of pixels (K, 2)."""
-        pixels = torch.as_tensor(np.asarray(pixels, np.float32), device=self._model.grid.device)
+        pixels = torch.as_tensor(np.asarray(pixels, np.float32), device=self._model.table.device)
         return project(torch.linalg.inv(self._model.homography), pixels)
 
     def _place(self, centres: torch.Tensor, angles: torch.Tensor) -> torch.Tensor:

@@ -9,13 +9,6 @@ from experiments.bench.engine import make_page as make_engine_page
 from experiments.paper.page import make_page as make_prediction_page
 from experiments.paper.results import load_runs, on_same_episodes, told_apart
 from experiments.paper.rows import as_frame, group_runs, make_rows
-from experiments.planning import results as planning
-from experiments.planning.evaluate import find_films
-from experiments.planning.page import make_page as make_planning_page
-from experiments.stacking import results as stacking
-from experiments.stacking.evaluate import find_films as find_stacking_films
-from experiments.stacking.page import make_page as make_stacking_page
-from tap_ros.evaluation import forward
 
 RESULTS = Path(__file__).parents[2] / 'docs' / 'results'
 
@@ -44,22 +37,6 @@ def test_the_page_about_predictions_is_made_from_the_numbers():
     pictures = sorted(path.name for path in RESULTS.glob('*.png'))
     assert make_prediction_page(rows, runs, left_out, ['small'], pictures,
                                 text_of('findings.md')) == text_of('README.md')
-
-
-def test_numbers_and_page_of_planning_are_made_from_the_scenes():
-    rows = planning.make_rows(planning.load_results(RESULTS / 'planning'))
-    assert rows == rows_of('planning.json')
-    assert make_planning_page(rows, find_films(RESULTS, rows), rows_of(forward.FILE),
-                              text_of('planning_findings.md')) == text_of('planning.md')
-
-
-def test_numbers_and_page_of_stacking_are_made_from_the_scenes():
-    results = planning.load_results(RESULTS / 'stacking')
-    rows = stacking.make_rows(results)
-    assert rows == rows_of('stacking.json')
-    findings = RESULTS / 'stacking_findings.md'
-    assert make_stacking_page(rows, find_stacking_films(RESULTS, results), findings.read_text(
-        ) if findings.exists() else '') == text_of('stacking.md')
 
 
 def test_the_page_about_engines_is_made_from_the_numbers():

@@ -31,8 +31,8 @@ def read_recording(path):
 
 def read_weights(path):
     """Return a hash of what a weights file makes the planner's forward model compute with."""
-    from tap_ros.planning.forward_model import load_forward_model
-    model = load_forward_model(path, precision='float32')
+    from tap_ros.planning.forward_model import LearnedForwardModel
+    model = LearnedForwardModel.load(path, precision='float32')
     found = hashlib.sha1(repr(model.config).encode())
     for name, tensor in sorted(model.state_dict().items()):
         found.update(name.encode() + tensor.contiguous().numpy().tobytes())

@@ -7,7 +7,7 @@ from tap_msgs.action import ReachGoal
 from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.planner.settings import check_request, unlike_training
-from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
+from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 
 
 def test_an_empty_mode_is_subgoal_and_the_limit_of_a_budget_is_named():
@@ -26,7 +26,7 @@ def test_samples_that_are_weighed_are_bounded_and_those_of_direct_goals_are_not_
 
 @pytest.mark.parametrize('trained', ROBOT_MASKS)
 def test_pictures_unlike_those_of_the_training_are_named(trained):
-    model = ForwardModel(ForwardModelConfig((1.0,) * 9, (1.0,) * 12, robot_mask=trained))
+    model = LearnedForwardModel(ForwardModelConfig((1.0,) * 9, (1.0,) * 12, robot_mask=trained))
     for robot_mask in ROBOT_MASKS:
         told = unlike_training(model, robot_mask)
         assert bool(told) is (robot_mask != trained)

@@ -4,7 +4,7 @@
 
 from made_episodes import write_bag
 import pytest
-from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig
+from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 import torch
 from toy_world import ARM, make_episode, SIZE, TABLE
 
@@ -19,4 +19,4 @@ def bag(tmp_path_factory):
 def model():
     """Build an untrained forward model whose push net predicts something."""
     torch.manual_seed(0)
-    return ForwardModel(ForwardModelConfig(TABLE, ARM, image_size=SIZE, width=16)).eval()
+    return LearnedForwardModel(ForwardModelConfig(TABLE, ARM, image_size=SIZE, width=16)).eval()

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the expected distance between a map and places."""
 
-from tap_ros.planning.expected_distance import (
+from tap_ros.planning.cost import (
     distances_to_all_pixels,
     distances_to_pixels,
     distances_to_places,

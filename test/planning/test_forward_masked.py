@@ -11,7 +11,7 @@ import pytest
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.planning.forward_data import augment_windows, read_windows
 from tap_ros.planning.forward_loss import forward_loss
-from tap_ros.planning.forward_model import ForwardModel, ForwardModelConfig, load_forward_model
+from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training import train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
@@ -47,7 +47,7 @@ def windows(bag, robot_mask, mirrored):
 def learn(batch, robot_mask='all'):
     """Return the loss and all gradients of an untrained model."""
     torch.manual_seed(0)
-    model = ForwardModel(ForwardModelConfig(
+    model = LearnedForwardModel(ForwardModelConfig(
         TABLE, ARM, image_size=SIZE, width=16, robot_mask=robot_mask))
     loss, _ = forward_loss(model, batch, {1, 3, 4}, ForwardTrainingConfig(('x',), 'x'))
     loss.backward()
@@ -75,7 +75,7 @@ def test_masks_are_mirrored_with_their_pictures(bags):
 
 def test_without_the_robot_no_arm_is_drawn():
     for robot_mask in ('none', 'arm', 'all'):
-        model = ForwardModel(ForwardModelConfig(
+        model = LearnedForwardModel(ForwardModelConfig(
             TABLE, ARM, image_size=SIZE, width=16, robot_mask=robot_mask))
         assert bool(model.draw_arm(torch.zeros(1, 4)).any()) is (robot_mask != 'all')
     with pytest.raises(ConfigError, match='robot_mask'):
@@ -100,7 +100,7 @@ def test_weights_tell_and_score_what_they_were_trained_with(bags, tmp_path):
     for name, value in load_tensors(path)[0].items():
         assert torch.equal(value, load_tensors(whole)[0][name]), name
     assert trained_robot_mask(load_tensors(path)[1]['training']) == ('all', 1.0)
-    model = load_forward_model(path, precision='float32')
+    model = LearnedForwardModel.load(path, precision='float32')
     assert model.config.robot_mask == 'all'
     store = open_recordings([bags[0]], progress=False)
     filled = FilledStore(store, 'all', filling=fill_from_past)

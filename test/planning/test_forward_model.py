@@ -4,8 +4,7 @@
 
 import pytest
 from tap_ros.errors import ConfigError, WeightsError
-from tap_ros.planning.forward_model import ForwardModelConfig, load_forward_model
-from tap_ros.prediction.warp import one_hot_maps
+from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.training.devices import has_bfloat16
 from tap_ros.training.weights import save_weights
 import torch
@@ -18,6 +17,15 @@ PIXELS = torch.tensor([[20.0, 17.0], [8.0, 9.0]])
 @pytest.fixture
 def image():
     return torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+
+@torch.inference_mode()
+def rollout(model, image, gripper, pixels, actions):
+    """Return the expected pixels (N, T, K, 2) of objects at pixels (K, 2)."""
+    start, maps = model.begin(image, gripper), model.table.seed_maps(pixels)
+    table = model.table.pixels().flatten(0, 1)
+    carried = model.carried_maps(start, gripper, maps, actions)
+    return torch.stack([m.flatten(2) @ table for m in carried], 1)
 
 
 def pushing(model):
@@ -33,21 +41,20 @@ def pushing(model):
 def test_maps_sum_to_one_and_stay_in_the_picture(model, image):
     actions = torch.randn(5, 6, 4) * 0.05
     features = model.begin(image, GRIPPER)
-    for maps in model.carried_maps(features, GRIPPER, model.seed_maps(PIXELS), actions):
+    for maps in model.carried_maps(features, GRIPPER, model.table.seed_maps(PIXELS), actions):
         assert maps.shape[:2] == (5, 2) and maps.min() >= 0
         torch.testing.assert_close(maps.sum((-1, -2)), torch.ones(5, 2))
 
 
 def test_no_action_moves_nothing(model, image):
-    expected = model.rollout(
-        image, GRIPPER, one_hot_maps(PIXELS, (32, 32))[None], torch.zeros(2, 4, 4))
+    expected = rollout(model, image, GRIPPER, PIXELS, torch.zeros(2, 4, 4))
     torch.testing.assert_close(expected, PIXELS.expand(2, 4, 2, 2), atol=0.01, rtol=0)
 
 
 def test_up_and_down_moves_nothing(model, image):
     actions = torch.zeros(1, 4, 4)
     actions[..., 2] = torch.tensor([0.15, -0.15, 0.1, -0.1])
-    expected = model.rollout(image, GRIPPER, one_hot_maps(PIXELS, (32, 32))[None], actions)
+    expected = rollout(model, image, GRIPPER, PIXELS, actions)
     torch.testing.assert_close(expected, PIXELS.expand(1, 4, 2, 2), atol=0.01, rtol=0)
 
 
@@ -56,7 +63,7 @@ def test_high_above_the_table_nothing_is_pushed(model, image):
     actions = torch.zeros(2, 6, 4)
     actions[:, 1:, 0] = 0.05
     actions[0, 0, 2] = 0.13  # up first
-    high, low = model.rollout(image, GRIPPER, one_hot_maps(PIXELS, (32, 32))[None], actions)
+    high, low = rollout(model, image, GRIPPER, PIXELS, actions)
     torch.testing.assert_close(high, PIXELS.expand(6, 2, 2), atol=0.01, rtol=0)
     assert (low[-1] - PIXELS).abs().max() > 1
 
@@ -68,8 +75,7 @@ def test_what_is_pushed_moves_as_the_gripper_does(model, image, step):
     ahead = GRIPPER[0, :2] + 2 * torch.tensor(step)
     pixels = (table @ torch.cat([ahead, torch.ones(1)]))[:2]
     actions = torch.tensor([*step, 0.0, 0.0]).expand(1, 3, 4)
-    expected = model.rollout(
-        image, GRIPPER, one_hot_maps(pixels[None], (32, 32))[None], actions)[0, :, 0]
+    expected = rollout(model, image, GRIPPER, pixels[None], actions)[0, :, 0]
     moved = table[:2, :2] @ torch.tensor(step)
     torch.testing.assert_close(
         expected, pixels + torch.arange(1, 4)[:, None] * moved, atol=0.25, rtol=0)
@@ -80,7 +86,7 @@ def test_objects_beyond_the_crop_stay(model, image):
     gripper = torch.tensor([[0.4, -0.4, 0.0, 0.0]])
     far = torch.tensor([[5.0, 5.0]])
     actions = torch.full((1, 3, 4), 0.03)
-    expected = model.rollout(image, gripper, one_hot_maps(far, (32, 32))[None], actions)
+    expected = rollout(model, image, gripper, far, actions)
     torch.testing.assert_close(expected, far.expand(1, 3, 1, 2), atol=0.01, rtol=0)
 
 
@@ -96,9 +102,9 @@ def test_the_crop_reaches_as_far_as_it_should_and_turns_with_the_motion(model, i
     table = torch.tensor(TABLE).view(3, 3)
     places = GRIPPER[0, :2] + torch.cat([within, beyond]) @ torch.stack([ahead, beside])
     pixels = places @ table[:2, :2].T + table[:2, 2]
-    maps, actions = model.seed_maps(pixels), torch.tensor([[[*step, 0.0, 0.0]]])
+    maps, actions = model.table.seed_maps(pixels), torch.tensor([[[*step, 0.0, 0.0]]])
     carried, = model.carried_maps(model.begin(image, GRIPPER), GRIPPER, maps, actions)
-    cells = model.pixel_table().flatten(0, 1)
+    cells = model.table.pixels().flatten(0, 1)
     moved = (carried[0] - maps).flatten(1) @ cells
     expected = torch.cat([(table[:2, :2] @ step).expand(4, 2), torch.zeros(4, 2)])
     torch.testing.assert_close(moved, expected, atol=0.25, rtol=0)
@@ -120,24 +126,24 @@ def test_gripper_moves_by_the_action_within_limits_and_workspace(model):
 
 def test_samples_do_not_see_each_other(model, image):
     actions = torch.randn(3, 4, 4) * 0.05
-    maps = one_hot_maps(PIXELS, (32, 32))[None]
-    together = model.rollout(image, GRIPPER, maps, actions)
-    alone = torch.cat([model.rollout(image, GRIPPER, maps, a[None]) for a in actions])
+    maps = PIXELS
+    together = rollout(model, image, GRIPPER, maps, actions)
+    alone = torch.cat([rollout(model, image, GRIPPER, maps, a[None]) for a in actions])
     torch.testing.assert_close(together, alone, atol=1e-3, rtol=0)
 
 
 def test_weights_round_trip(model, image, tmp_path):
     path = tmp_path / 'forward.safetensors'
     save_weights(path, model, 'forward_model', model.config, {})
-    actions, maps = torch.randn(2, 5, 4) * 0.05, one_hot_maps(PIXELS, (32, 32))[None]
-    before = model.rollout(image, GRIPPER, maps, actions)
-    exact = load_forward_model(path, precision='float32')
+    actions, maps = torch.randn(2, 5, 4) * 0.05, PIXELS
+    before = rollout(model, image, GRIPPER, maps, actions)
+    exact = LearnedForwardModel.load(path, precision='float32')
     assert exact.config == model.config
     torch.testing.assert_close(
-        exact.rollout(image, GRIPPER, maps, actions), before, atol=1e-3, rtol=0)
-    half = load_forward_model(path, precision='bfloat16')
+        rollout(exact, image, GRIPPER, maps, actions), before, atol=1e-3, rtol=0)
+    half = LearnedForwardModel.load(path, precision='bfloat16')
     torch.testing.assert_close(
-        half.rollout(image, GRIPPER, maps, actions), before, atol=0.2, rtol=0)
+        rollout(half, image, GRIPPER, maps, actions), before, atol=0.2, rtol=0)
 
 
 def test_only_the_push_net_loses_precision_and_only_where_it_is_wanted(model, tmp_path):
@@ -145,7 +151,7 @@ def test_only_the_push_net_loses_precision_and_only_where_it_is_wanted(model, tm
     save_weights(path, model, 'forward_model', model.config, {})
     auto = 'bfloat16' if has_bfloat16('cpu') else 'float32'
     for precision, used in (('float32', 'float32'), ('bfloat16', 'bfloat16'), ('auto', auto)):
-        loaded = load_forward_model(path, precision=precision)
+        loaded = LearnedForwardModel.load(path, precision=precision)
         kinds = {name.split('.')[0]: value.dtype for name, value in loaded.named_parameters()}
         assert kinds['push'] == getattr(torch, used)
         assert kinds['encoder'] == kinds['sprite'] == loaded.push.fields.dtype == torch.float32
@@ -156,7 +162,7 @@ def test_weights_of_another_kind_are_refused(model, tmp_path):
     path = tmp_path / 'predictor.safetensors'
     save_weights(path, model, 'predictor', model.config, {})
     with pytest.raises(WeightsError, match='forward_model'):
-        load_forward_model(path)
+        LearnedForwardModel.load(path)
 
 
 @pytest.mark.parametrize('named, good, bad', [
@@ -180,7 +186,7 @@ def test_impossible_settings_are_named(named, good, bad):
 
 
 def test_objects_lose_themselves_only_with_nearly_all_of_their_mass(model):
-    maps = model.seed_maps(PIXELS)[None]
+    maps = model.table.seed_maps(PIXELS)[None]
     flow = model.still(1).clone()
     torch.testing.assert_close(model.carry(maps, flow), maps)
     flow[..., 0] = 4.0  # from beyond the table

@@ -21,7 +21,7 @@ from tap_ros.planning.forward_loss import (
     motion_weight,
     picture_loss,
 )
-from tap_ros.planning.forward_model import ForwardModel
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training import draw_step, model_config, train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
@@ -250,7 +250,7 @@ def test_learning_rate_clip_and_averaging_say_how_far_a_step_goes(bag, tmp_path)
         store = open_recordings([bag], progress=False)
         training, _ = split_episodes(store, config.test_fraction, config.horizon + 1)
         torch.manual_seed(config.seed)
-        first = ForwardModel(model_config(config, store, training)).state_dict()
+        first = LearnedForwardModel(model_config(config, store, training)).state_dict()
         assert first.keys() == trained.keys()
         return max(float((trained[key] - first[key]).abs().max()) for key in first)
 

@@ -9,7 +9,7 @@ import pytest
 from sim_bridge.world.looks import get_look
 from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.images.drawing import OBJECT_COLOURS
-from tap_ros.planning.forward_model import ForwardModelConfig, load_forward_model
+from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.plan_picture import (
     CHOSEN,
     draw_plan,
@@ -57,7 +57,7 @@ def test_a_way_is_the_sum_of_its_moves_within_the_workspace():
 
 def test_fingertips_are_drawn_where_the_camera_sees_them():
     camera = get_look('hand').camera(False, 64, 64)
-    config = load_forward_model(FORWARD_MODEL).config
+    config = LearnedForwardModel.load(FORWARD_MODEL).config
     points = np.random.default_rng(0).uniform(WORKSPACE_LOW, WORKSPACE_HIGH, (200, 3))
     gaps = np.linalg.norm(fingertip_pixels(config, points) - camera.project(points), axis=1)
     assert gaps.max() < 3 and gaps.mean() < 1.5

@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.contract import LIFTED, LOW
-from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
-from tap_ros.planning.cem import CEMConfig
+from tap_ros.planning.action_sequences import FULL, HORIZON, Limits, PUSH_LIMIT, SequenceShape
+from tap_ros.planning.cost import PlanCost
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.plan_cost import cost_of_maps, landing_clash, prices
+from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 import torch
 from toy_world import SIZE, to_pixels
 
 # every term left out
 PLAIN = VisualMPCConfig(
-    search=CEMConfig(40, 1, 5), proposals=0, recheck=0, unfinished=0.0, clearance=0.0,
+    search=SearchConfig(40, 1, 5), proposals=0, recheck=0, unfinished=0.0, clearance=0.0,
     warm_start=False, cost_every=1, batch_size=40, threads=1)
 IMAGE = np.zeros((SIZE, SIZE, 3), np.uint8)
 NEW = Memory()
@@ -38,10 +38,7 @@ class Puppets:
     """
 
     def __init__(self, model, outcome):
-        self.image_size, self.device = model.image_size, model.device
-        self.table_points, self.pixel_table = model.table_points, model.pixel_table
-        self.seed_maps, self.gripper_after = model.seed_maps, model.gripper_after
-        self._outcome, self.judged = outcome, []
+        self.table, self._outcome, self.judged = model.table, outcome, []
 
     def begin(self, image, gripper, arm_hidden=False):
         self.arm_hidden = arm_hidden
@@ -52,7 +49,7 @@ class Puppets:
         for t in range(every - 1, actions.shape[1], every):
             at = pixels[:, t].reshape(-1, 2)
             lost = torch.from_numpy(np.isnan(at).any(1))[:, None, None]
-            carried = self.seed_maps(torch.from_numpy(np.nan_to_num(at))).where(~lost, 0.0)
+            carried = self.table.seed_maps(torch.from_numpy(np.nan_to_num(at))).where(~lost, 0.0)
             yield carried.view(len(actions), -1, *carried.shape[1:])
 
 
@@ -122,7 +119,7 @@ def test_an_object_that_is_lost_is_as_far_as_can_be(model):
     assert goes_right(model, away(9, np.nan), away(12, np.nan))
     lost = plan(steady(model, away(np.nan, np.nan)))
     farthest = np.linalg.norm(
-        GOALS[:, None] - model.pixel_table().flatten(0, 1).numpy(), axis=2).max(1).mean()
+        GOALS[:, None] - model.table.pixels().flatten(0, 1).numpy(), axis=2).max(1).mean()
     assert lost.expected_distance == pytest.approx(farthest, abs=0.01)
 
 
@@ -193,8 +190,7 @@ def test_a_search_after_a_plan_looks_near_it_half_as_widely(model):
         miss = np.linalg.norm(actions[:, :, :2].mean(1) - [0.03, 0.03], axis=1)
         return GOALS + 200 * miss[:, None, None, None] * np.ones((1, HORIZON, 2, 1))
 
-    wide = replace(PLAIN, search=CEMConfig(200, 2, 5), batch_size=200, cost_every=HORIZON,
-                   upright=False, free_phase=False, push_limit=0.08)
+    wide = replace(PLAIN, search=SearchConfig(200, 2, 5), batch_size=200, cost_every=HORIZON)
     first, middles, spreads = plan(Puppets(model, chosen), wide), {}, {}
     for warm in (True, False):
         puppets = Puppets(model, chosen)
@@ -219,7 +215,7 @@ def slips(actions, grippers):
 
 
 def test_a_push_that_succeeds_from_one_place_only_is_not_taken(model):
-    search = CEMConfig(40, 1, 40)  # so that elites go both ways
+    search = SearchConfig(40, 1, 40)  # so that elites go both ways
     plans = {n: plan(Puppets(model, slips), replace(PLAIN, search=search, recheck=n))
              for n in (0, 1, 6)}
     right = {n: found.actions[:, 0].sum() > 0 for n, found in plans.items()}
@@ -238,7 +234,7 @@ def test_the_best_of_all_that_were_judged_is_taken(model):
 
     puppets = Puppets(model, lambda actions, _: GOALS + miss(actions)[:, None, None, None]
                       * np.ones((1, HORIZON, 2, 1)))
-    found = plan(puppets, replace(PLAIN, search=CEMConfig(60, 3, 6), batch_size=7))
+    found = plan(puppets, replace(PLAIN, search=SearchConfig(60, 3, 6), batch_size=7))
     judged = np.concatenate(puppets.judged)
     assert len(judged) > 180 and miss(found.actions[None])[0] <= miss(judged).min() + 0.01
 
@@ -250,24 +246,6 @@ def test_every_plan_draws_candidates_of_its_own(model):
     assert not np.array_equal(first.actions, second.actions)
     assert not np.array_equal(first.actions, other.actions)
     assert second.memory.count == 2 and second.memory.seed == 0
-
-
-def test_between_two_searches_the_plan_is_carried_out_unless_goal_or_limits_change(model):
-    puppets, every3 = steady(model, away(5, 5)), replace(PLAIN, replan_every=3)
-    plans, hand = [plan(puppets, every3)], GRIPPER
-    for _ in range(3):
-        hand = hand + np.append(plans[-1].action[:3], 0)
-        plans.append(plan(puppets, every3, hand, memory=plans[-1].memory))
-    for i in (1, 2):
-        np.testing.assert_allclose(plans[i].actions[:-i], plans[0].actions[i:], atol=1e-6)
-    assert not np.allclose(plans[3].actions[:-3], plans[0].actions[3:], atol=1e-3)
-    after, searched = plans[3].memory, len(puppets.judged)
-    plan(puppets, every3, memory=after, goals=GOALS.copy())
-    assert len(puppets.judged) == searched
-    plan(puppets, every3, memory=after, goals=GOALS + 0.5)
-    assert len(puppets.judged) > searched
-    limited = np.abs(plan(puppets, every3, memory=after, limits=Limits(0.02, 0.03)).actions)
-    assert limited[:, :2].max() <= 0.02 + 1e-6 and limited[:, 2].max() <= 0.03 + 1e-6
 
 
 def candidates(model, height=LOW, limits=FULL, **changes):
@@ -284,28 +262,18 @@ def test_candidates_keep_to_the_limits_and_use_them(model):
         actions, _ = candidates(model, limits=Limits(move, climb))
         extent = np.abs(actions).max((0, 1))
         np.testing.assert_allclose(extent, [move, move, climb, 0], atol=1e-6)
-    assert PLAIN.shape(Limits(1.0, 1.0), 0) == PLAIN.shape(FULL, 0)  # the contract's hold anyway
+    assert vars(SequenceShape(Limits(1.0, 1.0))) == vars(SequenceShape())  # the contract's hold
 
 
-@pytest.mark.parametrize('upright', [True, False])
-def test_upright_says_whether_the_arm_climbs_on_the_spot(model, upright):
-    actions, _ = candidates(model, upright=upright)
+def test_the_arm_climbs_on_the_spot_pushes_slowly_and_a_way_takes_any_number_of_periods(model):
+    actions, heights = candidates(model)
     climbing = np.abs(actions[..., 2]) > 0.06
-    assert climbing.any() and actions[climbing][:, :2].any() != upright
-
-
-@pytest.mark.parametrize('limit', [0.02, 0.05])
-def test_push_limit_holds_where_the_gripper_is_low_and_only_there(model, limit):
-    actions, heights = candidates(model, push_limit=limit)
+    assert climbing.any() and not actions[climbing][:, :2].any()
     length, low = np.linalg.norm(actions[..., :2], axis=2), heights < 0.05
-    assert length[low].max() == pytest.approx(limit, abs=1e-6) and length[~low].max() > limit
-
-
-@pytest.mark.parametrize('free', [True, False])
-def test_free_phase_says_whether_a_way_takes_whole_segments(model, free):
-    _, heights = candidates(model, free_phase=free)
+    assert length[low].max() == pytest.approx(PUSH_LIMIT, abs=1e-6)
+    assert length[~low].max() > PUSH_LIMIT + 0.01
     lifted = (heights > 0.1).sum(1)
-    assert lifted.any() and (lifted % 3 != 0).any() == free
+    assert lifted.any() and (lifted % 3 != 0).any()
 
 
 @pytest.mark.parametrize('height, first', [(0.06, 1), (LOW, 0), (LIFTED, 0)])
@@ -321,29 +289,19 @@ def test_the_model_is_told_whether_the_arm_is_hidden(model, hidden):
     assert puppets.arm_hidden is hidden
 
 
-@pytest.mark.parametrize('warm, changes', [(True, [2, 5, 8, 11, 14]), (False, [3, 6, 9, 12])])
-def test_segments_go_on_where_the_last_plan_left_them(model, warm, changes):
-    config = replace(PLAIN, free_phase=False, upright=False, warm_start=warm)
-    first = plan(steady(model, away(5, 5)), config)
-    puppets = steady(model, away(5, 5))
-    plan(puppets, config, GRIPPER + np.append(first.action[:3], 0), memory=first.memory)
-    changed = np.abs(np.diff(puppets.judged[0][..., :2], axis=1)).max((0, 2)) > 1e-6
-    assert (np.flatnonzero(changed) + 1).tolist() == changes
-
-
 def test_an_unfinished_object_costs_all_of_its_price_from_3_px_on():
-    cost = prices(torch.tensor([[0.0, 1.5, 3.0, 6.0]]), 4.0)
+    cost = PlanCost(unfinished=4.0).prices(torch.tensor([[0.0, 1.5, 3.0, 6.0]]))
     torch.testing.assert_close(cost, torch.tensor([[0.0, 3.5, 7.0, 10.0]]))
 
 
 @pytest.mark.parametrize('seen', [2, 3, 5, HORIZON])
 def test_what_stands_costs_the_same_however_often_it_is_looked_at(seen):
     maps = torch.full((1, 2, 1, 2), 0.5)  # two objects, each half in either cell
-    cost, last = cost_of_maps([maps] * seen, torch.tensor([[1.0, 3.0], [4.0, 8.0]]))
+    cost, last = PlanCost().of_maps([maps] * seen, torch.tensor([[1.0, 3.0], [4.0, 8.0]]))
     assert cost.item() == pytest.approx((14 + 10) * (2 + 6)) and last.item() == 4
 
 
 def test_landing_too_near_costs_100_px_and_10_for_each_missing_centimetre():
     landings = np.array([[0.0, 0.0], [0.125, 0.0], [0.25, 0.0], [0.9, 1.0], [np.nan, np.nan]])
-    cost = landing_clash(landings, np.array([[0.0, 0.0], [1.0, 1.0]]), 0.25)
+    cost = PlanCost(clearance=0.25).of_landings(landings, np.array([[0.0, 0.0], [1.0, 1.0]]))
     np.testing.assert_allclose(cost, [350, 225, 0, 250, 0])

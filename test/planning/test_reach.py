@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.planning.action_sequences import Limits
-from tap_ros.planning.cem import CEMConfig
 from tap_ros.planning.hierarchy import Target
-from tap_ros.planning.mpc_config import STALL, VisualMPCConfig
+from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.reach import (
     Aim,
     Command,
@@ -27,7 +27,7 @@ from toy_world import SIZE
 SECOND = 10**9
 START = np.array([[8.0, 8.0], [20.0, 20.0]], np.float32)
 GOAL = Target(np.array([[12.0, 8.0], [20.0, 24.0]], np.float32))
-SMALL = VisualMPCConfig(search=CEMConfig(8, 1, 2), proposals=4, batch_size=8, threads=1)
+SMALL = VisualMPCConfig(search=SearchConfig(8, 1, 2), proposals=4, batch_size=8, threads=1)
 
 
 @pytest.fixture
@@ -224,21 +224,6 @@ def test_names_in_another_order_are_the_same_scene(mpc):
     assert isinstance(reach.step(look(1, names=('b', 'a'))), Command)
 
 
-def test_only_the_chosen_objects_are_brought_to_their_goals(mpc):
-    goal = Target(GOAL.pixels[1:])
-    reach = Reach(mpc, ReachConfig(10, objects=(1,)), 3)
-    reach.step(look(0))
-    reach.head_for([goal])
-    command = reach.step(look(0))
-    seen = look(0)
-    alone = mpc.plan(Scene(seen.image, seen.gripper, START[1:]), mpc.goal(GOAL.pixels[1:]),
-                     Memory(3))
-    np.testing.assert_array_equal(command.plan.actions, alone.actions)
-    assert reach.distance == 4.0 and reach.pixels is seen.pixels
-    end = reach.step(look(1, np.stack([START[0], GOAL.pixels[1]])))
-    assert isinstance(end, End) and end.outcome == 'reached'
-
-
 def test_a_command_says_which_target_it_is_for(mpc):
     reach = Reach(mpc, ReachConfig(10), 3)
     reach.step(look(0))
@@ -249,22 +234,6 @@ def test_a_command_says_which_target_it_is_for(mpc):
         reach.sent()
     assert stages[0] == 0 and stages[-1] == 1 and stages == sorted(stages)
     assert reach.switches == [stages.index(1)]
-
-
-def test_what_a_refused_command_answered_is_no_motion(mpc):
-    reach = Reach(mpc, ReachConfig(60, switch='stalled'), 3)
-    reach.step(look(0))
-    reach.head_for([Target(START + 9), GOAL])
-    for t in range(STALL):
-        assert reach.step(look(t, START + 2 * min(t, 1))).stage == 0
-        reach.sent()
-    moved = look(STALL, START + 5)
-    assert reach.step(moved).stage == 0
-    reach.sent()
-    assert reach.refused(moved.stamp_ns, 'the arm stood still')
-    assert reach.step(look(STALL + 1, START + 2)).stage == 0
-    reach.sent()
-    assert reach.step(look(STALL + 2, START + 2)).stage == 1 and reach.switches == [STALL + 1]
 
 
 def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):

@@ -5,14 +5,14 @@
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.tracking import ObjectTracker
 from tap_ros.weights import FORWARD_MODEL
 
 
 @pytest.fixture(scope='module')
 def learned():
-    return load_forward_model(FORWARD_MODEL)
+    return LearnedForwardModel.load(FORWARD_MODEL)
 
 
 @pytest.fixture(scope='module')

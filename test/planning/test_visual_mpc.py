@@ -9,18 +9,18 @@ import pytest
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.images.pixels import to_float
 from tap_ros.planning.action_sequences import FULL, HORIZON, Limits
-from tap_ros.planning.cem import CEMConfig
-from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.cost import LAST_WEIGHT, PlanCost
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig, with_preset
 from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.plan_cost import LAST_WEIGHT
+from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.rollouts import Rollouts
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.weights import FORWARD_MODEL
 import torch
 
-SMALL = VisualMPCConfig(search=CEMConfig(24, 2, 5), proposals=8, batch_size=24, threads=1)
+SMALL = VisualMPCConfig(search=SearchConfig(24, 2, 5), proposals=8, batch_size=24, threads=1)
 IMAGE = np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8)
 GRIPPER = np.array([0.05, -0.1, 0.01, 0.0], np.float32)
 PIXELS = np.array([[20.0, 17.0], [9.0, 9.0]])
@@ -30,7 +30,7 @@ GOALS = np.array([[24.0, 15.0], [9.0, 14.0]])
 
 @pytest.fixture(scope='module')
 def trained():
-    return load_forward_model(FORWARD_MODEL)
+    return LearnedForwardModel.load(FORWARD_MODEL)
 
 
 def plans(model, config=SMALL, seed=0, steps=3, limits=FULL, scale=1, **goal):
@@ -47,10 +47,11 @@ def plans(model, config=SMALL, seed=0, steps=3, limits=FULL, scale=1, **goal):
 def judge(model, actions, batch_size):
     """Judge sequences that begin at the middle of the table."""
     start = model.begin(to_float(IMAGE)[None], torch.zeros(1, 4))
-    maps = model.seed_maps(torch.tensor(PIXELS).float())
+    maps = model.table.seed_maps(torch.tensor(PIXELS).float())
     prices = torch.from_numpy(DISTANCE).float()
     grippers = np.zeros((len(actions), 4), np.float32)
-    return Rollouts(model, batch_size).judge(start, maps, prices, actions, grippers, every=1)
+    rollouts = Rollouts(model, PlanCost(), batch_size)
+    return rollouts.judge(start, maps, prices, actions, grippers, every=1)
 
 
 def same(first, second):
@@ -184,8 +185,7 @@ def test_a_bad_goal_is_named(model, wrong, name):
 
 @pytest.mark.parametrize('wrong, name', [
     ({'cost_every': 4}, 'cost_every'),
-    ({'proposals': 500}, 'proposals'), ({'replan_every': 0}, 'replan_every'),
-    ({'replan_every': 16}, 'replan_every'), ({'recheck': -1}, 'recheck'),
+    ({'proposals': 500}, 'proposals'), ({'recheck': -1}, 'recheck'),
     ({'batch_size': 0}, 'batch_size')])
 def test_impossible_settings_are_named(wrong, name):
     with pytest.raises(ConfigError, match=name):
@@ -193,9 +193,8 @@ def test_impossible_settings_are_named(wrong, name):
 
 
 @pytest.mark.parametrize('right', [
-    {'cost_every': 1}, {'cost_every': HORIZON}, {'replan_every': 1}, {'replan_every': HORIZON},
-    {'recheck': 0}, {'batch_size': 1}, {'proposals': 0},
-    {'proposals': VisualMPCConfig().search.num_samples}])
+    {'cost_every': 1}, {'cost_every': HORIZON}, {'recheck': 0}, {'batch_size': 1},
+    {'proposals': 0}, {'proposals': VisualMPCConfig().search.num_samples}])
 def test_the_least_and_the_most_are_allowed(right):
     VisualMPCConfig(**right)
 
@@ -214,6 +213,6 @@ def test_paper_preset_has_the_papers_numbers():
         200, 3, 10)
     assert HORIZON == 15 and LAST_WEIGHT == 10
     assert not paper.warm_start and not paper.proposals
-    assert not paper.free_phase and not paper.recheck
+    assert not paper.recheck and not paper.unfinished and not paper.clearance
     with pytest.raises(ConfigError, match='default, large, paper'):
         with_preset('fast')

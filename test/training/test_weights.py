@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from safetensors.torch import save_file
 from tap_ros.errors import WeightsError
-from tap_ros.planning.forward_model import load_forward_model
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.predictor import load_network
 from tap_ros.training.weights import (
@@ -207,7 +207,7 @@ def test_planning_results_are_of_one_forward_model_and_the_page_says_where_it_is
     lambda tensor: tensor + torch.inf if tensor.dim() == 1 else tensor],
     ids=['zero', 'nan', 'infinite'])
 @pytest.mark.parametrize('shipped, load', [
-    (PREDICTORS['push2'], load_network), (FORWARD_MODEL, load_forward_model)],
+    (PREDICTORS['push2'], load_network), (FORWARD_MODEL, LearnedForwardModel.load)],
     ids=['predictor', 'forward'])
 def test_weights_that_are_zero_or_not_finite_are_refused(tmp_path, shipped, load, change):
     tensors, about = load_tensors(shipped)
@@ -241,7 +241,7 @@ def test_a_forward_model_that_cannot_be_is_refused(tmp_path, name, value):
     if value is ...:
         del about['config'][name]
     save_tensors(tmp_path / 'w', tensors, about)
-    refusal(load_forward_model, tmp_path / 'w')
+    refusal(LearnedForwardModel.load, tmp_path / 'w')
 
 
 @pytest.mark.parametrize('change', [

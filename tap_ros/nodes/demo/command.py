@@ -45,7 +45,7 @@ from tap_ros.nodes.demo.report import (
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.topics import STREAM
 from tap_ros.options import Flag, Folder, one_of
-from tap_ros.planning.scenes import FIRST_SCENE
+from tap_ros.planning.mpc_config import FIRST_SCENE
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tqdm import tqdm
 from tyro import conf

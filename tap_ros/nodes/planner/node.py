@@ -40,7 +40,7 @@ from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import internal_error, log_error
 from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.topics import STREAM, to_stamp
-from tap_ros.planning.forward_model import ForwardModel
+from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.hierarchy import choose_sample, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, Command, End, Reach
@@ -156,9 +156,9 @@ class VisualMpcNode(LifecycleBase):
             self._busy.release()
 
     @property
-    def _model(self) -> ForwardModel:
+    def _model(self) -> LearnedForwardModel:
         """Return the forward model of the weights."""
-        return cast(ForwardModel, self._mpc.model)  # as load_planner has loaded it
+        return cast(LearnedForwardModel, self._mpc.model)  # as load_planner has loaded it
 
     # Callbacks
 

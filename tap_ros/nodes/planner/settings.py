@@ -20,11 +20,12 @@ from tap_ros.nodes.parameters import check_device, declare_device, Parameters
 from tap_ros.nodes.planner.arm_joints import declare_mount, declare_opening
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.action_sequences import Limits
-from tap_ros.planning.forward_model import ForwardModel
-from tap_ros.planning.mpc_config import PRESETS, STALL, SWITCHES, with_preset
+from tap_ros.planning.forward_model import LearnedForwardModel
+from tap_ros.planning.mpc_config import PRESETS, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import ReachConfig
 from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.plugins import names
 from tap_ros.text import escaped
 from tap_ros.weights import FORWARD_MODEL
 
@@ -48,6 +49,9 @@ def declare_parameters(node: 'Node') -> Parameters:
     declare_device(parameters)
     parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
                        'with more samples, or what the paper says.', choices=list(PRESETS))
+    parameters.declare('solver', 'cem', 'What searches the actions: the cross-entropy method '
+                       '(cem), the improved one (icem), or a solver of another package.',
+                       choices=names('tap_ros.solvers'))
     parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
     declare_transport(parameters)
     declare_robot_mask(parameters)
@@ -72,9 +76,7 @@ def declare_parameters(node: 'Node') -> Parameters:
              'the mean expected distance to its maps is so much above the least possible.')):
         parameters.declare(name, default, description, low=low, high=high, read_only=False)
     parameters.declare('switch', 'reached', 'When to go on from a subgoal: when it is reached, '
-                       'or its share of the budget spent; also when an object has moved and then '
-                       f'none for {STALL} commands (stalled); or at its share (half), as the '
-                       'paper does.',
+                       'or its share of the budget spent; or (half) then alone, as in the paper.',
                        choices=SWITCHES, read_only=False)
     parameters.declare('subgoal_rounds', 1, 'How often a goal in subgoal mode asks for subgoals: '
                        'again, from what is seen then, when those of a round are passed.',
@@ -117,7 +119,7 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     """
     check_device(parameters['device'])
     config = with_preset(
-        parameters['preset'],
+        parameters['preset'], solver=parameters['solver'],
         arm_hidden=parameters['arm_hidden'] or parameters['robot_mask'] == 'all')
     mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
     height, width = mpc.image_size
@@ -127,7 +129,7 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     return mpc
 
 
-def unlike_training(model: ForwardModel, robot_mask: str) -> str:
+def unlike_training(model: LearnedForwardModel, robot_mask: str) -> str:
     """
     Return how the pictures differ from those of the training, '' if they do not.
 
@@ -141,7 +143,7 @@ def unlike_training(model: ForwardModel, robot_mask: str) -> str:
 
 
 def reach_config(parameters: Parameters, request: 'ReachGoal.Goal',
-                 model: ForwardModel) -> ReachConfig:
+                 model: LearnedForwardModel) -> ReachConfig:
     """Return the settings of the control loop for one goal."""
     return ReachConfig(
         request.step_budget, parameters['switch'], parameters['goal_tolerance'],

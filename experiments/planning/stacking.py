@@ -9,15 +9,14 @@ true physics. A picture says which object goes where.
 
 from dataclasses import dataclass, field
 
-from experiments.planning.episode import View
-from experiments.stacking.reading import Move, PictureReader, read_moves
+from experiments.planning.episode import shown_mask, View
+from experiments.planning.reading import Move, PictureReader, read_moves
 import mujoco.rollout
 import numpy as np
 from sim_bridge.tasks.expert import run_episode as run_expert
 from sim_bridge.tasks.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
 from tap_ros.contract import LIFTED, SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError
-from tap_ros.training.robot_mask import trained_robot_mask
 
 OVER = 0.045  # m; an object whose place is nearer to another one, from above, is put on that
 ARRIVED = 0.01  # m from its last place, then an object of the expert's is where it goes
@@ -51,7 +50,7 @@ class StackedEpisode:
         return [move for stage in self.stages for move in stage.moves]
 
 
-def run_episode(simulator, method, seed, predictor=None):
+def stack(simulator, method, seed, predictor=None):
     """
     Bring the pictures of a method about in one scene.
 
@@ -139,8 +138,7 @@ def _expert_subgoals(simulator, seed):
 
 def _predict(predictor, method, start, goal, seed):
     """Return the pictures of the predicted subgoals, the earliest first."""
-    robot_mask, share = trained_robot_mask(predictor.training)
-    view = View(robot_mask if share else 'none')
+    view = View(shown_mask(predictor))
     subgoals = predictor.predict(view.see(start).image, view.fill(goal).image,
                                  recursion_depth=method.recursion, seed=seed)
     return [subgoal.image for subgoal in subgoals]

@@ -1,0 +1,115 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What can be put in the planner's place: a forward model, a solver. Names: tap_ros.plugins."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable, TYPE_CHECKING
+
+import numpy as np
+from tap_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tap_ros.planning.table import Table
+    import torch
+
+Judge = Callable[[np.ndarray], np.ndarray]  # samples (N, D) to costs (N,); NaN counts as worst
+
+
+@runtime_checkable
+class ForwardModel(Protocol):
+    """
+    Says where objects go when the gripper moves, as maps on a square grid of the table.
+
+    forward_model.LearnedForwardModel and true_model.TrueModel are two.
+    """
+
+    @property
+    def table(self) -> 'Table':
+        """Where the grid is in the pictures that the model takes."""
+
+    def begin(self, image: 'torch.Tensor', gripper: 'torch.Tensor',
+              arm_hidden: bool = False) -> Any:
+        """
+        Look once at what all sequences of a plan begin with.
+
+        :param image: (1, 3, H, W) in [-1, 1]; gripper (1, 4) metres and opening.
+        :param arm_hidden: the arm is not in the picture.
+        :return: what carried_maps takes first.
+        """
+
+    def carried_maps(self, start: Any, gripper: 'torch.Tensor', maps: 'torch.Tensor',
+                     actions: 'torch.Tensor', /, every: int = 1) -> 'Iterator[torch.Tensor]':
+        """
+        Yield the maps (N, K, n, n) after every so many steps of N action sequences.
+
+        :param start: from begin; gripper (N, 4), where each sequence begins.
+        :param maps: (K, n, n) now.
+        :param actions: (N, T, 4), T a multiple of `every`.
+        :return: each map sums to 1, or to 0 where nobody knows where the object is.
+        """
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """
+    How much a solver searches.
+
+    :param num_samples: per iteration; num_iterations; num_elites: that the next one begins from.
+    """
+
+    num_samples: int = 200
+    num_iterations: int = 3
+    num_elites: int = 10
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.num_elites <= self.num_samples:
+            raise ConfigError(f'num_elites: expected 1..{self.num_samples} (num_samples), '
+                              f'got {self.num_elites}')
+        if self.num_iterations < 1:
+            raise ConfigError(f'num_iterations: expected at least 1, got {self.num_iterations}')
+
+
+@dataclass(frozen=True)
+class Problem:
+    """
+    What a solver minimises.
+
+    :param cost: Judge.
+    :param mean: (D,) of the first Gaussian; std: (D,).
+    :param clip: limits samples (N, D) to what is allowed.
+    :param proposals: (P, D), samples that are worth a look.
+    :param kept: (E, D), elites of the plan before, one step later.
+    :param moves: T; the first 2 T parameters are x, y of T displacements, one after the other.
+    :param recheck: a dearer Judge, for the last elites alone.
+    """
+
+    cost: Judge
+    mean: np.ndarray
+    std: np.ndarray
+    clip: Judge = np.asarray
+    proposals: np.ndarray | None = None
+    kept: np.ndarray | None = None
+    moves: int = 0
+    recheck: Judge | None = None
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver found."""
+
+    best: np.ndarray  # (D,)
+    cost: float  # of the best, by Problem.cost
+    elites: np.ndarray  # (E, D), the cheapest first
+
+
+class Solver(Protocol):
+    """Searches the minimum of a Problem; solvers.cem and solvers.icem are two."""
+
+    def __call__(self, problem: Problem, config: SearchConfig,
+                 rng: np.random.Generator) -> Solution:
+        """
+        Search.
+
+        :param rng: all randomness comes from it, in an order that depends on the shapes only.
+        """
