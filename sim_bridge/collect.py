@@ -28,13 +28,15 @@ from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.writer import count_episodes, EpisodeWriter, write_metadata
+from tap_ros.robots.arm import DEFAULT_ARM
 from tap_ros.text import escaped
 from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
 # What they were before they were settings.
-EARLIER = {'misses': 0.0, 'frames': 0, 'timing': 'natural', 'look': 'plain', 'appearance': 'usual'}
+EARLIER = {'misses': 0.0, 'frames': 0, 'timing': 'natural', 'look': 'plain', 'appearance': 'usual',
+           'arm': DEFAULT_ARM}
 MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 
 
@@ -57,6 +59,7 @@ class CollectSettings:
     :param look: of the world, see looks.LOOKS.
     :param appearance: of table, light and camera, see appearance.CHOICES; 'random' is drawn anew
         for every episode.
+    :param arm: name of an arm, see robots.arm.get_arm.
     """
 
     task: str = 'push2'
@@ -69,6 +72,7 @@ class CollectSettings:
     misses: float = 0.0
     look: str = DEFAULT_LOOK
     appearance: str = 'usual'
+    arm: str = DEFAULT_ARM
 
 
 @dataclass(frozen=True)
@@ -211,7 +215,8 @@ def _episodes(config: CollectConfig, shard: int) -> range:
 
 def _collect_shard(folder: str | Path, config: CollectConfig, shard: int) -> dict[str, Any]:
     """Collect one file; runs in a worker process."""
-    simulator = Simulator(config.task, config.image_size, config.look, config.appearance)
+    simulator = Simulator(
+        config.task, config.image_size, config.look, config.appearance, config.arm)
     stats: dict[str, Any] = {
         'shard': shard, 'frames': 0, 'outcomes': [], 'distances': [],
         'seconds': {'search': 0.0, 'step': 0.0, 'write': 0.0}}

@@ -12,6 +12,7 @@ from sim_bridge.world.appearance import CHOICES
 from sim_bridge.world.looks import LOOKS
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Folder, one_of
+from tap_ros.plugins import names
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,7 @@ class Recording(CollectSettings):
     timing: Annotated[str, one_of(TIMINGS)] = CollectSettings.timing
     look: Annotated[str, one_of(LOOKS)] = CollectSettings.look
     appearance: Annotated[str, one_of(CHOICES)] = CollectSettings.appearance
+    arm: Annotated[str, one_of(names('tap_ros.arms'))] = CollectSettings.arm
 
 
 @dataclass(frozen=True)

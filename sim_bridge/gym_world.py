@@ -71,6 +71,8 @@ class GymWorld:
     :param showing: Binding of the same environment; None: there are no goal pictures.
     """
 
+    arm = None  # its joints are not told
+
     def __init__(self, acting: Binding, showing: Binding | None = None) -> None:
         self._acting, self._showing = acting, showing
         self._seed: int | None = None

@@ -35,7 +35,7 @@ from tap_ros.contract import (
     WORKSPACE_LOW,
 )
 from tap_ros.errors import SceneError
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 from tap_ros.text import escaped
 
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
@@ -48,38 +48,42 @@ LEAVE_HEIGHT = 0.12  # m of the gripper when it has put the object down, in the 
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
 
 
-def clip_action(action: ArrayLike) -> np.ndarray:
+def clip_action(action: ArrayLike, limit: Sequence[float] = ACTION_LIMIT) -> np.ndarray:
     """
     Limit an action to what the arm does in one control period.
 
     :param action: (4,) displacement x, y, z in m and gripper opening in [0, 1].
+    :param limit: (3,) m, of the displacement.
     :return: (4,) float64.
     :raises SceneError: for another shape or values that are not finite.
     """
     action = np.asarray(action, np.float64)
     if action.shape != (4,) or not np.isfinite(action).all():
         raise SceneError(f'action {action}: expected 4 finite numbers (dx, dy, dz, opening)')
-    return np.append(clip_moves(action[:3]), np.clip(action[3], 0, 1))
+    return np.append(clip_moves(action[:3], limit), np.clip(action[3], 0, 1))
 
 
-def clip_moves(moves: np.ndarray) -> np.ndarray:
+def clip_moves(moves: np.ndarray, limit: Sequence[float] = ACTION_LIMIT) -> np.ndarray:
     """Limit displacements (..., 3), in m, to what the arm does in one control period."""
-    return np.clip(moves, np.negative(ACTION_LIMIT), ACTION_LIMIT)
+    return np.clip(moves, np.negative(limit), limit)
 
 
-def ramp_controls(target: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def ramp_controls(target: np.ndarray, actions: np.ndarray,
+                  low: Sequence[float] = WORKSPACE_LOW, high: Sequence[float] = WORKSPACE_HIGH,
+                  ) -> tuple[np.ndarray, np.ndarray]:
     """
     Turn actions into servo targets for every physics step.
 
     :param target: (4,) the present target: x, y, z, opening.
     :param actions: (..., T, 4) actions within the limits.
+    :param low: (3,) m, where the gripper may be, least; high: greatest.
     :return: controls (..., T * SUBSTEPS, 5) and the targets after each action (..., T, 4).
     """
     targets = np.empty(actions.shape)
     targets[..., 3] = actions[..., 3]
     position = np.broadcast_to(target[:3], actions[..., 0, :3].shape)
     for t in range(actions.shape[-2]):
-        position = np.clip(position + actions[..., t, :3], WORKSPACE_LOW, WORKSPACE_HIGH)
+        position = np.clip(position + actions[..., t, :3], low, high)
         targets[..., t, :3] = position
     first = np.broadcast_to(target, targets[..., :1, :].shape)
     before = np.concatenate([first, targets[..., :-1, :]], axis=-2)
@@ -98,13 +102,15 @@ class Simulator:
     :param image_size: pixels of the square picture.
     :param look: name of a look, see looks.LOOKS.
     :param appearance: name of an appearance, see appearance.CHOICES.
+    :param arm: name of an arm, see robots.arm.get_arm.
+    :raises ConfigError: for an unknown arm.
     :raises SceneError: for an unknown task, look or appearance, a bad size, or when nothing can be
         rendered.
     """
 
     def __init__(self, task: str = 'push2', image_size: int = 64, look: str = DEFAULT_LOOK,
-                 appearance: str = 'usual') -> None:
-        self.task, self.look = get_task(task), get_look(look)
+                 appearance: str = 'usual', arm: str = DEFAULT_ARM) -> None:
+        self.task, self.look, self.arm = get_task(task), get_look(look), get_arm(arm)
         if not 16 <= image_size <= 1024:
             raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')
         choose_appearance(appearance, 0)  # refuses what there is not
@@ -139,7 +145,8 @@ class Simulator:
         :raises SceneError: for a bad seed.
         """
         gripping = self.task.gripping
-        self.scene = sample_scene(self.task, seed, GRIP_SPREAD if gripping else 1.0)
+        self.scene = sample_scene(
+            self.task, seed, GRIP_SPREAD if gripping else 1.0, self.arm.low, self.arm.high)
         self.model = build_scene(self.scene.shapes, gripping)
         self.data = mujoco.MjData(self.model)
         self._prepare_camera()
@@ -167,7 +174,8 @@ class Simulator:
         state, controls = self.state(), self.data.ctrl.copy()
         if gripper is None:
             rng = np.random.default_rng([self.scene.seed, 7])
-            gripper = gripper_away_from(rng, object_poses[:, :2])
+            gripper = gripper_away_from(
+                rng, object_poses[:, :2], self.arm.low[:2], self.arm.high[:2])
         self._place(object_poses, gripper)
         observation = self.observe(hide_arm)
         mujoco.mj_resetData(self.model, self.data)
@@ -256,7 +264,7 @@ class Simulator:
         :param action: (4,) displacement x, y, z in m, limited to ACTION_LIMIT and to the
             workspace, and gripper opening from 0 (closed) to 1.
         :return: Observation.
-        :raises SceneError: for another shape, values that are not finite, or what the UR10e
+        :raises SceneError: for another shape, values that are not finite, or what the arm
             cannot do; then nothing moves.
         """
         controls, self.target = self._ramp(action)
@@ -276,9 +284,11 @@ class Simulator:
 
     def _ramp(self, action: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the servo targets of an action (SUBSTEPS, 5) and the last one (4,)."""
-        controls, targets = ramp_controls(self.target, clip_action(action)[None])
-        ur10e.check_motion(
-            ur10e.joints_at(self.target), ur10e.joints_at(targets[0]), CONTROL_PERIOD)
+        arm = self.arm
+        controls, targets = ramp_controls(
+            self.target, clip_action(action, arm.action_limit)[None], arm.low, arm.high)
+        arm.check_motion(
+            arm.joints_at(self.target), arm.joints_at(targets[0]), CONTROL_PERIOD)
         return controls, targets[0]
 
     def observe(self, hide_arm: bool = False) -> Observation:
@@ -300,7 +310,7 @@ class Simulator:
     def observer_picture(self) -> np.ndarray:
         """Take a picture from the side, for people: uint8 (360, 480, 3) rgb."""
         if self._observer is None:
-            self._observer = Studio(OBSERVER, arm=True)
+            self._observer = Studio(OBSERVER, self.arm, links=True)
         self._observer.dress(replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
         self._observer.use(self.model)
         return self._observer.render(self.data).picture
@@ -360,7 +370,7 @@ class Simulator:
     def _prepare_camera(self) -> None:
         """Let the camera see the scene, as it looks with its seed."""
         if self._renderer is None:
-            self._renderer = Studio(self._usual_camera, self.look.arm)
+            self._renderer = Studio(self._usual_camera, self.arm, self.look.arm)
         self._worn = choose_appearance(self._appearance, self.scene.seed)
         self._renderer.dress(self._worn)
         self._renderer.use(self.model)

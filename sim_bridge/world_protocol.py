@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.errors import SceneError
 from tap_ros.plugins import load_plugin
+from tap_ros.robots.arm import Arm
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,16 @@ class World(Protocol):
     `object_motions()`. Keyword arguments look=, appearance= and arm= are the table's, too.
 
     :ivar task_name: of the present task.
+    :ivar arm: the Arm that is seen, None where it is not known.
     :ivar camera_matrix: (3, 3) intrinsics in pixels; (0, 0) is the centre of the top-left pixel.
     :ivar camera_pose: (4, 4) of the camera's optical frame in the world; None: not known.
     """
 
     @property
     def task_name(self) -> str: ...
+
+    @property
+    def arm(self) -> Arm | None: ...
 
     @property
     def camera_matrix(self) -> np.ndarray: ...

@@ -18,7 +18,8 @@ from tap_ros.errors import ConfigError
 
 # By group: name -> 'module:attribute'.
 BUILT_IN: dict[str, dict[str, str]] = {
-    'tap_ros.arms': {},
+    'tap_ros.arms': {
+        'panda': 'tap_ros.robots.panda:PANDA', 'ur10e': 'tap_ros.robots.ur10e:UR10E'},
     'tap_ros.forward_models': {
         'learned': 'tap_ros.planning.forward_model:LearnedForwardModel',
         'true': 'tap_ros.planning.true_model:TrueModel'},

@@ -19,7 +19,6 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from sim_bridge.tasks.run_state import MAX_PERIODS, RunState
 from sim_bridge.world.appearance import CHOICES
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
-from sim_bridge.world.robot_description import robot_description
 from sim_bridge.world.transforms import arm_transforms, fixed_arm_transforms, Transform
 from sim_bridge.world_protocol import ability, make_world, Observation, World
 from std_msgs.msg import Float64, String
@@ -52,12 +51,14 @@ from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.tf_publisher import TransformPublisher
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.plugins import names
+from tap_ros.robots.arm import DEFAULT_ARM
+from tap_ros.robots.description import robot_description
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
 MAX_TIMEOUT = 60.0  # s
-OPTIONS = {'look': DEFAULT_LOOK, 'appearance': 'usual'}  # of worlds that take them
+OPTIONS = {'look': DEFAULT_LOOK, 'appearance': 'usual', 'arm': DEFAULT_ARM}  # if taken
 LAST_WORDS_S = 1.0  # s that the end of the last episode may take to arrive
 
 
@@ -142,7 +143,8 @@ class SimNode(Node):
                 'camera/image_raw': Image}.items()}
         self._goal_mask = self.create_publisher(Image, 'goal/robot_mask', LATCHED)
         self._description = self.create_publisher(String, 'robot_description', LATCHED)
-        self._description.publish(String(data=robot_description()))
+        if self._sim.arm is not None:
+            self._description.publish(String(data=robot_description(self._sim.arm)))
         if self.params['observer']:
             self._streams['observer/image_raw'] = self.create_publisher(
                 Image, 'observer/image_raw', STREAM)
@@ -394,10 +396,12 @@ class SimNode(Node):
         if self._hide_arm:
             observation = self._sim.observe(hide_arm=True)
         stamp = to_stamp(self._stamp_ns)
+        arm = self._sim.arm
         self._newest = {
             'clock': ClockMessage(clock=stamp),
             'joint_states': encode_joints(
-                observation.gripper, stamp, WORLD_FRAME, observation.arm_joints),
+                observation.gripper, stamp, WORLD_FRAME,
+                dict(zip(arm.joints, observation.arm_joints)) if arm is not None else None),
             'objects': encode_observed(observation, stamp),
             'camera/camera_info': encode_camera_info(
                 self._sim.camera_matrix, observation.image.shape[:2], stamp, CAMERA_FRAME),
@@ -406,8 +410,8 @@ class SimNode(Node):
         if self.params['observer']:
             self._newest['observer/image_raw'] = encode_image(
                 ability(self._sim, 'observer_picture')(), stamp, OBSERVER_FRAME)
-        if len(observation.arm_joints):
-            self._transforms.moving(arm_transforms(observation.arm_joints), stamp)
+        if arm is not None:
+            self._transforms.moving(arm_transforms(arm, observation.arm_joints), stamp)
         self._send_newest()
 
     def _publish_fixed_transforms(self) -> None:
@@ -417,7 +421,8 @@ class SimNode(Node):
             poses[OBSERVER_FRAME] = OBSERVER.pose
         fixed = [Transform(WORLD_FRAME, frame, pose)
                  for frame, pose in poses.items() if pose is not None]
-        fixed += fixed_arm_transforms()
+        if self._sim.arm is not None:
+            fixed += fixed_arm_transforms(self._sim.arm)
         self._transforms.fixed(fixed, to_stamp(self._stamp_ns))
 
     def _send_newest(self) -> None:
@@ -454,8 +459,9 @@ def declare_parameters(node: Node) -> Parameters:
                        low=16, high=1024)
     parameters.declare(
         'look', OPTIONS['look'],
-        "What the camera's pictures show: the whole UR10e at a wooden table, or its hand alone.",
+        "What the camera's pictures show: the whole arm at a wooden table, or its hand alone.",
         choices=list(LOOKS))
+    parameters.declare('arm', DEFAULT_ARM, 'The arm at the table.', choices=names('tap_ros.arms'))
     parameters.declare(
         'appearance', OPTIONS['appearance'], 'Table, light and camera; random: drawn from '
         'the seed of each scene.', choices=list(CHOICES))

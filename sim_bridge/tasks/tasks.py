@@ -31,7 +31,7 @@ from sim_bridge.world.places import (
     OBJECT_RANGE,
 )
 from sim_bridge.world.scene import ObjectShape, random_shape
-from tap_ros.contract import EPISODE_FRAMES
+from tap_ros.contract import EPISODE_FRAMES, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import SceneError
 
 GOAL_SEPARATION = 0.2  # m between goals
@@ -40,6 +40,7 @@ GRASP_REACH_RANGE = 0.3  # m, |x| and |y| of the gripper's start before a grasp,
 PLACE_RANGE = 0.2  # m, |x| and |y| of the place where a picked object goes
 PLACE_DISTANCE = (0.12, 0.36)  # m, from the start of an object to its place
 LIFT_HEIGHT = 0.11  # m, of the goal of a grasp
+Place = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,8 @@ def get_task(name: str) -> Task:
     return TASKS[name]
 
 
-def sample_scene(task: Task, seed: int, spread: float = 1.0) -> Scene:
+def sample_scene(task: Task, seed: int, spread: float = 1.0, low: Place = WORKSPACE_LOW,
+                 high: Place = WORKSPACE_HIGH) -> Scene:
     """
     Draw shapes, starts, goals and the gripper's start.
 
@@ -123,12 +125,25 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0) -> Scene:
     :param seed: non-negative integer; the same seed gives the same scene.
     :param spread: factor of the ranges in which an object to be gripped, its goal and the gripper
         lie.
+    :param low: x, y, z in m of what the arm reaches, least; high: greatest. Scenes are drawn until
+        starts, places to push from, goals and the gripper are within.
     :return: Scene.
     :raises SceneError: for a seed that is negative or not an integer.
     """
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.stream])
+    while True:
+        scene = _draw(task, seed, rng, spread)
+        starts, goals = scene.start_poses[:, :2], scene.goal_poses[:, :2]
+        needed = np.concatenate(
+            [starts, starts - (goals - starts) / 2, goals, scene.gripper_start[None, :2]])
+        if (needed >= low[:2]).all() and (needed <= high[:2]).all():
+            return scene
+
+
+def _draw(task: Task, seed: int, rng: np.random.Generator, spread: float) -> Scene:
+    """Draw a scene wherever its objects are."""
     if task.kind == 'stack':
         return _sample_stack(task, seed, rng, spread)
     if task.gripping:

@@ -102,7 +102,7 @@ class View:
 
     picture: np.ndarray  # uint8 (H, W, 3) rgb
     robot_mask: np.ndarray  # uint8 (H, W), values as in contract.py
-    arm_joints: np.ndarray  # (6,) rad, of the UR10e
+    arm_joints: np.ndarray  # (J,) rad, of the arm
 
 
 class OpenGL:

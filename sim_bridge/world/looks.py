@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.errors import SceneError
+from tap_ros.plugins import names
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class Look:
 
     Hands and objects are the same in all of them, and so is the camera of tasks with a grasp.
 
-    :param arm: the camera's pictures show the whole UR10e; else the hand alone.
+    :param arm: the camera's pictures show the whole arm; else the hand alone.
     :param push_camera: what Camera is given for tasks that push.
     """
 
@@ -35,7 +36,7 @@ _NEAR = (0.73, 18.5, CAMERA_POSITION)
 GRIP_SPREAD = 0.65  # of the ranges in which objects to be gripped lie: that camera sees less
 LOOKS = {
     'hand': Look(False, _TABLE),
-    'ur10e': Look(True, _TABLE_AND_ARM),
+    'arm': Look(True, _TABLE_AND_ARM),
 }
 DEFAULT_LOOK = 'hand'
 # From the side, at a person's height: for films.
@@ -44,10 +45,12 @@ OBSERVER = Camera(480, 360, tilt=1.05, fovy=38.0, position=(1.15, -1.35, 1.15), 
 
 def get_look(name: str) -> Look:
     """
-    Look up a look.
+    Look up a look; the name of an arm stands for 'arm', as it did in earlier recordings.
 
     :raises SceneError: for an unknown name.
     """
+    if name in names('tap_ros.arms'):
+        name = 'arm'
     if name not in LOOKS:
         raise SceneError(f'look {name!r} is unknown; valid looks: {", ".join(LOOKS)}')
     return LOOKS[name]

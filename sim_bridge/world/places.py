@@ -3,6 +3,7 @@
 """Where things may stand when a scene is drawn, and in which order objects are taken."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 OBJECT_RANGE = 0.35  # m, |x| and |y| of object origins at start and goal
 GOAL_DISTANCE = 0.2  # m from start to goal of every object that is pushed
@@ -19,17 +20,20 @@ def apart(positions: np.ndarray, separation: float) -> bool:
     return (gaps[np.triu_indices(len(positions), 1)] >= separation).all()
 
 
-def gripper_away_from(rng: np.random.Generator, positions: np.ndarray) -> np.ndarray:
+def gripper_away_from(rng: np.random.Generator, positions: np.ndarray, low: ArrayLike,
+                      high: ArrayLike) -> np.ndarray:
     """
     Draw a place of the gripper that touches no object.
 
     :param rng: numpy Generator.
     :param positions: (K, 2) object origins in metres.
+    :param low: (2,) m, x and y that the arm reaches, least; high: greatest.
     :return: (3,) metres.
     """
     while True:
         xy = rng.uniform(-GRIPPER_RANGE, GRIPPER_RANGE, 2)
-        if np.linalg.norm(positions - xy, axis=1).min() > GRIPPER_MARGIN:
+        away = np.linalg.norm(positions - xy, axis=1).min()
+        if away > GRIPPER_MARGIN and (xy >= low).all() and (xy <= high).all():
             return np.append(xy, rng.uniform(0, GRIPPER_HEIGHT))
 
 

@@ -4,11 +4,11 @@
 Pictures of a scene as a camera in a laboratory would take them, and where the robot is in them.
 
 The physics model of scene.py has neither arm nor furniture. A second model, compiled once, has a
-wooden table, a light and a UR10e; for each picture the arm is posed so that it carries the gripper
-and the moving things of the physics model are added to its scene. Physics is never touched: the
-arm is kinematic. Shadows are those that the light throws on the table's plane: everything that
-moves is drawn once more, flattened onto it, in a picture of labels, which also tells where the
-robot is. That takes a tenth of the time of shadow maps.
+wooden table, a light and perhaps an arm; for each picture the arm is posed so that it carries the
+gripper, and the moving things of the physics model are added to its scene. Physics is never
+touched: the arm is kinematic. Shadows are those that the light throws on the table's plane: all
+that moves is drawn once more, flattened onto it, in a picture of labels, which also tells where
+the robot is. That takes a tenth of the time of shadow maps.
 """
 
 import contextlib
@@ -17,12 +17,11 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 from sim_bridge.world.appearance import Appearance, USUAL
-from sim_bridge.world.arm_shape import add_arm
 from sim_bridge.world.camera import Camera, OpenGL, View
 from sim_bridge.world.scene import ARM_GEOM_GROUP
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import SceneError
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import Arm
 
 SAMPLES = 2  # along each side of a pixel
 MAX_GEOMS = 400
@@ -39,14 +38,15 @@ class Studio:
     Takes pictures of physics models with one OpenGL context, in the thread that built it.
 
     :param camera: Camera.
-    :param arm: draw the whole UR10e; else the hand alone, as if the links were rendered away.
+    :param arm: Arm.
+    :param links: draw it whole; else the hand alone, as if the links were rendered away.
     :raises SceneError: when nothing can be rendered.
     """
 
-    def __init__(self, camera: Camera, arm: bool) -> None:
-        self._camera, self._arm = camera, arm
-        self._joints = np.zeros(len(ur10e.JOINTS))
-        self._model = _studio_model(arm)
+    def __init__(self, camera: Camera, arm: Arm, links: bool) -> None:
+        self._camera, self._arm, self._links = camera, arm, links
+        self._joints = np.zeros(len(arm.joints))
+        self._model = _studio_model(arm if links else None)
         self._model.vis.global_.offwidth = SAMPLES * camera.width
         self._model.vis.global_.offheight = SAMPLES * camera.height
         self._table_colour = self._model.mat('table').rgba.copy()
@@ -121,8 +121,8 @@ class Studio:
         # Contact can press the gripper a little beyond where commands may bring it, and the arm's
         # reach: then the arm stays as it was.
         with contextlib.suppress(SceneError):
-            self._joints = ur10e.joints_at(gripper)
-        if self._arm:
+            self._joints = self._arm.joints_at(gripper)
+        if self._links:
             self._data.qpos[:] = self._joints
             mujoco.mj_kinematics(self._model, self._data)
 
@@ -155,7 +155,7 @@ class Studio:
         return labels[[*range(scene.ngeom), -1]]
 
 
-def _studio_model(arm: bool) -> mujoco.MjModel:
+def _studio_model(arm: Arm | None) -> mujoco.MjModel:
     """Compile table, rim, floor, light, camera and perhaps the arm."""
     spec = mujoco.MjSpec()
     spec.visual.quality.shadowsize = spec.visual.quality.offsamples = 0
@@ -175,12 +175,32 @@ def _studio_model(arm: bool) -> mujoco.MjModel:
         builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, rgb1=[0.78, 0.79, 0.8],
         rgb2=[0.5, 0.51, 0.53])
     _add_furniture(spec)
-    if arm:
-        add_arm(spec)
+    if arm is not None:
+        _add_arm(spec, arm)
         for geom in spec.geoms:
             if geom.parent.name != 'world':
                 geom.group = ARM_GEOM_GROUP
     return spec.compile()
+
+
+def _add_arm(spec: mujoco.MjSpec, arm: Arm) -> None:
+    """Add the arm's bodies, joints and shapes to a model; nothing of it touches anything."""
+    half = arm.mount.yaw / 2
+    body = spec.worldbody.add_body(
+        name=f'{arm.name}_base', pos=arm.mount.position,
+        quat=[np.cos(half), 0, 0, np.sin(half)])
+    bodies = [body]
+    for joint, link, (place, roll) in zip(arm.joints, arm.links[1:], arm.origins):
+        body = body.add_body(
+            name=link, pos=place, quat=[np.cos(roll / 2), np.sin(roll / 2), 0, 0])
+        body.mass, body.inertia, body.explicitinertial = 1.0, [0.01] * 3, True
+        body.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
+        bodies.append(body)
+    for shape in arm.shapes:
+        kind = mujoco.mjtGeom.mjGEOM_CAPSULE if shape.capsule else mujoco.mjtGeom.mjGEOM_CYLINDER
+        bodies[shape.link].add_geom(
+            type=kind, fromto=[*shape.start, *shape.end], size=[shape.radius, 0, 0],
+            rgba=[*shape.colour, 1], contype=0, conaffinity=0)
 
 
 def _add_furniture(spec: mujoco.MjSpec) -> None:

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.world.robot_description import BASE_FRAME, joint_origins, LINKS, TIP_FRAME
 from tap_ros.contract import WORLD_FRAME
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import Arm, BASE_FRAME, TIP_FRAME, turned
 
 
 @dataclass(frozen=True)
@@ -29,30 +28,20 @@ class Transform:
         return np.roll(wxyz, -1)
 
 
-def fixed_arm_transforms(mount: ur10e.Mount = ur10e.SIMULATED) -> list[Transform]:
+def fixed_arm_transforms(arm: Arm) -> list[Transform]:
     """Return where the arm's base and the fingertips are, which no joint changes."""
-    tip, roll = joint_origins(mount)[-1]
-    return [Transform(WORLD_FRAME, BASE_FRAME, mount.pose),
-            Transform(LINKS[-1], TIP_FRAME, _pose(tip, roll, 0.0))]
+    (x, y, z), roll = arm.origins[-1]
+    return [Transform(WORLD_FRAME, BASE_FRAME, arm.mount.pose),
+            Transform(arm.links[-1], TIP_FRAME, turned((x, y, z + arm.mount.tool), roll, 0.0))]
 
 
-def arm_transforms(joints: ArrayLike) -> Iterator[Transform]:
+def arm_transforms(arm: Arm, joints: ArrayLike) -> Iterator[Transform]:
     """
     Yield where each link is in the one before.
 
-    :param joints: (6,) rad, of ur10e.JOINTS.
-    :return: six, from the base on.
+    :param joints: (J,) rad.
+    :return: J, from the base on.
     """
-    for parent, child, (place, roll), angle in zip(
-            LINKS, LINKS[1:], joint_origins(), np.asarray(joints, np.float64)):
-        yield Transform(parent, child, _pose(place, roll, angle))
-
-
-def _pose(place: tuple[float, float, float], roll: float, yaw: float) -> np.ndarray:
-    """Return the pose (4, 4) of a frame at a place (m) that is rolled, then turned (rad)."""
-    c, s, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
-    pose = np.eye(4)
-    pose[:3, :3] = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]]) @ np.array(
-        [[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    pose[:3, 3] = place
-    return pose
+    for parent, child, origin, angle in zip(
+            arm.links, arm.links[1:], arm.origins, np.asarray(joints, np.float64)):
+        yield Transform(parent, child, turned(*origin, angle))

@@ -4,8 +4,7 @@
 Joint states, live or recorded, to the gripper's state at the moment of a picture, and back.
 
 Drivers publish at times of their own. What counts for a picture lies between the states before
-and after it (`between`); a state that is farther away than a limit says nothing of it. The arm's
-kinematics are called here alone, by `named_arm_joints` and `gripper_place`.
+and after it (`between`); a state that is farther away than a limit says nothing of it.
 """
 
 from bisect import bisect_left, bisect_right
@@ -19,23 +18,13 @@ import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import KinematicsError, PlanningError
 from tap_ros.messages.stamps import header_fields, MAX_GAP, PROOF, Stamp, to_nanoseconds
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import Arm
 from tap_ros.text import listing
 
 PLACE, OPENING = GRIPPER_JOINTS[:3], GRIPPER_JOINTS[3]
 KEPT_NS = 5 * 10**9  # what is older than the newest state by more is forgotten
 MOST = 10_000  # states kept of a joint
 FARTHEST = 100.0  # rad or m; no joint is there
-
-
-def named_arm_joints(positions: Mapping[str, float]) -> list[float] | None:
-    """Return the positions of the arm's joints, in rad; None where there is not one arm."""
-    return ur10e.named_joints(positions)
-
-
-def gripper_place(joints: np.ndarray, mount: ur10e.Mount) -> np.ndarray:
-    """Return where the fingertips are, (..., 3) m, by the arm's joints, (..., J) rad."""
-    return ur10e.gripper_at(joints, mount)
 
 
 def decode_positions(message: Any) -> dict[str, float]:
@@ -65,19 +54,19 @@ def decode_gripper(message: Any, name: str = 'joint_states') -> np.ndarray:
 
 
 def joint_fields(gripper: Iterable[float], stamp: Stamp | int, frame_id: str,
-                 arm: Iterable[float] | None = None) -> dict[str, Any]:
+                 arm: Mapping[str, float] | None = None) -> dict[str, Any]:
     """
     Return the fields of a sensor_msgs/JointState: GRIPPER_JOINTS, then the arm's.
 
     :param gripper: (4,) x, y, z in metres and opening from 0 to 1.
     :param stamp: a Stamp or ns.
     :param frame_id: frame of the position.
-    :param arm: (6,) rad of the UR10e, or None without one.
+    :param arm: the arm's joints, rad by name; None: without one.
     """
     names, positions = [*GRIPPER_JOINTS], [*gripper]
     if arm is not None:
-        names.extend(ur10e.JOINTS)
-        positions.extend(arm)
+        names.extend(arm)
+        positions.extend(arm.values())
     return {'header': header_fields(stamp, frame_id), 'name': names,
             'position': [float(position) for position in positions]}
 
@@ -238,15 +227,15 @@ class GripperHistory:
 
     States may tell its place, as the simulator's do; else it follows from the arm's joints.
 
-    :param mount: where the arm stands.
+    :param arm: Arm, with the Mount where it stands.
     :param prefix: of the names of its joints.
     :param opening: of the gripper where no states of an arm's driver tell it, 0 to 1.
     """
 
-    def __init__(self, mount: ur10e.Mount, prefix: str, opening: float) -> None:
-        self._mount, self._fixed_opening = mount, opening
+    def __init__(self, arm: Arm, prefix: str, opening: float) -> None:
+        self._kind, self._fixed_opening = arm, opening
         self._told, self._opening = JointHistory(PLACE), JointHistory([OPENING])
-        self._arm = JointHistory([prefix + name for name in ur10e.JOINTS])
+        self._arm = JointHistory([prefix + name for name in arm.joints])
 
     @property
     def received(self) -> float:
@@ -286,8 +275,8 @@ class GripperHistory:
         """
         source = self._source
         found = source.at(stamp_ns, max_gap_s)
-        place = found.positions if source is self._told else gripper_place(
-            found.positions, self._mount)
+        place = found.positions if source is self._told else (
+            self._kind.gripper_at(found.positions))
         opening: float | np.ndarray = self._fixed_opening
         try:
             opening, = self._opening.at(stamp_ns, max_gap_s).positions

@@ -21,7 +21,7 @@ from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.mounts import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.spans import assign, in_gaps, Mark, MAX_JITTER_NS, read_spans, Span
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import get_arm, MOST_JOINTS
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
 _LOOKED_AT = 4096  # messages looked at together
@@ -36,7 +36,8 @@ _EMPTY = {
     'command_log': ((0,), np.int64), 'command': ((0,), np.float32),
     'joint_log': ((0,), np.int64), 'joint_stamp': ((0,), np.int64),
     'joint': ((0, 4), np.float32),
-    'arm_log': ((0,), np.int64), 'arm_stamp': ((0,), np.int64), 'arm': ((0, 6), np.float64),
+    'arm_log': ((0,), np.int64), 'arm_stamp': ((0,), np.int64),
+    'arm': ((0, MOST_JOINTS), np.float64),
     'object_log': ((0,), np.int64), 'object_stamp': ((0,), np.int64),
     'object': ((0, 0, 9), np.float64), 'object_names': ((0,), np.int64),
     'goal_object_log': ((0,), np.int64), 'goal_object_stamp': ((0,), np.int64),
@@ -327,7 +328,9 @@ def _grippers(data: dict[str, np.ndarray], clock: _Clock, arm: ArmMount) -> np.n
     rows, found = clock.nearest_rows(data['arm_log'], data['arm_stamp'])
     found &= np.isnan(grippers[:, :3]).all(1)
     if found.any():
-        grippers[found, :3] = ur10e.gripper_at(data['arm'][rows[found]], arm.mount)
+        kind = get_arm(arm.arm)
+        joints = data['arm'][rows[found]]
+        grippers[found, :3] = kind.gripper_at(joints[:, :len(kind.joints)], arm.mount)
         grippers[found & np.isnan(grippers[:, 3]), 3] = arm.opening
     return grippers
 

@@ -27,12 +27,12 @@ from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.messages import decode
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import Mark
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import find_joints, MOST_JOINTS
 from tap_ros.text import escaped
 
 _ENDINGS = ('_log', '_stamp', '_names', '_event', '_index')  # of column names
 _NUMBERS = {'twist': ((3,), np.float32), 'command': ((), np.float32),
-            'joint': ((4,), np.float32), 'arm': ((6,), np.float64)}
+            'joint': ((4,), np.float32), 'arm': ((MOST_JOINTS,), np.float64)}
 # Messages that are no pictures cost time to decode: so many bytes in any file, and so many for
 # each byte of it.
 _FREE_STATES, _STATES_PER_BYTE = 2**24, 64
@@ -357,9 +357,9 @@ class _Decoder:
         if known.keys() & set(GRIPPER_JOINTS):
             self._add('joint', log, [known.get(name, np.nan) for name in GRIPPER_JOINTS],
                       stamp=_stamp(message))
-        arm = None if known.keys() & set(GRIPPER_JOINTS[:3]) else ur10e.named_joints(known)
+        arm = None if known.keys() & set(GRIPPER_JOINTS[:3]) else find_joints(known)
         if arm is not None and np.isfinite(arm).all():
-            self._add('arm', log, arm, stamp=_stamp(message))
+            self._add('arm', log, np.pad(arm, (0, MOST_JOINTS - len(arm))), stamp=_stamp(message))
 
     def _objects(self, column: str, log: int, message: Any) -> None:
         numbers: list[float] = []

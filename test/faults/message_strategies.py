@@ -10,7 +10,6 @@ import re
 
 from fault_world import first_pictures
 from hypothesis import strategies as st
-from sim_bridge.world.robot_description import robot_description
 from tap_ros.contract import (
     GRIPPER_JOINTS,
     MAP_ENCODING,
@@ -21,7 +20,8 @@ from tap_ros.contract import (
     ROBOT_MASK_HAND,
 )
 from tap_ros.images.encodings import ENCODINGS
-from tap_ros.robots.ur10e import JOINTS
+from tap_ros.robots.description import robot_description
+from tap_ros.robots.ur10e import UR10E
 
 MASK = 'sensor_msgs/msg/Image mask'  # what comes after a blank tells strategies apart
 TOPICS = {
@@ -109,15 +109,15 @@ def joint_states():
     likely = st.floats(-3, 3)
     return built(
         'sensor_msgs/msg/JointState',
-        name=st.permutations(JOINTS).map(list) | st.lists(
-            st.sampled_from(GRIPPER_JOINTS + JOINTS) | texts(), max_size=6),
+        name=st.permutations(UR10E.joints).map(list) | st.lists(
+            st.sampled_from(GRIPPER_JOINTS + UR10E.joints) | texts(), max_size=6),
         position=st.lists(likely, min_size=6, max_size=6) | st.lists(
             likely | numbers(), max_size=7))
 
 
 def descriptions():
     """Return robot descriptions: the simulator's, whole or with one word replaced or cut."""
-    whole = robot_description()
+    whole = robot_description(UR10E)
     words = ('', 'mesh', 'sphere', 'world', 'base', 'nan', '1e308', '-1', '0 0 0', '<link/>',
              'shoulder_pan_joint', '&a;', '\x01')
 

@@ -23,7 +23,7 @@ BATCH = 25  # messages between two looks at the nodes
 ROUND = 200  # batches between two good calls to everything
 ANSWER_S = 10.0
 # So that masks and descriptions are used.
-PARAMETERS = {'sim_node': {'look': 'ur10e'}, 'predictor_node': {'robot_mask': 'arm'},
+PARAMETERS = {'sim_node': {'look': 'arm'}, 'predictor_node': {'robot_mask': 'arm'},
               'visual_mpc_node': {'robot_mask': 'arm'}}
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of finding joints, and by them the gripper, at the moment of a picture."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,8 @@ from tap_ros.messages.joints import (
     positions_at,
 )
 from tap_ros.messages.stamps import MAX_GAP, stamp_fields
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import Mount
+from tap_ros.robots.ur10e import UR10E
 
 MS = 10**6
 
@@ -119,18 +121,18 @@ def test_a_position_that_no_joint_has_is_refused(position):
     assert known.missing() == ['a', 'b']
 
 
-MOUNT = ur10e.Mount((0.2, 0.6, -0.05), 0.4, 0.15)
+ARM = replace(UR10E, mount=Mount((0.2, 0.6, -0.05), 0.4, 0.15))
 AT = [-0.1, 0.05, 0.08]
 
 
 def arm_message(angles, stamp_ns, **more):
-    named = {f'left_{name}': angle for name, angle in zip(ur10e.JOINTS, angles)}
+    named = {f'left_{name}': angle for name, angle in zip(UR10E.joints, angles)}
     return joints(stamp_ns, **dict(reversed(named.items())), **more)
 
 
 def test_the_gripper_is_where_the_mounted_arm_holds_it():
-    gripper = GripperHistory(MOUNT, 'left_', 0.25)
-    angles = ur10e.joints_at(AT, MOUNT)
+    gripper = GripperHistory(ARM, 'left_', 0.25)
+    angles = ARM.joints_at(AT)
     assert gripper.received == -np.inf
     assert gripper.take(arm_message(angles, 98 * MS), 1) and gripper.received == 1
     gripper.take(arm_message(angles, 102 * MS), 2)
@@ -146,7 +148,7 @@ def test_the_gripper_is_where_the_mounted_arm_holds_it():
 
 
 def test_a_gripper_that_is_told_counts_and_arm_joints_beside_it_do_not():
-    gripper = GripperHistory(MOUNT, 'left_', 0.25)
+    gripper = GripperHistory(ARM, 'left_', 0.25)
     for stamp, x in ((100, 0.1), (110, 0.3)):
         told = dict(zip(('gripper_x', 'gripper_y', 'gripper_z', 'gripper_opening'),
                         (x, -0.2, 0.05, 10 * x - 1)))
@@ -154,14 +156,14 @@ def test_a_gripper_that_is_told_counts_and_arm_joints_beside_it_do_not():
     found, received = gripper.at(105 * MS, 0.35)
     np.testing.assert_allclose(found, [0.2, -0.2, 0.05, 1], rtol=1e-6)
     assert received == 100
-    unopened = GripperHistory(MOUNT, '', 0.25)
+    unopened = GripperHistory(ARM, '', 0.25)
     unopened.take(joints(100 * MS, gripper_x=0.1, gripper_y=0.2, gripper_z=0.3), 0)
     with pytest.raises(KinematicsError, match='nothing is known of gripper_opening'):
         unopened.at(100 * MS, 0.35)
 
 
 def test_joint_states_of_neither_gripper_nor_arm_are_named():
-    gripper = GripperHistory(MOUNT, 'left_', 0.25)
+    gripper = GripperHistory(ARM, 'left_', 0.25)
     with pytest.raises(PlanningError, match=r'neither gripper_x.* nor left_shoulder_.* has wheel'):
         gripper.take(joints(1, wheel=0.5), 0)
     assert gripper.received == -np.inf

@@ -18,7 +18,7 @@ from tap_ros.nodes.clients import send_goal, wait_for_result
 from tap_ros.nodes.topics import STREAM, to_stamp
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
-from tap_ros.robots import ur10e
+from tap_ros.robots.ur10e import UR10E
 from tap_ros.weights import FORWARD_MODEL
 
 pytestmark = pytest.mark.slow
@@ -39,7 +39,7 @@ class Driver:
         known = dict(zip(message.name, message.position))
         for offset in () if self.silent else self.offsets:
             stamp = to_stamp(to_nanoseconds(message.header.stamp) + offset)
-            arm = JointState(name=ur10e.JOINTS, position=[known[n] for n in ur10e.JOINTS])
+            arm = JointState(name=UR10E.joints, position=[known[n] for n in UR10E.joints])
             finger = JointState(name=['finger_joint'], position=[0.3])  # another driver's
             arm.header.stamp = finger.header.stamp = stamp
             self._publisher.publish(finger)
@@ -59,7 +59,7 @@ def driven(tmp_path_factory):
         try:
             nodes['sim'] = NodeProcess(
                 'sim_node', folder / 'sim.txt', {'lock_step': 'true', 'seed': SEED,
-                                                 'look': 'ur10e'},
+                                                 'look': 'arm'},
                 ['-r joint_states:=arm_driver'])
             nodes['mpc'] = NodeProcess(
                 'visual_mpc_node', folder / 'mpc.txt', {'image_timeout': 4.0})
@@ -93,12 +93,12 @@ def test_six_joints_alone_tell_the_planner_where_the_gripper_is(driven):
     _, reach, twists = driven
     status, result = reach(step_budget=2, seed=5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    sim, mpc = Simulator('push2', 64, 'ur10e'), VisualMPC.load(FORWARD_MODEL)
+    sim, mpc = Simulator('push2', 64, 'arm'), VisualMPC.load(FORWARD_MODEL)
     try:
         seen = sim.reset(SEED)
         goal, memory, actions = mpc.goal(sim.goal().object_pixels), Memory(5), []
         for _ in range(2):
-            place = ur10e.gripper_at(seen.arm_joints)
+            place = UR10E.gripper_at(seen.arm_joints)
             np.testing.assert_allclose(place, seen.gripper[:3], atol=1e-6)
             gripper = np.array([*place, 0], np.float32)
             plan = mpc.plan(Scene(seen.image, gripper, seen.object_pixels), goal, memory)

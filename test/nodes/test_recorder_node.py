@@ -28,7 +28,8 @@ from tap_ros.recording.attachments import read_attachments
 from tap_ros.recording.messages import decode
 from tap_ros.recording.mounts import ArmMount, read_mount
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import Mount
+from tap_ros.robots.ur10e import UR10E
 
 
 def read(folder):
@@ -180,9 +181,9 @@ def test_topics_of_any_type_can_be_recorded_and_where_the_arm_stands(client, rec
     assert kind == 'sensor_msgs/msg/JointState'
     assert message.name == ['a'] and message.position.tolist() == [1.5]
     assert found['/robot_description'][1].data == '<robot/>'
-    stood = ur10e.SIMULATED
+    stood = UR10E.mount
     assert read_mount(tmp_path / 'bag') == ArmMount(
-        ur10e.Mount((0.25, *stood.position[1:]), stood.yaw, stood.tool), 0.5)
+        Mount((0.25, *stood.position[1:]), stood.yaw, stood.tool), 0.5)
 
 
 def test_a_full_disk_is_told_and_the_node_stays_up(client, tmp_path):

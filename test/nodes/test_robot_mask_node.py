@@ -22,7 +22,7 @@ CAMERA = {  # of the simulator with its arm: 0.84 rad from straight down
 
 def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path):
     sim = NodeProcess('sim_node', tmp_path / 'sim.txt',
-                      {'lock_step': 'true', 'seed': 3, 'look': 'ur10e'})
+                      {'lock_step': 'true', 'seed': 3, 'look': 'arm'})
     nodes = []
     try:
         sim.wait_for('ready')

@@ -14,13 +14,13 @@ from tap_ros.messages.joints import decode_gripper
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.robots import ur10e
+from tap_ros.robots.ur10e import UR10E
 
 
 def test_the_world_of_the_arm_tells_where_the_robot_is(tmp_path):
     process = NodeProcess(
         'sim_node', tmp_path / 'log.txt',
-        {'lock_step': 'true', 'seed': 3, 'look': 'ur10e', 'observer': 'true'})
+        {'lock_step': 'true', 'seed': 3, 'look': 'arm', 'observer': 'true'})
     try:
         process.wait_for('ready')
         with Client() as node:
@@ -50,7 +50,7 @@ def test_the_world_of_the_arm_tells_where_the_robot_is(tmp_path):
             assert side.wait(10, next_one).height == 360
             told = joints.wait(10, next_one)
             angles = dict(zip(told.name, told.position, strict=True))
-            gripper = ur10e.gripper_at([angles[name] for name in ur10e.JOINTS])
+            gripper = UR10E.gripper_at([angles[name] for name in UR10E.joints])
             assert np.allclose(gripper, decode_gripper(told)[:3], atol=1e-6)
             assert gripper[0] - before[0] > 0.03
     finally:

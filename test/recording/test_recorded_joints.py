@@ -13,10 +13,11 @@ from tap_ros.recording.messages import encode
 from tap_ros.recording.mounts import ArmMount, FILE_NAME, write_mount
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import write_metadata
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import Mount
+from tap_ros.robots.ur10e import UR10E
 
 FRAMES, PERIOD, FAST = 6, 250_000_000, 4_000_000  # ns: of the camera, of the driver
-STANDS = ArmMount(ur10e.Mount((0.3, 0.5, 0.0), 1.0, 0.17), 0.5)
+STANDS = ArmMount(Mount((0.3, 0.5, 0.0), 1.0, 0.17), 0.5)
 
 
 def place(stamp):
@@ -31,7 +32,7 @@ def header(stamp):
 def bag(path, mount, extra=(), prefix='ur_'):
     """Write a bag of a driver at 250 Hz whose states never have the stamp of a picture."""
     path.mkdir()
-    names = [prefix + name for name in reversed(ur10e.JOINTS)]
+    names = [prefix + name for name in reversed(UR10E.joints)]
     messages = []
     for i in range(FRAMES):
         stamp = 10**9 + i * PERIOD
@@ -39,7 +40,7 @@ def bag(path, mount, extra=(), prefix='ur_'):
             'header': header(stamp), 'height': 8, 'width': 8, 'step': 24, 'encoding': 'rgb8',
             'data': np.full((8, 8, 3), i, np.uint8)}))
     for stamp in range(10**9 - 9_000_000, 10**9 + FRAMES * PERIOD, FAST):
-        angles = ur10e.joints_at(place(stamp), mount)
+        angles = UR10E.joints_at(place(stamp), mount)
         messages.append((stamp + 10, topics.JOINT_STATES, joints(
             stamp, [*names, *extra], [*angles[::-1], *[0.9] * len(extra)])))
         messages.append((stamp + 20, topics.JOINT_STATES, joints(stamp, ['finger'], [0.1])))
@@ -81,14 +82,14 @@ def test_the_gripper_follows_from_the_arms_joints_where_it_stood(tmp_path):
 
 
 def test_without_a_word_the_arm_stood_as_the_simulators(tmp_path):
-    path = bag(tmp_path / 'bag', ur10e.SIMULATED, ['gripper_opening'], prefix='')
+    path = bag(tmp_path / 'bag', UR10E.mount, ['gripper_opening'], prefix='')
     grippers = read(path).grippers
     np.testing.assert_allclose(grippers[:, :3], places(), atol=0.16e-9 * FAST)
     np.testing.assert_array_equal(grippers[:, 3], np.float32(0.9))
 
 
 def test_a_gripper_that_is_told_counts(tmp_path):
-    path = bag(tmp_path / 'bag', ur10e.SIMULATED, ['gripper_x', 'gripper_y', 'gripper_z'])
+    path = bag(tmp_path / 'bag', UR10E.mount, ['gripper_x', 'gripper_y', 'gripper_z'])
     np.testing.assert_allclose(read(path).grippers, [[0.9, 0.9, 0.9, np.nan]] * FRAMES, rtol=1e-6)
 
 
@@ -98,7 +99,7 @@ def test_a_gripper_that_is_told_counts(tmp_path):
     '{"position": [0, 0, NaN], "yaw": 0, "tool": 0, "opening": 0}',
     '{"position": [0, 0, 0], "yaw": "left", "tool": 0, "opening": 0}'])
 def test_a_mount_that_cannot_be_used_is_refused_in_one_line(tmp_path, text):
-    path = bag(tmp_path / 'bag', ur10e.SIMULATED)
+    path = bag(tmp_path / 'bag', UR10E.mount)
     (path / FILE_NAME).write_text(text)
     with pytest.raises(RecordingError, match=FILE_NAME) as told:
         list(iter_episodes(path))

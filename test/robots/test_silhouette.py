@@ -5,11 +5,11 @@
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from sim_bridge.world.robot_description import robot_description
 from sim_bridge.world.studio import Studio
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.robots import ur10e
+from tap_ros.robots.description import robot_description
 from tap_ros.robots.silhouette import Body, draw_mask, Light, View
+from tap_ros.robots.ur10e import UR10E
 from tap_ros.robots.urdf import read_urdf
 
 ARM, HAND = ROBOT_MASK_ARM, ROBOT_MASK_HAND
@@ -42,7 +42,7 @@ def arms():
     seen = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Studio, '_add_shadows', bodies_only)
-        simulator = Simulator('push2', 64, 'ur10e')
+        simulator = Simulator('push2', 64, 'arm')
         for seed in range(6):
             observation = simulator.reset(seed)
             seen.append((observation.arm_joints, observation.robot_mask))
@@ -57,10 +57,10 @@ def arms():
 @pytest.mark.parametrize('dilation, overlap, free', [(0, 0.75, 0.96), (1, 0.55, 0.9)])
 def test_the_arm_is_covered_and_the_rest_is_free(arms, dilation, overlap, free):
     view, seen = arms
-    robot = read_urdf(robot_description(), 'own')
+    robot = read_urdf(robot_description(UR10E), 'own')
     overlaps, left = [], []
     for joints, true in seen:
-        poses = robot.poses(dict(zip(ur10e.JOINTS, joints)))
+        poses = robot.poses(dict(zip(UR10E.joints, joints)))
         bodies = [Body(s.corners @ poses[s.link][:3, :3].T + poses[s.link][:3, 3], ARM)
                   for s in robot.shapes]
         mask = draw_mask(bodies, view, dilation)

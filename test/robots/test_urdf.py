@@ -5,9 +5,10 @@
 import mujoco
 import numpy as np
 import pytest
-from sim_bridge.world.robot_description import robot_description, TIP_FRAME
 from tap_ros.errors import ConfigError
-from tap_ros.robots import ur10e
+from tap_ros.robots.arm import Mount, TIP_FRAME
+from tap_ros.robots.description import robot_description
+from tap_ros.robots.ur10e import UR10E
 from tap_ros.robots.urdf import read_urdf
 
 ARM = """<robot name="r">
@@ -52,11 +53,11 @@ def test_links_are_where_mujoco_has_them():
 
 
 def test_the_own_arm_stands_where_it_is_mounted():
-    mount = ur10e.Mount((0.3, -0.2, 0.1), 0.8, 0.25)
-    robot = read_urdf(robot_description(mount, 0.05), 'own')
+    mount = Mount((0.3, -0.2, 0.1), 0.8, 0.25)
+    robot = read_urdf(robot_description(UR10E, mount, 0.05), 'own')
     joints = np.random.default_rng(0).uniform(-3, 3, 6)
-    tip = robot.poses(dict(zip(ur10e.JOINTS, joints)))[TIP_FRAME]
-    np.testing.assert_allclose(tip[:3, 3], ur10e.gripper_at(joints, mount))
+    tip = robot.poses(dict(zip(UR10E.joints, joints)))[TIP_FRAME]
+    np.testing.assert_allclose(tip[:3, 3], UR10E.gripper_at(joints, mount))
     hand, = [shape for shape in robot.shapes if shape.link == TIP_FRAME]
     assert np.allclose([hand.corners[:, 2].min(), hand.corners[:, 2].max()], [-0.25, 0])
     assert robot.held_by('wrist_3_link') == {'wrist_3_link', TIP_FRAME}

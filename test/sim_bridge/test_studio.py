@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The looks of the world: pictures, robot masks and the URDF, beside unchanged physics."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import mujoco
@@ -13,12 +14,11 @@ from sim_bridge.tasks.expert import run_episode
 from sim_bridge.world.appearance import Appearance, choose_appearance, USUAL
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.looks import LOOKS, OBSERVER
-from sim_bridge.world.robot_description import robot_description, TIP_FRAME
 from sim_bridge.world.studio import Studio
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import KinematicsError, SceneError
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.robots import ur10e
+from tap_ros.robots.ur10e import UR10E
 
 TASKS = ('push2', 'pick_place')
 ACTIONS = np.array([[0.06, -0.03, -0.05, 1], [-0.08, 0.05, 0, 1], [0, 0.08, 0.1, 0]])
@@ -62,32 +62,32 @@ def test_pictures_differ_from_those_without_the_robot_in_the_mask_alone(simulato
 @pytest.mark.parametrize('task', TASKS)
 def test_the_mask_tells_hand_and_arm_apart(simulators, task):
     hand = simulators[task, 'hand'].reset(5)
-    whole = simulators[task, 'ur10e'].reset(5)
+    whole = simulators[task, 'arm'].reset(5)
     assert set(np.unique(hand.robot_mask)) == {ROBOT_MASK_FREE, ROBOT_MASK_HAND}
     assert set(np.unique(whole.robot_mask)) == {
         ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM}
-    for observation, look in ((hand, 'hand'), (whole, 'ur10e')):
+    for observation, look in ((hand, 'hand'), (whole, 'arm')):
         camera = simulators[task, look].camera
         u, v = np.rint(camera.project(observation.gripper[:3] + [0, 0, 0.03])).astype(int)
         assert observation.robot_mask[v, u] == ROBOT_MASK_HAND
 
 
-@pytest.mark.parametrize('look', ['hand', 'ur10e'])
+@pytest.mark.parametrize('look', ['hand', 'arm'])
 def test_the_joints_that_are_told_carry_the_gripper(simulators, look):
     simulator = simulators['push2', look]
     observation = simulator.reset(1)
     for action in (*ACTIONS, np.zeros(4)):
         assert np.allclose(
-            ur10e.gripper_at(observation.arm_joints), observation.gripper[:3], atol=1e-6)
+            UR10E.gripper_at(observation.arm_joints), observation.gripper[:3], atol=1e-6)
         observation = simulator.step(action)
 
 
-@pytest.mark.parametrize('look', ['hand', 'ur10e'])
+@pytest.mark.parametrize('look', ['hand', 'arm'])
 def test_what_the_arm_cannot_do_moves_nothing(simulators, monkeypatch, look):
     simulator = simulators['push2', look]
     simulator.reset(1)
     before, target = simulator.state(), simulator.target.copy()
-    monkeypatch.setattr(ur10e, 'SPEED_LIMITS', ur10e.SPEED_LIMITS / 10)
+    monkeypatch.setattr(simulator, 'arm', replace(UR10E, speeds=UR10E.speeds / 10))
     for attempt in (simulator.check_action, simulator.step):
         with pytest.raises(KinematicsError, match='_joint'):
             attempt(ACTIONS[1])
@@ -143,13 +143,22 @@ def test_the_camera_projects_as_mujoco_does(camera):
     assert np.allclose(camera.project(np.column_stack([places, np.zeros(10)])), pixels)
 
 
+@pytest.mark.parametrize('camera', [OBSERVER, Camera(64, 64)])
+def test_a_camera_sees_in_its_optical_frame_what_it_projects(camera):
+    points = np.random.default_rng(1).uniform(-0.2, 0.2, (5, 3))
+    x, y, z = np.linalg.inv(camera.pose)[:3] @ np.column_stack([points, np.ones(5)]).T
+    pixels = np.column_stack([x / z, y / z]) * camera.K[0, 0] + camera.K[:2, 2]
+    assert (z > 0).all()
+    np.testing.assert_allclose(pixels, camera.project(points))
+
+
 def test_rays_above_the_horizon_meet_no_table():
     camera = Camera(64, 64, tilt=np.pi / 2)
     assert not np.isfinite(camera.on_table([[32.0, 5.0]])).all()
 
 
 def test_the_view_from_the_side_shows_the_scene(simulators):
-    simulator = simulators['push2', 'ur10e']
+    simulator = simulators['push2', 'arm']
     simulator.reset(1)
     before = simulator.observer_picture()
     assert before.shape == (360, 480, 3)
@@ -164,8 +173,8 @@ def test_the_view_from_the_side_shows_the_scene(simulators):
 def test_shadows_fall_onto_the_table_only(simulators):
     simulator = simulators['push2', 'hand']
     simulator.reset(2)
-    camera = LOOKS['ur10e'].camera(False, 64, 64)  # what lies behind the table is in view
-    studio = Studio(camera, arm=False)
+    camera = LOOKS['arm'].camera(False, 64, 64)  # what lies behind the table is in view
+    studio = Studio(camera, UR10E, links=False)
     studio.use(simulator.model)
     simulator.data.qpos[:3] = 0.0, 0.45, 0.1  # beside the far edge
     mujoco.mj_forward(simulator.model, simulator.data)
@@ -180,21 +189,6 @@ def test_shadows_fall_onto_the_table_only(simulators):
     studio.close()
 
 
-def test_the_urdf_says_what_the_kinematics_say():
-    spec = mujoco.MjSpec.from_string(robot_description())
-    spec.compiler.fusestatic = False
-    for body in spec.bodies[1:]:
-        body.mass, body.inertia, body.explicitinertial = 1, [1, 1, 1], True
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    assert [model.joint(i).name for i in range(model.njnt)] == list(ur10e.JOINTS)
-    assert np.allclose(model.jnt_range[:, 1], ur10e.JOINT_LIMITS)
-    for joints in np.random.default_rng(0).uniform(-3, 3, (20, 6)):
-        data.qpos[:] = joints
-        mujoco.mj_kinematics(model, data)
-        assert np.allclose(data.body(TIP_FRAME).xpos, ur10e.gripper_at(joints))
-
-
 def test_appearances_are_drawn_from_the_seed():
     assert choose_appearance('usual', 7) == USUAL
     assert choose_appearance('random', 7) == choose_appearance('random', 7)
@@ -203,9 +197,9 @@ def test_appearances_are_drawn_from_the_seed():
 
 def test_a_recording_carries_the_masks_of_its_pictures(tmp_path):
     collect(tmp_path / 'bag', CollectConfig(
-        task='pick_place', episodes=1, look='ur10e', appearance='random'), progress=False)
+        task='pick_place', episodes=1, look='arm', appearance='random'), progress=False)
     episode, = iter_episodes(tmp_path / 'bag')
-    simulator = Simulator('pick_place', 64, 'ur10e', 'random')
+    simulator = Simulator('pick_place', 64, 'arm', 'random')
     observations, *_ = run_episode(simulator, 0)
     assert np.array_equal(episode.frames, [o.image for o in observations])
     assert np.array_equal(episode.robot_masks, [o.robot_mask for o in observations])

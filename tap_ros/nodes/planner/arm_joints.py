@@ -1,12 +1,14 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of nodes that say where a UR10e stands whose joint states have its joints alone."""
+"""Parameters of nodes that say which arm it is, and where it stands."""
 
+from dataclasses import replace
 import math
 from typing import TYPE_CHECKING
 
 from tap_ros.contract import GRIPPER_JOINTS
-from tap_ros.robots import ur10e
+from tap_ros.plugins import names
+from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
 
 if TYPE_CHECKING:
     from tap_ros.nodes.parameters import Parameters
@@ -14,14 +16,21 @@ if TYPE_CHECKING:
 PLACE, OPENING = GRIPPER_JOINTS[:3], GRIPPER_JOINTS[3]
 
 
-def declare_mount(parameters: 'Parameters') -> None:
-    """Declare where an arm stands whose joint states do not tell where the gripper is."""
-    default = ur10e.SIMULATED
+def declare_arm(parameters: 'Parameters') -> None:
+    """Declare which arm it is whose joint states do not tell where the gripper is, and where."""
+    arm = parameters.declare(
+        'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
+        'joints and not gripper_x.', choices=names('tap_ros.arms'))
+    declare_mount(parameters, arm)
+
+
+def declare_mount(parameters: 'Parameters', arm: str) -> None:
+    """Declare where an arm stands; by default at the simulated table."""
+    default = get_arm(arm).mount
     for axis, value in zip('xyz', default.position):
         parameters.declare(
-            f'mount_{axis}', value, f'{axis} of the base of a UR10e in the world, m; of its '
-            'controller\'s frame "base". Heeded where joint_states has the six joints of the arm '
-            'and not gripper_x.', low=-10.0, high=10.0)
+            f'mount_{axis}', value, f'{axis} of the base of the arm in the world, m; of its '
+            'controller\'s frame "base".', low=-10.0, high=10.0)
     parameters.declare('mount_turn', default.yaw,
                        'Turn of that frame about the vertical, rad; the base stands upright.',
                        low=-2 * math.pi, high=2 * math.pi)
@@ -36,7 +45,12 @@ def declare_opening(parameters: 'Parameters') -> None:
                        'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
 
 
-def declared_mount(parameters: 'Parameters') -> ur10e.Mount:
+def declared_arm(parameters: 'Parameters') -> Arm:
+    """Return the Arm that declare_arm's parameters say, which stands where they say."""
+    return replace(get_arm(parameters['arm']), mount=declared_mount(parameters))
+
+
+def declared_mount(parameters: 'Parameters') -> Mount:
     """Return the Mount that the parameters say."""
     x, y, z = (parameters[f'mount_{axis}'] for axis in 'xyz')
-    return ur10e.Mount((x, y, z), parameters['mount_turn'], parameters['tool_length'])
+    return Mount((x, y, z), parameters['mount_turn'], parameters['tool_length'])

@@ -21,7 +21,7 @@ from tap_ros.messages.objects import decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.camera_topic import camera_topic
 from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
-from tap_ros.nodes.planner.arm_joints import declared_mount
+from tap_ros.nodes.planner.arm_joints import declared_arm
 from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.subscriptions import subscribe
@@ -67,7 +67,7 @@ class PlannerInputs:
         self._tell = on_message
         self.sensors = Observations(*self._types)
         self._gripper = GripperHistory(
-            declared_mount(params), params['joint_prefix'], params['fixed_opening'])
+            declared_arm(params), params['joint_prefix'], params['fixed_opening'])
         self._useless = ''  # why the joint states cannot be used
         self.begin(0.0)
         self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,

@@ -17,7 +17,7 @@ from tap_ros.errors import ConfigError
 from tap_ros.nodes.camera_topic import declare_transport
 from tap_ros.nodes.lifecycle import declare_autostart
 from tap_ros.nodes.parameters import check_device, declare_device, Parameters
-from tap_ros.nodes.planner.arm_joints import declare_mount, declare_opening
+from tap_ros.nodes.planner.arm_joints import declare_arm, declare_opening
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
@@ -96,7 +96,7 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('max_age', 3.0,
                        'Seconds; what was received longer ago is not acted upon, so a plan that '
                        'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
-    declare_mount(parameters)
+    declare_arm(parameters)
     declare_opening(parameters)
     parameters.declare('joint_prefix', '',
                        "What the names of the arm's joints begin with, before "

@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError, RecordingError, StorageError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.planner.arm_joints import declare_mount, declare_opening, declared_mount
+from tap_ros.nodes.planner.arm_joints import declare_arm, declare_opening, declared_mount
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import AdaptiveSubscription
 from tap_ros.nodes.topics import SERVICE_QOS
@@ -105,7 +105,8 @@ class RecorderNode(Node):
 
     def _write_mount(self) -> None:
         """Say where the arm stands, unless that is where the reader takes it to stand anyway."""
-        arm = ArmMount(declared_mount(self.params), self.params['fixed_opening'])
+        arm = ArmMount(
+            declared_mount(self.params), self.params['fixed_opening'], self.params['arm'])
         if self._writer is not None and arm != ArmMount():
             try:
                 write_mount(self._writer.folder, arm)
@@ -270,7 +271,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('topics', list(TYPES), 'Topics to record.')
     parameters.declare('compression', 'zstd', 'Compression of chunks.',
                        choices=['zstd', 'lz4', 'none'])
-    declare_mount(parameters)
+    declare_arm(parameters)
     declare_opening(parameters)
     parameters.declare('record_on_start', True,
                        'Record from the start; else from the call of recorder/record on.')

@@ -9,6 +9,9 @@ import numpy as np
 from tap_ros.errors import ConfigError, KinematicsError
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.planner.arm_joints import declare_mount, declared_mount
+from tap_ros.plugins import names
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
+from tap_ros.robots.description import robot_description
 from tap_ros.robots.silhouette import Light
 from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
 from tap_ros.text import escaped
@@ -16,7 +19,6 @@ from tap_ros.text import escaped
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-OWN = 'ur10e'  # the arm of this package
 PLACES = ('parameters', 'tf')
 
 
@@ -24,16 +26,16 @@ def declare_parameters(node: 'Node') -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare('urdf', '',
-                       'Shape of the robot: a URDF file; ur10e: the arm of this package, at '
+                       'Shape of the robot: a URDF file; the name of an arm: that arm, at '
                        'mount_x and so on; empty: the topic robot_description.')
     parameters.declare('joint_prefix', '',
                        'What names in joint_states begin with, before those of the robot.')
     parameters.declare('hand_link', '',
                        'Link that is the hand, with all that it carries; empty: there is none, or '
-                       'with ur10e its own.')
+                       'with a named arm its own.')
     parameters.declare('hand_radius', 0.06,
-                       'With ur10e: radius of a cylinder around the hand, from the flange to the '
-                       'fingertips, m.', low=0.001, high=1.0)
+                       'With a named arm: radius of a cylinder around the hand, from the flange '
+                       'to the fingertips, m.', low=0.001, high=1.0)
     parameters.declare('camera_pose', 'parameters',
                        'Where the camera is: as camera_x and so on say, or tf.', choices=PLACES)
     for axis in 'xyz':
@@ -63,7 +65,8 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('max_silence', 0.35,
                        'Seconds; a picture without joint states nearer to it than this gets no '
                        'mask.', low=0.05, high=60.0, read_only=False)
-    declare_mount(parameters)
+    named = parameters['urdf'] in names('tap_ros.arms')
+    declare_mount(parameters, parameters['urdf'] if named else DEFAULT_ARM)
     return parameters
 
 
@@ -76,15 +79,16 @@ def named_robot(parameters: Parameters) -> Robot | None:
     urdf = parameters['urdf']
     if not urdf:
         return None
-    if urdf == OWN:
-        from sim_bridge.world.robot_description import robot_description  # brings mujoco
-        text = robot_description(declared_mount(parameters), parameters['hand_radius'])
-        return read_urdf(text, OWN)
+    if urdf in names('tap_ros.arms'):
+        text = robot_description(
+            get_arm(urdf), declared_mount(parameters), parameters['hand_radius'])
+        return read_urdf(text, urdf)
     path = Path(urdf)
     try:
         if not path.is_file() or path.stat().st_size > MOST_CHARACTERS:
             raise ConfigError(f'parameter urdf: {escaped(urdf)} is no file of at most '
-                              f'{MOST_CHARACTERS} bytes; expected a URDF, or {OWN}')
+                              f'{MOST_CHARACTERS} bytes; expected a URDF, or '
+                              f'one of {", ".join(names("tap_ros.arms"))}')
         return read_urdf(path.read_text('utf-8', 'replace'), escaped(urdf))
     except (OSError, ValueError) as error:
         raise ConfigError(f'parameter urdf: {escaped(urdf)}: {escaped(error)}') from error
@@ -93,8 +97,7 @@ def named_robot(parameters: Parameters) -> Robot | None:
 def hand_link(parameters: Parameters) -> str:
     """Return the link that is the hand, or an empty string."""
     from_parameter = parameters['hand_link']
-    if not from_parameter and parameters['urdf'] == OWN:
-        from sim_bridge.world.robot_description import TIP_FRAME
+    if not from_parameter and parameters['urdf'] in names('tap_ros.arms'):
         return TIP_FRAME
     return from_parameter
 

@@ -36,6 +36,7 @@ from tap_ros.recording.formats.lerobot import (
 )
 from tap_ros.recording.reading import reading_of
 from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.robots.arm import DEFAULT_ARM
 from tap_ros.text import escaped
 from tqdm import tqdm
 
@@ -247,7 +248,7 @@ def _write_meta(folder: Path, features: dict[str, Any], tasks: dict[str, int],
     import pyarrow
     from pyarrow import parquet
     _write_json(folder / INFO, {
-        'codebase_version': 'v3.0', 'robot_type': 'ur10e', 'fps': fps,
+        'codebase_version': 'v3.0', 'robot_type': DEFAULT_ARM, 'fps': fps,
         'total_episodes': len(rows), 'total_frames': rows[-1]['dataset_to_index'],
         'total_tasks': len(tasks), 'chunks_size': FILES_PER_CHUNK, 'data_files_size_in_mb': 100,
         'video_files_size_in_mb': 200, 'splits': {'train': f'0:{len(rows)}'}, 'data_path': DATA,

@@ -1,0 +1,162 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of every arm: kinematics, limits, the pictures and the mask; and an arm that is added."""
+
+from dataclasses import replace
+from itertools import product
+
+import mujoco
+import numpy as np
+import pytest
+from sim_bridge.simulator import Simulator
+from sim_bridge.world.transforms import arm_transforms, fixed_arm_transforms
+from tap_ros import plugins
+from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE
+from tap_ros.errors import ConfigError, KinematicsError
+from tap_ros.robots.arm import find_joints, get_arm, Mount, TIP_FRAME
+from tap_ros.robots.description import robot_description
+from tap_ros.robots.silhouette import Body, draw_mask, View
+from tap_ros.robots.ur10e import inverse, UR10E
+from tap_ros.robots.urdf import read_urdf
+
+ARMS = [get_arm(name) for name in plugins.names('tap_ros.arms')]
+each_arm = pytest.mark.parametrize('arm', ARMS, ids=lambda arm: arm.name)
+
+
+def places(arm, number, seed=0):
+    """Draw places of the gripper, the corners of what the arm reaches first."""
+    corners = np.array(list(product(*zip(arm.low, arm.high, strict=True))))
+    rng = np.random.default_rng(seed)
+    return np.concatenate([corners, rng.uniform(arm.low, arm.high, (number, 3))])
+
+
+@each_arm
+def test_the_hand_points_down_wherever_the_gripper_may_be(arm):
+    joints = np.array([arm.joints_at(place) for place in places(arm, 50)])
+    np.testing.assert_allclose(arm.gripper_at(joints), places(arm, 50), atol=1e-9)
+    flange = arm.mount.pose @ arm.forward(joints)
+    assert np.allclose(flange[:, :3, :3], np.diag([1, -1, -1]), atol=1e-9)
+    assert (joints >= arm.limits[:, 0]).all() and (joints <= arm.limits[:, 1]).all()
+
+
+@each_arm
+def test_every_command_within_the_limits_is_within_the_joint_speeds(arm):
+    signs = np.array(list(product((-1, 0, 1), repeat=3)))
+    for place in places(arm, 20, seed=4):
+        before = arm.joints_at(place)
+        for sign in signs:
+            after = np.clip(place + sign * arm.action_limit, arm.low, arm.high)
+            arm.check_motion(before, arm.joints_at(after), CONTROL_PERIOD)
+
+
+@each_arm
+def test_urdf_transforms_and_kinematics_agree(arm):
+    spec = mujoco.MjSpec.from_string(robot_description(arm))
+    spec.compiler.fusestatic = False
+    for body in spec.bodies[1:]:
+        body.mass, body.inertia, body.explicitinertial = 1, [1, 1, 1], True
+    model = spec.compile()
+    data, robot = mujoco.MjData(model), read_urdf(robot_description(arm), 'own')
+    assert [model.joint(i).name for i in range(model.njnt)] == list(arm.joints)
+    assert np.allclose(model.jnt_range, arm.limits)
+    for joints in np.random.default_rng(0).uniform(-3, 3, (5, len(arm.joints))):
+        data.qpos[:] = joints
+        mujoco.mj_kinematics(model, data)
+        assert np.allclose(data.body(TIP_FRAME).xpos, arm.gripper_at(joints))
+        poses = {'world': np.eye(4)}
+        base, tip = fixed_arm_transforms(arm)
+        for one in (base, *arm_transforms(arm, joints), tip):
+            poses[one.child] = poses[one.parent] @ one.pose
+        wanted = robot.poses(dict(zip(arm.joints, joints)))
+        assert set(poses) == set(wanted) == {'world', *arm.links, TIP_FRAME}
+        for name, pose in poses.items():
+            np.testing.assert_allclose(pose, wanted[name], atol=1e-12, err_msg=name)
+
+
+def seen_and_drawn(name):
+    """Return the masks of the simulator, and those that the URDF and the joints tell."""
+    simulator, arm = Simulator('push2', 64, 'arm', arm=name), get_arm(name)
+    robot = read_urdf(robot_description(arm), 'own')
+    seen = [simulator.reset(seed) for seed in range(3)]
+    view = View(simulator.camera_matrix, (64, 64), simulator.camera_pose)
+    drawn = []
+    for one in seen:
+        poses = robot.poses(dict(zip(arm.joints, one.arm_joints)))
+        drawn.append(draw_mask([
+            Body(s.corners @ poses[s.link][:3, :3].T + poses[s.link][:3, 3], ROBOT_MASK_ARM)
+            for s in robot.shapes], view, 1))
+    simulator.close()
+    return [one.robot_mask for one in seen], drawn
+
+
+def test_another_package_adds_an_arm_in_a_few_lines(monkeypatch):
+    taller = replace(UR10E, name='taller', mount=replace(UR10E.mount, position=(0.0, 0.7, 0.1)))
+    monkeypatch.setattr(plugins, 'taller', taller, raising=False)
+    monkeypatch.setitem(plugins.BUILT_IN['tap_ros.arms'], 'taller', 'tap_ros.plugins:taller')
+    masks = {name: seen_and_drawn(name) for name in ('panda', 'taller', 'ur10e')}
+    for name, (seen, drawn) in masks.items():
+        for true, mask in zip(seen, drawn):
+            assert (true == ROBOT_MASK_ARM).mean() > 0.02, name
+            # But for shadows, which the mask of the URDF was not asked for.
+            covered = (mask == ROBOT_MASK_ARM)[true == ROBOT_MASK_ARM].mean()
+            assert covered > 0.5 and (mask == ROBOT_MASK_FREE).mean() > 0.6, (name, covered)
+    assert (masks['taller'][0][0] != masks['ur10e'][0][0]).any()
+    with pytest.raises(ConfigError, match="did you mean 'panda'"):
+        Simulator(arm='pandas')
+
+
+def test_an_arm_limits_what_the_gripper_does_and_which_scenes_are_drawn():
+    simulator, arm = Simulator('push2', arm='panda'), get_arm('panda')
+    for seed in range(5):
+        simulator.reset(seed)
+        for poses in (simulator.scene.start_poses, simulator.scene.goal_poses):
+            assert (np.abs(poses[:, :2]) <= arm.high[:2]).all()
+    for _ in range(10):
+        gripper = simulator.step([0, 0.08, 0.15, 0]).gripper
+    np.testing.assert_allclose(gripper[1:3], arm.high[1:], atol=0.005)
+    simulator.close()
+
+
+def test_the_solution_of_any_pose_leads_there():
+    solved = 0
+    for joints in np.random.default_rng(1).uniform(-np.pi, np.pi, (100, 6)):
+        pose = UR10E.forward(joints)
+        try:
+            found = inverse(pose)
+        except KinematicsError:
+            continue
+        solved += 1
+        assert np.allclose(UR10E.forward(found), pose, atol=1e-9)
+    assert solved > 50
+
+
+@each_arm
+def test_the_mount_moves_the_gripper_with_it(arm):
+    joints, (x, y, z) = arm.joints_at((0.1, -0.1, 0.05)), arm.mount.position
+    moved = Mount((x + 1, y - 2, z + 0.5), arm.mount.yaw, arm.mount.tool + 0.1)
+    assert np.allclose(arm.gripper_at(joints, moved), [1.1, -2.1, 0.45])
+    assert np.allclose(arm.joints_at((1.1, -2.1, 0.45), moved), joints)
+
+
+@each_arm
+def test_out_of_reach_and_too_fast_is_refused_with_the_reason(arm):
+    for place in ((0, -0.9, 0.1), (0, 0.6, -0.5), (0, 0, 1.5)):
+        with pytest.raises(KinematicsError, match=r'cannot reach .* m|of its limit'):
+            arm.joints_at(place)
+    for joint, name in enumerate(arm.joints):
+        moved = np.zeros(len(arm.joints))
+        moved[joint] = arm.speeds[joint] * CONTROL_PERIOD
+        arm.check_motion(np.zeros(len(moved)), 0.99 * moved, CONTROL_PERIOD)
+        with pytest.raises(KinematicsError, match=name):
+            arm.check_motion(np.zeros(len(moved)), 1.01 * moved, CONTROL_PERIOD)
+    across = np.pi - 0.04
+    arm.check_motion(np.full(len(moved), across), np.full(len(moved), -across), CONTROL_PERIOD)
+
+
+@each_arm
+def test_joints_are_found_whatever_their_names_begin_with(arm):
+    named = {f'left_{name}': float(i) for i, name in enumerate(arm.joints)}
+    assert find_joints(dict(reversed(named.items()))) == list(range(len(arm.joints)))
+    assert find_joints(named | {f'right_{name}': 0.0 for name in arm.joints}) is None
+    named.popitem()
+    assert find_joints(named) is None
