@@ -49,12 +49,10 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                 'tap_ros.nodes.explorer.command'),
     'bench': ('measure speed; without a name, all of it', {
         'collect': ('speed of collecting', 'experiments.bench.collect'),
-        'engine': ('what a task costs beside its own work', 'experiments.bench.engine'),
         'recording': ('speed of reading recordings', 'experiments.bench.recording'),
         'training': ('speed of training the predictor', 'experiments.bench.training'),
         'planning': ('time of a plan', 'experiments.bench.planning'),
         'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
-        'growth': ('how times grow with the work, as curves', 'experiments.bench.growth'),
     }),
     'hub': ('share trained weights on the Hugging Face Hub', {
         'push': ('upload weights with their model card', 'tap_ros.hub.push_command'),

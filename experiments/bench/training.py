@@ -4,8 +4,7 @@
 Benchmark of training: what each method costs, and what makes it faster than the first row.
 
 A CPU second is one of one core, all threads of the process together: what else the machine does
-matters little. The share is of the rate of a large matrix product in the precision of the
-training, measured in the same run.
+matters little.
 """
 
 from dataclasses import dataclass, replace
@@ -14,13 +13,11 @@ import tempfile
 import time
 from typing import Annotated
 
-from experiments.bench.speed import matrix_rate, matrix_side
 from tap_ros.options import Bags, Flag
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.training.devices import pick_device, pick_precision
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 from tyro import conf
 
 METHODS = ('genmin-wo-gan', 'genmin', 'genmin-vae', 'genmin-vae-gan')
@@ -77,14 +74,11 @@ def run(args):
     device = pick_device(args.device)
     torch.set_num_threads(args.threads or len(os.sched_getaffinity(0)))
     chosen = pick_precision('auto', device)
-    peaks = {name: matrix_rate(device, getattr(torch, name)) for name in {'float32', chosen}}
     print(f'batch {args.batch_size}, base width {args.base_width}, new pixels, {device.type}'
           + (f', {torch.get_num_threads()} threads' if device.type == 'cpu' else '')
-          + f'; auto is {chosen}; peak: ' + ', '.join(
-              f'{peak / 1e12:.2f} T operations/s in {name}' for name, peak in peaks.items())
-          + f', a product of {matrix_side(device)}')
+          + f'; auto is {chosen}')
     print(f'{"method":<16}{"decoder":<16}{"precision":<10}{"samples/s":>10}'
-          f'{"samples/CPU s":>15}{"ratio":>7}{"G operations a sample":>23}{"share of peak":>15}')
+          f'{"samples/CPU s":>15}{"ratio":>7}')
     first = None
     for row in (*LADDER, *({'method': method} for method in args.methods)):
         with tempfile.TemporaryDirectory() as folder:
@@ -94,13 +88,11 @@ def run(args):
                 batch_size=args.batch_size, device=args.device, threads=args.threads,
                 compile=args.compile, save_every=10 ** 9, **row)
             cost = time_step(config, args.steps)
-            operations = count_operations(config) / args.batch_size
         rate, efficiency = (args.batch_size / each for each in (cost.seconds, cost.cpu_seconds))
         first = first or efficiency
         precision = pick_precision(config.precision, device)
         print(f'{config.method:<16}{config.decoder + " + skips" * config.skips:<16}'
-              f'{precision:<10}{rate:>10.0f}{efficiency:>15.0f}{efficiency / first:>7.2f}'
-              f'{operations / 1e9:>23.2f}{rate * operations / peaks[precision]:>15.0%}',
+              f'{precision:<10}{rate:>10.0f}{efficiency:>15.0f}{efficiency / first:>7.2f}',
               flush=True)
 
 
@@ -120,19 +112,3 @@ def time_step(config, steps):
     # A point of the curves waits for the GPU.
     train(replace(config, log_every=steps), stop_at=2 * steps, progress=False, after_step=note)
     return Cost(*((end - begin) / steps for begin, end in zip(times[steps], times[2 * steps])))
-
-
-def count_operations(config):
-    """
-    Count the floating-point operations of a step: of convolutions and matrix products.
-
-    :param config: TrainingConfig.
-    :return: operations; a product and a sum are two.
-    """
-    counts = []
-    for steps in (1, 2):  # the difference is one step without what surrounds it
-        with tempfile.TemporaryDirectory() as folder, FlopCounterMode(display=False) as counter:
-            train(replace(config, out=folder, compile=False, precision='float32'),  # without trial
-                  stop_at=steps, progress=False)
-        counts.append(counter.get_total_flops())
-    return counts[1] - counts[0]

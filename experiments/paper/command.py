@@ -35,7 +35,7 @@ class Options:
     :param only: only runs whose names fit, such as "grasp-forward-*".
     :param list: show the runs, how far they are and their scores; do nothing.
     :param collect: make the recordings only.
-    :param results_only: only write the page and its data from the runs that are done.
+    :param results_only: only write the data and figures of the runs that are done.
     :param limit: stop after so many; the next call goes on.
     :param seeds: of the trainings; none: 0, and 0 1 2 of the main rows.
     :param episodes: collect so many of each task; 0: as the scale says.
@@ -139,16 +139,16 @@ def _scores(result):
 
 
 def _write_results(places, pictures):
-    """Write the page and its data."""
+    """Write the data and figures."""
     from experiments.paper.results import write_results
     write_results(places.results, runs=places.runs, recordings=places.recordings,
                   pictures=pictures)
 
 
 def _try_results(places, pictures):
-    """Write the page, but let the runs go on if that fails."""
+    """Write the data and figures, but let the runs go on if that fails."""
     try:
         _write_results(places, pictures)
     except Exception as error:
-        print(f'{places.results}: the page could not be written: {error!r}; try again with '
+        print(f'{places.results}: the results could not be written: {error!r}; try again with '
               '--results-only')

@@ -1,24 +1,16 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The plots: forward scatter (Fig. 4), gains over fix, bottleneck curve, match-steps."""
+"""The plots: forward scatter (Fig. 4), and bottlenecks over when they come."""
 
 import io
-from textwrap import fill
 
 from experiments.paper.names import COPIES, method_order, short_name, variant_of
-from experiments.paper.published import (
-    BOTTLENECK_2PX,
-    FORWARD_GRASP,
-    GAINS,
-    TIMED_TITLES,
-    TITLES,
-)
-from experiments.paper.rows import find, lower_hull, select
+from experiments.paper.published import FORWARD_GRASP, TIMED_TITLES, TITLES
+from experiments.paper.rows import lower_hull, select
 from experiments.paper.runs import OURS
 from matplotlib.figure import Figure
 import numpy as np
 from tap_ros.contract import EPISODE_FRAMES
-from tap_ros.evaluation.bottleneck import THRESHOLDS
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
 COLOURS = {'copy': '#8c8c8c', 'fix': '#0072b2', 'min': '#e69f00', 'genmin': '#d55e00',
@@ -153,57 +145,6 @@ def _scatter(axis, points, frames):
     axis.grid(color='#f0f0f0')
 
 
-def bottleneck_curve(rows, task='push2', new_pixels=False):
-    """
-    Draw the bottleneck frequency over the threshold, copying beside it (appendix E).
-
-    On the left as in the paper, on the right without predictions that leave out an object.
-
-    :param rows: of rows.as_frame, of one scale.
-    :param task: whose.
-    :param new_pixels: which variant; the paper's curve is of the one without.
-    :return: bytes of a PNG, or None without such rows.
-    """
-    own = select(rows, task, 'bidirectional', new_pixels)
-    methods = sorted((name for name in own['method'][own['metric'] == 'bottleneck_frequency_0px']
-                      if name in COPIES or variant_of(name) in ('', OURS)), key=method_order)
-    if not set(methods) - set(COPIES):
-        return None
-    figure, axes = new_figure(4.2, 2, sharey=True)
-    styles = _line_styles(methods)
-    for axis, prefix, title in zip(axes[0], ('', 'visible_'), (
-            ': bottleneck frequency', ', no object left out')):
-        ends = {}
-        for method in methods:
-            points = 100 * own[own['method'] == method].set_index('metric').loc[
-                [f'{prefix}bottleneck_frequency_{threshold}px' for threshold in THRESHOLDS],
-                ['value', 'ci_low', 'ci_high']].to_numpy(float)
-            value, low, high = points.T
-            colour = COLOURS[family(method)]
-            axis.fill_between(THRESHOLDS, low, high, color=colour, alpha=0.10, linewidth=0)
-            axis.plot(THRESHOLDS, value, linestyle=styles[method], color=colour, linewidth=1.8)
-            ends[method] = value[-1]
-        axis.set(xlim=(0, 10), ylim=(0, 100), xticks=THRESHOLDS)
-        axis.grid(axis='y', color='#f0f0f0')
-        axis.set_xlabel('expected distance, sum of both objects, px', fontsize=9, color=_INK)
-        axis.set_title(TITLES[task] + title, fontsize=10, loc='left', color=_INK)
-    axes[0, 0].set_ylabel('predictions within so many pixels, %', fontsize=9, color=_INK)
-    for method, share in BOTTLENECK_2PX.items() if task == 'push2' else ():
-        axes[0, 0].plot(2, 100 * share, 'D', color=COLOURS[method], markersize=6,
-                        markerfacecolor='white', markeredgewidth=1.4, clip_on=False, zorder=4)
-        axes[0, 0].annotate(
-            f"the paper's {method}", (2, 100 * share), (7, 1), textcoords='offset points',
-            ha='left', va='top' if share else 'bottom', fontsize=8, color=COLOURS[method],
-            zorder=5, bbox={'color': 'white', 'alpha': 0.75, 'pad': 0.5})
-    for method, y in zip(ends, _spread(list(ends.values()), 4.5)):
-        colour = COLOURS[family(method)]
-        axis.plot([10.15, 10.7], [y, y], linestyle=styles[method], color=colour, linewidth=1.8,
-                  clip_on=False)
-        axis.annotate(method, (10.9, y), fontsize=8.5, color=colour, va='center',
-                      annotation_clip=False)
-    return to_png(figure)
-
-
 def timing(rows):
     """
     Draw the bottleneck frequency of methods over when the bottleneck comes.
@@ -258,81 +199,3 @@ def _line_styles(methods):
             '-', '--', '-.', ':', (0, (6, 1, 1, 1, 1, 1)))
         styles[method] = order[number % len(order)]
     return styles
-
-
-def gains(rows):
-    """
-    Draw how far each method's error is below fix's, with the paper's gains of genmin.
-
-    Dots compare with fix, squares with fixed-time prediction at the same match-step.
-
-    :param rows: of rows.as_frame, of one scale.
-    :return: bytes of a PNG, or None without such rows.
-    """
-    markers = {'gain_over_fix': 'o', 'gain_over_fix_at_match_step': 's'}
-    chosen = rows[rows['metric'].isin(markers) & (rows['mode'] == 'bidirectional')
-                  & rows['new_pixels'].fillna(True)]
-    if chosen.empty:
-        return None
-    tasks = [task for task in TITLES if task in set(chosen['task'])]
-    methods = sorted(set(chosen['method']), key=method_order)
-    figure, axes = new_figure(1.3 + 0.27 * len(methods), len(tasks), sharey=True)
-    for axis, task in zip(axes[0], tasks):
-        axis.axvline(0, color='#a0a0a0', linewidth=1)
-        for y, method in enumerate(methods):
-            for shift, (metric, marker) in zip((-0.16, 0.16), markers.items()):
-                row = find(chosen, task=task, method=method, metric=metric)
-                if row is None:
-                    continue
-                value, low, high = (100 * row[name] for name in ('value', 'ci_low', 'ci_high'))
-                colour = COLOURS[family(method)]
-                axis.plot([low, high], [y + shift] * 2, color=colour, linewidth=2.2, alpha=0.45)
-                axis.plot(value, y + shift, marker, color=colour, markersize=5.5,
-                          markeredgecolor='white')
-        if task in GAINS and 'genmin' in methods:
-            axis.plot(100 * GAINS[task], methods.index('genmin'), 'D', color=COLOURS['genmin'],
-                      markerfacecolor='none', markersize=7, markeredgewidth=1.3)
-        axis.set_title(fill(TITLES[task], 14), fontsize=10, loc='left', color=_INK)
-        axis.set_yticks(range(len(methods)), methods)
-        axis.set_ylim(len(methods) - 0.4, -0.6)
-        axis.set_xlabel('error below\nfix, %', fontsize=9, color=_INK)
-        axis.grid(color='#f0f0f0')
-    for label, method in zip(axes[0, 0].get_yticklabels(), methods):
-        label.set_color(COLOURS[family(method)])
-    return to_png(figure)
-
-
-def match_histograms(groups):
-    """
-    Draw at which share of the episode the matches of each method lie, a row for each task.
-
-    A predictor that copies an input matches a frame beside it.
-
-    :param groups: rows.Group of one scale.
-    :return: bytes of a PNG, or None without such groups.
-    """
-    shown = [group for group in groups if group.key['mode'] == 'bidirectional'
-             and group.key.get('new_pixels') and 'match_fraction' in group.scores]
-    if not shown:
-        return None
-    tasks = [task for task in TITLES if any(group.key['task'] == task for group in shown)]
-    methods = sorted({group.key['method'] for group in shown}, key=method_order)
-    figure, axes = new_figure(0.75 + 1.0 * len(tasks), len(methods), len(tasks), sharex=True,
-                               sharey='row')
-    bins = np.linspace(0, 1, 16)
-    for row, task in zip(axes, tasks):
-        for axis, method in zip(row, methods):
-            axis.spines['left'].set_visible(False)
-            axis.set_yticks([])
-            axis.set_xticks([0, 0.5, 1], ['start', '', 'goal'])
-            axis.tick_params(labelsize=7)
-            for group in shown:
-                if (group.key['task'], group.key['method']) == (task, method):
-                    values = group.scores['match_fraction'].ravel()
-                    axis.hist(values, bins, weights=np.full(len(values), 1 / len(values)),
-                              color=COLOURS[family(method)])
-        row[0].set_ylabel(TITLES[task].replace(' ', '\n', 1), fontsize=8, color=_INK)
-    for axis, method in zip(axes[0], methods):
-        axis.set_title(method.replace('-', '\n', 1).replace('+', '\n+'),
-                       fontsize=8, color=COLOURS[family(method)])
-    return to_png(figure)

@@ -25,12 +25,11 @@ from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
-from tap_ros.prediction.warp import warp
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.split import split_episodes, TEST_FRACTION
 import torch
 
-EPISODES = 5
+EPISODES = 3
 SAMPLES = 6
 _DPI = 100
 _INK = '#333333'
@@ -51,7 +50,7 @@ class Shown:
 
 def write_grids(folder, runs, weights, recordings='bags'):
     """
-    Write the grids of every task of Table 1 and mode of one scale.
+    Write the grids of every task of Table 1 and mode of one scale, of networks with new pixels.
 
     A picture that is there stays where weights of a method that it should show are not at hand.
     Of several seeds the first one at hand is shown.
@@ -62,11 +61,10 @@ def write_grids(folder, runs, weights, recordings='bags'):
     :param recordings: folder with the recordings of each task, where those that a run was trained
         on are no longer.
     """
-    settings = sorted({(run['task'], run['mode'], run['new_pixels']) for run in runs
-                       if run['task'] in TITLES})
-    for task, mode, new_pixels in settings:
-        same = sorted((run for run in runs if (run['task'], run['mode'], run['new_pixels']) == (
-            task, mode, new_pixels)), key=lambda run: (method_order(run['method']), run['seed']))
+    runs = [run for run in runs if run['task'] in TITLES and run['new_pixels']]
+    for task, mode in sorted({(run['task'], run['mode']) for run in runs}):
+        same = sorted((run for run in runs if (run['task'], run['mode']) == (task, mode)),
+                      key=lambda run: (method_order(run['method']), run['seed']))
         paths = {}
         for run in same:
             path = Path(weights) / run['name'] / 'predictor.safetensors'
@@ -75,16 +73,15 @@ def write_grids(folder, runs, weights, recordings='bags'):
         episodes = paths and _held_out(same, recordings)
         if not paths or episodes is None:
             continue
-        variant = '' if new_pixels else '-warp'
-        title = f'{TITLES[task]}, {mode}' + ('' if new_pixels else ', no new pixels')
+        title = f'{TITLES[task]}, {mode}'
         for name, (choose, make) in GRIDS.items():
-            path = Path(folder) / file_name(f'{task}-{mode}{variant}{name}', same[0]['scale'])
+            path = Path(folder) / file_name(f'{task}-{mode}{name}', same[0]['scale'])
             chosen = choose(same)
             if not paths.keys() >= set(chosen):
                 chosen = [] if path.exists() else choose(
                     [run for run in same if run['method'] in paths])
             sheet = chosen and make(
-                task, mode, [Shown(method, load_network(paths[method])[0]) for method in chosen],
+                mode, [Shown(method, load_network(paths[method])[0]) for method in chosen],
                 *episodes)
             if sheet:
                 write_atomically(path, png_bytes(draw(title, *sheet)))
@@ -182,7 +179,7 @@ def _append(rows, images):
 
 
 @torch.inference_mode()
-def _methods(task, mode, shown, store, episodes, goal_picture):
+def _methods(mode, shown, store, episodes, goal_picture):
     """Show inputs, the output of each method, and matches of genmin and ours (Figs. 5, 6)."""
     batch, context = _gather(store, episodes, mode, goal_picture)
     headings, rows = _inputs(batch)
@@ -245,31 +242,7 @@ def _by_name(choose):
 
 
 @torch.inference_mode()
-def _parts(task, mode, shown, store, episodes, goal_picture):
-    """Show what pushing predictions are blended from (Figs. 9, 15): masked warps, new pixels."""
-    if not task.startswith('push') or mode != 'bidirectional':
-        return None
-    batch, context = _gather(store, episodes, mode, goal_picture)
-    headings, rows = _inputs(batch)
-    above = [('', None, len(headings))]
-    for one in shown:
-        prediction = _predict(one, episodes, context)
-        parts = [*warp(context, prediction.flow).unbind(1)]
-        if prediction.new_pixels is not None:
-            parts.append(prediction.new_pixels)
-        for n, part in enumerate(parts):
-            # On [0, 1], so that what a mask leaves out is black.
-            masked = (part + 1) / 2 * prediction.masks[:, n]
-            _append(rows, to_uint8(masked * 2 - 1))
-        _append(rows, to_uint8(prediction.image))
-        names = [*('warped start', 'warped goal', 'new pixels')[:len(parts)], 'output']
-        headings += [_coloured(one.method, name) for name in names]
-        above.append(_coloured(one.method, one.method, len(names)))
-    return [above, headings], rows
-
-
-@torch.inference_mode()
-def _recursion(task, mode, shown, store, episodes, goal_picture):
+def _recursion(mode, shown, store, episodes, goal_picture):
     """Show predictions with the prediction before as the goal (Fig. 7)."""
     if mode != 'bidirectional':
         return None
@@ -288,7 +261,7 @@ def _recursion(task, mode, shown, store, episodes, goal_picture):
 
 
 @torch.inference_mode()
-def _samples(task, mode, shown, store, episodes, goal_picture):
+def _samples(mode, shown, store, episodes, goal_picture):
     """Show samples of the VAE for one start and goal (Figs. 9, 16)."""
     chosen, = shown
     batch, context = _gather(store, episodes, mode, goal_picture)
@@ -301,5 +274,5 @@ def _samples(task, mode, shown, store, episodes, goal_picture):
 
 
 GRIDS = {  # end of the file name -> (which methods of which runs, how they are shown)
-    '': (_by_name(_main_methods), _methods), '-masks': (_by_name(_contrast), _parts),
+    '': (_by_name(_main_methods), _methods),
     '-recursion': (_by_name(_recursive), _recursion), '-samples': (_sampling, _samples)}

@@ -12,12 +12,9 @@ TITLES = {'grasp': 'Grasping', 'pick_place': 'Pick-and-place', 'push2': 'Pushing
 ORDER_TITLES = {'order2': 'Two objects, one on the goal of the other',
                 'order2_late': 'Two objects, one on the goal of the other, late',
                 'order3': 'Three objects, two on goals of others'}
-# Of recordings whose bottleneck comes at another time, and of other looks of pushing.
+# Of recordings whose bottleneck comes at another time.
 TIMED_TITLES = {'push2_early': 'early', 'push2_middle': 'in the middle', 'push2_late': 'late',
                 'push2_mixed': 'any of these'}
-SHIFTED_TITLES = {'push2': 'as trained', 'push2_lighter_table': 'lighter table',
-                  'push2_other_light': 'other light', 'push2_other_camera': 'other camera',
-                  'push2_arm_elsewhere': 'arm elsewhere in the goal picture'}
 
 # Table 1: task -> method -> (min l1, match-step, its standard deviation over episodes).
 TABLE_1 = {
@@ -56,6 +53,3 @@ FORWARD_GRASP = {
 
 # Appendix E: share of predictions within 2 px of a bottleneck, pushing two objects.
 BOTTLENECK_2PX = {'genmin': 0.58, 'fix': 0.0}
-
-# The best of 100 samples is below the best method without samples (Table 1).
-BEST_OF_100 = ('pick_place', 'push2')

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Results from finished runs: the numbers as data, the page, its plots and pictures."""
+"""Results from finished runs: the numbers as data, plots and pictures."""
 
 from collections import Counter
 import json
@@ -8,14 +8,12 @@ from pathlib import Path
 
 from experiments.paper import figures
 from experiments.paper.names import COPIES
-from experiments.paper.page import make_page
 from experiments.paper.pictures import write_grids
 from experiments.paper.rows import as_frame, group_runs, make_rows
 from experiments.paper.runs import label
 from tap_ros.errors import ConfigError
-from tap_ros.files import write_atomically, write_rows
+from tap_ros.files import write_atomically
 
-SCALES = ('full', 'small')  # the order on the page
 _KEYS = {'name', 'task', 'mode', 'method', 'new_pixels', 'seed', 'scale', 'command', 'config',
          'data', 'training', 'evaluation'}
 
@@ -72,14 +70,13 @@ def on_same_episodes(runs):
 
 def write_results(folder='docs/results', runs='runs/paper', recordings='bags', pictures=True):
     """
-    Write prediction.json, the page README.md, its plots, and pictures where weights are at hand.
+    Write prediction.csv, its plots, and pictures where weights are at hand.
 
-    :param folder: to write to; the runs' numbers are in its subfolder runs/<scale>, and
-        findings.md, if there, is put into the page.
+    :param folder: to write to; the runs' numbers are in its subfolder runs/<scale>.
     :param runs: folder with runs' weights: <scale>/<name>/predictor.safetensors.
     :param recordings: folder with the recordings, one for each task.
     :param pictures: whether to make the pictures of predictions again.
-    :return: rows of prediction.json.
+    :return: rows of prediction.csv.
     :raises ConfigError: if there are no finished runs, or one cannot be read.
     """
     folder = Path(folder)
@@ -88,55 +85,20 @@ def write_results(folder='docs/results', runs='runs/paper', recordings='bags', p
         raise ConfigError(f'{folder / "runs"}: there are no finished runs; make some with '
                           'python -m tap_ros paper')
     kept, left_out = on_same_episodes(loaded)
-    groups = group_runs(kept)
-    rows = make_rows(groups)
-    write_rows(folder / 'prediction.json', told_apart(rows))
-    frame = as_frame(rows)
-    scales = [scale for scale in SCALES if any(run['scale'] == scale for run in kept)]
-    for scale in scales:
-        _write_plots(folder, scale, frame, groups)
+    if left_out:
+        print('scored on other episodes, left out: ' + ', '.join(run['name'] for run in left_out))
+    rows = as_frame(make_rows(group_runs(kept)))
+    write_atomically(folder / 'prediction.csv', rows.to_csv(index=False))
+    for scale in sorted({run['scale'] for run in kept}):
+        own = rows[rows['scale'] == scale]
+        for name, png in (('forward_scatter', figures.forward_scatter(own)),
+                          ('timing', figures.timing(own))):
+            path = folder / figures.file_name(name, scale)
+            if png is not None:
+                write_atomically(path, png)
+            else:
+                path.unlink(missing_ok=True)
         if pictures:
             write_grids(folder, [run for run in kept if run['scale'] == scale],
                         Path(runs) / scale, recordings)
-    findings = folder / 'findings.md'
-    page = make_page(frame, kept, left_out, scales, sorted(p.name for p in folder.glob('*.png')),
-                     findings.read_text() if findings.exists() else '')
-    write_atomically(folder / 'README.md', page)
     return rows
-
-
-def told_apart(rows):
-    """
-    Name metrics so that task, mode, method, metric and scale belong to one row.
-
-    The metrics of models without new pixels end in _warp_only where the task has models with new
-    pixels, too; but for bottlenecks, which only the former have.
-
-    :param rows: of make_rows.
-    :return: list of dicts.
-    """
-    def place(row):
-        return row['task'], row['mode'], row['scale']
-
-    both = {place(row) for row in rows if row.get('new_pixels')}
-    return [{**row, 'metric': f'{row["metric"]}_warp_only'}
-            if row.get('new_pixels') is False and 'bottleneck' not in row['metric']
-            and place(row) in both else row for row in rows]
-
-
-def _write_plots(folder, scale, rows, groups):
-    """Draw the plots of a scale; remove those that have nothing to show any more."""
-    rows = rows[rows['scale'] == scale]
-    groups = [group for group in groups if group.key['scale'] == scale]
-    plots = {
-        'forward_scatter': figures.forward_scatter(rows),
-        'bottleneck_curve': figures.bottleneck_curve(rows),
-        'gains': figures.gains(rows),
-        'timing': figures.timing(rows),
-        'match_steps': figures.match_histograms(groups)}
-    for name, png in plots.items():
-        path = folder / figures.file_name(name, scale)
-        if png is not None:
-            write_atomically(path, png)
-        else:
-            path.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-From the scores of runs to rows: one number each, with an interval and the command that makes it.
+From the scores of runs to rows: one number each, with an interval and the runs that it is from.
 
 Intervals are 95% bootstrap intervals over the held-out episodes. Runs that differ by the seed only
 are averaged, episode by episode; by_seed tells how far trainings differ.
@@ -32,7 +32,7 @@ PLACE, PICK = 0.8, 0.2  # least and most of the object's way behind it, for thes
 _DIGITS = 6
 _NONE = np.empty((1, 0))
 COLUMNS = ['task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n', 'seeds',
-           'by_seed', 'scale', 'command', 'new_pixels', 'of', 'baseline']
+           'by_seed', 'scale', 'new_pixels', 'of', 'baseline', 'runs']
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class Group:
 
     :param key: dict of task, mode, method, scale and, where something was trained, new_pixels.
     :param scores: dict of float arrays (S, N), a row for each run; NaN where undefined.
-    :param command: makes the runs.
+    :param runs: their names, with blanks between.
     :param of: for the best of 100, the method that was sampled from.
     """
 
     key: dict
     scores: dict
-    command: str
+    runs: str
     of: str = ''
 
 
@@ -107,8 +107,8 @@ def _group(key, runs, part, of=''):
             scores[f'recursion_{name}'] = np.array(
                 [[level[name] for level in run['evaluation']['recursion']] for run in runs],
                 float).swapaxes(1, 2)  # S, N, levels
-    command = ' && '.join(run['command'] for run in runs)
-    return Group(key, scores, command, of)
+    names = ' '.join(run['name'] for run in runs)
+    return Group(key, scores, names, of)
 
 
 def make_rows(groups):
@@ -117,7 +117,7 @@ def make_rows(groups):
 
     :param groups: of group_runs.
     :return: list of dicts: task, mode, method, metric, value, ci_low, ci_high, n, seeds, scale,
-        command; new_pixels where something was trained; baseline for numbers that compare, of for
+        runs; new_pixels where something was trained; baseline for numbers that compare, of for
         the best of 100.
         Bottlenecks are scored without new pixels only, which have no origin to follow (App. E).
         min_l1 is the per-pixel mean on [0, 1], match_step counts frames from the start picture
@@ -130,7 +130,7 @@ def make_rows(groups):
         next level's match has them PICK of it behind them; with _shown it shows both as well.
     """
     rows = [_row(group, metric, lambda array, statistic=statistic: statistic(array, -1).mean(0),
-                 values, by_seed=[round(float(x), _DIGITS) for x in statistic(values, -1)])
+                 values, by_seed=' '.join(f'{x:.6g}' for x in statistic(values, -1)))
             for group in groups for metric, statistic, values in _measures(group)
             if values.size]
     return rows + _gain_rows(groups) + _equal_gain_rows(groups) + _best_rows(groups)
@@ -199,7 +199,7 @@ def _row(group, metric, statistic, *arrays, **more):
     key = {name: group.key[name] for name in ('task', 'mode', 'method')}
     return {**key, 'metric': metric, 'value': value, 'ci_low': low, 'ci_high': high,
             'n': arrays[0].shape[-1], 'seeds': len(arrays[0]), 'scale': group.key['scale'],
-            'command': group.command,
+            'runs': group.runs,
             **{name: group.key[name] for name in ('new_pixels',) if name in group.key},
             **({'of': group.of} if group.of else {}), **more}
 
@@ -350,21 +350,3 @@ def select(rows, task, mode, new_pixels=True):
     """Choose the rows (of as_frame) of one setting; those of copying belong to both variants."""
     return rows[(rows['task'] == task) & (rows['mode'] == mode)
                 & (rows['new_pixels'] == new_pixels).fillna(True)]
-
-
-def of_metric(rows, metric, methods):
-    """Return a line of a metric for each method, indexed by it; lines of NaN where none is."""
-    return rows[rows['metric'] == metric].set_index('method').reindex(methods)
-
-
-def find(rows, **wanted):
-    """
-    Find a row.
-
-    :param rows: of as_frame.
-    :param wanted: the values of its keys; a row without new_pixels fits any.
-    :return: dict, the first row that fits, or None.
-    """
-    for name, value in wanted.items():
-        rows = rows[(rows[name] == value).fillna(name == 'new_pixels')]
-    return None if rows.empty else rows.iloc[0].dropna().to_dict()

@@ -2,19 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the numbers that are made from the scores of runs."""
 
-import json
+from dataclasses import asdict
+from pathlib import Path
 
+import cv2
 from experiments.paper.names import best_of_name, method_order, network_of, short_name
-from experiments.paper.results import (
-    load_runs,
-    on_same_episodes,
-    told_apart,
-    write_results,
-)
+from experiments.paper.pictures import write_grids
+from experiments.paper.results import load_runs, on_same_episodes, write_results
 from experiments.paper.rows import (
     as_frame,
     COLUMNS,
-    find,
     group_runs,
     lower_hull,
     make_rows,
@@ -23,13 +20,25 @@ from made_runs import EPISODES, made_run, save_runs, scores
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
+from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.recording.cache import open_recordings
+from tap_ros.training.weights import save_weights
+import torch
 
+SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
 KEYS = {'task', 'mode', 'method', 'metric', 'value', 'ci_low', 'ci_high', 'n', 'seeds', 'scale',
-        'command'}
+        'runs'}
 
 
 def rows_of(*runs):
     return as_frame(make_rows(group_runs(runs)))
+
+
+def find(rows, **wanted):
+    """Return the first row that fits as a dict, or None; one without new_pixels fits any."""
+    for name, value in wanted.items():
+        rows = rows[(rows[name] == value).fillna(name == 'new_pixels')]
+    return None if rows.empty else rows.iloc[0].dropna().to_dict()
 
 
 def test_every_row_has_all_keys_and_lies_in_its_interval():
@@ -49,9 +58,8 @@ def test_seeds_are_averaged_and_do_not_count_as_episodes():
     both = [np.mean(first['min_l1']), np.mean(second['min_l1'])]
     assert row['value'] == pytest.approx(np.mean(both), abs=1e-6)
     assert (row['n'], row['seeds']) == (EPISODES, 2)
-    assert row['by_seed'] == pytest.approx(both, abs=1e-6)
-    assert row['command'] == ('make push2-bidirectional-fix-s0 && '
-                              'make push2-bidirectional-fix-s1')
+    assert list(map(float, row['by_seed'].split())) == pytest.approx(both, rel=1e-5)
+    assert row['runs'] == 'push2-bidirectional-fix-s0 push2-bidirectional-fix-s1'
 
 
 def test_gains_are_paired_by_episode():
@@ -95,21 +103,6 @@ def test_an_object_that_is_left_out_is_no_visible_bottleneck():
 def test_no_bottlenecks_are_counted_where_pixels_are_painted():
     rows = rows_of(made_run('genmin', scores(0.01, bottleneck=[1.0] * 40)))
     assert not find(rows, method='genmin', metric='bottleneck_frequency_2px')
-
-
-def test_every_row_of_the_data_has_a_place_of_its_own():
-    rows = told_apart(make_rows(group_runs(
-        made_run(method, scores(0.01, bottleneck=[1.0] * 40), new_pixels=new_pixels)
-        for method in ('fix', 'genmin') for new_pixels in (True, False))))
-    places = [(row['task'], row['mode'], row['method'], row['metric']) for row in rows]
-    assert len(set(places)) == len(places)
-    rows = as_frame(rows)
-    painted = find(rows, method='genmin', metric='min_l1')
-    assert painted['new_pixels'] and find(rows, method='genmin', metric='min_l1_warp_only')
-    assert find(rows, method='genmin', metric='bottleneck_frequency_2px')
-    alone = told_apart(make_rows(group_runs(
-        [made_run('fix', scores(0.01), new_pixels=False, task='push3')])))
-    assert find(as_frame(alone), method='fix', metric='min_l1')  # it keeps its name
 
 
 def test_variants_of_a_method_have_names_of_their_own(tmp_path):
@@ -303,15 +296,44 @@ def test_a_damaged_file_is_named(tmp_path):
 
 
 def test_results_are_the_same_when_made_again(tmp_path):
-    save_runs(tmp_path, [made_run('fix', scores(0.02)), made_run('min', scores(0.01))])
+    save_runs(tmp_path, [made_run('fix0.50', scores(0.02), task='grasp', mode='forward'),
+                         made_run('fix', scores(0.02, bottleneck=[1.0] * 40), new_pixels=False,
+                                  task='push2_early')])
     rows = write_results(tmp_path, pictures=False)
     written = {path.name: path.read_bytes() for path in tmp_path.glob('*.*')}
-    assert json.loads(written['prediction.json']) == rows
-    assert {'README.md', 'gains.png'} <= set(written)
+    assert written['prediction.csv'].decode().count('\n') == len(rows) + 1
+    assert set(written) == {'prediction.csv', 'forward_scatter.png', 'timing.png'}
     write_results(tmp_path, pictures=False)
     assert {path.name: path.read_bytes() for path in tmp_path.glob('*.*')} == written
-
-
-def test_without_runs_the_command_is_named(tmp_path):
     with pytest.raises(ConfigError, match='tap_ros paper'):
-        write_results(tmp_path)
+        write_results(tmp_path / 'nothing')
+
+
+def test_grids_show_each_method_that_has_weights(tmp_path):
+    runs = [made_run('fix', scores(0.02)), made_run('genmin', scores(0.01)),
+            made_run('genmin-vae-gan', scores(0.01)),
+            made_run('genmin4', scores(0.01), mode='forward')]
+    data_hash = open_recordings([str(SAMPLE)]).data_hash
+    there = tmp_path / 'push2-bidirectional.png'
+    there.write_bytes(b'of all')
+
+    def write(*chosen):
+        for run in chosen:
+            run['config'] = {'recordings': [str(SAMPLE)], 'test_fraction': 0.5}
+            run['data'] = run['data'] | {'hash': data_hash}
+            torch.manual_seed(0)
+            config = PredictorConfig(base_width=4,
+                                     num_context=1 if run['mode'] == 'forward' else 2,
+                                     latent_size=8 if 'vae' in run['method'] else 0)
+            save_weights(tmp_path / 'weights' / run['name'] / 'predictor.safetensors',
+                         Predictor(config), 'predictor', asdict(config), {})
+        write_grids(tmp_path, runs, tmp_path / 'weights')
+
+    write(runs[0])
+    assert there.read_bytes() == b'of all', 'a picture that shows more stays'
+    write(*runs)
+    sizes = {path.stem: cv2.imread(str(path)).shape[1] for path in tmp_path.glob('*.png')}
+    columns = {name: (width + 2) // 130 for name, width in sizes.items()}
+    assert columns == {
+        'push2-bidirectional': 2 + 3 + 1, 'push2-bidirectional-recursion': 2 + 2 * 2,
+        'push2-bidirectional-samples': 2 + 6, 'push2-forward': 1 + 1 + 1}

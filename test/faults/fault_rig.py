@@ -12,20 +12,14 @@ import sys
 import threading
 import time
 
-from action_msgs.msg import GoalStatus
 from fault_files import end_group
 from fault_world import goal_fields, predict_fields, World
 from geometry_msgs.msg import TwistStamped
-from rclpy.action import ActionClient
-from rclpy.context import Context
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
-from tap_msgs.action import ReachGoal
-from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
-from tap_ros.nodes.clients import call, cancel_goal, Newest, send_goal, Spinner, wait_for_result
+from tap_ros.nodes.client import Client
+from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.topics import STREAM
 
@@ -33,8 +27,6 @@ CALL_S = 20.0
 START_S = 90.0
 STOP_S = 0.5
 SIM_MODES = {'lock-step': {'lock_step': True}, 'real': {'lock_step': False}}
-ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_ABORTED: 'aborted',
-        GoalStatus.STATUS_CANCELED: 'cancelled'}
 
 
 def _hear_signals():
@@ -209,29 +201,20 @@ class Rig:
 
     def __init__(self, folder):
         self.folder, self.processes = Path(folder), {}
-        self._handle = None
-        self._context = Context()
-        self._context.init()
-        self.node = node = Node('attacker', context=self._context)
-        self.reset_client = node.create_client(ResetScene, 'sim/reset')
-        self.record_client = node.create_client(SetBool, 'recorder/record')
-        self.predict_client = node.create_client(PredictSubgoal, 'predict_subgoal')
-        self.reach_client = ActionClient(node, ReachGoal, 'reach_goal')
-        self.joints = Newest(node, JointState, 'joint_states', STREAM)
-        self.commands = Commands(node)
-        self.alive = {name: Liveness(node, name) for name in NODE_MODULES}
-        self._spinner = Spinner(node)
+        self.client = Client(timeout_s=CALL_S)
+        self.node = self.client.node
+        self._reaching = None
+        self.joints = Newest(self.node, JointState, 'joint_states', STREAM)
+        self.commands = Commands(self.node)
+        self.alive = {name: Liveness(self.node, name) for name in NODE_MODULES}
 
     def __enter__(self):
-        self._spinner.__enter__()
         return self
 
     def __exit__(self, *_):
         for name in list(self.processes):
             self.remove(name)
-        self._spinner.__exit__()
-        self.node.destroy_node()
-        self._context.try_shutdown()
+        self.client.close()
 
     # Nodes
 
@@ -257,11 +240,14 @@ class Rig:
         for attacked in new:
             attacked.wait_for('ready')
         if new:
-            self._wait_until_connected(wanted)
-        elif self._handle is not None and 'visual_mpc_node' in wanted:
+            self.client.wait_until_ready(*wanted, timeout_s=CALL_S)
+            if 'predictor_node' in wanted:
+                self.expect_prediction(CALL_S)
+            time.sleep(0.5)  # what has no name to wait for: its subscriptions
+        elif self._reaching is not None and 'visual_mpc_node' in wanted:
             with suppress(TapError):  # it may have ended
-                self.finish(self._handle, 5.0)
-        self._handle = None
+                self.finish(self._reaching)
+        self._reaching = None
         self.commands.forget()
 
     def start(self, name, arguments=(), **parameters):
@@ -286,18 +272,6 @@ class Rig:
         for attacked in self.processes.values():
             attacked.check()
 
-    def _wait_until_connected(self, names):
-        offered = {'sim_node': self.reset_client.wait_for_service,
-                   'predictor_node': self.predict_client.wait_for_service,
-                   'visual_mpc_node': self.reach_client.wait_for_server,
-                   'recorder_node': self.record_client.wait_for_service}
-        for name in names:
-            if name in offered and not offered[name](timeout_sec=CALL_S):
-                raise TapError(f'{name}: what it offers was not found in {CALL_S:g} s')
-        if 'predictor_node' in names:
-            self.expect_prediction(CALL_S)
-        time.sleep(0.5)  # what has no name to wait for: its subscriptions
-
     @contextmanager
     def world(self, rate_hz=10.0):
         """Have a World that the planner has heard of."""
@@ -307,49 +281,43 @@ class Rig:
 
     # Calls
 
-    def predict(self, timeout_s=CALL_S, **fields):
-        """Call predict_subgoal; return the response."""
-        return call(self.predict_client, PredictSubgoal.Request(**fields), timeout_s,
-                    server=self.alive['predictor_node'])
-
     def expect_prediction(self, timeout_s):
         """Make a good call; raise TapError when it is not answered well."""
-        response = self.predict(timeout_s, **predict_fields())
-        if not response.success:
-            raise TapError(f'a good request was refused: {response.message}')
+        self.client.call('predict', timeout_s, **predict_fields())
 
     def reset(self, seed, task='push2'):
-        """Start a scene; return the response."""
-        return call(self.reset_client, ResetScene.Request(task=task, seed=seed), CALL_S,
-                    server=self.alive['sim_node'])
+        """Start a scene."""
+        self.client.call('reset', task=task, seed=seed)
 
-    def begin(self, timeout_s=CALL_S, on_feedback=None, **fields):
-        """Send a goal; return its handle."""
-        self._handle = send_goal(self.reach_client, ReachGoal.Goal(**fields), timeout_s,
-                                 on_feedback, self.alive['visual_mpc_node'])
-        return self._handle
+    def begin(self, **fields):
+        """Send a goal, by default one that a World never fulfils; return its Reaching."""
+        self._reaching = self.client.reach(**{'timeout_s': 90.0, **(fields or goal_fields())})
+        return self._reaching
 
     def begin_moving(self, moves=2, **fields):
-        """Send a goal, by default one that a World never fulfils, and wait until the arm moves."""
+        """Send a goal, and wait until the arm moves."""
         begin = time.monotonic()
-        handle = self.begin(**(fields or goal_fields()))
+        reaching = self.begin(**fields)
         if not self.commands.wait_for_moves(begin, moves):
-            raise TapError(f'nothing moved within {CALL_S:g} s; the goal {self.finish(handle)}')
-        return handle
+            raise TapError(f'nothing moved within {CALL_S:g} s; the goal {self.finish(reaching)}')
+        return reaching
 
-    def finish(self, handle, timeout_s=CALL_S):
+    def finish(self, reaching):
         """Cancel a goal, and return its end in words."""
-        cancel_goal(handle)
-        return self.result(handle, timeout_s)
+        reaching.cancel()
+        return self.result(reaching)
 
-    def result(self, handle, timeout_s=60.0):
+    def result(self, reaching):
         """Wait for the end of a goal; return it in words, the message behind a colon."""
-        status, result = wait_for_result(handle, timeout_s, self.alive['visual_mpc_node'])
-        self._handle = None
-        return f'{ENDS.get(status, status)}: {result.message}'
+        self._reaching = None
+        result = reaching.result()
+        return f'{result.end}: {result.message}'
 
-    def expect_end(self, handle, words, timeout_s=60.0, within=''):
-        """Raise AssertionError unless a goal ends by itself with these words and those within."""
-        end = self.result(handle, timeout_s)
+    def expect_end(self, reaching, words, within='', timeout_s=30.0):
+        """Raise AssertionError unless a goal ends in time with these words and those within."""
+        begin = time.monotonic()
+        end = self.result(reaching)
         assert end.startswith(words) and within in end, f'the goal {end}'
+        took = time.monotonic() - begin
+        assert took < timeout_s, f'the goal ended after {took:.0f} s'
         return end

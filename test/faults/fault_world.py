@@ -11,6 +11,7 @@ from sensor_msgs.msg import Image, JointState
 from sim_bridge.simulator import Simulator
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
+from tap_ros.nodes.client import request_fields
 from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
 from tap_ros.nodes.topics import STREAM, to_stamp
 
@@ -39,20 +40,18 @@ def objects_message(observation, stamp, pixels=None, names=None):
 
 
 def goal_fields(mode='direct', **fields):
-    """Return fields of a reach_goal goal that needs no goal topics."""
+    """Return arguments of Client.reach for a goal that needs no goal topics."""
     _, goal = first_pictures()
-    return {'mode': mode, 'goal_image': encode_image(goal.image, to_stamp(0), CAMERA_FRAME),
-            'goal_objects': objects_message(goal, to_stamp(0)), 'step_budget': 1000, **fields}
+    pixels = dict(zip(goal.object_names, goal.object_pixels))
+    return {'goal': goal.image, 'goal_pixels': pixels, 'mode': mode, 'step_budget': 1000, **fields}
 
 
 def predict_fields(**fields):
     """Return fields of a whole predict_subgoal request."""
     start, goal = first_pictures()
-    stamp = to_stamp(0)
-    return {'start': encode_image(start.image, stamp, CAMERA_FRAME),
-            'goal': encode_image(goal.image, stamp, CAMERA_FRAME),
-            'start_objects': objects_message(start, stamp),
-            'goal_objects': objects_message(goal, stamp), **fields}
+    return request_fields(
+        start.object_names, start=start.image, goal=goal.image, start_objects=start.object_pixels,
+        goal_objects=goal.object_pixels) | fields
 
 
 class World:

@@ -13,6 +13,7 @@ from fault_files import Reader, run_limited, write_recording
 from fault_report import fault
 import numpy as np
 import pytest
+from tap_ros.errors import TapError
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.recording.writer import write_metadata
 from tap_ros.training.weights import load_tensors, save_weights
@@ -117,8 +118,6 @@ def test_disk_full_train(trials, tmp_path):
 @fault('the disk is full while recorder_node records', 'error in log and answer, exit code not 0; '
        'what was recorded can be read', 20)
 def test_disk_full_recorder(trials, rig, tmp_path):
-    from std_srvs.srv import SetBool
-    from tap_ros.nodes.clients import call
     random = np.random.default_rng(0)
     rig.need()
     for trial in trials:
@@ -134,8 +133,8 @@ def test_disk_full_recorder(trials, rig, tmp_path):
                     assert time.monotonic() < deadline, 'no error in the log'
                     time.sleep(0.1)
                 fill(disk / 'rest')
-                answer = call(rig.record_client, SetBool.Request(data=True), 10.0)
-                assert not answer.success, f'recorder/record says success: {answer.message}'
+                with pytest.raises(TapError, match='refused'):
+                    rig.client.start_recording()
             assert node.alive, f'it ended: {node.last_line()}'
             assert node.end(), 'exit code 0 though the recording is not whole'
             assert 'Traceback' not in node.text, 'a traceback'

@@ -9,8 +9,9 @@ import hypothesis
 import message_strategies as strategies
 import pytest
 from rcl_interfaces.srv import GetParameters
+from rclpy.action import ActionClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from std_srvs.srv import SetBool
+from tap_msgs.action import ReachGoal
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
 from tap_ros.nodes import heartbeat
@@ -43,6 +44,7 @@ class Target:
                          for name, kind in strategies.SERVICES.items()}
         self._parameters = {name: rig.node.create_client(GetParameters, f'{name}/get_parameters')
                             for name in NODE_MODULES}
+        self._reach = ActionClient(rig.node, ReachGoal, 'reach_goal')
         self.restore()
 
     def close(self):
@@ -78,8 +80,7 @@ class Target:
     def good_calls(self):
         """Make a good call to everything; raise TapError when one is not answered well."""
         self._rig.expect_prediction(ANSWER_S)
-        answer = call(self._clients['sim/pause'], SetBool.Request(), ANSWER_S)
-        assert answer.success, answer.message
+        self._rig.client.pause(False)
         self._rig.reset(1)
 
     def _look(self, name):
@@ -89,7 +90,7 @@ class Target:
 
     def _pursue(self, goal):
         """Send a goal, let it begin, and cancel it; raise AssertionError if it does not end."""
-        node, client = self._rig.node, self._rig.reach_client
+        node, client = self._rig.node, self._reach
         future = in_executor(node, lambda: client.send_goal_async(goal), ANSWER_S)
         assert wait_for_future(future, ANSWER_S), 'no answer to a goal'
         handle = future.result()

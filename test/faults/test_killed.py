@@ -9,7 +9,7 @@ import time
 from fault_files import describe_exit
 from fault_report import fault
 from fault_rig import Attacked, STOP_S
-from fault_world import goal_fields, predict_fields
+from fault_world import goal_fields
 import numpy as np
 import pytest
 from tap_ros.errors import TapError
@@ -36,7 +36,7 @@ def expect_notice(trials, watch, moment):
 
 def expect_first_goal(rig):
     """Raise AssertionError unless the first goal after a restart succeeds."""
-    rig.expect_end(rig.begin(10.0, mode='direct', step_budget=1), 'succeeded', 20.0)
+    rig.expect_end(rig.begin(mode='direct', step_budget=1), 'succeeded', timeout_s=20.0)
 
 
 @fault('the predictor is killed during a call', 'noticed within 1 s; no move; goal and calls '
@@ -57,14 +57,14 @@ def test_predictor_killed(rig, trials):
                 time.sleep(random.uniform(0.1, 0.3))
                 victim.kill()
                 seconds = expect_notice(trials, watch, moment)
-                rig.expect_end(handle, 'aborted', 30.0, 'predict')
+                rig.expect_end(handle, 'aborted', 'predict')
                 took = time.monotonic() - moment
                 assert took < max(limit, seconds + 0.1), f'the goal was told after {took:.1f} s'
                 rig.commands.assert_stopped(moment, STOP_S * trials.patience)
                 assert not rig.commands.moves(moment), 'the arm was moved'
                 begin = time.monotonic()
                 with pytest.raises(TapError, match='predictor_node, has ended'):
-                    rig.predict(5.0, **predict_fields())
+                    rig.expect_prediction(5.0)
                 assert time.monotonic() - begin < limit, 'a call while it was dead took long'
                 rig.restart('predictor_node')
                 rig.expect_prediction(5.0)
@@ -88,7 +88,7 @@ def test_planner_killed(rig, trials):
             victim, watch = rig.processes['visual_mpc_node'], rig.alive['visual_mpc_node']
             moment = victim.kill()
             with pytest.raises(TapError):
-                rig.result(handle, 4.0)
+                rig.result(handle)
             took = time.monotonic() - moment
             assert took < NOTICED_S * trials.patience, f'its client was told after {took:.1f} s'
             expect_notice(trials, watch, moment)
@@ -112,7 +112,7 @@ def test_simulator_killed(rig, trials):
             expect_notice(trials, watch, moment)
             time.sleep(max(0.0, moment + 1.0 - time.monotonic()))
             rig.commands.assert_stopped(moment, STOP_S * trials.patience)
-            rig.expect_end(handle, 'aborted', 30.0)
+            rig.expect_end(handle, 'aborted')
             rig.restart('sim_node')
             rig.reset(trial % 10)
             expect_first_goal(rig)
@@ -132,7 +132,7 @@ def test_planner_paused(rig, trials):
                 time.sleep(PAUSED_S)
                 moment = time.monotonic()
                 victim.send(signal.SIGCONT)
-                rig.expect_end(handle, 'aborted', 20.0, 'stood still')
+                rig.expect_end(handle, 'aborted', 'stood still', 20.0)
                 time.sleep(2.0)  # it is found again, and would move by now
                 moves = rig.commands.moves(moment)
                 assert not moves, f'{len(moves)} moves after it went on'

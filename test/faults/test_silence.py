@@ -7,9 +7,10 @@ import time
 
 from fault_report import fault
 from fault_rig import STOP_S
-from fault_world import first_pictures, goal_fields, objects_message, predict_fields
+from fault_world import first_pictures, objects_message, predict_fields
 import numpy as np
 import pytest
+from tap_ros.errors import TapError
 from tap_ros.nodes.topics import to_stamp
 from tap_ros.planning.mpc_inputs import GRIPPER_PARTS
 
@@ -56,7 +57,7 @@ def test_camera_dead(rig, trials):
             rig.need('visual_mpc_node')
             begin = time.monotonic()
             with trials.one():
-                rig.expect_end(rig.begin(**goal_fields()), 'aborted', 30.0)
+                rig.expect_end(rig.begin(), 'aborted')
                 moves = rig.commands.moves(begin)
                 trials.measured(len(moves))
                 assert not moves, f'{len(moves)} moves, the camera dead for {age:g} s'
@@ -95,8 +96,8 @@ def test_absurd_to_planner(rig, trials, spoil):
                 time.sleep(0.0 if during else 0.5)
                 moment = time.monotonic()
                 if not during:
-                    handle = rig.begin(**goal_fields())
-                end = rig.expect_end(handle, 'aborted: ', 12.0)
+                    handle = rig.begin()
+                end = rig.expect_end(handle, 'aborted: ', timeout_s=12.0)
                 moves = rig.commands.moves(moment + (STOP_S * trials.patience if during else 0.0))
                 assert not moves, f'{spoiled}: {len(moves)} moves'
                 assert_refuses(end.removeprefix('aborted: '), name)
@@ -112,12 +113,12 @@ def test_absurd_to_predictor(rig, trials):
         field = list(views)[trial % 2]
         view = views[field]
         pixels = view.object_pixels.astype(float)
-        pixels[1, trial // 4 % 2] = value = ABSURD[trial // 2 % len(ABSURD)]
+        pixels[1, trial // 4 % 2] = ABSURD[trial // 2 % len(ABSURD)]
         objects = objects_message(view, to_stamp(0), pixels)
         with trials.one():
-            response = rig.predict(10.0, **predict_fields(**{field: objects}))
-            assert not response.success, f'pixel {value:g} was accepted'
-            assert_refuses(response.message, view.object_names[1])
+            with pytest.raises(TapError) as refused:
+                rig.client.call('predict', 10.0, **predict_fields(**{field: objects}))
+            assert_refuses(str(refused.value), view.object_names[1])
             rig.check()
 
 

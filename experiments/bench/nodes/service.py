@@ -9,6 +9,7 @@ while nothing else does. Answers per second are those of clients that ask again 
 are answered, each with a queue of its own, spread over a few processes.
 """
 
+from collections import Counter
 import contextlib
 from dataclasses import dataclass, field
 import multiprocessing
@@ -26,12 +27,10 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.nodes.client import Client, request_fields
 from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.node_processes import NodeProcesses
-from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
+from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import DEFAULT_PREDICTOR
 
-SERVICE = 'predict_subgoal'
-NAMES = ('cup', 'box')
 PIXELS = np.array([[[20, 21], [40, 33]], [[30, 12], [44, 50]]], np.float32)  # start, goal
 TIMEOUT = 20.0  # s; a call that takes longer counts as lost
 MOST_PROCESSES = 4  # of clients
@@ -42,18 +41,14 @@ class Load:
     """
     What many clients got.
 
-    :param clients: how many asked at once.
     :param latencies: (answers,) s, of the calls that were answered with a prediction.
     :param per_second: of these answers.
-    :param busy: calls that were told to ask again.
-    :param lost: calls that got no answer.
+    :param counts: of other ends: 'busy' (told to ask again), 'refused', 'lost' (no answer).
     """
 
-    clients: int
     latencies: np.ndarray
     per_second: float
-    busy: int
-    lost: int
+    counts: Counter
 
 
 @dataclass(frozen=True)
@@ -81,27 +76,19 @@ def run(args):
         nodes.start('predictor_node')
         with streaming(args.rate) as stream:
             alone, service = compare_latency(stream, args.rounds, args.calls)
-            show_latency(alone, service, args.rate)
+            for name, times in (('the model alone', alone), (
+                    f'/predict_subgoal, {args.rate:g} pictures/s', service)):
+                p50, p99 = 1e3 * np.percentile(times, (50, 99))
+                print(f'{name:<40}p50 {p50:6.2f} ms   p99 {p99:6.2f} ms   {len(times)} calls')
             print(f'{"clients":>8}{"answers/s":>11}{"p50, ms":>10}{"p99, ms":>10}'
                   f'{"busy":>7}{"lost":>7}')
             for count in args.clients:
                 load = measure_load(count, args.seconds)
                 p50, p99 = 1e3 * np.percentile(load.latencies, (50, 99)) if len(
                     load.latencies) else (np.nan, np.nan)
-                print(f'{load.clients:>8}{load.per_second:>11.1f}{p50:>10.1f}{p99:>10.1f}'
-                      f'{load.busy:>7}{load.lost:>7}', flush=True)
+                print(f'{count:>8}{load.per_second:>11.1f}{p50:>10.1f}{p99:>10.1f}'
+                      f'{load.counts["busy"]:>7}{load.counts["lost"]:>7}', flush=True)
         nodes.check()
-
-
-def show_latency(alone, service, rate):
-    """Print how the times (s) of single calls compare with those of the model alone."""
-    bound = 1.2 * np.median(alone) + 1e-3
-    for name, times in (('the model alone', alone),
-                        (f'/{SERVICE}, {rate:g} pictures/s', service)):
-        p50, p99 = 1e3 * np.percentile(times, (50, 99))
-        print(f'{name:<40}p50 {p50:6.2f} ms   p99 {p99:6.2f} ms   {len(times)} calls')
-    print(f'{"1.2 x the model alone + 1 ms":<40}p50 {1e3 * bound:6.2f} ms: '
-          f'{"held" if np.median(service) <= bound else "not held"}', flush=True)
 
 
 def compare_latency(stream, rounds, calls):
@@ -115,16 +102,16 @@ def compare_latency(stream, rounds, calls):
     """
     predictor = SubgoalPredictor.load(DEFAULT_PREDICTOR)
     start, goal = pictures()
-    times = {'alone': [], 'service': []}
-    with Client(timeout_s=TIMEOUT) as client:
-        request = make_fields()
-        client.call('predict', 120, **request)
+    alone, service = [], []
+    with Client() as client:
+        ask, request = make_client(client, SERVICE_QOS.depth), make_request()
+        call(ask, request, 120)
         for _ in range(rounds):
             os.kill(stream.pid, signal.SIGSTOP)
-            times['alone'].append(timed(lambda: predictor.predict(start, goal, *PIXELS), calls))
+            alone += timed(lambda: predictor.predict(start, goal, *PIXELS), calls)
             os.kill(stream.pid, signal.SIGCONT)
-            times['service'].append(timed(lambda: client.call('predict', **request), calls))
-    return np.concatenate(times['alone']), np.concatenate(times['service'])
+            service += timed(lambda: call(ask, request, TIMEOUT), calls)
+    return np.array(alone), np.array(service)
 
 
 def timed(work, count, warm_up=5):
@@ -157,9 +144,8 @@ def measure_load(clients, seconds, depth=SERVICE_QOS.depth):
     for process in processes:
         process.join()
     latencies = np.concatenate([part[0] for part in found])
-    elapsed = max(part[3] for part in found)
-    return Load(clients, latencies, len(latencies) / elapsed, sum(part[1] for part in found),
-                sum(part[2] for part in found))
+    return Load(latencies, len(latencies) / max(part[2] for part in found),
+                sum((part[1] for part in found), Counter()))
 
 
 def ask_many(clients, seconds, depth, barrier, results):
@@ -170,39 +156,42 @@ def ask_many(clients, seconds, depth, barrier, results):
     :param seconds: how long to ask.
     :param depth: answers that wait in the queue of a client.
     :param barrier: passed when all processes are ready.
-    :param results: queue for (latencies, busy, lost, s that it took).
+    :param results: queue for (latencies, counts of other ends, s that it took).
     """
-    latencies, busy, lost = [], [], []
-    qos = QoSProfile(depth=depth)
-
-    request = PredictSubgoal.Request(**make_fields())
+    latencies, others = [], []
 
     def ask(client, deadline):
+        request = make_request()
         while (begin := time.monotonic()) < deadline:
             try:
                 response = call(client, request, TIMEOUT)
-            except CallError as error:
-                lost.append(error)
+            except CallError:
+                others.append('lost')
                 continue
             if response.success:
                 latencies.append(time.monotonic() - begin)
             else:
-                busy.append(response.message)
+                others.append('busy' if 'busy' in response.message else 'refused')
+                time.sleep(0.05)  # as a client does that is told to come later
 
-    with Client() as owner:
-        each = [owner.node.create_client(PredictSubgoal, SERVICE, qos_profile=qos)
-                for _ in range(clients)]
-        for client in each:
-            call(client, request, 120)
+    with Client() as client:
+        each = [make_client(client, depth) for _ in range(clients)]
+        for one in each:
+            call(one, make_request(), 120)
         barrier.wait(300)
         begin = time.monotonic()
-        threads = [threading.Thread(target=ask, args=(client, begin + seconds))
-                   for client in each]
+        threads = [threading.Thread(target=ask, args=(one, begin + seconds)) for one in each]
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-        results.put((np.array(latencies), len(busy), len(lost), time.monotonic() - begin))
+        results.put((np.array(latencies), Counter(others), time.monotonic() - begin))
+
+
+def make_client(client, depth):
+    """Return a further rclpy client of the predictor, with a queue of its own."""
+    return client.node.create_client(
+        PredictSubgoal, 'predict_subgoal', qos_profile=QoSProfile(depth=depth))
 
 
 @contextlib.contextmanager
@@ -219,20 +208,16 @@ def streaming(rate):
 
 
 def publish(rate):
-    """Publish a start at this rate and a goal once, until killed."""
+    """Publish a start at this rate, until killed."""
     with Client() as client:
         image = client.node.create_publisher(Image, 'camera/image_raw', STREAM)
         objects = client.node.create_publisher(ObjectStates, 'objects', STREAM)
-        goals = (client.node.create_publisher(Image, 'goal/image', LATCHED),
-                 client.node.create_publisher(ObjectStates, 'goal/objects', LATCHED))
-        request = make_fields()
-        for publisher, name in zip(goals, ('goal', 'goal_objects')):
-            publisher.publish(request[name])
+        request = make_request()
         while True:
             stamp = to_stamp(time.time_ns())
-            for publisher, name in ((image, 'start'), (objects, 'start_objects')):
-                request[name].header.stamp = stamp
-                publisher.publish(request[name])
+            for publisher, message in ((image, request.start), (objects, request.start_objects)):
+                message.header.stamp = stamp
+                publisher.publish(message)
             time.sleep(1 / rate)
 
 
@@ -241,8 +226,8 @@ def pictures():
     return np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), np.uint8)
 
 
-def make_fields():
-    """Return the fields of a request that has all it needs."""
+def make_request():
+    """Return a request that has all it needs."""
     start, goal = pictures()
-    return request_fields(NAMES, start=start, goal=goal, start_objects=PIXELS[0],
-                          goal_objects=PIXELS[1])
+    return PredictSubgoal.Request(**request_fields(
+        ('cup', 'box'), start=start, goal=goal, start_objects=PIXELS[0], goal_objects=PIXELS[1]))
