@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.evaluation.prediction import evaluate
-from tap_ros.options import parse
 from tap_ros.prediction.batches import make_batch
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.formats.bair import find_shards, import_bair, Options
-from tap_ros.recording.formats.tfrecord import parse_example, read_records
+from tap_ros.recording.formats.bair import find_shards, import_bair
+from tap_ros.recording.formats.tfrecord import parse_example
 from tap_ros.training.split import split_episodes
 
 
@@ -151,37 +150,20 @@ def test_train_and_test_do_not_share_seeds(tmp_path, data_set):
     assert sorted([*kept, *held_out]) == list(range(5))
 
 
-def test_the_order_of_keys_does_not_matter(tmp_path):
+def test_a_record_is_the_same_in_any_order_of_keys_and_however_its_pictures_are_kept(tmp_path):
     features, expected = make_features(1)
-    path = write_file(tmp_path, 0, [dict(sorted(features.items(), reverse=True))])
-    import_bair([path], tmp_path / 'bair', progress=False)
-    assert_is(open_recordings(tmp_path / 'bair')[0], expected)
-
-
-def test_the_other_camera_is_taken_where_it_is_the_only_one(tmp_path):
-    features, expected = make_features(1, camera='image_view0')
-    path = write_file(tmp_path, 0, [features])
-    import_bair([path], tmp_path / 'bair', progress=False)
-    assert_is(open_recordings(tmp_path / 'bair')[0], expected)
-
-
-def test_aux1_comes_before_the_other_cameras(tmp_path):
-    features, expected = make_features(1)
-    for camera in ('image_view0', 'image_main'):
-        others, _ = make_features(2, camera=camera)
-        features = {**others, **features}
-    path = write_file(tmp_path, 0, [features])
-    import_bair([path], tmp_path / 'bair', progress=False)
-    np.testing.assert_array_equal(open_recordings(tmp_path / 'bair')[0].frames, expected[0])
-
-
-def test_compressed_pictures_are_decoded(tmp_path):
-    features, expected = make_features(1)
-    for t, image in enumerate(expected[0]):
-        png = cv2.imencode('.png', image[..., ::-1])[1].tobytes()
-        features[f'{t}/image_aux1/encoded'] = png
-    import_bair([write_file(tmp_path, 0, [features])], tmp_path / 'bair', progress=False)
-    assert_is(open_recordings(tmp_path / 'bair')[0], expected)
+    others = {name: value for camera in ('image_view0', 'image_main')
+              for name, value in make_features(2, camera=camera)[0].items()}
+    compressed = features | {
+        f'{t}/image_aux1/encoded': cv2.imencode('.png', image[..., ::-1])[1].tobytes()
+        for t, image in enumerate(expected[0])}
+    records = [dict(sorted(features.items(), reverse=True)), {**others, **features}, compressed,
+               make_features(1, camera='image_view0')[0]]
+    import_bair([write_file(tmp_path, 0, records)], tmp_path / 'bair', progress=False)
+    store = open_recordings(tmp_path / 'bair')
+    assert len(store) == 4
+    for i in range(4):
+        assert_is(store[i], expected)
 
 
 def test_numbers_that_are_not_packed_are_read_too():
@@ -190,29 +172,22 @@ def test_numbers_that_are_not_packed_are_read_too():
     np.testing.assert_array_equal(parse_example(field(1, field(1, entry)))['x'], [1.5, -2])
 
 
-@pytest.mark.parametrize('damage', ['length', 'length crc', 'data', 'data crc'])
-def test_a_damaged_record_is_named_and_what_came_before_stays(tmp_path, data_set, made, damage):
-    path = data_set / 'train' / 'traj_2_to_3.tfrecords'
-    data = bytearray(path.read_bytes())
-    start = len(data) // 2  # of the second record: both are equally long
-    data[{'length': start, 'length crc': start + 9, 'data': start + 5000, 'data crc': -1}[
-        damage]] ^= 16
-    path.write_bytes(data)
-    assert 'traj_2_to_3.tfrecords: record 1 is damaged' in refused(data_set, tmp_path / 'bair')
-    store = open_recordings(tmp_path / 'bair')
+def test_a_damaged_record_is_named_and_what_came_before_stays(tmp_path, data_set, made):
+    path, out = data_set / 'train' / 'traj_2_to_3.tfrecords', tmp_path / 'bair'
+    whole = path.read_bytes()
+    start = len(whole) // 2  # of the second record: both are equally long
+    for where in (start, start + 9, start + 5000, len(whole) - 1):  # length, its CRC, data, CRC
+        data = bytearray(whole)
+        data[where] ^= 16
+        path.write_bytes(data)
+        assert 'traj_2_to_3.tfrecords: record 1 is damaged' in refused(data_set, out)
+    for kept in (start + 3, start + 11, start + 12, start + 100_000, len(whole) - 5, -1):
+        path.write_bytes(whole[:kept])
+        assert f'{path}: record 1 is cut off' in refused(data_set, out)
+    store = open_recordings(out)
     assert len(store) == 2
     assert_is(store[1], made[1][1])
-    assert sorted(p.name for p in (tmp_path / 'bair' / 'train').iterdir()) == [
-        'metadata.yaml', 'train_0.mcap']
-
-
-@pytest.mark.parametrize('kept', [3, 11, 12, 100_000, -5, -1])
-def test_a_file_that_is_cut_off_is_named(tmp_path, kept):
-    features, _ = make_features(1)
-    path = write_file(tmp_path, 0, [features, features])
-    data = path.read_bytes()
-    path.write_bytes(data[:len(data) // 2 + kept if kept > 0 else kept])
-    assert f'{path}: record 1 is cut off' in refused(path, tmp_path / 'bair')
+    assert sorted(p.name for p in (out / 'train').iterdir()) == ['metadata.yaml', 'train_0.mcap']
 
 
 def test_a_file_with_fewer_or_more_records_than_its_name_says_is_refused(tmp_path):
@@ -224,43 +199,26 @@ def test_a_file_with_fewer_or_more_records_than_its_name_says_is_refused(tmp_pat
     assert not list((tmp_path / 'bair').rglob('*.mcap*'))
 
 
-@pytest.mark.parametrize('name', ['17/action', '0/endeffector_pos', '29/image_aux1/encoded',
-                                  '0/image_aux1/encoded'])
-def test_a_missing_key_is_named(tmp_path, name):
-    features, _ = make_features(1)
-    del features[name]
-    path = write_file(tmp_path, 0, [make_features(2)[0], features])
-    text = refused(path, tmp_path / 'bair')
-    assert f'{path}: record 1' in text and f'lacks {name}' in text
-
-
-@pytest.mark.parametrize('changes, expected', [
-    ({'size': 32}, '0/image_aux1/encoded has 3072 bytes'),
-    ({'frames': 29}, 'lacks 29/image_aux1/encoded'), ({'frames': 31}, 'more than 30 frames')])
-def test_other_sizes_and_lengths_are_refused(tmp_path, changes, expected):
-    path = write_file(tmp_path, 0, [make_features(1, **changes)[0]])
-    text = refused(path, tmp_path / 'bair')
-    assert f'{path}: record 0' in text and expected in text
-
-
-@pytest.mark.parametrize('value, expected', [
-    (cv2.imencode('.jpg', np.zeros((48, 64, 3), np.uint8))[1].tobytes(), '64x48 pixels'),
-    (b'\x89PNG not really', 'cannot be decoded'), ((1.0, 2.0), 'lacks 3/image_aux1/encoded')])
-def test_a_wrong_picture_is_named(tmp_path, value, expected):
-    features = {**make_features(1)[0], '3/image_aux1/encoded': value}
-    assert expected in refused(write_file(tmp_path, 0, [features]), tmp_path / 'bair')
-
-
-@pytest.mark.parametrize('value', [(1.0, 2.0, 3.0), b'abcd'])
-def test_a_wrong_action_is_named(tmp_path, value):
-    features = {**make_features(1)[0], '3/action': value}
-    assert 'lacks 3/action' in refused(write_file(tmp_path, 0, [features]), tmp_path / 'bair')
-
-
-def test_a_record_that_is_no_example_is_named(tmp_path):
-    path = tmp_path / 'traj_0_to_0.tfrecords'
-    path.write_bytes(frame_record(b'\x0a\xff'))
-    assert 'record 0: holds no tf.train.Example' in refused(path, tmp_path / 'bair')
+def test_a_record_that_lacks_something_is_named_with_what(tmp_path):
+    good, _ = make_features(1)
+    picture = '3/image_aux1/encoded'
+    wide = cv2.imencode('.jpg', np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    for record, words in (
+            *(({key: value for key, value in good.items() if key != name}, f'lacks {name}')
+              for name in ('17/action', '0/endeffector_pos', '29/image_aux1/encoded',
+                           '0/image_aux1/encoded')),
+            (make_features(1, size=32)[0], '0/image_aux1/encoded has 3072 bytes'),
+            (make_features(1, frames=29)[0], 'lacks 29/image_aux1/encoded'),
+            (make_features(1, frames=31)[0], 'more than 30 frames'),
+            (good | {picture: wide}, '64x48 pixels'),
+            (good | {picture: b'\x89PNG not really'}, 'cannot be decoded'),
+            (good | {picture: (1.0, 2.0)}, f'lacks {picture}'),
+            (good | {'3/action': (1.0, 2.0, 3.0)}, 'lacks 3/action'),
+            (good | {'3/action': b'abcd'}, 'lacks 3/action')):
+        text = refused(write_file(tmp_path, 0, [record]), tmp_path / 'bair')
+        assert 'record 0' in text and words in text
+    (tmp_path / 'traj_0_to_0.tfrecords').write_bytes(frame_record(b'\x0a\xff'))
+    assert 'record 0: holds no tf.train.Example' in refused(tmp_path, tmp_path / 'bair')
 
 
 def test_an_import_goes_on_with_the_files_that_are_missing(tmp_path, data_set):
@@ -295,12 +253,6 @@ def test_files_are_taken_in_the_order_of_their_numbers(tmp_path):
         ('train', 0), ('train', 256), ('train', 1024), ('test', 0)]
 
 
-def test_an_empty_file_has_no_records(tmp_path):
-    path = tmp_path / 'empty'
-    path.touch()
-    assert not list(read_records(path))
-
-
 def test_prediction_is_evaluated_without_objects(tmp_path, data_set):
     import_bair([data_set], tmp_path / 'bair', progress=False)
     store = open_recordings(tmp_path / 'bair')
@@ -310,7 +262,3 @@ def test_prediction_is_evaluated_without_objects(tmp_path, data_set):
     for scores in evaluate(network, store, range(5)).values():
         assert np.isfinite(scores.min_l1).all() and np.isnan(scores.bottleneck).all()
         assert scores.summary()['bottleneck_episodes'] == 0
-
-
-def test_the_command_takes_files_and_a_folder():
-    assert parse(Options, ['a', 'b', '--out', 'c']) == Options(('a', 'b'), 'c')
