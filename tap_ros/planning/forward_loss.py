@@ -3,30 +3,14 @@
 """The forward model's training loss: pictures reconstructed along whole rollouts."""
 
 from collections.abc import Collection
-from typing import Protocol
 
 from tap_ros.planning.forward_data import mirror, recolour, Windows
 from tap_ros.planning.forward_model import LearnedForwardModel
+from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 import torch
 from torch.nn import functional as F
 
 MOTION_THRESHOLD = 0.08  # of the range 2: mean channel difference that counts as change
-
-
-class LossSettings(Protocol):
-    """The settings that the loss takes, of forward_training.ForwardTrainingConfig."""
-
-    @property
-    def motion_factor(self) -> float:
-        """Extra weight of pixels that changed since the window's first picture."""
-
-    @property
-    def still_weight(self) -> float:
-        """Weight of the mean share of the crop that is said to move."""
-
-    @property
-    def object_weight(self) -> float:
-        """Weight of the mean share of the picture that is said to be objects."""
 
 
 def draw_arm_like(model: LearnedForwardModel, grippers: torch.Tensor, mirrored: torch.Tensor,
@@ -73,7 +57,7 @@ def picture_loss(predicted: torch.Tensor, target: torch.Tensor,
 
 
 def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Collection[int],
-                 config: LossSettings) -> tuple[torch.Tensor, dict[str, float]]:
+                 config: ForwardTrainingConfig) -> tuple[torch.Tensor, dict[str, float]]:
     """
     Roll the model along the windows and compare pictures at some of the steps.
 
@@ -83,7 +67,7 @@ def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Coll
     :param model: LearnedForwardModel.
     :param batch: Windows.
     :param picture_steps: indices in 1..T of the pictures compared.
-    :param config: with motion_factor, still_weight and object_weight.
+    :param config: ForwardTrainingConfig.
     :return: loss, dict of its parts.
     """
     arms = draw_arm_like(model, batch.grippers[:, 0], batch.mirrored, batch.colours)
