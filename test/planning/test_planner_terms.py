@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 from tap_ros.contract import LIFTED, LOW
 from tap_ros.planning.action_sequences import FULL, HORIZON, Limits, PUSH_LIMIT, SequenceShape
-from tap_ros.planning.cost import PlanCost
+from tap_ros.planning.cost import (
+    distances_to_all_pixels,
+    distances_to_pixels,
+    distances_to_places,
+    PlanCost,
+)
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.prediction.warp import one_hot_maps
 import torch
 from toy_world import SIZE, to_pixels
 
@@ -23,6 +29,7 @@ PLAIN = VisualMPCConfig(
 IMAGE = np.zeros((SIZE, SIZE, 3), np.uint8)
 NEW = Memory()
 GRIPPER = np.array([0.0, 0.0, LOW, 0.0], np.float32)
+PICTURE = (24, 32)
 PLACES = 1.1 / 43 * np.array([[14, 21], [25, 14]]) - 0.55  # m, of two objects: table cells
 GOALS = to_pixels(PLACES)
 
@@ -135,16 +142,15 @@ def dives(actions, _):
     return np.where(down, away(6, 6), away(7, 7))
 
 
-@pytest.mark.parametrize('clearance, down', [(0.0, True), (0.1, False)])
-def test_the_gripper_does_not_come_down_upon_an_object(model, clearance, down):
+def test_the_gripper_does_not_come_down_upon_an_object(model):
     above = np.append(PLACES[1] + [0.03, 0.0], [LIFTED, 0]).astype(np.float32)
-    config = replace(PLAIN, clearance=clearance)
-    found = plan(Puppets(model, dives), config, above, GOALS)
-    assert (found.action[2] < 0) == down
-    beside = above + np.float32([0.12, 0, 0, 0])  # where there is room it changes nothing
-    clear, careless = (plan(Puppets(model, dives), c, beside, GOALS) for c in (config, PLAIN))
-    assert clear.action[2] < 0 and np.array_equal(clear.actions, careless.actions)
-    assert clear.cost == careless.cost
+    beside = above + np.float32([0.12, 0, 0, 0])
+    careful = replace(PLAIN, clearance=0.1)
+    found = [plan(Puppets(model, dives), config, gripper, GOALS)
+             for gripper in (above, beside) for config in (PLAIN, careful)]
+    assert [one.action[2] < 0 for one in found] == [True, False, True, True]
+    # where there is room it changes nothing
+    assert np.array_equal(found[2].actions, found[3].actions) and found[2].cost == found[3].cost
 
 
 def sticks(actions, grippers):
@@ -276,17 +282,17 @@ def test_the_arm_climbs_on_the_spot_pushes_slowly_and_a_way_takes_any_number_of_
     assert lifted.any() and (lifted % 3 != 0).any()
 
 
-@pytest.mark.parametrize('height, first', [(0.06, 1), (LOW, 0), (LIFTED, 0)])
-def test_a_gripper_that_stands_upon_something_goes_up_before_it_pushes(model, height, first):
-    _, heights = candidates(model, height)
-    assert (heights[:, 0] > 0.1).all() == bool(first)
+def test_a_gripper_that_stands_upon_something_goes_up_before_it_pushes(model):
+    for height, first in ((0.06, True), (LOW, False), (LIFTED, False)):
+        _, heights = candidates(model, height)
+        assert (heights[:, 0] > 0.1).all() == first
 
 
-@pytest.mark.parametrize('hidden', [True, False])
-def test_the_model_is_told_whether_the_arm_is_hidden(model, hidden):
-    puppets = Puppets(model, dives)
-    plan(puppets, replace(PLAIN, arm_hidden=hidden))
-    assert puppets.arm_hidden is hidden
+def test_the_model_is_told_whether_the_arm_is_hidden(model):
+    for hidden in (True, False):
+        puppets = Puppets(model, dives)
+        plan(puppets, replace(PLAIN, arm_hidden=hidden))
+        assert puppets.arm_hidden is hidden
 
 
 def test_an_unfinished_object_costs_all_of_its_price_from_3_px_on():
@@ -294,14 +300,42 @@ def test_an_unfinished_object_costs_all_of_its_price_from_3_px_on():
     torch.testing.assert_close(cost, torch.tensor([[0.0, 3.5, 7.0, 10.0]]))
 
 
-@pytest.mark.parametrize('seen', [2, 3, 5, HORIZON])
-def test_what_stands_costs_the_same_however_often_it_is_looked_at(seen):
+def test_what_stands_costs_the_same_however_often_it_is_looked_at():
     maps = torch.full((1, 2, 1, 2), 0.5)  # two objects, each half in either cell
-    cost, last = PlanCost().of_maps([maps] * seen, torch.tensor([[1.0, 3.0], [4.0, 8.0]]))
-    assert cost.item() == pytest.approx((14 + 10) * (2 + 6)) and last.item() == 4
+    for seen in (2, 3, 5, HORIZON):
+        cost, last = PlanCost().of_maps([maps] * seen, torch.tensor([[1.0, 3.0], [4.0, 8.0]]))
+        assert cost.item() == pytest.approx((14 + 10) * (2 + 6)) and last.item() == 4
 
 
 def test_landing_too_near_costs_100_px_and_10_for_each_missing_centimetre():
     landings = np.array([[0.0, 0.0], [0.125, 0.0], [0.25, 0.0], [0.9, 1.0], [np.nan, np.nan]])
     cost = PlanCost(clearance=0.25).of_landings(landings, np.array([[0.0, 0.0], [1.0, 1.0]]))
     np.testing.assert_allclose(cost, [350, 225, 0, 250, 0])
+
+
+def test_distances_to_a_sure_position_are_plain_distances():
+    maps = one_hot_maps(torch.tensor([[3.0, 4.0]]), PICTURE)
+    assert distances_to_pixels(maps, torch.tensor([[0.0, 0.0]])) == 5
+    assert distances_to_pixels(maps, torch.tensor([[3.0, 4.0]])) == 0
+
+
+def test_distance_is_expected_over_the_map_not_from_its_mean():
+    maps = one_hot_maps(torch.tensor([[0.0, 5.0], [10.0, 5.0]]), PICTURE).mean(0)
+    assert distances_to_pixels(maps, torch.tensor([5.0, 5.0])) == 5
+
+
+def test_all_three_ways_give_the_same():
+    maps = torch.rand(3, *PICTURE, generator=torch.Generator().manual_seed(0))
+    maps[0] = one_hot_maps(torch.tensor([20.3, 7.8]), PICTURE)
+    v, u = torch.meshgrid(*map(torch.arange, PICTURE), indexing='ij')
+    places = torch.stack([u, v], -1).flatten(0, 1).float()
+    sure = maps / maps.sum((1, 2), keepdim=True)
+    exact = torch.stack([
+        distances_to_pixels(m.expand(len(places), *PICTURE), places) for m in sure])
+    close = {'atol': 0.05, 'rtol': 0}
+    torch.testing.assert_close(distances_to_places(maps, places), exact, **close)
+    everywhere = torch.from_numpy(distances_to_all_pixels(maps.numpy()))
+    torch.testing.assert_close(everywhere.flatten(1), exact, **close)
+    between = places[:50] + 0.4
+    exact = torch.stack([distances_to_pixels(m.expand(50, *PICTURE), between) for m in sure])
+    torch.testing.assert_close(distances_to_places(maps, between), exact, **close)

@@ -58,18 +58,18 @@ def same(first, second):
     return all(np.array_equal(a.actions, b.actions) for a, b in zip(first, second))
 
 
-@pytest.mark.parametrize('preset', PRESETS)
-def test_plans_are_within_limits_and_finite(model, preset):
-    config = replace(PRESETS[preset], search=SMALL.search, batch_size=24, threads=1,
-                     proposals=min(8, PRESETS[preset].proposals))
-    for plan in plans(model, config, steps=4):
-        assert plan.action.shape == (4,) and plan.action.dtype == np.float32
-        assert plan.actions.shape == (15, 4)
-        assert np.abs(plan.action[:2]).max() <= 0.08 + 1e-6 and plan.action[3] == 0
-        assert np.isfinite([plan.expected_distance, plan.current_distance]).all()
-        assert plan.elites.shape[1:] == (15, 4) and plan.places.shape[1:] == (2,)
-        assert any(np.array_equal(one, plan.actions) for one in plan.elites)
-        assert len(np.unique(plan.elites, axis=0)) > 1, 'not all are the same'
+def test_plans_are_within_limits_and_finite(model):
+    for preset in PRESETS.values():
+        config = replace(preset, search=SMALL.search, batch_size=24, threads=1,
+                         proposals=min(8, preset.proposals))
+        for plan in plans(model, config, steps=4):
+            assert plan.action.shape == (4,) and plan.action.dtype == np.float32
+            assert plan.actions.shape == (15, 4)
+            assert np.abs(plan.action[:2]).max() <= 0.08 + 1e-6 and plan.action[3] == 0
+            assert np.isfinite([plan.expected_distance, plan.current_distance]).all()
+            assert plan.elites.shape[1:] == (15, 4) and plan.places.shape[1:] == (2,)
+            assert any(np.array_equal(one, plan.actions) for one in plan.elites)
+            assert len(np.unique(plan.elites, axis=0)) > 1, 'not all are the same'
 
 
 def test_same_seed_same_plans_and_another_seed_others(model):
@@ -88,17 +88,13 @@ def test_the_same_scene_goal_and_memory_give_the_same_plan_whatever_came_between
     assert not same(found[:1], found[1:2])
 
 
-@pytest.mark.parametrize('changes', [{'batch_size': 5}, {'batch_size': 50}, {'threads': 2}])
-def test_batch_size_and_threads_change_nothing(model, changes):
-    assert same(plans(model), plans(model, replace(SMALL, **changes)))
-
-
-@pytest.mark.parametrize('batch_size', [32, 50])
-def test_trained_weights_plan_the_same_in_any_batch(trained, batch_size):
-    def chosen(batch_size):
-        return plans(trained, with_preset('default', batch_size=batch_size), steps=1, scale=2)
-
-    assert same(chosen(64), chosen(batch_size))
+def test_batch_size_and_threads_change_nothing(model, trained):
+    expected = plans(model)
+    for changes in ({'batch_size': 5}, {'batch_size': 50}, {'threads': 2}):
+        assert same(expected, plans(model, replace(SMALL, **changes)))
+    first, *others = (plans(trained, with_preset('default', batch_size=size), steps=1, scale=2)
+                      for size in (64, 32, 50))
+    assert all(same(first, other) for other in others)
 
 
 def test_the_planner_stays_within_limits_that_are_given(model):
@@ -108,8 +104,7 @@ def test_the_planner_stays_within_limits_that_are_given(model):
     assert same(plans(model), plans(model, limits=Limits(1.0, 1.0)))
 
 
-@pytest.mark.parametrize('count, lengths', [(48, {24}), (64, {32}), (33, {17}), (1, {1})])
-def test_sequences_are_predicted_in_even_batches(model, monkeypatch, count, lengths):
+def test_sequences_are_predicted_in_even_batches(model, monkeypatch):
     seen, carried_maps = [], model.carried_maps
 
     def spy(features, begin, maps, actions, *rest):
@@ -117,8 +112,10 @@ def test_sequences_are_predicted_in_even_batches(model, monkeypatch, count, leng
         return carried_maps(features, begin, maps, actions, *rest)
 
     monkeypatch.setattr(model, 'carried_maps', spy)
-    costs, _ = judge(model, np.zeros((count, 15, 4), np.float32), 32)
-    assert len(costs) == count and set(seen) == lengths
+    for count, length in ((48, 24), (64, 32), (33, 17), (1, 1)):
+        seen.clear()
+        costs, _ = judge(model, np.zeros((count, 15, 4), np.float32), 32)
+        assert len(costs) == count and set(seen) == {length}
 
 
 def test_equal_sequences_cost_the_same_in_any_batch(model):
@@ -149,65 +146,52 @@ def nan(values):
     return values
 
 
-@pytest.mark.parametrize('wrong, name', [
-    ({'image': IMAGE[:16]}, 'image'),
-    ({'image': IMAGE.astype(np.float32)}, 'image'),
-    ({'gripper': GRIPPER[:3]}, 'gripper'),
-    ({'gripper': nan(GRIPPER)}, 'gripper'),
-    ({'gripper': 1000 * GRIPPER}, 'expected -1 to 1'),
-    ({'gripper': GRIPPER - np.float32([0, 0, 5, 0])}, 'z is -4.* expected -0.1 to 1'),
-    ({'gripper': GRIPPER + np.float32([0, 0, 0, 1e9])}, 'opening is 1e.09'),
-    ({'object_pixels': nan(PIXELS)}, r'object_pixels.*\[0\]'),
-    ({'object_pixels': PIXELS[0]}, 'object_pixels'),
-    ({'object_pixels': PIXELS[:0]}, 'object_pixels'),
-    ({'object_pixels': PIXELS[:1]}, '2 goals for 1 objects'),
-])
-def test_a_bad_scene_is_named(model, wrong, name):
+def test_a_bad_scene_is_named(model):
     mpc, scene = VisualMPC(model, SMALL), Scene(IMAGE, GRIPPER, PIXELS)
-    with pytest.raises(PlanningError, match=name):
-        mpc.plan(replace(scene, **wrong), mpc.goal(GOALS))
+    for wrong, name in (
+            ({'image': IMAGE[:16]}, 'image'), ({'image': IMAGE.astype(np.float32)}, 'image'),
+            ({'gripper': GRIPPER[:3]}, 'gripper'), ({'gripper': nan(GRIPPER)}, 'gripper'),
+            ({'gripper': 1000 * GRIPPER}, 'expected -1 to 1'),
+            ({'gripper': GRIPPER - np.float32([0, 0, 5, 0])}, 'z is -4.* expected -0.1 to 1'),
+            ({'gripper': GRIPPER + np.float32([0, 0, 0, 1e9])}, 'opening is 1e.09'),
+            ({'object_pixels': nan(PIXELS)}, r'object_pixels.*\[0\]'),
+            ({'object_pixels': PIXELS[0]}, 'object_pixels'),
+            ({'object_pixels': PIXELS[:0]}, 'object_pixels'),
+            ({'object_pixels': PIXELS[:1]}, '2 goals for 1 objects')):
+        with pytest.raises(PlanningError, match=name):
+            mpc.plan(replace(scene, **wrong), mpc.goal(GOALS))
 
 
-@pytest.mark.parametrize('wrong, name', [
-    ({'pixels': GOALS + 30}, 'outside the 32x32 picture'),
-    ({'pixels': nan(GOALS)}, r'goal_pixels.*\[0\]'),
-    ({}, 'one of pixels and maps'),
-    ({'pixels': GOALS, 'maps': np.ones((2, 32, 32))}, 'one of pixels and maps'),
-    ({'maps': np.ones((32, 32))}, r'goal_maps.*\(K, 32, 32\)'),
-    ({'maps': np.ones((2, 16, 32))}, r'goal_maps.*\(K, 32, 32\)'),
-    ({'maps': np.zeros((2, 32, 32))}, 'goal_maps'),
-    ({'maps': nan(np.ones((2, 32, 32)))}, 'goal_maps'),
-])
-def test_a_bad_goal_is_named(model, wrong, name):
-    with pytest.raises(PlanningError, match=name):
-        VisualMPC(model, SMALL).goal(**wrong)
+def test_a_bad_goal_is_named(model):
+    mpc = VisualMPC(model, SMALL)
+    for wrong, name in (
+            ({'pixels': GOALS + 30}, 'outside the 32x32 picture'),
+            ({'pixels': nan(GOALS)}, r'goal_pixels.*\[0\]'), ({}, 'one of pixels and maps'),
+            ({'pixels': GOALS, 'maps': np.ones((2, 32, 32))}, 'one of pixels and maps'),
+            ({'maps': np.ones((32, 32))}, r'goal_maps.*\(K, 32, 32\)'),
+            ({'maps': np.ones((2, 16, 32))}, r'goal_maps.*\(K, 32, 32\)'),
+            ({'maps': np.zeros((2, 32, 32))}, 'goal_maps'),
+            ({'maps': nan(np.ones((2, 32, 32)))}, 'goal_maps')):
+        with pytest.raises(PlanningError, match=name):
+            mpc.goal(**wrong)
 
 
-@pytest.mark.parametrize('wrong, name', [
-    ({'cost_every': 4}, 'cost_every'),
-    ({'proposals': 500}, 'proposals'), ({'recheck': -1}, 'recheck'),
-    ({'batch_size': 0}, 'batch_size')])
-def test_impossible_settings_are_named(wrong, name):
-    with pytest.raises(ConfigError, match=name):
-        VisualMPCConfig(**wrong)
+def test_impossible_settings_are_named():
+    for name, good, bad in (
+            ('cost_every', [1, HORIZON], [0, 4]), ('recheck', [0], [-1]), ('batch_size', [1], [0]),
+            ('proposals', [0, VisualMPCConfig().search.num_samples], [-1, 500])):
+        for value in good:
+            VisualMPCConfig(**{name: value})
+        for value in bad:
+            with pytest.raises(ConfigError, match=name):
+                VisualMPCConfig(**{name: value})
 
 
-@pytest.mark.parametrize('right', [
-    {'cost_every': 1}, {'cost_every': HORIZON}, {'recheck': 0}, {'batch_size': 1},
-    {'proposals': 0}, {'proposals': VisualMPCConfig().search.num_samples}])
-def test_the_least_and_the_most_are_allowed(right):
-    VisualMPCConfig(**right)
-
-
-@pytest.mark.parametrize('preset', PRESETS)
-def test_changes_of_a_preset_change_that_alone(preset):
-    changed = with_preset(preset, clearance=0.125, arm_hidden=True)
-    assert (changed.clearance, changed.arm_hidden) == (0.125, True)
-    assert replace(changed, clearance=PRESETS[preset].clearance,
-                   arm_hidden=False) == PRESETS[preset]
-
-
-def test_paper_preset_has_the_papers_numbers():
+def test_changes_of_a_preset_change_that_alone_and_paper_has_the_papers_numbers():
+    for preset, config in PRESETS.items():
+        changed = with_preset(preset, clearance=0.125, arm_hidden=True)
+        assert (changed.clearance, changed.arm_hidden) == (0.125, True)
+        assert replace(changed, clearance=config.clearance, arm_hidden=False) == config
     paper = with_preset('paper')
     assert (paper.search.num_samples, paper.search.num_iterations, paper.search.num_elites) == (
         200, 3, 10)
