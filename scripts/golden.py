@@ -41,18 +41,19 @@ import tyro  # noqa: E402
 
 FILE = ROOT / 'test' / 'golden.json'
 SAMPLE = ROOT / 'bags' / 'sample_push2'
-QUICK = ['--steps', '10', '--batch-size', '4', '--test-fraction', '0.3', '--threads', '1',
-         '--device', 'cpu', '--recordings', str(SAMPLE)]
-PREDICTOR = [*QUICK, '--precision', 'float32', '--base-width', '4']
+QUICK = [str(SAMPLE), '--steps', '10', '--batch-size', '4', '--test-fraction', '0.3', '--threads',
+         '1', '--device', 'cpu']
+PREDICTOR = ['predictor', *QUICK, '--precision', 'float32', '--base-width', '4', '--outer-power',
+             '0.5', '--start-crop', '0', '--progress-margin', '0']
+PAPER = [*PREDICTOR, '--decoder', 'separate', '--no-skips']
 TRAININGS = {  # options of `train`
-    'relative': [*PREDICTOR, '--method', 'genmin-wo-gan+relative', '--decoder', 'shared',
-                 '--skips', '--start-crop', '0.3'],
-    'progress': [*PREDICTOR, '--method', 'genmin-wo-gan+progress', '--progress-margin', '0.5',
-                 '--new-pixels', '--goal-picture', 'last'],
-    'vae-gan': [*PREDICTOR, '--method', 'genmin-vae-gan', '--new-pixels', '--min-crop', '0.8'],
-    'fix': [*PREDICTOR, '--method', 'fix-wo-gan'],
-    'forward prediction': [*PREDICTOR, '--method', 'genmin2-wo-gan', '--mode', 'forward'],
-    'forward model': ['--model', 'forward', *QUICK]}
+    'relative': [*PREDICTOR, '--selection', 'relative', '--start-crop', '0.3'],
+    'progress': [*PAPER, '--progress-margin', '0.5', '--new-pixels', '--goal-picture', 'last'],
+    'vae-gan': [*PAPER, '--selection', 'absolute', '--gan', '--latent', 'vae', '--new-pixels',
+                '--min-crop', '0.8'],
+    'fix': [*PAPER, '--loss', 'fix'],
+    'forward prediction': [*PAPER, '--selection', 'absolute', '--beta', '2', '--mode', 'forward'],
+    'forward model': ['forward', *QUICK]}
 TASKS = {'push2': 2, 'order3': 1, 'grasp': 2, 'pick_place': 1, 'stack2': 1}  # episodes of each
 
 

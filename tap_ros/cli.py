@@ -18,9 +18,8 @@ import sys
 from typing import Annotated, Any, cast, TypeAlias
 
 from tap_ros.errors import ConfigError, TapError, UsageError
-from tap_ros.options import parse, parse_known
+from tap_ros.options import parse
 from tap_ros.text import escaped
-from tap_ros.training.model_option import ModelOption
 from tyro import conf
 
 # Of a command: the name of its module, or {word: (one line of help, the same)}.
@@ -33,7 +32,10 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'import-lerobot': ('import a LeRobot data set', 'tap_ros.recording.formats.lerobot'),
     'export-lerobot': ('export recordings as a LeRobot data set',
                        'tap_ros.recording.formats.lerobot_export'),
-    'train': ('train on recordings', 'tap_ros.prediction.train_command'),
+    'train': ('train on recordings', {
+        'predictor': ('train a subgoal predictor', 'tap_ros.prediction.train_command'),
+        'forward': ("train the planner's forward model", 'tap_ros.planning.train_command'),
+    }),
     'evaluate': ('score trained weights', {
         'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.prediction'),
         'forward': ('score a forward model on recordings', 'tap_ros.evaluation.forward'),
@@ -65,7 +67,6 @@ EXTRAS = {  # what only some commands need, and what pip installs for it
     'google': "'.[bair]'", 'google_crc32c': "'.[bair]'", 'huggingface_hub':
     '-r requirements-hub.txt', 'jinja2': '-r requirements-experiments.txt',
     'pandas': '-r requirements-experiments.txt', 'pyarrow': "'.[lerobot]'"}
-TRAIN_FORWARD = 'tap_ros.planning.train_command'  # what trains with --model forward
 PROG = 'python -m tap_ros'
 _COMPLETION = ('--tyro-print-completion', '--tyro-write-completion')
 _SHELLS = (['bash'], ['zsh'], ['fish'])
@@ -133,6 +134,10 @@ def read(arguments: Sequence[str]) -> tuple[Run, Any]:
     # What is completed is a name that a shell can look up, not three words.
     options = parse(reduce(or_, kinds), words, 'tap_ros' if completion else PROG,
                     (__doc__ or '').split('\n')[1])
+    again = getattr(sys.modules[type(options).__module__], 'defaults', None)
+    if again:  # what is left out depends on what was said
+        options = parse(type(options), words[2:], f'{PROG} {words[0]} {words[1]}',
+                        default=again(options))
     return runs[type(options)], options
 
 
@@ -156,15 +161,8 @@ def _command(name: str, summary: str, module: Module, words: list[str] | None,
     elif not asked:
         kind = Unread
     else:
-        if name == 'train' and words and _which_model(words[1:]) == 'forward':
-            module = TRAIN_FORWARD
         kind = _load(module, runs, needed=words is not None)
     return Annotated[kind, conf.subcommand(name, description=summary)]
-
-
-def _which_model(words: list[str]) -> str:
-    """Return what --model says, which decides about the other options of train."""
-    return str(parse_known(ModelOption, words, f'{PROG} train').model)
 
 
 def _load(name: str, runs: dict[Any, Run], needed: bool = True) -> Any:

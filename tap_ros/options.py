@@ -39,7 +39,7 @@ _RULES = ConstructorRegistry()
 
 
 def parse(kind: Any, words: Sequence[str], prog: str = 'python -m tap_ros',
-          description: str | None = None) -> Any:
+          description: str | None = None, default: Any = None) -> Any:
     """
     Make options from words.
 
@@ -47,21 +47,14 @@ def parse(kind: Any, words: Sequence[str], prog: str = 'python -m tap_ros',
     :param words: list of strings.
     :param prog: what the command is called in --help.
     :param description: what it does, in --help; by default the summary of the dataclass.
+    :param default: what stands for words that are missing, an object of that kind.
     :return: an object of that kind.
     :raises UsageError: for words that it cannot be made from.
     :raises SystemExit: after --help, and after what prints shell completion.
     """
     with failures.on_parse_error(_refuse):
-        return tyro.cli(
-            kind, args=words, prog=prog, description=description, config=_STYLE, registry=_RULES)
-
-
-def parse_known(kind: Any, words: Sequence[str], prog: str) -> Any:
-    """Make options from those of the words that are some, and leave out the others; see parse."""
-    with failures.on_parse_error(_refuse):
-        return tyro.cli(
-            kind, args=words, prog=prog, config=_STYLE, registry=_RULES, add_help=False,
-            return_unknown_args=True)[0]
+        return tyro.cli(kind, args=words, prog=prog, description=description, config=_STYLE,
+                        registry=_RULES, **({} if default is None else {'default': default}))
 
 
 def one_of(choices: Iterable[str]) -> PrimitiveConstructorSpec[str]:

@@ -15,7 +15,7 @@ SAMPLE = ROOT / 'bags' / 'sample_push2'
 
 
 @pytest.mark.parametrize('command', [
-    ['collect'], ['train'], ['train', '--model', 'forward'], ['evaluate', 'prediction'],
+    ['collect'], ['train', 'predictor'], ['train', 'forward'], ['evaluate', 'prediction'],
     ['evaluate', 'planning'], ['evaluate', 'faults'],
     ['bench', 'collect'], ['bench', 'recording'], ['bench', 'planning'], ['bench', 'training'],
     ['import-bair'], ['paper'], ['inspect'], []], ids=' '.join)
@@ -29,7 +29,7 @@ def test_every_command_explains_itself(command, capsys):
 @pytest.mark.parametrize('arguments, named', [
     (['inspect', 'nowhere.mcap'], 'nowhere.mcap'),
     (['inspect', 'nowhere.safetensors'], 'nowhere.safetensors'),
-    (['train', '--recordings', 'nowhere', '--out', 'somewhere'], 'nowhere'),
+    (['train', 'predictor', 'nowhere', '--out', 'somewhere'], 'nowhere'),
 ])
 def test_an_error_names_the_file_and_is_one_line(arguments, named, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -122,11 +122,11 @@ def test_help_says_of_every_option_what_it_is(command, capsys, monkeypatch):
 @pytest.mark.parametrize('line, named', [
     ('', 'expected one of collect, import-bair'), ('colect', 'colect'),
     ('evaluate', 'planning'), ('evaluate nothing', 'nothing'), ('bench nothing', 'nothing'),
-    ('train --model other', '--model'), ('collect', '--out'), ('collect --out', '--out'),
+    ('train other', 'other'), ('collect', '--out'), ('collect --out', '--out'),
     ('collect --out a --episodes many', '--episodes: expected INT'),
     ('collect --out a --nothing 3', '--nothing'), ('collect --out a b', 'b'),
     ('import-bair --out a', 'PATH'), ('paper --only', '--only'), ('paper --seeds 1 x', '--seeds'),
-    ('train --recordings --out a', '--recordings'),
+    ('train predictor --out a', 'BAG'),
     ('--tyro-print-completion', 'bash'), ('--tyro-print-completion sh', 'bash'),
     ('collect --out a --seed "\x1b[31m\n"', r'\x1b'), ('collect --out a --task "\x1b\n"', r'\x1b'),
     ('collect --out a "\x1b\n"', r'\x1b')])
@@ -138,7 +138,7 @@ def test_words_that_are_wrong_are_named_in_one_line(line, named, capsys):
 
 
 @pytest.mark.parametrize('command, needed', [
-    ('', ()), ('evaluate', ()), ('bench', ()), ('train', ()), ('train --model forward', ()),
+    ('', ()), ('evaluate', ()), ('bench', ()), ('train predictor', ()), ('train forward', ()),
     ('evaluate planning', ('mujoco',)), ('hub push', ()), ('hub pull', ())])
 def test_help_comes_without_what_takes_long_to_import(command, needed):
     slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard', 'huggingface_hub'} - {*needed}
@@ -163,5 +163,5 @@ def test_a_shell_completes_commands_options_and_choices(tmp_path):
 
     assert completed('ev') == ['evaluate']
     assert {'prediction', 'planning'} <= set(completed('evaluate', ''))
-    assert completed('train', '--learning') == ['--learning-rate']
+    assert completed('train', 'predictor', '--learning') == ['--learning-rate']
     assert completed('collect', '--engine', '') == ['local', 'ray']

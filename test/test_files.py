@@ -74,7 +74,7 @@ def test_a_folder_has_one_writer_until_that_one_is_dead(tmp_path):
 
 @pytest.mark.parametrize('arguments', [
     ['collect', '--episodes', '1', '--out'], ['inspect', 'bags/sample_push2', '--picture'],
-    ['train', '--recordings', 'bags/sample_push2', '--out']], ids=lambda words: words[0])
+    ['train', 'predictor', 'bags/sample_push2', '--out']], ids=lambda words: words[0])
 def test_a_place_that_cannot_be_written_is_one_line(arguments, tmp_path, capsys):
     (tmp_path / 'file').write_text('')
     assert main([*arguments, str(tmp_path / 'file' / 'below')]) == 1

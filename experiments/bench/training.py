@@ -14,6 +14,7 @@ import time
 from typing import Annotated
 
 from tap_ros.options import Bags, Flag
+from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.training.devices import pick_device, pick_precision
@@ -23,12 +24,10 @@ from tyro import conf
 METHODS = ('genmin-wo-gan', 'genmin', 'genmin-vae', 'genmin-vae-gan')
 # One change after the other; `auto` is bfloat16 where that is faster.
 LADDER = (
-    {'method': 'genmin', 'precision': 'float32'},
-    {'method': 'genmin-wo-gan', 'precision': 'float32'},
-    {'method': 'genmin-wo-gan', 'precision': 'float32', 'decoder': 'shared'},
-    {'method': 'genmin-wo-gan', 'precision': 'float32', 'decoder': 'shared', 'skips': True},
-    {'method': 'genmin-wo-gan', 'precision': 'auto', 'decoder': 'shared'},
-    {'method': 'genmin-wo-gan', 'precision': 'auto', 'decoder': 'shared', 'skips': True})
+    {'gan': True, 'precision': 'float32'}, {'precision': 'float32'},
+    {'precision': 'float32', 'decoder': 'shared'},
+    {'precision': 'float32', 'decoder': 'shared', 'skips': True},
+    {'decoder': 'shared'}, {'decoder': 'shared', 'skips': True})
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Options:
     Options of this benchmark.
 
     :param recordings: to train on.
-    :param methods: further rows: each as --method of train, in the precision `auto`.
+    :param methods: further rows: methods by their names in results, in the precision `auto`.
     :param steps: how many to time.
     :param base_width: as for train.
     :param batch_size: as for train.
@@ -80,13 +79,14 @@ def run(args):
     print(f'{"method":<16}{"decoder":<16}{"precision":<10}{"samples/s":>10}'
           f'{"samples/CPU s":>15}{"ratio":>7}')
     first = None
-    for row in (*LADDER, *({'method': method} for method in args.methods)):
+    for row in (*LADDER, *map(method_fields, args.methods)):
         with tempfile.TemporaryDirectory() as folder:
-            config = TrainingConfig(
-                recordings=tuple(args.recordings), out=folder, new_pixels=True,
-                margin=0, outer_power=1.0, goal_picture='last', base_width=args.base_width,
-                batch_size=args.batch_size, device=args.device, threads=args.threads,
-                compile=args.compile, save_every=10 ** 9, **row)
+            config = TrainingConfig(**{
+                'recordings': tuple(args.recordings), 'out': folder, 'new_pixels': True,
+                'selection': 'absolute', 'margin': 0, 'goal_picture': 'last', 'start_crop': 0.0,
+                'decoder': 'separate', 'skips': False, 'base_width': args.base_width,
+                'batch_size': args.batch_size, 'device': args.device, 'threads': args.threads,
+                'compile': args.compile, 'save_every': 10 ** 9, **row})
             cost = time_step(config, args.steps)
         rate, efficiency = (args.batch_size / each for each in (cost.seconds, cost.cpu_seconds))
         first = first or efficiency

@@ -134,16 +134,15 @@ def score(run, config, weights, places):
               evaluate(network, store, held_out).items()}
     if run.shifted:
         scores['shifted'] = _shifted(run, network, store, held_out, places)
-    if config.new_pixels and config.mode == 'bidirectional' and not config.chosen.vae:
+    if config.new_pixels and config.mode == 'bidirectional' and config.latent == 'none':
         scores['recursion'] = [_rounded(level) for level in score_recursion(
             network, store, held_out)]
     if not config.new_pixels:
         scores['bottleneck_at'] = _rounded_list(
             [bottleneck_share(store[i]) for i in held_out])
-    fraction = config.chosen.fraction
-    if fraction is not None and config.mode == 'bidirectional':
+    if config.loss == 'fix' and config.mode == 'bidirectional':
         scores['target_bottleneck'] = _rounded_list(
-            target_bottlenecks([store[i] for i in held_out], fraction, 'last'))
+            target_bottlenecks([store[i] for i in held_out], config.fraction, 'last'))
     if network.config.latent_size:
         samples = _rounded(score_samples(network, store, held_out))
         for name in [name for name in samples if name.startswith('spread')]:

@@ -4,8 +4,8 @@
 
 import re
 
-from experiments.paper.runs import LONG, OURS, VARIANTS
-from tap_ros.prediction.methods import parse_method
+from experiments.paper.runs import LONG, OURS, PAST_VARIANTS, VARIANTS
+from tap_ros.prediction.methods import method_fields
 
 COPIES = ('copy-start', 'copy-goal')
 BEST = 'best-of-100'
@@ -28,9 +28,10 @@ def best_of_name(method):
 
 
 def variant_of(method):
-    """Return which of runs.VARIANTS a method's name stands for; '' for the method as it is."""
+    """Return which variant of runs.py a method's name has; '' for the method as it is."""
     name = re.sub(r'-r\d+$', '', method)
-    return max((variant for variant in VARIANTS if name.endswith(variant)), key=len)
+    return max((variant for variant in (*VARIANTS, *PAST_VARIANTS) if name.endswith(variant)),
+               key=len)
 
 
 def trained_as_long(method):
@@ -61,9 +62,9 @@ def method_order(method):
     name = method.replace(f'-wo-gan-{BEST}', '').replace(f'-{BEST}', '')
     name = re.sub(r'-r\d+$', '', name)
     variant = variant_of(name)
-    parsed = parse_method(name.removesuffix(variant))
-    number = (parsed.fraction if parsed.loss == 'fix' else
-              -parsed.beta if parsed.beta is not None else 0)
-    kind = ('fix', 'min', 'genmin').index(parsed.loss) + 1 + 3 * parsed.vae + 3 * (BEST in method)
+    parsed = method_fields(name.removesuffix(variant))
+    number = {'fix': parsed['fraction'], 'genmin': -parsed['beta']}.get(parsed['loss'], 0)
+    kind = (('fix', 'min', 'genmin').index(parsed['loss']) + 1
+            + 3 * (parsed['latent'] == 'vae') + 3 * (BEST in method))
     network = 1 + (network_of(method) == OURS)
-    return (network, kind, parsed.selection != 'time_preference', number, variant, method)
+    return (network, kind, parsed['selection'] != 'absolute', number, variant, method)

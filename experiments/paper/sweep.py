@@ -18,6 +18,7 @@ from experiments.paper.places import is_collected, read_json, recording_hash
 from tap_ros.engines.run import run_tasks
 from tap_ros.engines.task import LOCAL, Task
 from tap_ros.errors import EngineError, TapError
+from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.training_config import DEFAULTS
 from tqdm import tqdm
 
@@ -88,8 +89,9 @@ def _same(settings, config):
     """Compare settings of a run, all that training depends on; new ones count as the default."""
     from tap_ros.training.checkpoints import FREE  # torch takes seconds, --help does without
     wanted = json.loads(json.dumps(asdict(config)))
-    settings = {**DEFAULTS, **settings}
-    return all(settings[name] == value for name, value in wanted.items() if name not in FREE)
+    settings = {**DEFAULTS, **todays_settings(settings)}
+    return all(settings.get(name) == wanted.get(name)
+               for name in {**settings, **wanted} if name not in FREE)
 
 
 def data_hashes(runs, places):

@@ -4,7 +4,6 @@
 
 import json
 from pathlib import Path
-import shlex
 
 from experiments.pages import interval, render
 import numpy as np
@@ -29,23 +28,25 @@ _COLUMNS = {  # of the table: what EpisodeScores.intervals calls it, and digits
     'shows both': ('shows_both', 2)}
 
 
-def ship(recipe, bags, runs, out):
+def ship(name, task, run, fresh, out, commands):
     """
     Write a run's weights as float16, with a card and a picture.
 
-    :param recipe: Recipe whose run is done and whose recordings are there.
-    :param bags: folder of recordings; runs: of trainings.
+    :param name: of the recipe; task: of its scenes.
+    :param run: folder of the training.
+    :param fresh: folder of the recording of scenes that it never saw.
     :param out: folder to write into.
+    :param commands: lines: those that collect, that of the fresh scenes, that of the training.
     :return: Path of the card.
     """
-    run = Path(runs, recipe.name)
+    run = Path(run)
     config, state, about = load_weights(run / 'predictor.safetensors', 'predictor')
     state = {name: value.to(torch.float16) if value.is_floating_point() else value
              for name, value in state.items()}
-    file = Path(out, f'predictor_{recipe.name}.safetensors')
+    file = Path(out, f'predictor_{name}.safetensors')
     save_weights(file, state, 'predictor', config, about)
     network, _ = load_network(file)
-    store = open_recordings([str(recipe.fresh(bags))], progress=False)
+    store = open_recordings([str(fresh)], progress=False)
     episodes = np.arange(len(store))
     forward = config['num_context'] == 1
     goals = ['none' if forward else 'last frame']
@@ -59,12 +60,11 @@ def ship(recipe, bags, runs, out):
     shown = [*np.flatnonzero(good)[:PICTURED], *np.flatnonzero(~good)[:PICTURED]]
     write_pictures(file.with_suffix('.png'), network, store, shown, 'last')
     card = file.with_suffix('.md')
-    *collect, again, train = (shlex.join(['python', '-m', 'tap_ros', *words])
-                              for words in recipe.commands('bags', 'runs/weights'))
+    *collect, again, train = commands
     write_atomically(card, render(
-        'weights/templates/card.md.j2', file=file.name, name=recipe.name, task=recipe.task,
+        'weights/templates/card.md.j2', file=file.name, name=name, task=task,
         collect=collect, again=again, train=train,
-        run=json.loads((run / 'run.json').read_text()), method=about['settings']['method'],
+        run=json.loads((run / 'run.json').read_text()),
         fresh=len(store), pushing=np.isfinite(first.bottleneck).any(), forward=forward,
         goal=goals[0], metrics=headline(first), samples=samples,
         scores=tabulate(scores), succeed=int(good[shown].sum()),

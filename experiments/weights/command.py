@@ -1,17 +1,20 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `python -m tap_ros weights`: make the shipped predictors again."""
+"""The command `python -m tap_ros weights`: make the shipped predictors again by their recipes."""
 
 from dataclasses import dataclass
 from pathlib import Path
 import shlex
-import subprocess
-import sys
 from typing import Annotated
 
 from experiments.weights.card import ship
-from experiments.weights.recipes import RECIPES
+from sim_bridge.collect import collect, CollectConfig
 from tap_ros.options import Flag, Folder, one_of
+from tap_ros.training.recipes import RECIPES
+from tap_ros.training.train import train
+
+FRESH_SEED, FRESH_EPISODES = 900_000, 100  # of the scenes that weights are scored in
+SHIPPED = [name for name, recipe in RECIPES['predictor'].items() if recipe.recordings]
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Options:
     :param out: folder for weights, cards and pictures.
     """
 
-    only: tuple[Annotated[str, one_of(RECIPES)], ...] = ()
+    only: tuple[Annotated[str, one_of(SHIPPED)], ...] = ()
     list: Flag = False
     threads: int = 1
     bags: Folder = 'bags'
@@ -35,24 +38,54 @@ class Options:
     out: Folder = 'runs/weights/shipped'
 
 
+def collections(name, bags):
+    """
+    Return what a recipe's weights are trained on, and last the fresh scenes for their scores.
+
+    :param name: of the recipe.
+    :param bags: folder of recordings.
+    :return: {folder: options of `collect`}.
+    """
+    recipe = RECIPES['predictor'][name]
+    found = {**recipe.recordings, f'fresh_{recipe.task}': {
+        'episodes': FRESH_EPISODES, 'seed': FRESH_SEED}}
+    return {str(Path(bags, folder)): {'task': recipe.task, **options}
+            for folder, options in found.items()}
+
+
+def commands(name, bags='bags', runs='runs/weights'):
+    """
+    Return the command line of each step, in order.
+
+    :param name: of the recipe.
+    :param bags: folder of recordings; runs: of trainings.
+    :return: list: one or several that collect, one of fresh scenes, and that of the training.
+    """
+    found = collections(name, bags)
+    lines = [['collect', *(word for option, value in options.items()
+                           for word in (f'--{option.replace("_", "-")}', str(value))),
+              '--out', folder] for folder, options in found.items()]
+    lines.append(['train', 'predictor', *list(found)[:-1], '--recipe', name,
+                  '--out', str(Path(runs, name))])
+    return [shlex.join(['python', '-m', 'tap_ros', *words]) for words in lines]
+
+
 def run(args):
     """
     Collect, train and write the card of each, one after the other.
 
     :param args: Options.
-    :return: exit status: 0, or that of the step that failed.
     """
-    for name in args.only or RECIPES:
-        recipe = RECIPES[name]
-        for words in recipe.commands(args.bags, args.runs):
-            if words[0] == 'train':
-                words = [*words, '--threads', str(args.threads)]
-            print(shlex.join(['python', '-m', 'tap_ros', *words]), flush=True)
-            if not args.list:
-                status = subprocess.run([sys.executable, '-m', 'tap_ros', *words]).returncode
-                if status:
-                    return status
-        if not args.list:
-            Path(args.out).mkdir(parents=True, exist_ok=True)
-            print(ship(recipe, args.bags, args.runs, args.out), flush=True)
-    return 0
+    for name in args.only or SHIPPED:
+        print('\n'.join(commands(name, args.bags, args.runs)), flush=True)
+        if args.list:
+            continue
+        found = collections(name, args.bags)
+        for folder, options in found.items():
+            collect(folder, CollectConfig(**options))
+        *recordings, fresh = found
+        run_folder = Path(args.runs, name)
+        train(recordings, run_folder, recipe=name, threads=args.threads)
+        Path(args.out).mkdir(parents=True, exist_ok=True)
+        print(ship(name, RECIPES['predictor'][name].task, run_folder, fresh, args.out,
+                   commands(name)), flush=True)

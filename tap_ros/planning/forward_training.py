@@ -31,7 +31,6 @@ from tap_ros.training.inpainted import Episodes, FilledStore, with_masks
 from tap_ros.training.panels import grey_panels
 from tap_ros.training.robot_mask import fill_from_past
 from tap_ros.training.run_folder import describe_run, run_facts, run_folder
-from tap_ros.training.schedule import learning_rate
 from tap_ros.training.split import split_episodes, warn_if_none
 from tap_ros.training.weights import save_weights
 import torch
@@ -78,7 +77,8 @@ def _train(config: ForwardTrainingConfig, device: torch.device, store: EpisodeSt
     state = start(
         LearnedForwardModel(model_config(config, store, training)), config.learning_rate, device)
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
-    load_checkpoint(checkpoint, state, asdict(config), store.data_hash, DEFAULTS)
+    load_checkpoint(checkpoint, state, asdict(config), store.data_hash,
+                    lambda settings: {**DEFAULTS, **settings})
     # The picture that is looked at shows what a node would show; see FreeView.
     episodes = store if config.robot_mask == 'none' else FilledStore(
         store, config.robot_mask, progress, fill_from_past)
@@ -89,10 +89,7 @@ def _train(config: ForwardTrainingConfig, device: torch.device, store: EpisodeSt
     with SummaryWriter(config.out, purge_step=state.step) as curves, bar:
         began = time.monotonic() - state.seconds
         for step in range(state.step, last):
-            rate = learning_rate(
-                step, config.steps, config.warmup, config.learning_rate)
-            for group in state.optimizers[0].param_groups:
-                group['lr'] = rate
+            state.set_rates(config.steps, config.warmup, config.learning_rate)
             # One step of Adam towards the recorded pictures.
             batch, shown = draw_step(config, episodes, training, step, tables)
             loss, parts = forward_loss(state.network, batch.to(device), shown, config)

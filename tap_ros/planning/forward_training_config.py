@@ -57,7 +57,7 @@ class ForwardTrainingConfig(Reading, ForwardRun):
     :param save_every: steps between checkpoints, scores and sample pictures.
     """
 
-    steps: int = 6000
+    steps: int = 5000
     batch_size: int = 16
     horizon: int = 8
     grow: float = 0.4

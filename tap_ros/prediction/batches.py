@@ -81,7 +81,6 @@ class Sampling:
 
     :param margin: frames left out of the targets next to each context picture.
     :param num_targets: at most so many targets, drawn at random without repetition; 0: all.
-    :param max_frames: longer episodes are cut to a random piece of this many; 0: never.
     :param min_crop: cut episodes to a random piece of at least this share; 1: never.
     :param start_crop: leave out a random beginning of at most this share; 0: never.
     :param goal_picture: 'last', 'recorded' or 'mixed', see uses_recorded_goal.
@@ -96,7 +95,6 @@ class Sampling:
 
     margin: int = 0
     num_targets: int = 0
-    max_frames: int = 0
     min_crop: float = 1.0
     start_crop: float = 0.0
     goal_picture: str = 'last'
@@ -238,8 +236,6 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
     available = length = int(store.lengths[i])
     if sampling.min_crop < 1:
         length = max(3, round(length * rng.uniform(sampling.min_crop, 1)))
-    if sampling.max_frames:
-        length = min(length, sampling.max_frames)
     start = int(rng.integers(available - length + 1)) if length < available else 0
     if sampling.start_crop:
         late = min(int(rng.uniform(0, sampling.start_crop) * length), length - 3)

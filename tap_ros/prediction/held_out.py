@@ -9,7 +9,7 @@ from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import l1_error
 from tap_ros.prediction.networks import Prediction, Predictor
-from tap_ros.prediction.selection import selection_errors, Targets
+from tap_ros.prediction.selection import Targets
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.training.devices import Autocast
 import torch
@@ -31,8 +31,7 @@ def matched(network: Predictor, batch: Batch, config: TrainingConfig,
     with autocast():
         prediction = network(context)
     targets = Targets(batch, None, config)
-    return prediction, targets.match(
-        prediction.image, targets.measured(context), selection_errors)
+    return prediction, targets.match(prediction.image, targets.measured(context))
 
 
 @torch.no_grad()

@@ -41,27 +41,6 @@ def changed_pixels(targets: torch.Tensor, context: torch.Tensor) -> torch.Tensor
     return difference.amin(1) > 2 * CHANGED
 
 
-def weighted_l1_error(images: torch.Tensor, targets: torch.Tensor, context: torch.Tensor,
-                      changed_weight: float) -> torch.Tensor:
-    """
-    Measure the l1 error with more weight on changed pixels; not in the paper.
-
-    The l1 error alone teaches the median: something small that is at each place with a chance
-    below a half is left out everywhere, and it costs next to nothing. With a weight of w on the
-    pixels of the target that differ from every input, a chance of 1 / (2 + w) suffices.
-
-    :param images: (B, 3, H, W) in [-1, 1].
-    :param targets: the same.
-    :param context: (B, C, 3, H, W) in [-1, 1].
-    :param changed_weight: w; at 0 it is l1_error.
-    :return: (B,); has a gradient.
-    """
-    if changed_weight == 0:
-        return l1_error(images, targets)
-    weight = 1 + changed_weight * changed_pixels(targets, context)
-    return l1_error(images * weight, targets * weight)
-
-
 @torch.no_grad()
 def l1_errors(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     """
@@ -86,33 +65,18 @@ def l1_errors(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     return distances / 255
 
 
-def match_step(selection_error: torch.Tensor, valid: torch.Tensor | None = None,
-               temperature: float = 0.0, chance: torch.Tensor | None = None) -> torch.Tensor:
+def match_step(selection_error: torch.Tensor,
+               valid: torch.Tensor | None = None) -> torch.Tensor:
     """
     Pick the target with the least selection error, the argmin of Eq. 5.
 
-    With a temperature above 0, which is not in the paper, the target is drawn with probabilities
-    softmax((1 - E'_t / min E') / temperature). Early in a training the argmin keeps to what the
-    network happens to show first, mostly an input; a temperature that falls lets the match settle
-    slowly, as in annealed multiple choice learning (Perera et al. 2024, Victorletzelter/
-    annealed_mcl, losses.py; a soft match of frames also in orybkin/video-gcp, adaptive.py).
-
     :param selection_error: (B, T), E'_t.
     :param valid: bool (B, T), False where an episode is padded; None: all are valid.
-    :param temperature: of the softmax; 0: the argmin, infinity: any valid target.
-    :param chance: (B, T) uniform in 0..1, to draw with; needed with a temperature.
     :return: int64 (B,), indices into T; never a padded one.
     """
     if valid is not None:
         selection_error = selection_error.masked_fill(~valid, math.inf)
-    if temperature == 0:
-        return selection_error.argmin(1)
-    assert chance is not None, 'the target is drawn'
-    excess = selection_error / selection_error.amin(1, keepdim=True).clamp(min=1e-12) - 1
-    # The largest logit with Gumbel noise is a draw from the softmax.
-    noise = -torch.log(-torch.log(chance.clamp(1e-12, 1 - 1e-7)))
-    score = noise - excess / temperature
-    return score.masked_fill(selection_error.isinf(), -math.inf).argmax(1)
+    return selection_error.argmin(1)
 
 
 def fixed_time_loss(error: torch.Tensor | Callable[[torch.Tensor], torch.Tensor],
@@ -195,34 +159,31 @@ def remaining_targets(valid: torch.Tensor, times: torch.Tensor, matched: torch.T
     return valid & (times > matched if forward else times < matched)
 
 
-def bell_preference(times: torch.Tensor, first: torch.Tensor | float, last: torch.Tensor | float,
-                    edge: float = 2 / 3) -> torch.Tensor:
+def bell_preference(times: torch.Tensor, first: torch.Tensor | float,
+                    last: torch.Tensor | float) -> torch.Tensor:
     """
-    Prefer the middle: a Gaussian over the target times, 1 in the middle and `edge` at both ends.
+    Prefer the middle: a Gaussian over the target times, 1 in the middle and 2/3 at both ends.
 
-    w(t) = exp(-(t - m)^2 / (2 sigma^2)), m the middle; the paper's edge, 2/3, makes sigma 1.110
-    of half the range (section 4).
+    w(t) = exp(-(t - m)^2 / (2 sigma^2)), m the middle, sigma 1.110 of half the range (section 4).
 
     :param times: (B, T) times of the targets.
     :param first: (B, 1) or number, the earliest target time.
     :param last: (B, 1) or number, the latest.
-    :param edge: w at the ends, above 0 and at most 1; 1 prefers none.
     :return: w(t), (B, T).
     """
     half_range = ((last - first) / 2)
     half_range = torch.as_tensor(half_range, dtype=torch.float32).clamp(min=0.5)
-    return bell((times - (last + first) / 2) / half_range, edge)
+    return bell((times - (last + first) / 2) / half_range)
 
 
-def bell(position: torch.Tensor, edge: float) -> torch.Tensor:
+def bell(position: torch.Tensor) -> torch.Tensor:
     """
-    Compute the Gaussian that is 1 at 0 and `edge` at -1 and 1.
+    Compute the Gaussian that is 1 at 0 and 2/3 at -1 and 1.
 
     :param position: any shape.
-    :param edge: above 0 and at most 1.
     :return: the same shape.
     """
-    return torch.exp(math.log(edge) * position ** 2)
+    return torch.exp(math.log(2 / 3) * position ** 2)
 
 
 def picture_progress(copy_error: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
@@ -307,41 +268,3 @@ def relative_to_copying(error: torch.Tensor, copy_error: torch.Tensor,
     :return: (B, T).
     """
     return error / (copy_error.amin(1).clamp(min=_MIN_COPY_DISTANCE) * preference)
-
-
-@torch.no_grad()
-def path_length(start: torch.Tensor, targets: torch.Tensor,
-                valid: torch.Tensor | None = None) -> torch.Tensor:
-    """
-    Measure how much changed on the way to each target: a cost of reaching it that pictures show.
-
-    :param start: uint8 (B, H, W, 3), the start picture.
-    :param targets: uint8 (B, T, H, W, 3), in the order of time.
-    :param valid: bool (B, T), False where an episode is padded; None: all are valid.
-    :return: (B, T), the l1 length on [0, 1] of the way from the start picture through the
-        targets, as a share of the way to the last one: 0 to 1, never falling.
-    """
-    frames = torch.cat([start[:, None], targets], 1).flatten(2)  # B, T+1, D
-    steps = torch.stack([(before.float() - after.float()).abs().mean(-1)
-                         for before, after in zip(frames[:, :-1].unbind(1),
-                                                  frames[:, 1:].unbind(1))], 1)
-    if valid is not None:
-        steps = steps.masked_fill(~valid, 0)  # padding is no way
-    length = steps.cumsum(1)
-    return length / length[:, -1:].clamp(min=1e-6)
-
-
-def cost_of_reaching(error: torch.Tensor, cost: torch.Tensor, preference: torch.Tensor,
-                     weight: float = 1.0) -> torch.Tensor:
-    """
-    Prefer states that are cheap to reach, the other preference that section 3.2 names.
-
-    E'_t = E_t (1 + weight * cost_t) / w(t).
-
-    :param error: (B, T).
-    :param cost: (B, T), not negative, for example path_length, the way of the arm, or time.
-    :param preference: (B, T), w(t).
-    :param weight: how much a cost of 1 adds, not negative; 0 leaves preferred_error.
-    :return: (B, T).
-    """
-    return error * (1 + weight * cost) / preference

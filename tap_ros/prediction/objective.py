@@ -14,13 +14,14 @@ from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.discriminator import discriminator_loss, generator_loss
 from tap_ros.prediction.losses import (
     fixed_time_loss,
+    match_step,
     recursive_loss,
     remaining_targets,
     total,
 )
 from tap_ros.prediction.networks import Prediction, Predictor
 from tap_ros.prediction.recognition import kl_divergence, Recognition, sample_latent
-from tap_ros.prediction.selection import outer_error, Selection, selection_errors, Targets
+from tap_ros.prediction.selection import outer_error, selection_errors, Targets
 from tap_ros.prediction.training_config import ObjectiveSettings
 from tap_ros.training.devices import Autocast
 from tap_ros.training.parallel import ALONE, Processes
@@ -54,17 +55,15 @@ class Draws:
         'frame', else the first.
     :param prior: (B, latent_size) normal.
     :param other: (B, T) in 0..1, to draw t' of Eq. 11.
-    :param match: (B, R, T) in 0..1, to draw the matches of R levels of recursion.
     """
 
     posterior: torch.Tensor
     prior: torch.Tensor
     other: torch.Tensor
-    match: torch.Tensor
 
     @classmethod
     def make(cls, batch: Batch, latent_size: int, seed: int, step: int,
-             processes: Processes = ALONE, levels: int = 1) -> Self:
+             processes: Processes = ALONE) -> Self:
         """
         Draw those of a step, on the batch's device, the same ones whenever asked.
 
@@ -72,7 +71,6 @@ class Draws:
         :param latent_size: of z.
         :param seed: of the training; step: number of the step.
         :param processes: Processes that share the batch.
-        :param levels: of recursion.
         :return: Draws.
         """
         rng = np.random.default_rng([seed, 4, step])
@@ -80,8 +78,7 @@ class Draws:
         B *= processes.count
         draws = (rng.standard_normal((B, T, latent_size), np.float32),
                  rng.standard_normal((B, latent_size), np.float32),
-                 rng.random((B, T), np.float32),
-                 rng.random((B, levels, T), np.float32))
+                 rng.random((B, T), np.float32))
         part = processes.part(B)
         return cls(*(torch.from_numpy(draw[part]).to(batch.times.device) for draw in draws))
 
@@ -110,7 +107,6 @@ class Outcome:
 def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation | None,
                    config: ObjectiveSettings, draws: Draws | None = None,
                    autocast: Autocast = contextlib.nullcontext,
-                   selection: Selection = selection_errors, temperature: float = 0.0,
                    kl_share: float = 1.0) -> Outcome:
     """
     Compute the predictor's training loss of a batch.
@@ -131,14 +127,12 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
     :param batch: batches.Batch.
     :param augmentation: Augmentation, or None.
     :param config: ObjectiveSettings.
-    :param draws: Draws; needed with GAN, VAE or a temperature.
+    :param draws: Draws; needed with GAN or VAE.
     :param autocast: makes the context manager to run the networks in.
-    :param selection: function as selection.selection_errors: any preference.
-    :param temperature: of the match at this step, see losses.match_step.
-    :param kl_share: of the weight of the KL divergence at this step, see schedule.kl_share.
+    :param kl_share: of the weight of the KL divergence at this step, see training.kl_share.
     :return: Outcome.
     """
-    targets = Targets(batch, augmentation, config, temperature, draws.match if draws else None)
+    targets = Targets(batch, augmentation, config)
     kl_weight = kl_share * config.kl_weight
     context = to_float(batch.context)  # B, C, 3, H, W
     context = augmentation.apply(context) if augmentation else context
@@ -148,7 +142,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
         assert draws is not None, 'z is drawn'
         if config.posterior == 'frame':
             return _frame_posterior_loss(
-                networks, targets, context, config, draws, autocast, selection, kl_weight)
+                networks, targets, context, config, draws, autocast, kl_weight)
         assert batch.video is not None, 'see Sampling.video_frames'
         video = to_float(batch.video)
         with autocast():
@@ -160,8 +154,8 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
     with autocast():
         prediction = networks.predictor(context, z)
     measured = targets.measured(context)
-    match = targets.match(prediction.image, measured, selection)
-    parts['error'] = targets.loss(prediction.image, match, measured)
+    match = targets.match(prediction.image, measured)
+    parts['error'] = targets.loss(prediction.image, match)
     judged = None
     if networks.discriminator is not None:
         assert draws is not None, "t' is drawn"
@@ -173,7 +167,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
     if config.recursion > 1:
         parts['error'] = _recursive_loss(
             networks, prediction, targets, context, measured, match, parts['error'], config, z,
-            autocast, selection)
+            autocast)
     return Outcome(total(parts.values()), match, prediction,
                    {name: value.detach() for name, value in parts.items()}, judged,
                    None if nats is None else nats.detach())
@@ -223,25 +217,23 @@ def discriminators_loss(judged: dict[str, Any],
 def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets,
                     context: torch.Tensor, measured: torch.Tensor, match: torch.Tensor,
                     loss: torch.Tensor, config: ObjectiveSettings, z: torch.Tensor | None,
-                    autocast: Autocast, selection: Selection) -> torch.Tensor:
+                    autocast: Autocast) -> torch.Tensor:
     """
-    Add the levels r > 0 of Eq. 3; gradients flow through the predictions as contexts.
+    Add the levels r > 0 of Eq. 3.
 
-    With detach_recursion, which is not in the paper, they do not: the loss of a later level cannot
-    bend a picture that serves for itself into one that is easy to go on from.
+    Unlike in the paper, no gradients flow through the predictions as contexts: else the loss of a
+    later level bends a picture that serves for itself into one that is easy to go on from.
     """
     batch, valid = targets.batch, targets.batch.valid
     losses, counts = [loss], [len(context)]
-    for level in range(1, config.recursion):
+    for _ in range(1, config.recursion):
         matched = batch.times.gather(1, match[:, None])
         valid = remaining_targets(valid, batch.times, matched, config.forward)
         left = valid.any(1)
         if not left.any():
             break
         # The prediction takes the place of the start (forward) or of the goal.
-        following = prediction.image[:, None]
-        if config.detach_recursion:  # unlike Eq. 3
-            following = following.detach()
+        following = prediction.image[:, None].detach()
         context, measured = (
             following if config.forward else torch.cat([pictures[:, :1], following], 1)
             for pictures in (context, measured))
@@ -253,8 +245,8 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
             end = torch.where(left[:, None], matched, batch.end)
             between = replace(between, end=end, last=torch.where(
                 left[:, None], matched - 1, batch.last))
-        match = targets.match(prediction.image, measured, selection, between, level)
-        errors = outer_error(targets.outer_l1(prediction.image, match, measured), config)
+        match = targets.match(prediction.image, measured, between)
+        errors = outer_error(targets.outer_l1(prediction.image, match), config)
         losses.append(errors[left].mean())
         counts.append(int(left.sum().item()))
     return recursive_loss(losses, counts)
@@ -262,7 +254,7 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
 
 def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.Tensor,
                           config: ObjectiveSettings, draws: Draws, autocast: Autocast,
-                          selection: Selection, kl_weight: float) -> Outcome:
+                          kl_weight: float) -> Outcome:
     """
     Compute the alternative of appendix B: the minimum over time of the whole CVAE loss.
 
@@ -284,11 +276,11 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
             prediction = networks.predictor(
                 context, sample_latent(mean, log_variance, draws.posterior[:, t]))
         divergences.append(kl_divergence(mean, log_variance))
-        errors.append(targets.outer_l1(prediction.image, step, measured))
+        errors.append(targets.outer_l1(prediction.image, step))
         predictions.append(prediction)
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
     whole = (kl_weight * divergences + errors).detach()
-    match = targets.choose(selection(
+    match = match_step(selection_errors(
         whole, lambda: targets.errors(measured), batch, config), batch.valid)
     nats = fixed_time_loss(divergences, match)
     parts = {'kl': kl_weight * nats,

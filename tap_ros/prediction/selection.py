@@ -12,18 +12,15 @@ from tap_ros.prediction.losses import (
     bell,
     bell_preference,
     beside_context,
-    cost_of_reaching,
     fixed_time_loss,
+    l1_error,
     l1_errors,
     linear_preference,
     match_step,
-    path_length,
     picture_progress,
     preferred_error,
     relative_to_copying,
-    weighted_l1_error,
 )
-from tap_ros.prediction.methods import DEFAULT_BETA
 from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
@@ -39,10 +36,8 @@ def time_preference(batch: Batch, config: ObjectiveSettings) -> torch.Tensor:
     :return: (B, T).
     """
     if config.forward:
-        beta = config.chosen.beta
-        return linear_preference(
-            batch.times, batch.end, DEFAULT_BETA if beta is None else beta)
-    return bell_preference(batch.times, batch.first, batch.last, config.bell_edge)
+        return linear_preference(batch.times, batch.end, config.beta)
+    return bell_preference(batch.times, batch.first, batch.last)
 
 
 def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor], batch: Batch,
@@ -57,26 +52,18 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
     :param config: ObjectiveSettings.
     :return: (B, T).
     """
-    if config.chosen.loss == 'min':
+    if config.loss == 'min':
         return error
     preference = time_preference(batch, config)
-    if config.chosen.selection == 'relative_to_copying':
+    if config.selection == 'relative':
         return relative_to_copying(error, copy_error(), preference)
-    if config.chosen.selection == 'picture_progress':
+    if config.selection == 'progress':
         progress = picture_progress(copy_error(), batch.valid)
         if config.progress_margin:
             hidden = beside_context(progress, config.progress_margin, batch.valid)
             error = error.masked_fill(hidden, math.inf)
-        return preferred_error(error, bell(progress, config.bell_edge))
-    if config.chosen.selection == 'cost_of_reaching':
-        cost = path_length(batch.measured[:, 0], batch.targets, batch.valid)
-        return cost_of_reaching(error, cost, preference)
+        return preferred_error(error, bell(progress))
     return preferred_error(error, preference)
-
-
-# The type of selection_errors.
-Selection = Callable[
-    [torch.Tensor, Callable[[], torch.Tensor], Batch, ObjectiveSettings], torch.Tensor]
 
 
 class Targets:
@@ -86,15 +73,11 @@ class Targets:
     :param batch: batches.Batch.
     :param augmentation: Augmentation of all pictures that networks see, or None.
     :param config: ObjectiveSettings.
-    :param temperature: of the match, see losses.match_step.
-    :param chances: (B, R, T) uniform in 0..1, to draw the matches of R levels of recursion with;
-        needed with a temperature.
     """
 
-    def __init__(self, batch: Batch, augmentation: Augmentation | None, config: ObjectiveSettings,
-                 temperature: float = 0.0, chances: torch.Tensor | None = None) -> None:
+    def __init__(self, batch: Batch, augmentation: Augmentation | None,
+                 config: ObjectiveSettings) -> None:
         self.batch, self.augmentation, self.config = batch, augmentation, config
-        self.temperature, self.chances = temperature, chances
         self.rows = torch.arange(len(batch.context), device=batch.context.device)
 
     def frame(self, step: torch.Tensor) -> torch.Tensor:
@@ -118,8 +101,8 @@ class Targets:
             seen = torch.where(self.augmentation.flip[:, None, None], seen.flip(-1), seen)
         return image.masked_fill(~seen[:, None], -1)
 
-    def match(self, image: torch.Tensor, context: torch.Tensor, selection: Selection,
-              batch: Batch | None = None, level: int = 0) -> torch.Tensor:
+    def match(self, image: torch.Tensor, context: torch.Tensor,
+              batch: Batch | None = None) -> torch.Tensor:
         """
         Find the target that each prediction is trained towards, the argmin of Eq. 5.
 
@@ -128,25 +111,16 @@ class Targets:
 
         :param image: (B, 3, H, W), predictions, augmented.
         :param context: (B, C, 3, H, W), what they come from, as measured returns it.
-        :param selection: function as selection_errors.
         :param batch: with the valid targets and the bounds of the preference, where these are not
             the batch's own.
-        :param level: of recursion, from 0.
         :return: int64 (B,), indices into T.
         """
-        if self.config.chosen.loss == 'fix':
+        if self.config.loss == 'fix':
             return torch.zeros_like(self.rows)  # the batch begins with the fixed frame
         batch = batch or self.batch
         error = self.errors(image.detach()[:, None])[:, 0]
-        selection_error = selection(
-            error, lambda: self.errors(context.detach()), batch, self.config)
-        return self.choose(selection_error, batch.valid, level)
-
-    def choose(self, selection_error: torch.Tensor, valid: torch.Tensor,
-               level: int = 0) -> torch.Tensor:
-        """Return the match of a level from E' (B, T), see losses.match_step."""
-        chance = None if self.chances is None else self.chances[:, level]
-        return match_step(selection_error, valid, self.temperature, chance)
+        return match_step(selection_errors(
+            error, lambda: self.errors(context.detach()), batch, self.config), batch.valid)
 
     def errors(self, images: torch.Tensor) -> torch.Tensor:
         """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
@@ -154,23 +128,14 @@ class Targets:
             images = self.augmentation.undo(images)
         return l1_errors(self.batch.visible(images), self.batch.targets.movedim(-1, 2))
 
-    def outer_l1(self, image: torch.Tensor, step: torch.Tensor,
-                 context: torch.Tensor) -> torch.Tensor:
-        """
-        Measure the l1 error of E_t, with the configured weight on changed pixels.
+    def outer_l1(self, image: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """Return the l1 errors (B,) of predictions (B, 3, H, W) at targets (B,) of T."""
+        return l1_error(self.visible(image), self.frame(step))
 
-        :param image: (B, 3, H, W), predictions.
-        :param step: int64 (B,), the targets, as indices into T.
-        :param context: (B, C, 3, H, W), what the predictions come from, as measured returns it.
-        :return: (B,).
-        """
-        return weighted_l1_error(
-            self.visible(image), self.frame(step), context, self.config.changed_weight)
-
-    def loss(self, image: torch.Tensor, step: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
+    def loss(self, image: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return E_t: the l1 error at step, to the configured power, as a mean."""
         return fixed_time_loss(
-            lambda step: outer_error(self.outer_l1(image, step, context), self.config), step)
+            lambda step: outer_error(self.outer_l1(image, step), self.config), step)
 
 
 def outer_error(error: torch.Tensor, config: ObjectiveSettings) -> torch.Tensor:

@@ -1,32 +1,31 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `python -m tap_ros train`: the options are the parts of TrainingConfig."""
+"""The command `python -m tap_ros train predictor`: options are the parts of TrainingConfig."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
-from tap_ros.options import Bags, Folder
+from tap_ros.options import Folder
 from tap_ros.prediction.training_config import (
     DataSettings,
     NetworkSettings,
     ObjectiveSettings,
     OptimizerSettings,
     RunSettings,
-    TrainingConfig,
 )
 from tap_ros.recording.reading_options import ReadingOptions
-from tap_ros.training.model_option import ModelOption
+from tap_ros.training.command import RecipeOption, Recordings, run_training, with_recipe
 
 
 @dataclass(frozen=True)
 class RunOptions(RunSettings):
     """Where the run happens and what it leaves."""
 
-    recordings: Bags
-    out: Folder
+    recordings: Recordings
+    out: Folder = 'runs/predictor'
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(ModelOption):
+class Options(RecipeOption):
     """Options of the command."""
 
     run: RunOptions
@@ -36,19 +35,12 @@ class Options(ModelOption):
     network: NetworkSettings = NetworkSettings()
     optimizer: OptimizerSettings = OptimizerSettings()
 
-    @property
-    def config(self) -> TrainingConfig:
-        """All of them as a TrainingConfig."""
-        parts = (self.run, self.reading, self.objective, self.data, self.network,
-                 self.optimizer)
-        return TrainingConfig(**{
-            name: value for part in parts for name, value in asdict(part).items()})
+
+def defaults(args: Options) -> Options:
+    """Return what stands for the options that were left out: those of the recipe."""
+    return with_recipe('predictor', args)
 
 
 def run(args: Options) -> None:
     """Train as the command line says, and print where the weights are."""
-    from tap_ros.prediction.training import train
-    from tap_ros.training.parallel import local_rank  # torch takes seconds, --help does without
-    weights = train(args.config)
-    if not local_rank():
-        print(weights)
+    run_training('predictor', args)

@@ -20,6 +20,7 @@ from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch, episode_order, make_batch, Sampling
 from tap_ros.prediction.discriminator import Discriminator
 from tap_ros.prediction.held_out import held_out_scores, matched
+from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.networks import Predictor, PredictorConfig
 from tap_ros.prediction.objective import (
     discriminators_loss,
@@ -30,7 +31,6 @@ from tap_ros.prediction.objective import (
 )
 from tap_ros.prediction.pictures import sample_grid
 from tap_ros.prediction.predictor import load_network
-from tap_ros.prediction.pretraining import pretrain_decoders
 from tap_ros.prediction.recognition import Recognition
 from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
 from tap_ros.recording.bags import check_first_picture
@@ -42,7 +42,6 @@ from tap_ros.training.frames import Frames, MappedFrames, ResidentFrames
 from tap_ros.training.inpainted import fill, Filled, with_masks
 from tap_ros.training.parallel import joined, Processes, share_batch_norm
 from tap_ros.training.run_folder import describe_run, run_facts, run_folder
-from tap_ros.training.schedule import kl_share, learning_rate, match_temperature
 from tap_ros.training.split import split_episodes, warn_if_none
 from tap_ros.training.weights import save_weights
 import torch
@@ -102,7 +101,8 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
     for module in (network, *helpers.values()):
         share_batch_norm(module, processes)
     state = start(network, config.learning_rate, device, helpers)
-    load_checkpoint(checkpoint, state, asdict(config), store.data_hash, DEFAULTS)
+    load_checkpoint(checkpoint, state, asdict(config), store.data_hash,
+                    lambda settings: {**DEFAULTS, **todays_settings(settings)})
     # A run keeps what it began with. Processes of other machines may find otherwise: one decides.
     state.precision = state.precision or ('bfloat16' if processes.agree(
         pick_precision(config.precision, device) == 'bfloat16', device) else 'float32')
@@ -112,16 +112,7 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
                    if device.type == 'cuda' else MappedFrames)
     frames = make_frames(store)
     filled = fill(store, config.robot_mask, make_frames, progress)
-    begun = checkpoint.exists()
     processes.wait()  # before the first one writes a checkpoint
-    if config.pretrain_steps and not begun:
-        draw = partial(
-            _single_frames, store, filled.frames if filled else frames, training, config)
-        pretrain_decoders(state.network, draw, config.pretrain_steps, seed=config.seed,
-                          autocast=autocast, progress=progress)
-        state.average.load_state_dict(state.network.state_dict())
-        if processes.first:
-            save_checkpoint(checkpoint, state, asdict(config), store.data_hash)
     compiled: Callable[[Any], Any] = (
         torch.compile if config.compile else lambda module: module)
     networks = Networks(compiled(state.network), **{
@@ -136,14 +127,10 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
         began = time.monotonic() - state.seconds
         for step, batch, augmentation in _batches(
                 store, frames, filled, training, config, processes, state.step, last):
-            for optimizer, highest in zip(
-                    state.optimizers, (config.learning_rate, config.discriminator_rate)):
-                for group in optimizer.param_groups:
-                    group['lr'] = learning_rate(
-                        step, config.steps, config.warmup, highest)
+            state.set_rates(config.steps, config.warmup, config.learning_rate,
+                            config.discriminator_rate)
             batch, augmentation = batch.to(device), augmentation.to(device)
-            draws = Draws.make(
-                batch, config.latent_size, config.seed, step, processes, config.recursion)
+            draws = Draws.make(batch, config.latent_size, config.seed, step, processes)
             outcome, norm = _step(state, networks, batch, augmentation, draws, config, processes,
                                   autocast)
             state.update_average(config.average_decay)
@@ -168,6 +155,21 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
                 break
 
 
+def kl_share(step: int, steps: int, warmup: float) -> float:
+    """
+    Compute which share of its weight the KL divergence has at a step: 0, a linear rise, then 1.
+
+    Adam scales gradients, so that even a small price can shut z off before it is of use.
+
+    :param step: from 0 on.
+    :param steps: length of the training.
+    :param warmup: share of the training in which it is 0, and over which it then rises; 0: the
+        share is 1 from the start.
+    :return: the share, 0 to 1.
+    """
+    return min(1.0, max(0.0, step / (warmup * steps) - 1)) if warmup else 1.0
+
+
 def network_config(config: TrainingConfig, image_size: tuple[int, int]) -> PredictorConfig:
     """
     Say which network a training run needs.
@@ -180,9 +182,9 @@ def network_config(config: TrainingConfig, image_size: tuple[int, int]) -> Predi
     check_trainable(image_size, 'the predictor')
     return PredictorConfig(image_size=image_size[0], base_width=config.base_width,
                            num_context=1 if config.forward else 2,
-                           latent_size=config.latent_size if config.chosen.vae else 0,
-                           new_pixels=config.new_pixels, flow_scale=config.flow_scale,
-                           decoder=config.decoder, skips=config.skips)
+                           latent_size=config.latent_size if config.latent == 'vae' else 0,
+                           new_pixels=config.new_pixels, decoder=config.decoder,
+                           skips=config.skips)
 
 
 def _begin_with(network: Predictor, weights: str) -> None:
@@ -206,11 +208,8 @@ def _step(state: TrainingState[Predictor], networks: Networks, batch: Batch,
               if judge is not None]  # a compiled network has no truth value
     for judge in judges:
         judge.requires_grad_(False)
-    temperature = match_temperature(
-        state.step, config.steps, config.match_temperature, config.match_share)
-    outcome = predictor_loss(
-        networks, batch, augmentation, config, draws, autocast, temperature=temperature,
-        kl_share=kl_share(state.step, config.steps, config.kl_warmup))
+    outcome = predictor_loss(networks, batch, augmentation, config, draws, autocast,
+                             kl_share(state.step, config.steps, config.kl_warmup))
     state.optimizers[0].zero_grad()
     outcome.loss.backward()
     processes.average_gradients(state.optimizers[0].param_groups[0]['params'])
@@ -233,37 +232,32 @@ def _helpers(config: TrainingConfig, shape: PredictorConfig,
              store: EpisodeStore) -> dict[str, torch.nn.Module]:
     """Make the networks that the method needs for its training alone."""
     helpers: dict[str, torch.nn.Module] = {}
-    method = config.chosen
     longest = int(store.lengths.max())
-    if method.vae:
+    if config.latent == 'vae':
         images = (config.video_frames if config.posterior == 'video'
                   else shape.num_context + 1)
         helpers['recognition'] = Recognition(shape, images, config.posterior_std)
-    if method.gan:
+    if config.gan:
         helpers['discriminator'] = Discriminator(shape, longest - 1)
-        if method.vae:
+        if config.latent == 'vae':
             helpers['posterior_discriminator'] = Discriminator(shape, longest - 1)
     return helpers
 
 
-def _single_frames(store: EpisodeStore, frames: Frames, episodes: np.ndarray,
-                   config: TrainingConfig, step: int) -> torch.Tensor:
-    """Draw single frames of the training episodes, for the decoders' pretraining."""
-    rng = np.random.default_rng([config.seed, 3, step])
-    chosen = rng.choice(episodes, config.batch_size)
-    return frames(chosen, rng.integers(store.lengths[chosen])[:, None])[:, 0]
+def _fraction(config: TrainingConfig) -> float | None:
+    """Return the share of an episode at which the only target is, None for all targets."""
+    return config.fraction if config.loss == 'fix' else None
 
 
 def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episodes: np.ndarray,
              config: TrainingConfig, processes: Processes, first: int,
              last: int) -> Iterator[tuple[int, Batch, Augmentation]]:
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
-    whole = config.chosen.vae and config.posterior == 'video'
+    whole = config.latent == 'vae' and config.posterior == 'video'
     sampling = Sampling(
-        config.margin, config.num_targets, config.max_frames, config.min_crop,
-        config.start_crop, config.goal_picture, config.forward, config.chosen.fraction,
-        int(config.chosen.gan), config.video_frames if whole else 0, config.fill_context)
-
+        config.margin, config.num_targets, config.min_crop, config.start_crop,
+        config.goal_picture, config.forward, _fraction(config), int(config.gan),
+        config.video_frames if whole else 0, config.fill_context)
     part = processes.part(config.batch_size)
 
     def make(step: int) -> tuple[int, Batch, Augmentation]:
@@ -311,7 +305,7 @@ def _report(state: TrainingState[Predictor], curves: SummaryWriter, config: Trai
 
     sampling = Sampling(
         config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
-        forward=config.forward, fraction=config.chosen.fraction,
+        forward=config.forward, fraction=_fraction(config),
         fill_context=config.fill_context)
 
     def batch(episodes: np.ndarray) -> Batch:

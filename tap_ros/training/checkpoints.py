@@ -6,11 +6,11 @@ The state of a training run, and its way to a file and back.
 Batches and augmentation are drawn from (seed, step), so that there are no random numbers in it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 import copy
 from dataclasses import dataclass
+import math
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 from tap_ros.errors import ConfigError, WeightsError
@@ -49,6 +49,20 @@ class TrainingState(Generic[Trained]):
     step: int = 0
     seconds: float = 0.0
     precision: str = ''
+
+    def set_rates(self, steps: int, warmup: int, *highest: float) -> None:
+        """
+        Set this step's learning rates: a linear rise, then half a cosine down to 2 %.
+
+        :param steps: length of the training.
+        :param warmup: steps of the rise.
+        :param highest: of each optimizer, the rate after the rise.
+        """
+        rise = min(1.0, (self.step + 1) / (warmup + 1))
+        fall = 0.5 + 0.5 * math.cos(math.pi * self.step / steps)
+        for optimizer, rate in zip(self.optimizers, highest):
+            for group in optimizer.param_groups:
+                group['lr'] = rate * rise * (0.02 + 0.98 * fall)
 
     @torch.no_grad()
     def update_average(self, decay: float) -> None:
@@ -113,7 +127,7 @@ def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
 
 
 def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mapping[str, Any],
-                    data_hash: str, defaults: Mapping[str, Any] = MappingProxyType({})) -> None:
+                    data_hash: str, todays: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
     """
     Put the state of a run back.
 
@@ -121,7 +135,7 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     :param state: TrainingState as start made it; changed in place.
     :param settings: dict of the run's settings.
     :param data_hash: of the recordings.
-    :param defaults: dict of what settings were before they existed.
+    :param todays: makes settings of earlier versions into those of today.
     :raises ConfigError: if the checkpoint is of other settings or other recordings.
     :raises WeightsError: if it is damaged, or no checkpoint of such a network.
     """
@@ -133,8 +147,9 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
             or not isinstance(about.get('seconds'), (int, float))
             or about.get('precision', '') not in ('', 'float32', 'bfloat16')):
         raise WeightsError(f'{escaped(path)}: is no checkpoint; {_REMEDY}')
-    for name, value in settings.items():
-        before = about['settings'].get(name, defaults.get(name))
+    begun = todays(about['settings'])
+    for name in {**begun, **settings}:
+        before, value = begun.get(name), settings.get(name)
         if name not in FREE and before != value:
             raise ConfigError(
                 f'{escaped(path)}: made with {name}={escaped(repr(before))}, not {value!r}; to go '

@@ -17,7 +17,7 @@ SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
 @pytest.fixture
 def config(tmp_path):
     return TrainingConfig(
-        recordings=(str(SAMPLE),), out=str(tmp_path / 'run'), method='genmin-wo-gan',
+        recordings=(str(SAMPLE),), out=str(tmp_path / 'run'), selection='absolute',
         base_width=4, batch_size=2, threads=1, device='cpu')
 
 

@@ -5,33 +5,34 @@
 from dataclasses import fields, replace
 from pathlib import Path
 
-from experiments.weights import command, recipes
+from experiments.weights import command
 from experiments.weights.card import found
-from experiments.weights.recipes import Recipe, RECIPES
 import numpy as np
 import pytest
 from tap_ros.cli import main
+from tap_ros.errors import ConfigError
 from tap_ros.evaluation.prediction import EpisodeScores
 from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.training.recipes import Recipe, RECIPES
 from tap_ros.weights import PREDICTORS
 
-TINY = Recipe('tiny', 'grasp', {'grasp': '--episodes 30',
-                                'light': '--episodes 2 --appearance lighter_table'},
-              '--method genmin-wo-gan --steps 2 --batch-size 2 --base-width 4 '
-              '--goal-picture last')
+TINY = Recipe({'selection': 'absolute', 'steps': 2, 'batch_size': 2, 'base_width': 4,
+               'goal_picture': 'last'},
+              'grasp', {'grasp': {'episodes': 30},
+                        'light': {'episodes': 2, 'appearance': 'lighter_table'}})
 
 
 @pytest.fixture
 def places(tmp_path, monkeypatch):
-    monkeypatch.setitem(RECIPES, TINY.name, TINY)
-    monkeypatch.setattr(recipes, 'FRESH_EPISODES', 3)
+    monkeypatch.setitem(RECIPES['predictor'], 'tiny', TINY)
+    monkeypatch.setattr(command, 'FRESH_EPISODES', 3)
     return {'bags': str(tmp_path / 'bags'), 'runs': str(tmp_path / 'runs'),
             'out': str(tmp_path / 'out')}
 
 
 def test_weights_are_made_from_nothing_and_their_card_says_how(places, capfd):
-    options = command.Options(only=(TINY.name,), **places)
-    assert command.run(options) == 0
+    options = command.Options(only=('tiny',), **places)
+    command.run(options)
     file, source = (Path(places['out'], 'predictor_tiny.safetensors'),
                     Path(places['runs'], 'tiny', 'predictor.safetensors'))
     assert file.stat().st_size < 0.6 * source.stat().st_size
@@ -44,22 +45,23 @@ def test_weights_are_made_from_nothing_and_their_card_says_how(places, capfd):
                  'python -m tap_ros collect --task grasp --episodes 30 --out bags/grasp',
                  'python -m tap_ros collect --task grasp --episodes 3 --seed 900000',
                  '--episodes 2 --appearance lighter_table --out bags/light',
-                 'python -m tap_ros train --recordings bags/grasp bags/light', '--steps 2',
+                 'python -m tap_ros train predictor bags/grasp bags/light --recipe tiny',
+                 '; recipe: tiny (',
                  'copy-start', 'last frame', f'({file.stem}.png)', '3 scenes'):
         assert text in card
     assert file.with_suffix('.png').read_bytes().startswith(b'\x89PNG')
 
     before = source.stat().st_mtime_ns
-    assert command.run(options) == 0  # nothing is collected or trained twice
+    command.run(options)  # nothing is collected or trained twice
     assert source.stat().st_mtime_ns == before
 
 
 def test_a_card_says_what_samples_are_worth_and_that_no_goal_is_given(
         places, monkeypatch, capfd):
-    monkeypatch.setitem(RECIPES, TINY.name, replace(
-        TINY, task='push2', collections={'push2': '--episodes 30'},
-        train='--method genmin-vae --mode forward --steps 2 --batch-size 2 --base-width 4'))
-    assert command.run(command.Options(only=(TINY.name,), **places)) == 0
+    monkeypatch.setitem(RECIPES['predictor'], 'tiny', replace(
+        TINY, task='push2', recordings={'push2': {'episodes': 30}},
+        settings={**TINY.settings, 'latent': 'vae', 'mode': 'forward'}))
+    command.run(command.Options(only=('tiny',), **places))
     card = Path(places['out'], 'predictor_tiny.md').read_text()
     for text in ('a later picture from a start picture alone', ' weights:=tiny',
                  'The best of 100 samples', 'Samples place an object', 'prediction (z = 0)',
@@ -69,9 +71,10 @@ def test_a_card_says_what_samples_are_worth_and_that_no_goal_is_given(
 
 
 def test_the_list_is_of_commands_that_exist(places, capsys):
-    assert command.run(command.Options(list=True, **places)) == 0
+    command.run(command.Options(list=True, **places))
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == sum(2 + len(recipe.collections) for recipe in RECIPES.values())
+    assert len(lines) == sum(
+        2 + len(RECIPES['predictor'][name].recordings) for name in command.SHIPPED)
     assert not Path(places['runs']).exists()
     for line in lines:
         words = line.split()[3:]
@@ -81,8 +84,9 @@ def test_the_list_is_of_commands_that_exist(places, capsys):
 
 
 def test_a_step_that_fails_ends_it(places, monkeypatch, capfd):
-    monkeypatch.setitem(RECIPES, TINY.name, replace(TINY, train='--steps -1'))
-    assert command.run(command.Options(only=(TINY.name,), **places)) != 0
+    monkeypatch.setitem(RECIPES['predictor'], 'tiny', replace(TINY, settings={'steps': -1}))
+    with pytest.raises(ConfigError, match='steps'):
+        command.run(command.Options(only=('tiny',), **places))
     assert not Path(places['out']).exists()
 
 
@@ -95,5 +99,4 @@ def test_success_is_a_bottleneck_or_hand_and_objects():
 
 
 def test_recipes_are_of_shipped_weights():
-    assert RECIPES.keys() <= PREDICTORS.keys()
-    assert all(name == recipe.name for name, recipe in RECIPES.items())
+    assert set(command.SHIPPED) == PREDICTORS.keys()

@@ -105,7 +105,7 @@ def test_disk_full_train(trials, tmp_path):
         with trials.one(), small_disk(disk, size) as mounted:
             shutil.copy(old, disk)
             trials.measured(run_on_full_disk(
-                mounted, size, 'train', '--recordings', source, '--out', disk, '--steps', 20,
+                mounted, size, 'train', 'predictor', source, '--out', disk, '--steps', 20,
                 '--batch-size', 4, '--base-width', 4, '--save-every', 5))
             assert (disk / old.name).exists(), 'the weights that were there before are gone'
             for path in disk.rglob('*.safetensors'):

@@ -1,36 +1,103 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Names of methods and what they stand for."""
+"""Names of methods, settings of earlier versions, and recipes of the shipped weights."""
+
+from dataclasses import asdict
+import json
+from pathlib import Path
+import re
 
 import pytest
+import tap_ros
+from tap_ros.cli import read
 from tap_ros.errors import ConfigError
-from tap_ros.prediction.methods import parse_method
+from tap_ros.planning.forward_training_config import ForwardTrainingConfig
+from tap_ros.prediction.methods import method_fields, todays_settings
+from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
+from tap_ros.training.checkpoints import FREE
+from tap_ros.training.recipes import DEFAULT, find_recipe, RECIPES
+from tap_ros.training.weights import load_tensors
+from tap_ros.weights import FORWARD_MODEL, PREDICTORS
+
+ROOT = Path(__file__).parents[2]
+SAMPLE = ROOT / 'bags' / 'sample_push2'
 
 
-@pytest.mark.parametrize('name, expected', [
-    ('fix', ('fix', 0.5, None, True, False, 'time_preference')),
-    ('fix0.25', ('fix', 0.25, None, True, False, 'time_preference')),
-    ('fix1.00', ('fix', 1.0, None, True, False, 'time_preference')),
-    ('min', ('min', None, None, True, False, 'time_preference')),
-    ('genmin', ('genmin', None, None, True, False, 'time_preference')),
-    ('genmin0.5', ('genmin', None, 0.5, True, False, 'time_preference')),
-    ('genmininf', ('genmin', None, float('inf'), True, False, 'time_preference')),
-    ('genmin-wo-gan', ('genmin', None, None, False, False, 'time_preference')),
-    ('genmin-vae', ('genmin', None, None, False, True, 'time_preference')),
-    ('genmin-vae-gan', ('genmin', None, None, True, True, 'time_preference')),
-    ('genmin+relative', ('genmin', None, None, True, False, 'relative_to_copying')),
-    ('genmin-wo-gan+reach', ('genmin', None, None, False, False, 'cost_of_reaching')),
-    ('genmin2-vae-gan+relative', ('genmin', None, 2.0, True, True, 'relative_to_copying'))])
-def test_names_of_the_paper(name, expected):
-    method = parse_method(name)
-    assert method.name == name
-    assert (method.loss, method.fraction, method.beta, method.gan, method.vae,
-            method.selection) == expected
+def test_names_of_the_paper_and_of_every_result_are_read_and_made():
+    stored = [json.loads(path.read_text()) for path in ROOT.glob('docs/results/runs/*/*.json')]
+    assert len(stored) > 100
+    for name, mode in {(run['method'], run['mode']) for run in stored}:
+        config = TrainingConfig(('x',), 'x', mode=mode, **method_fields(name))
+        assert method_fields(config.method) == method_fields(name)
+    assert method_fields('genmin2-vae-gan+relative') == {
+        'loss': 'genmin', 'selection': 'relative', 'gan': True, 'latent': 'vae', 'fraction': 0.5,
+        'beta': 2.0}
+    assert method_fields('fix0.25-wo-gan') == {
+        'loss': 'fix', 'selection': 'absolute', 'gan': False, 'latent': 'none', 'fraction': 0.25,
+        'beta': 4.0}
+    for name in ('', 'Fix', 'min2', 'genmin-gan', 'fix+relative', 'genmin+', 'min+progress',
+                 'genmin+reach', 'genmin-2'):
+        with pytest.raises(ConfigError, match='method'):
+            method_fields(name)
 
 
-@pytest.mark.parametrize('name', [
-    '', 'Fix', 'fix1.01', 'fix0', 'min2', 'genmin-gan', 'genmin0', 'fix+relative', 'genmin+',
-    'genmin-vae+copying', 'min+reach', 'genmin-2'])
-def test_other_names_are_refused_with_what_would_be_right(name):
-    with pytest.raises(ConfigError, match='method'):
-        parse_method(name)
+def test_settings_of_earlier_versions_are_those_of_today_but_for_what_is_gone():
+    assert todays_settings({'method': 'min', 'bell_edge': 2 / 3, 'steps': 3}) == {
+        **method_fields('min'), 'steps': 3}
+    assert todays_settings({'match_temperature': 1.0}) == {'match_temperature': 1.0}
+
+
+def trained_settings(path):
+    """Return what weights were trained with, without places and devices, as today's fields."""
+    settings = todays_settings(load_tensors(path)[1]['training']['settings'])
+    return {name: value for name, value in settings.items() if name not in FREE}
+
+
+@pytest.mark.parametrize('name', PREDICTORS)
+def test_card_recipe_and_weights_agree(name):
+    settings = {**DEFAULTS, **trained_settings(PREDICTORS[name])}
+    # Its folder was given before shipped weights had names.
+    settings['initial_weights'] = re.sub(
+        r'.*/predictor_(.*)\.safetensors', r'\1', settings['initial_weights'])
+    recipe = asdict(TrainingConfig(('x',), 'x', **find_recipe('predictor', name).settings))
+    assert {key: recipe[key] for key in settings if key not in FREE} == {
+        key: value for key, value in settings.items() if key not in FREE}
+    card = PREDICTORS[name].with_suffix('.md').read_text()
+    assert f'recipe: {name} ' in card and f' --recipe {name} ' in card
+    config = load_tensors(PREDICTORS[name])[1]['config']
+    assert config['latent_size'] == (recipe['latent_size'] if recipe['latent'] == 'vae' else 0)
+    assert all(config[key] == recipe[key] for key in (
+        'base_width', 'new_pixels', 'decoder', 'skips'))
+
+
+def test_the_forward_models_recipe_is_its_default():
+    settings = trained_settings(FORWARD_MODEL)
+    recipe = asdict(ForwardTrainingConfig(('x',), 'x', **find_recipe('forward', 'push').settings))
+    assert {name: recipe[name] for name in settings} == settings
+    assert '--recipe push ' in FORWARD_MODEL.with_suffix('.md').read_text()
+
+
+def test_every_recipe_can_be_trained_and_a_typo_is_answered_with_the_nearest():
+    for model, kind in (('predictor', TrainingConfig), ('forward', ForwardTrainingConfig)):
+        assert DEFAULT[model] in RECIPES[model] and not find_recipe(
+            model, DEFAULT[model]).settings  # the defaults are the recipe
+        for recipe in RECIPES[model].values():
+            kind(('x',), 'x', **recipe.settings)
+    with pytest.raises(ConfigError, match="'pusch2' is unknown; did you mean 'push2'"):
+        find_recipe('predictor', 'pusch2')
+
+
+def test_without_options_the_sample_is_trained_by_its_tasks_recipe(tmp_path):
+    asked = read(['train', 'predictor', str(SAMPLE)])[1]
+    named = read(['train', 'predictor', str(SAMPLE), '--recipe', 'push2'])[1]
+    assert vars(asked) | {'recipe': 'push2'} == vars(named)
+    order = read(['train', 'predictor', str(SAMPLE), '--recipe', 'order2', '--steps', '3'])[1]
+    assert order.objective.selection == 'relative' and order.optimizer.steps == 3
+
+    weights = tap_ros.train(SAMPLE, tmp_path / 'run', recipe='debug', steps=2)
+    trained = load_tensors(weights)[1]['training']['settings']
+    expected = TrainingConfig((str(SAMPLE),), str(tmp_path / 'run'), **{
+        **RECIPES['predictor']['debug'].settings, 'steps': 2})
+    assert trained == json.loads(json.dumps(asdict(expected)))
+    with pytest.raises(ConfigError, match="'step' .* did you mean 'steps'"):
+        tap_ros.train(SAMPLE, tmp_path / 'other', step=2)

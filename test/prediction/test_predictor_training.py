@@ -17,13 +17,14 @@ from tap_ros.errors import ConfigError, StorageError, WeightsError
 from tap_ros.files import only_writer
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import make_batch
+from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
-from tap_ros.prediction.training import train
+from tap_ros.prediction.training import kl_share, train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training import devices
+from tap_ros.training.checkpoints import start
 from tap_ros.training.parallel import Processes
-from tap_ros.training.schedule import kl_share, learning_rate
 from tap_ros.training.weights import load_tensors, load_weights, save_tensors
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
@@ -35,7 +36,8 @@ ROOT = Path(__file__).parents[2]
 def config(bag, tmp_path):
     return TrainingConfig(
         recordings=(str(bag),), out=str(tmp_path / 'run'), base_width=4, batch_size=4, steps=4,
-        warmup=1, margin=1, test_fraction=0.3, threads=1, save_every=2, log_every=1)
+        warmup=1, margin=1, test_fraction=0.3, threads=1, save_every=2, log_every=1,
+        selection='relative')
 
 
 def weights(config):
@@ -45,13 +47,12 @@ def weights(config):
 @pytest.mark.parametrize('values', [
     {'precision': 'float32', 'num_targets': 3, 'min_crop': 0.6},
     {'precision': 'bfloat16', 'num_targets': 3, 'min_crop': 0.6},
-    {'method': 'genmin-vae-gan'},
-    {'method': 'fix0.25', 'mode': 'forward', 'pretrain_steps': 2},
-    {'method': 'genmin4', 'mode': 'forward', 'recursion': 2},
-    {'decoder': 'shared', 'skips': True, 'recursion': 2, 'detach_recursion': True,
-     'match_temperature': 1.0, 'match_share': 1.0},
-    {'method': 'genmin-vae', 'kl_warmup': 0.5, 'posterior_std': 0.1},
-    {'method': 'genmin-vae', 'posterior': 'frame', 'num_targets': 2}])
+    {**method_fields('genmin-vae-gan')},
+    {**method_fields('fix0.25'), 'mode': 'forward'},
+    {**method_fields('genmin4'), 'mode': 'forward', 'recursion': 2},
+    {'decoder': 'separate', 'skips': False, 'recursion': 2},
+    {**method_fields('genmin-vae'), 'kl_warmup': 0.5, 'posterior_std': 0.1},
+    {**method_fields('genmin-vae'), 'posterior': 'frame', 'num_targets': 2}])
 def test_two_steps_and_two_more_equal_four(config, tmp_path, values):
     config = replace(config, **values)
     train(config, progress=False)
@@ -85,8 +86,8 @@ def test_weights_of_another_network_are_no_beginning(config, tmp_path):
     other = replace(config, out=str(tmp_path / 'other'), initial_weights=first, base_width=8)
     with pytest.raises(ConfigError, match='base_width 4 instead of 8'):
         train(other, progress=False)
-    with pytest.raises(ConfigError, match="decoder 'separate' instead of 'shared'"):
-        train(replace(other, base_width=4, decoder='shared'), progress=False)
+    with pytest.raises(ConfigError, match='skips True instead of False'):
+        train(replace(other, base_width=4, skips=False), progress=False)
     assert not (Path(other.out) / 'checkpoint.safetensors').exists()
 
 
@@ -100,12 +101,12 @@ def test_seed_decides(config, tmp_path):
 
 @pytest.mark.parametrize('mode, method', [
     ('bidirectional', 'fix'), ('bidirectional', 'min'), ('bidirectional', 'genmin'),
-    ('bidirectional', 'genmin-wo-gan+relative'), ('bidirectional', 'genmin+reach'),
+    ('bidirectional', 'genmin-wo-gan+relative'),
     ('bidirectional', 'genmin-wo-gan+progress'),
     ('bidirectional', 'genmin-vae'), ('bidirectional', 'genmin-vae-gan'), ('forward', 'fix1.00'),
     ('forward', 'genmin2')])
 def test_every_method_learns(config, mode, method):
-    config = replace(config, mode=mode, method=method, steps=30, learning_rate=2e-3,
+    config = replace(config, mode=mode, **method_fields(method), steps=30, learning_rate=2e-3,
                      new_pixels=True, save_every=1, average_decay=0.0)
     losses = []
     for stop in (1, 30):
@@ -116,7 +117,7 @@ def test_every_method_learns(config, mode, method):
 
 
 @pytest.mark.parametrize('values', [
-    {'method': 'genmin', 'new_pixels': True}, {'method': 'genmin-vae-gan', 'decoder': 'shared'}])
+    {**method_fields('genmin'), 'new_pixels': True}, method_fields('genmin-vae-gan')])
 def test_compiled_networks_are_trained(config, monkeypatch, values):
     monkeypatch.setattr(torch, 'compile', partial(torch.compile, backend='eager'))
     path = train(replace(config, compile=True, steps=1, **values), progress=False)
@@ -126,7 +127,7 @@ def test_compiled_networks_are_trained(config, monkeypatch, values):
 @pytest.mark.slow
 @pytest.mark.parametrize('method', ['genmin-wo-gan+relative', 'genmin-vae-gan'])
 def test_two_processes_learn_what_one_does_from_the_whole_batch(config, tmp_path, method):
-    config = replace(config, method=method, new_pixels=True, steps=3, average_decay=0.0)
+    config = replace(config, **method_fields(method), new_pixels=True, steps=3, average_decay=0.0)
     train(config, progress=False)
     both = replace(config, out=str(tmp_path / 'both'))
     script = tmp_path / 'script.py'
@@ -258,8 +259,8 @@ def test_a_second_training_in_the_same_folder_is_refused(config):
 
 
 def test_a_network_in_use_predicts_as_in_training(config):
-    config = replace(config, steps=60, average_decay=0.0, save_every=60, method='genmin-wo-gan',
-                     new_pixels=True)
+    config = replace(config, steps=60, average_decay=0.0, save_every=60, new_pixels=True,
+                     decoder='separate', skips=False, **method_fields('genmin-wo-gan'))
     network, _ = load_network(train(config, progress=False))
     store = open_recordings(list(config.recordings), progress=False)
     context = to_float(make_batch(store, range(len(store))).context)
@@ -274,8 +275,10 @@ def test_a_network_in_use_predicts_as_in_training(config):
 
 
 def test_learning_rate_rises_and_falls():
-    config = TrainingConfig(recordings=('bag',), out='', steps=1000, warmup=10)
-    rates = [learning_rate(step, config.steps, config.warmup, 1.0) for step in range(1000)]
+    state, rates = start(torch.nn.Linear(1, 1), 1e-3, 'cpu'), []
+    for state.step in range(1000):
+        state.set_rates(1000, 10, 1.0)
+        rates.append(state.optimizers[0].param_groups[0]['lr'])
     assert rates[0] < 0.1 and max(rates) == pytest.approx(1, abs=0.01)
     assert rates[-1] == pytest.approx(0.02, abs=0.001)
     assert all(a >= b for a, b in zip(rates[10:], rates[11:]))
@@ -288,17 +291,12 @@ def test_the_price_of_z_rises():
 
 
 @pytest.mark.parametrize('values', [
-    {'recordings': ()}, {'method': 'max'}, {'outer_power': 2.0}, {'mode': 'sideways'},
+    {'recordings': ()}, {'loss': 'max'}, {'outer_power': 2.0}, {'mode': 'sideways'},
     {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
-    {'bell_edge': 0.0}, {'max_frames': 2}, {'method': 'genmin2'}, {'method': 'fix1.5'},
-    {'method': 'min+relative'}, {'method': 'genmin+progress', 'mode': 'forward'},
-    {'recursion': 2, 'method': 'fix'}, {'progress_margin': 0.5, 'method': 'genmin'},
-    {'posterior': 'frame', 'method': 'genmin-vae-gan'},
-    {'posterior': 'frame', 'method': 'genmin-wo-gan'}, {'gan_weight': -1.0},
-    {'free_nats': -1.0, 'method': 'genmin-vae'}, {'free_nats': 1.0, 'method': 'genmin'},
-    {'kl_warmup': 0.6, 'method': 'genmin-vae'}, {'kl_warmup': 0.5, 'method': 'genmin'},
-    {'posterior_std': 0.0, 'method': 'genmin-vae'}, {'posterior_std': 0.1, 'method': 'genmin'},
-    {'free_nats': 1.0, 'posterior': 'frame', 'method': 'genmin-vae'}])
+    {'fraction': 1.5}, {'beta': 0.0}, {'selection': 'progress', 'mode': 'forward'},
+    {'recursion': 2, 'loss': 'fix'}, {'posterior': 'frame', 'latent': 'vae', 'gan': True},
+    {'posterior': 'frame'}, {'gan_weight': -1.0}, {'free_nats': -1.0}, {'kl_warmup': 0.6},
+    {'posterior_std': 0.0}, {'posterior': 'frame', 'free_nats': 1.0, 'latent': 'vae'}])
 def test_settings_that_make_no_sense_are_refused_by_name(values):
     with pytest.raises(ConfigError, match=next(iter(values))):
         TrainingConfig(**{'recordings': ('bag',), 'out': 'out', **values})
@@ -311,13 +309,13 @@ def test_a_device_that_is_not_there_is_refused(config):
 
 def test_the_command_line_sets_every_field(config, capsys):
     assert main([
-        'train', '--recordings', *config.recordings, '--out', config.out, '--steps', '1',
-        '--no-flip', '--base-width', '4', '--batch-size', '2', '--method', 'min-wo-gan',
+        'train', 'predictor', *config.recordings, '--out', config.out, '--steps', '1',
+        '--no-flip', '--base-width', '4', '--batch-size', '2', '--loss', 'min',
         '--new-pixels']) == 0
     assert capsys.readouterr().out.strip() == f'{config.out}/predictor.safetensors'
     with open(f'{config.out}/config.json') as file:
         settings = json.load(file)
-    assert settings['method'] == 'min-wo-gan' and settings['new_pixels'] and not settings['flip']
+    assert settings['loss'] == 'min' and settings['new_pixels'] and not settings['flip']
 
 
 def test_training_on_one_episode_works_without_held_out_ones(config):
