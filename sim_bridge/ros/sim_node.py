@@ -16,6 +16,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
+from sim_bridge.ros.tf_publisher import TransformPublisher
 from sim_bridge.tasks.run_state import MAX_PERIODS, RunState
 from sim_bridge.world.appearance import CHOICES
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
@@ -48,7 +49,6 @@ from tap_ros.nodes.ros_messages import (
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import answering
 from tap_ros.nodes.subscriptions import subscribe
-from tap_ros.nodes.tf_publisher import TransformPublisher
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 BEAT_S = 0.1
 LEASE_S = 0.4  # of the topic's liveliness, for other programs that watch it
-SILENT_S = 0.7  # without a beat for so long a node is thought dead
-DOUBT_S = 0.1  # if none comes in so long after that: the watcher itself may have been held up
+SILENT_S = 0.7  # s without a beat after which a node may be dead
+DOUBT_S = 0.1  # s more until it counts as dead: the watcher itself may have been delayed
 QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
                  liveliness=LivelinessPolicy.AUTOMATIC,
                  liveliness_lease_duration=Duration(seconds=LEASE_S))
@@ -30,8 +30,6 @@ class Heartbeat:
     Publish <node>/heartbeat ten times a second.
 
     A thread does it: a long callback is no death; a killed or stopped process is.
-
-    :param node: rclpy Node.
     """
 
     def __init__(self, node: 'Node') -> None:
@@ -42,7 +40,7 @@ class Heartbeat:
         self._thread.start()
 
     def end(self) -> None:
-        """Beat no more; to be called before the node is destroyed."""
+        """Stop the thread; to be called before the node is destroyed."""
         self._ended.set()
         self._thread.join(1.0)
 
@@ -59,8 +57,8 @@ class Liveness:
     """
     Watch the heartbeat of a node.
 
-    Only the beats count. Fast DDS tells the loss of liveliness too, but not always where a node
-    was started again soon after its death.
+    Fast DDS also reports the loss of liveliness, but not always for a node that was restarted soon
+    after its death; so only the beats count.
 
     :param node: rclpy Node that watches; another thread spins it.
     :param name: of the node that is watched, as seen from this one's namespace.
@@ -79,7 +77,7 @@ class Liveness:
 
     @property
     def dead(self) -> bool:
-        """Tell whether a node that was heard is heard no more; to be asked again and again."""
+        """Tell whether the beats of a node have stopped; to be polled."""
         now = time.monotonic()
         if not self._silent(now):
             self._doubted_at = None
@@ -89,7 +87,7 @@ class Liveness:
         return doubted_at is not None and now - doubted_at > DOUBT_S
 
     def wait_until_alive(self, seconds: float) -> bool:
-        """Wait until one that has died lives again; tell so, and True if none was heard yet."""
+        """Wait until a dead node lives again; return whether it does, or was never alive."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._silent(time.monotonic()), seconds)
 

@@ -1,8 +1,10 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Node parameters with a description and a range, refused with a reason when wrong."""
+"""Parameters with a description and a range, and those that several nodes have."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+import math
 from typing import Any, TYPE_CHECKING
 
 from rcl_interfaces.msg import (
@@ -12,11 +14,18 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from sensor_msgs.msg import CompressedImage, Image
 from tap_ros.errors import ConfigError
+from tap_ros.plugins import names
+from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
 
 if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.parameter import Parameter
+
+_TRANSPORTS: dict[str, tuple[type, str]] = {
+    'raw': (Image, 'camera/image_raw'),
+    'compressed': (CompressedImage, 'camera/image_raw/compressed')}
 
 
 class Parameters:
@@ -94,3 +103,57 @@ def check_device(device: str) -> None:
     import torch  # here, since it takes seconds, and not every node has a device
     if device == 'cuda' and not torch.cuda.is_available():
         raise ConfigError('parameter device: torch finds no GPU for cuda; valid here: cpu')
+
+
+def declare_transport(parameters: Parameters) -> None:
+    """Declare the parameter image_transport of a node."""
+    parameters.declare(
+        'image_transport', 'raw',
+        'How the camera sends pictures: sensor_msgs/Image on camera/image_raw (raw), or '
+        'CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).',
+        choices=tuple(_TRANSPORTS))
+
+
+def camera_topic(parameters: Parameters) -> tuple[type, str]:
+    """Return message type and name of the camera's topic by the parameter image_transport."""
+    return _TRANSPORTS[parameters['image_transport']]
+
+
+def declare_arm(parameters: Parameters) -> None:
+    """Declare the arm and its place, for joint states that do not contain the gripper's place."""
+    arm = parameters.declare(
+        'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
+        'joints and not gripper_x.', choices=names('tap_ros.arms'))
+    declare_mount(parameters, arm)
+
+
+def declare_mount(parameters: Parameters, arm: str) -> None:
+    """Declare the place of an arm; by default at the simulated table."""
+    default = get_arm(arm).mount
+    for axis, value in zip('xyz', default.position):
+        parameters.declare(
+            f'mount_{axis}', value, f'{axis} of the base of the arm in the world, m; of its '
+            'controller\'s frame "base".', low=-10.0, high=10.0)
+    parameters.declare('mount_turn', default.yaw,
+                       'Turn of that frame about the vertical, rad; the base stands upright.',
+                       low=-2 * math.pi, high=2 * math.pi)
+    parameters.declare('tool_length', default.tool,
+                       'From the flange to the fingertips along its z, m.', low=0.0, high=2.0)
+
+
+def declare_opening(parameters: Parameters) -> None:
+    """Declare the opening of the gripper where no message tells it."""
+    parameters.declare('fixed_opening', 0.0,
+                       'Opening of the gripper, 0 to 1, where no joint_states has '
+                       'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
+
+
+def declared_arm(parameters: Parameters) -> Arm:
+    """Return the Arm at its place, by the parameters of declare_arm."""
+    return replace(get_arm(parameters['arm']), mount=declared_mount(parameters))
+
+
+def declared_mount(parameters: Parameters) -> Mount:
+    """Return the place of the arm, by the parameters of declare_mount."""
+    x, y, z = (parameters[f'mount_{axis}'] for axis in 'xyz')
+    return Mount((x, y, z), parameters['mount_turn'], parameters['tool_length'])

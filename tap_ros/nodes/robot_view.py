@@ -31,7 +31,7 @@ def declare_robot_mask(parameters: 'Parameters') -> None:
 
 class RobotView:
     """
-    Fill what the robot hides; safe to use from several threads.
+    Fills what the robot hides with what was seen there last; thread-safe.
 
     :param robot_mask: as the parameter.
     :ivar used: whether anything is filled.
@@ -41,14 +41,13 @@ class RobotView:
         self.used = robot_mask != 'none'
         self._view = FreeView(robot_mask)
         self._lock = threading.Lock()
-        self._newest = -1, -1  # jumps of the clock, and stamp in ns of the newest picture
         self.clear()
 
     def clear(self) -> None:
         """Forget what was seen: another scene begins."""
         with self._lock:
             self._view.clear()
-            self._newest = -1, -1
+            self._newest = -1, -1  # jumps of the clock, and stamp in ns of the newest picture
 
     def see(self, image: Image, mask: Image, jumps: int) -> Image:
         """

@@ -2,12 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """All tests of this folder need ROS; nodes and clients for them."""
 
+import os
+
 import pytest
+
+# Apart from the domain of the other tests, whose nodes have the same names.
+LOOP_DOMAIN = str(1 + (os.getpid() + 50) % 100)
 
 
 def pytest_itemcollected(item):
     """Mark the tests of this folder."""
     item.add_marker(pytest.mark.ros)
+
+
+def pytest_collection_modifyitems(items):
+    """Let the test that ends all nodes of the loop be the last."""
+    items.sort(key=lambda item: 'every_node_ends_cleanly' in item.name)
 
 
 @pytest.fixture
@@ -18,9 +28,27 @@ def client():
         yield node
 
 
-@pytest.fixture(scope='module')
-def loop(tmp_path_factory):
-    """All nodes as processes, for the tests of one file."""
+def enter_domain(patch):
+    """Have what is started from now on in the domain of the loop, and predict as it does."""
+    patch.setenv('ROS_DOMAIN_ID', LOOP_DOMAIN)
+    # With more threads the predictor's last digits differ from process to process.
+    patch.setenv('OMP_NUM_THREADS', '1')
+
+
+@pytest.fixture(scope='session')
+def running(tmp_path_factory):
+    """All nodes as processes, started once."""
     from loop import running_loop
-    with running_loop(tmp_path_factory.mktemp('loop')) as loop:
-        yield loop
+    with pytest.MonkeyPatch.context() as patch:
+        enter_domain(patch)
+        context = running_loop(tmp_path_factory.mktemp('loop'))
+        loop = context.__enter__()
+    yield loop
+    context.__exit__(None, None, None)
+
+
+@pytest.fixture
+def loop(running, monkeypatch):
+    """All nodes as processes, and the domain that they are in."""
+    enter_domain(monkeypatch)
+    return running

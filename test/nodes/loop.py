@@ -3,7 +3,6 @@
 """All nodes as processes, over DDS, and how they are compared with one process."""
 
 from contextlib import contextmanager
-import os
 import threading
 
 from action_msgs.msg import GoalStatus
@@ -27,7 +26,9 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.planning.action_sequences import FULL
+from tap_ros.planning.mpc_inputs import Scene
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import FORWARD_MODEL
 import torch
@@ -65,12 +66,15 @@ class Loop:
 
     def reset(self, seed=SEED, patience=30.0):
         """Start a scene, and wait so many seconds for what is published at its start."""
-        before = to_nanoseconds(self.image.wait(30).header.stamp)  # in lock-step one always comes
+        self.image.wait(30)  # in lock-step one always comes
+        before = max(to_nanoseconds(topic.wait(30).header.stamp)
+                     for topic in (self.image, self.goal_image))
         response = call(self.reset_client, ResetScene.Request(task='push2', seed=seed), 30)
         assert response.success, response.message
-        image = self.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > before)
-        for topic in (self.objects, self.joints, self.goal_image, self.goal_objects):
-            topic.wait(patience, lambda m: m.header.stamp == image.header.stamp)
+        # A picture may still come that answers a command; a goal comes with a scene alone.
+        goal = self.goal_image.wait(patience, lambda m: to_nanoseconds(m.header.stamp) > before)
+        for topic in (self.image, self.objects, self.joints, self.goal_objects):
+            topic.wait(patience, lambda m: m.header.stamp == goal.header.stamp)
         self.twists.clear()
         self.distances.clear()
 
@@ -118,6 +122,21 @@ class Loop:
         handle = send_goal(self.reach_client, ReachGoal.Goal(**fields), 30, on_feedback)
         return wait_for_result(handle, 300)
 
+    def begin_moving(self, **fields):
+        """Start a scene and a goal; return its handle once the arm was moved."""
+        self.reset()
+        moving = threading.Event()
+        handle = send_goal(self.reach_client, ReachGoal.Goal(**{'mode': 'direct'} | fields), 30,
+                           lambda feedback: moving.set())
+        assert moving.wait(120)
+        return handle
+
+    def restart(self, name, remaps=(), **parameters):
+        """End a node and start it anew."""
+        assert self.processes[name].end() == 0, self.processes[name].text
+        self.start(name, remaps, **parameters)
+        self.processes[name].wait_for('ready', 120)
+
     def moves(self):
         """Return the commands (N, 3) so far, without the stops."""
         return np.array([
@@ -137,31 +156,49 @@ class Loop:
 @contextmanager
 def running_loop(folder):
     """Start all nodes, and kill them in the end."""
-    # With more threads the predictor's last digits differ from process to process.
-    before = os.environ.get('OMP_NUM_THREADS')
-    os.environ['OMP_NUM_THREADS'] = '1'
+    with Client() as node:
+        loop = Loop(node, folder)
+        try:
+            loop.start('recorder_node', folder=folder / 'bag')
+            loop.start('sim_node', lock_step='true')
+            loop.start('predictor_node')
+            loop.start('visual_mpc_node', image_timeout=10.0)
+            for process in loop.processes.values():
+                process.wait_for('ready', 120)
+            assert loop.predict_client.wait_for_service(30)
+            assert loop.reach_client.wait_for_server(30)
+            loop.reset()
+            loop.wait_until_seen()
+            yield loop
+        finally:
+            for process in loop.processes.values():
+                process.kill()
+
+
+def planned(seed, steps, prepare=lambda sim: None, gripper=lambda seen: seen.gripper,
+            sim=None, limits=FULL):
+    """
+    Plan and step in this process, directly to the goal.
+
+    :param prepare: called with the Simulator after its reset; gripper: what the planner is told
+        of what is seen.
+    :return: the moves (steps, 3), and the distance of the objects at the end.
+    """
+    sim, mpc = sim or Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
     try:
-        with Client() as node:
-            loop = Loop(node, folder)
-            try:
-                loop.start('recorder_node', folder=folder / 'bag')
-                loop.start('sim_node', lock_step='true')
-                loop.start('predictor_node')
-                loop.start('visual_mpc_node', image_timeout=10.0)
-                for process in loop.processes.values():
-                    process.wait_for('ready', 120)
-                assert loop.predict_client.wait_for_service(30)
-                assert loop.reach_client.wait_for_server(30)
-                loop.reset()
-                loop.wait_until_seen()
-                yield loop
-            finally:
-                for process in loop.processes.values():
-                    process.kill()
+        seen = sim.reset(SEED)
+        prepare(sim)
+        wanted = sim.goal().object_pixels
+        goal, memory, moves = mpc.goal(wanted), Memory(seed), []
+        for _ in range(steps):
+            plan = mpc.plan(Scene(seen.image, gripper(seen), seen.object_pixels), goal, memory,
+                            limits)
+            memory = plan.memory
+            moves.append(plan.action[:3])
+            seen = sim.step(plan.action)
+        return np.array(moves), np.linalg.norm(seen.object_pixels - wanted, axis=1).mean()
     finally:
-        os.environ.pop('OMP_NUM_THREADS')
-        if before is not None:
-            os.environ['OMP_NUM_THREADS'] = before
+        sim.close()
 
 
 def acts_like(loop, method, weights, **fields):

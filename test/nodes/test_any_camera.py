@@ -2,24 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras as people have them: 640x480, compressed, best effort; heard by real nodes over DDS."""
 
+from contextlib import contextmanager
 import io
 import time
 
 from lively import lively_network
 import numpy as np
 from PIL import Image as Picture
-from processes import Client, NodeProcess
+from processes import Client
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 from tap_msgs.msg import ObjectStates
-from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ConfigError, ImageError
 from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call
 from tap_ros.nodes.observations import Observations, OnDemandObservations
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import declare_parameters
@@ -32,6 +31,7 @@ from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import trained_reading
 from tap_ros.recording.writer import BagWriter
 from tap_ros.training.weights import save_weights
+from test_predictor_node import Service
 
 pytestmark = pytest.mark.slow
 STAMP = to_stamp(2_500_000_000)
@@ -65,58 +65,34 @@ def weights(tmp_path_factory):
     return path
 
 
-class Running:
-    """A predictor node of its own namespace, and what asks it."""
-
-    def __init__(self, client, folder, name, parameters, overrides=()):
-        self.node, self.name = client, name
-        self.process = NodeProcess('predictor_node', folder / f'{name}.log', parameters,
-                                   [f'-r __ns:=/{name}', *overrides])
-        self.client = client.create_client(PredictSubgoal, f'/{name}/predict_subgoal')
-
-    def __enter__(self):
-        self.process.wait_for('ready', 120)
-        assert self.client.wait_for_service(30)
-        return self
-
-    def __exit__(self, *_):
-        self.process.kill()
-
-    def publisher(self, kind, topic, qos):
-        return self.node.create_publisher(kind, f'/{self.name}/{topic}', qos)
-
-    def until(self, words, sends, timeout_s=30, **fields):
-        """Publish and ask again and again until the answer is that; return it."""
-        deadline, answer = time.monotonic() + timeout_s, None
-        while time.monotonic() < deadline:
-            for publisher, message in sends:
-                publisher.publish(message)
-            answer = call(self.client, PredictSubgoal.Request(**fields), 60)
-            if words in answer.message:
-                return answer
-            time.sleep(0.2)
-        raise AssertionError(f'no {words!r} in time, but: {answer.message}')
+@contextmanager
+def running(client, name, overrides=None, **parameters):
+    """Start a predictor node of its own namespace, and end it."""
+    service = Service(client, name, **parameters, **(overrides or {}))
+    try:
+        yield service
+    finally:
+        service.end()
 
 
 @pytest.mark.parametrize('transport', ['raw', 'compressed'])
 def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(
-        client, weights, tmp_path, transport):
+        client, weights, tmp_path, capfd, transport):
     start, topic = (jpeg(START), 'camera/image_raw/compressed') if transport == 'compressed' else (
         encode_image(START, STAMP, 'eye'), 'camera/image_raw')
     goal = encode_image(GOAL, STAMP, 'eye')
     objects, goal_objects = (
         encode_objects(('cup', 'box'), pixels, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP, 'world',
                        ObjectStates.SOURCE_TRACKED) for pixels in (PIXELS, PIXELS[::-1]))
-    parameters = {'weights': weights, 'image_transport': transport}
-    with Running(client, tmp_path, transport, parameters) as running:
+    with running(client, transport, weights=weights, image_transport=transport) as service:
         volatile = QoSProfile(depth=1)  # of a goal, as `ros2 topic pub` has it
         sends = [
-            (running.publisher(type(start), topic, qos_profile_sensor_data), start),
-            (running.publisher(ObjectStates, 'objects', qos_profile_sensor_data), objects),
-            (running.publisher(Image, 'goal/image', volatile), goal),
-            (running.publisher(ObjectStates, 'goal/objects', volatile), goal_objects)]
-        answer = running.until('maps of', sends)
-        assert 'taken best_effort and volatile, as it is published' in running.process.text
+            (service.publisher(type(start), topic, qos_profile_sensor_data), start),
+            (service.publisher(ObjectStates, 'objects', qos_profile_sensor_data), objects),
+            (service.publisher(Image, 'goal/image', volatile), goal),
+            (service.publisher(ObjectStates, 'goal/objects', volatile), goal_objects)]
+        answer = service.until('maps of', sends)
+        assert 'taken best_effort and volatile, as it is published' in capfd.readouterr().err
     # What was recorded is read as the same picture, so the answer is that of the recording.
     with BagWriter(tmp_path / 'bag') as writer:
         kind = f'sensor_msgs/msg/{type(start).__name__}'
@@ -189,33 +165,32 @@ def test_overrides_change_that_subscription_alone_and_wrong_ones_are_named(clien
                 subscribe(node, Image, 'camera/image_raw', print, STREAM)
 
 
-def test_an_object_beside_the_part_that_is_seen_is_named(client, weights, tmp_path):
+def test_an_object_beside_the_part_that_is_seen_is_named(client, weights):
     beside = encode_objects(('cup',), [(20.0, 200.0)], [[0, 0, 0, 0, 0, 0, 1]], STAMP, 'world',
                             ObjectStates.SOURCE_TRACKED)
-    with Running(client, tmp_path, 'beside', {'weights': weights}) as running:
+    with running(client, 'beside', weights=weights) as service:
         picture = encode_image(START, STAMP, 'eye')
-        answer = call(running.client, PredictSubgoal.Request(
-            start=picture, goal=picture, start_objects=beside, goal_objects=beside), 60)
-        assert not answer.success
+        message = service.refusal(
+            start=picture, goal=picture, start_objects=beside, goal_objects=beside)
         assert ('start_objects: cup not in the part of the picture that the weights see, 480x480 '
-                'pixels from (80, 0) on') in answer.message
+                'pixels from (80, 0) on') in message
         # Pictures that are cut already are taken as they are.
         small = encode_image(np.ascontiguousarray(START[:32, :32]), STAMP, 'eye')
-        assert call(running.client, PredictSubgoal.Request(start=small, goal=small), 60).success
+        service.answer(start=small, goal=small)
 
 
-def test_who_is_not_heard_because_of_its_quality_of_service_is_named(client, weights, tmp_path):
-    override = ('-p qos_overrides./strict/camera/image_raw.subscription.reliability:=reliable',)
-    with Running(client, tmp_path, 'strict', {'weights': weights}, override) as running:
-        running.until('nothing has come on /strict/camera/image_raw (no node publishes it)', [])
-        camera = running.publisher(Image, 'camera/image_raw', qos_profile_sensor_data)
+def test_who_is_not_heard_because_of_its_quality_of_service_is_named(client, weights):
+    override = {'qos_overrides./strict/camera/image_raw.subscription.reliability': 'reliable'}
+    with running(client, 'strict', override, weights=weights) as service:
+        service.until('nothing has come on /strict/camera/image_raw (no node publishes it)')
+        camera = service.publisher(Image, 'camera/image_raw', qos_profile_sensor_data)
         message = encode_image(START, STAMP, 'eye')
         # The middleware knows a publisher before the name of its node.
-        answer = running.until(f'its quality of service does not fit, {client.get_name()}',
+        answer = service.until(f'its quality of service does not fit, {client.get_name()}',
                                [(camera, message)])
         assert 'qos_overrides./strict/camera/image_raw.subscription.*' in answer.message
-        reliable = running.publisher(Image, 'camera/image_raw', STREAM)
-        running.until('nothing has come on /strict/goal/image', [(reliable, message)])
+        reliable = service.publisher(Image, 'camera/image_raw', STREAM)
+        service.until('nothing has come on /strict/goal/image', [(reliable, message)])
 
 
 @pytest.mark.parametrize('transport', ['raw', 'compressed'])
@@ -224,9 +199,9 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
     with Client('planner', parameter_overrides=[
             Parameter('image_transport', value=transport)]) as node:
         params = declare_parameters(node)
-        sight = PlannerInputs(node, params, lambda: crop, lambda name: None)
+        inputs = PlannerInputs(node, params, lambda: crop, lambda name: None)
         message = jpeg(START) if transport == 'compressed' else encode_image(START, STAMP, 'eye')
-        name = sight._types['image'][1]
+        name = inputs._types['image'][1]
         objects = encode_objects(('cup', 'box'), PIXELS, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP,
                                  'world', ObjectStates.SOURCE_TRACKED)
         joints = encode_joints(np.array([0.1, 0.2, 0.05, 0.5]), STAMP, 'world')
@@ -238,31 +213,31 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
             for publisher, one in publishers:
                 publisher.publish(one)
             time.sleep(0.2)
-            seen, lacking = sight.look(sight.topics())
+            seen, lacking = inputs.look(inputs.topics())
         assert seen is not None, lacking
         shown = decode_image(message, 'start')
         assert np.array_equal(seen.image, crop.crop.image(shown))
         np.testing.assert_allclose(seen.pixels, (PIXELS - [80, 0] + 0.5) * 64 / 480 - 0.5)
         # What it asks the predictor about is the whole picture, raw.
-        assert isinstance(sight.messages['image'], Image)
-        assert np.array_equal(decode_image(sight.messages['image'], 'start'), shown)
-        names, pixels = sight.decode_positions(objects, 'goal_objects', None)
+        assert isinstance(inputs.messages['image'], Image)
+        assert np.array_equal(decode_image(inputs.messages['image'], 'start'), shown)
+        names, pixels = inputs.decode_positions(objects, 'goal_objects', None)
         np.testing.assert_allclose(pixels, seen.pixels)
         # Pixels of a goal picture that is cut already are those of the part.
         small = encode_image(crop.crop.image(shown), STAMP, 'eye')
         inside = encode_objects(names, pixels, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP, 'world',
                                 ObjectStates.SOURCE_TRACKED)
         np.testing.assert_allclose(
-            sight.decode_positions(inside, 'goal_objects', small)[1], pixels)
-        assert np.array_equal(sight.cut(small, 'goal'), seen.image)
+            inputs.decode_positions(inside, 'goal_objects', small)[1], pixels)
+        assert np.array_equal(inputs.cut(small, 'goal'), seen.image)
         # Another camera shows the table elsewhere.
-        sight.begin(time.monotonic())
+        inputs.begin(time.monotonic())
         other = encode_image(np.ascontiguousarray(START[:240, :320]), to_stamp(9 * 10**9), 'eye')
-        sight.sensors.put('image', other), sight.sensors.put('objects', stamped(objects, 9))
-        sight.sensors.put('joints', stamped(joints, 9))
+        inputs.sensors.put('image', other), inputs.sensors.put('objects', stamped(objects, 9))
+        inputs.sensors.put('joints', stamped(joints, 9))
         with pytest.raises(ImageError, match='320x240 pixels; the forward model was trained on '
                                              'those of 640x480'):
-            sight.look(sight.topics())
+            inputs.look(inputs.topics())
 
 
 def stamped(message, seconds):

@@ -6,8 +6,9 @@ import time
 
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import TwistStamped
+from loop import planned, SEED
 import numpy as np
-from processes import Client, NodeProcess
+from processes import Client, LocalNode, NodeProcess
 import pytest
 from rclpy.action import ActionClient
 from sensor_msgs.msg import JointState
@@ -15,15 +16,12 @@ from sim_bridge.simulator import Simulator
 from tap_msgs.action import ReachGoal
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import send_goal, wait_for_result
+from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.topics import STREAM, to_stamp
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.robots.ur10e import UR10E
-from tap_ros.weights import FORWARD_MODEL
 
 pytestmark = pytest.mark.slow
 
-SEED = 1_000_003
 MS = 10**6
 
 
@@ -60,11 +58,8 @@ def driven(tmp_path_factory):
             nodes['sim'] = NodeProcess(
                 'sim_node', folder / 'sim.txt', {'lock_step': 'true', 'seed': SEED,
                                                  'look': 'arm'},
-                ['-r joint_states:=arm_driver'])
-            nodes['mpc'] = NodeProcess(
-                'visual_mpc_node', folder / 'mpc.txt', {'image_timeout': 4.0})
-            for process in nodes.values():
-                process.wait_for('ready', 180)
+                ['-r joint_states:=arm_driver']).wait_for('ready', 180)
+            nodes['mpc'] = LocalNode(VisualMpcNode, num_threads=4, image_timeout=4.0)
             assert client.wait_for_server(30)
 
             def reach(on_feedback=None, **fields):
@@ -80,8 +75,9 @@ def driven(tmp_path_factory):
 
             yield driver, reach, twists
         finally:
-            for process in nodes.values():
-                process.kill()
+            if 'mpc' in nodes:
+                nodes['mpc'].end()
+            nodes['sim'].kill()
 
 
 def moves(twists):
@@ -93,36 +89,30 @@ def test_six_joints_alone_tell_the_planner_where_the_gripper_is(driven):
     _, reach, twists = driven
     status, result = reach(step_budget=2, seed=5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    sim, mpc = Simulator('push2', 64, 'arm'), VisualMPC.load(FORWARD_MODEL)
-    try:
-        seen = sim.reset(SEED)
-        goal, memory, actions = mpc.goal(sim.goal().object_pixels), Memory(5), []
-        for _ in range(2):
-            place = UR10E.gripper_at(seen.arm_joints)
-            np.testing.assert_allclose(place, seen.gripper[:3], atol=1e-6)
-            gripper = np.array([*place, 0], np.float32)
-            plan = mpc.plan(Scene(seen.image, gripper, seen.object_pixels), goal, memory)
-            memory = plan.memory
-            actions.append(plan.action[:3])
-            seen = sim.step(plan.action)
-    finally:
-        sim.close()
-    assert np.array_equal(np.array(moves(twists), np.float32), np.array(actions))
+
+    def gripper(seen):
+        place = UR10E.gripper_at(seen.arm_joints)
+        np.testing.assert_allclose(place, seen.gripper[:3], atol=1e-6)
+        return np.array([*place, 0], np.float32)
+
+    wanted, _ = planned(5, 2, gripper=gripper, sim=Simulator('push2', 64, 'arm'))
+    assert np.array_equal(np.array(moves(twists), np.float32), wanted)
 
 
-@pytest.mark.parametrize('offsets, words', [
-    ((-800 * MS, -790 * MS), 'the newest state of shoulder_pan_joint is 0.790 s older'),
-    ((-800 * MS, 3 * MS), 'the nearest older state of shoulder_pan_joint is')])
-def test_joints_of_another_time_than_the_picture_move_nothing(driven, offsets, words):
+def test_joints_of_another_time_than_the_picture_move_nothing(driven):
     driver, reach, twists = driven
-    before, driver.offsets = driver.offsets, offsets
+    before = driver.offsets
     try:
-        status, result = reach(step_budget=2)
+        for driver.offsets, words in (
+                ((-800 * MS, -790 * MS),
+                 'the newest state of shoulder_pan_joint is 0.790 s older'),
+                ((-800 * MS, 3 * MS), 'the nearest older state of shoulder_pan_joint is')):
+            status, result = reach(step_budget=2)
+            assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+            assert words in result.message and '/joint_states' in result.message
+            assert not moves(twists)
     finally:
         driver.offsets = before
-    assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
-    assert words in result.message and '/joint_states' in result.message
-    assert not moves(twists)
 
 
 def test_a_driver_that_falls_silent_stops_the_arm(driven):

@@ -5,7 +5,6 @@
 from importlib import import_module
 from pathlib import Path
 
-import pytest
 from rclpy.context import Context
 from rclpy.node import Node
 from tap_ros.contract import NODE_MODULES
@@ -38,28 +37,21 @@ def declared(name, *arguments):
         context.try_shutdown()
 
 
-def test_every_node_has_its_part():
+def test_the_file_has_every_parameter_with_its_default_and_reaches_the_nodes(tmp_path):
     assert set(NODES) == set(NODE_MODULES)
-
-
-@pytest.mark.parametrize('name', NODES)
-def test_the_file_has_every_parameter_with_its_default(name):
-    values = declared(name)
-    for key in LEFT_OUT[name]:
-        del values[key]
-    if name == 'predictor_node':  # there a file, here its name
-        values['weights'] = Path(values['weights']).stem
-    assert NODES[name] == values
-    assert {key: type(value) for key, value in NODES[name].items()} == {
-        key: type(value) for key, value in values.items()}
-
-
-@pytest.mark.parametrize('name', NODES)
-def test_the_file_reaches_the_node(name, tmp_path):
-    given = NODES[name] | {
-        key: not value if isinstance(value, bool) else 0.9 * value
-        for key, value in NODES[name].items() if isinstance(value, (bool, float))}
-    file = tmp_path / 'changed.yaml'
-    file.write_text(yaml.dump({f'/**/{name}': {'ros__parameters': given}}))
-    values = declared(name, '--params-file', str(file))
-    assert {key: values[key] for key in given} == given
+    for name, written in NODES.items():
+        values = declared(name)
+        for key in LEFT_OUT[name]:
+            del values[key]
+        if name == 'predictor_node':  # there a file, here its name
+            values['weights'] = Path(values['weights']).stem
+        assert written == values
+        assert {key: type(value) for key, value in written.items()} == {
+            key: type(value) for key, value in values.items()}
+        given = written | {
+            key: not value if isinstance(value, bool) else 0.9 * value
+            for key, value in written.items() if isinstance(value, (bool, float))}
+        file = tmp_path / f'{name}.yaml'
+        file.write_text(yaml.dump({f'/**/{name}': {'ros__parameters': given}}))
+        values = declared(name, '--params-file', str(file))
+        assert {key: values[key] for key in given} == given

@@ -3,14 +3,17 @@
 """What /diagnostics says of a node's inputs and work."""
 
 import math
-import resource
 from threading import Thread
+import tracemalloc
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from processes import NodeProcess
+import numpy as np
+from processes import LocalNode
+import pytest
 from sensor_msgs.msg import JointState
 from tap_ros.nodes.clients import Newest
-from tap_ros.nodes.diagnostics import Diagnostics
+from tap_ros.nodes.diagnostics import Diagnostics, percentiles, rate, RollingWindow
+from tap_ros.nodes.recorder.node import RecorderNode
 from tap_ros.nodes.topics import STREAM
 
 
@@ -27,13 +30,10 @@ def wait_for(newest, name, accept):
     return statuses(message)[name]
 
 
-def test_an_input_is_not_received_then_ok_then_stale_and_a_failed_write_an_error(
-        client, tmp_path):
+def test_an_input_is_not_received_then_ok_then_stale(client, tmp_path):
     newest = Newest(client, DiagnosticArray, '/diagnostics', 10)
     joints = client.create_publisher(JointState, 'joint_states', STREAM)
-    process = NodeProcess(
-        'recorder_node', tmp_path / 'log.txt',
-        {'folder': tmp_path / 'bag', 'compression': 'none'})
+    node = LocalNode(RecorderNode, folder=tmp_path / 'bag')
     topic, service = 'recorder_node: /joint_states', 'recorder_node: service'
     try:
         level, _, values = wait_for(newest, topic, lambda *_: True)
@@ -51,16 +51,8 @@ def test_an_input_is_not_received_then_ok_then_stale_and_a_failed_write_an_error
         level, word, values = wait_for(newest, topic, lambda level, word, values: word != 'OK')
         assert (level, word) == (DiagnosticStatus.STALE, 'Stale')
         assert float(values['age_s']) >= 2.0  # it is rounded
-
-        # Files of this process cannot grow any further: what a full disk looks like to it.
-        resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (10_000, 10_000))
-        joints.publish(JointState(name=['x' * 20_000]))
-        level, text, values = wait_for(
-            newest, service, lambda level, text, values: values['errors'] != '0')
-        assert level == DiagnosticStatus.ERROR
-        assert text == values['last_error'] and str(tmp_path / 'bag') in text
     finally:
-        process.kill()
+        node.end()
 
 
 def test_work_and_inputs_of_many_threads_are_counted(client):
@@ -95,3 +87,58 @@ def test_work_and_inputs_of_many_threads_are_counted(client):
     stamp = message.header.stamp
     now = client.get_clock().now().nanoseconds * 1e-9
     assert 0 <= now - (stamp.sec + stamp.nanosec * 1e-9) < 60
+
+
+def test_the_rate_of_a_regular_stream_is_its_frequency_and_of_less_than_two_zero():
+    for frequency in (0.5, 4.0, 30.0, 5000.0):
+        window = RollingWindow(10.0, 100)
+        for index in range(500):
+            window.add(index / frequency)
+        assert rate(window.newest(500 / frequency)[0]) == pytest.approx(frequency, rel=1e-6)
+    window = RollingWindow(10.0, 100)
+    assert rate(window.newest(0.0)[0]) == 0.0
+    window.add(0.0)
+    assert rate(window.newest(0.0)[0]) == 0.0
+    window.add(0.0)
+    assert rate(window.newest(0.0)[0]) == 0.0  # two at once tell no rate
+    window.add(1.0)
+    assert rate(window.newest(1.0)[0]) > 0
+    assert rate(window.newest(11.1)[0]) == 0.0
+
+
+def test_percentiles_are_those_of_the_last_minute_only():
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.exponential(0.1, 2000))
+    values = rng.exponential(5.0, 2000)
+    window = RollingWindow(60.0, 10_000)
+    for now, value in zip(times, values):
+        window.add(now, value)
+        if rng.random() < 0.01:  # asking in between changes nothing
+            window.newest(now)
+    now = times[-1] + 3.0
+    late = values[now - times <= 60.0]
+    assert 300 < len(late) < 900
+    assert percentiles(window.newest(now)[1]).tolist() == np.percentile(late, (50, 99)).tolist()
+    assert np.isnan(percentiles(window.newest(now + 60.0)[1])).all()
+
+
+def test_a_number_counts_for_exactly_so_many_seconds():
+    window = RollingWindow(2.0, 10)
+    for now, value in enumerate((5.0, 6.0, 7.0)):
+        window.add(now, value)
+    assert [part.tolist() for part in window.newest(2.0)] == [[0, 1, 2], [5, 6, 7]]
+    assert [part.tolist() for part in window.newest(2.5)] == [[1, 2], [6, 7]]
+    window.add(3.0)
+    assert window.newest(5.0)[1].tolist() == [0.0]
+
+
+def test_memory_is_bounded_whatever_the_rate():
+    window = RollingWindow(60.0, 1000)
+    window.add(0.0, 0)
+    tracemalloc.start()
+    for index in range(1, 50_000):
+        window.add(index * 1e-6, index)
+    grown = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert grown < 100_000
+    assert window.newest(0.05)[1].tolist() == list(range(49_000, 50_000))

@@ -9,9 +9,11 @@ import json
 from pathlib import Path
 import time
 
-from processes import NodeProcess
+from processes import LocalNode, NodeProcess
 import pytest
 from rclpy.qos import DurabilityPolicy
+from tap_ros.nodes.planner.node import VisualMpcNode
+from tap_ros.nodes.predictor.node import PredictorNode
 import yaml
 
 FOLDER = Path(__file__).parents[2] / 'config' / 'layouts'
@@ -37,18 +39,17 @@ PLUGINS = {'rqt_image_view/ImageView': 'ImageViewWidget', 'rqt_plot/Plot': 'Data
 @pytest.fixture(scope='module')
 def nodes(tmp_path_factory):
     """Start the nodes whose topics are shown."""
-    folder = tmp_path_factory.mktemp('layouts')
-    started = []
+    sim = NodeProcess('sim_node', tmp_path_factory.mktemp('layouts') / 'log.txt',
+                      {'observer': 'true', 'lock_step': 'true'})
+    others = []
     try:
-        for name, parameters in (('sim_node', {'observer': 'true', 'lock_step': 'true'}),
-                                 ('predictor_node', {}), ('visual_mpc_node', {})):
-            started.append(NodeProcess(name, folder / f'{name}.log', parameters))
-        for process in started:
-            process.wait_for('ready', 120)
+        others += [LocalNode(make) for make in (PredictorNode, VisualMpcNode)]
+        sim.wait_for('ready', 120)
         yield
     finally:
-        for process in started:
-            process.kill()
+        sim.kill()
+        for node in others:
+            node.end()
 
 
 def found(ask, missing, give_up_after=200):

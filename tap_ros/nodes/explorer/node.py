@@ -26,7 +26,6 @@ from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoal, decode_subgoals
-from tap_ros.nodes.camera_topic import camera_topic, declare_transport
 from tap_ros.nodes.clients import CallError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.explorer.board import Board
@@ -34,7 +33,7 @@ from tap_ros.nodes.explorer.calls import ExplorerCalls
 from tap_ros.nodes.explorer.distances import Distances
 from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.observations import reception_time
-from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.parameters import camera_topic, declare_transport, Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
 from tap_ros.nodes.topics import LATCHED, STREAM

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What visual_mpc_node sends to the arm, and the watch that stops it."""
+"""Commands of visual_mpc_node to the arm, and the watch that stops it."""
 
 from collections.abc import Collection
 import math
@@ -22,22 +22,20 @@ if TYPE_CHECKING:
     from tap_ros.nodes.observations import Observations
     from tap_ros.nodes.parameters import Parameters
 
-WATCH_S = 0.02  # how often it is checked whether the arm has to be stopped
-STOOD_S = 2.0  # a watch that was away for longer shows that the process, or all, stood still
-REPEAT_S = 0.2  # a stop is repeated after so long, while a goal is in progress
+WATCH_S = 0.02  # s between two checks whether the arm has to be stopped
+STOOD_S = 2.0  # s; a longer gap between checks proves that the process or machine stood still
+REPEAT_S = 0.2  # s after which a stop is repeated, while a goal is in progress
 
 
 class Arm:
     """
-    Commands for one goal at a time; safe to use from several threads.
+    Commands for one goal at a time; thread-safe.
 
-    While a goal is in progress, the arm is sent zero unless a command is younger than max_silence
-    and so is all that is watched. A thread of its own does this: it does not matter what keeps the
-    planner or the executor busy.
+    While a goal is in progress, a thread of its own sends zero unless the last command and all
+    watched sensors are younger than max_silence, whatever keeps the planner or the executor busy.
 
-    :param node: rclpy Node.
-    :param params: its Parameters.
-    :param sensors: Observations of what is watched.
+    :param params: Parameters of the node.
+    :param sensors: Observations of the watched sensors.
     """
 
     def __init__(self, node: 'Node', params: 'Parameters', sensors: 'Observations') -> None:
@@ -56,7 +54,7 @@ class Arm:
         self._thread.start()
 
     def begin(self, goal: object) -> None:
-        """Let a goal, any object, move the arm; nothing else may from now on."""
+        """Let this goal (any object), and no other, move the arm from now on."""
         with self._lock:
             if self._closed:
                 return
@@ -70,7 +68,7 @@ class Arm:
         """
         Stop the arm; the goal may not move it any more.
 
-        :param goal: which one; None: any.
+        :param goal: as given to begin; None: any.
         """
         with self._lock:
             if goal is None or self._goal is goal:
@@ -80,7 +78,7 @@ class Arm:
     def send(self, goal: object, action: np.ndarray, stamp: 'Time',
              topics: Collection[str]) -> bool:
         """
-        Send one command within the limits.
+        Send one command, clipped to the limits.
 
         :param goal: as given to begin.
         :param action: (4,) metres moved in one control period, and gripper opening 0..1.
@@ -88,7 +86,7 @@ class Arm:
         :param topics: sensors that the arm depends on until the next command.
         :return: whether it was sent; not when the goal has ended or a sensor is silent.
         :raises PlanningError: for numbers that are not finite, and after this process stood still:
-            what is received then may have waited all the time.
+            messages received then may be old.
         """
         if not np.isfinite(action).all():
             raise PlanningError(f'the planner chose {action}; expected finite numbers')
@@ -116,7 +114,7 @@ class Arm:
         return True
 
     def close(self, seconds: float) -> None:
-        """Stop the arm for good; wait until that has left, at most so many seconds."""
+        """Stop the arm for good; wait until the command was delivered, at most so many seconds."""
         with self._lock:
             self._closed, self._goal = True, None
             self._stop()
@@ -125,7 +123,7 @@ class Arm:
         self._twist.wait_for_all_acked(Duration(seconds=seconds))
 
     def _watch(self) -> None:
-        """Stop the arm whenever it is time to, until close."""
+        """Stop the arm whenever it is due, until close."""
         while not self._closed:
             with self._lock:
                 if self._goal is None:
@@ -141,14 +139,14 @@ class Arm:
             time.sleep(WATCH_S)
 
     def _tick(self) -> None:
-        """Find out whether the process has stood still since the watch last came by."""
+        """Measure the time since the last check, to detect that the process stood still."""
         now = now_awake()
         if now - self._ticked_at > STOOD_S:
             self._stood_s = now - self._ticked_at
         self._ticked_at = now
 
     def _stop_if_due(self, now: float) -> None:
-        """Stop the arm when a command or a sensor is too old, and again after REPEAT_S."""
+        """Stop the arm if the last command or a sensor is too old, and again after REPEAT_S."""
         if now - self._stopped_at >= REPEAT_S and (
                 now - self._moved_at > self._params['max_silence']
                 or self._silent(self._topics, now, renewed=True)):
@@ -166,5 +164,5 @@ class Arm:
 
 
 def now_awake() -> float:
-    """Return a time in s that goes on while the machine is suspended."""
+    """Return a monotonic time in s that includes suspension of the machine."""
     return time.clock_gettime(time.CLOCK_BOOTTIME)

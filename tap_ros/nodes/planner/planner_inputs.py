@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What visual_mpc_node sees: messages put together by their stamp, and decoded once."""
+"""Inputs of visual_mpc_node: messages grouped by their stamp, and decoded once."""
 
 from collections.abc import Callable, Collection
 from contextlib import suppress
@@ -19,9 +19,8 @@ from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import GripperHistory
 from tap_ros.messages.objects import decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.camera_topic import camera_topic
 from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
-from tap_ros.nodes.planner.arm_joints import declared_arm
+from tap_ros.nodes.parameters import camera_topic, declared_arm
 from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.subscriptions import subscribe
@@ -130,7 +129,7 @@ class PlannerInputs:
         return begun_ns if known else 0
 
     def _without_robot(self, moment: Moment) -> Moment:
-        """Take the robot out of the picture of a Moment, if that is wanted; it is raw then."""
+        """Return the Moment with a raw picture, without the robot if a mask is used."""
         messages = moment.messages
         if self.robot.used:
             image = self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
@@ -163,15 +162,14 @@ class PlannerInputs:
         :param name: how errors call it.
         :param picture: the picture; None: the one that was seen last.
         :return: names, and pixels (K, 2) float32.
-        :raises TapError: see objects.decode_objects; also outside of the part that is
-            used.
+        :raises TapError: see objects.decode_objects; also for a pixel outside of the used part.
         """
         size = (self._camera_size or self._crop.size if picture is None
                 else (picture.height, picture.width))
         return decode_cut_objects(message, name, size, self._crop.of(size, name))
 
     def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
-        """Take joint states; they may be the gripper's, the arm's, or another driver's."""
+        """Take joint states of the gripper, of the arm, or of another driver."""
         received, name = reception_time(info), self._types['joints'][1]
         self._tell(name)
         try:
@@ -190,12 +188,12 @@ class PlannerInputs:
 
     def _match_joints(self, stamp_ns: int) -> None:
         """Add the gripper's state at the time of a picture, once the arm's joints are known."""
-        with suppress(KinematicsError):  # who looks at it is told
+        with suppress(KinematicsError):  # look() reports it
             self.sensors.attach('joints', stamp_ns, *self._gripper.at(
                 stamp_ns, self._params['max_silence']))
 
     def _unmatched_joints(self) -> str:
-        """Say why the newest picture has no joints, where it should have those of an arm."""
+        """Return why the newest picture has no joints, where joints of an arm have come."""
         newest = self.sensors.moment(('image',))
         if self._gripper.received == -math.inf or newest is None:
             return ''
@@ -206,7 +204,7 @@ class PlannerInputs:
         return ''
 
     def _on_message(self, name: str) -> None:
-        """Take notice of what the camera sees between the goals, too."""
+        """Remember what the camera sees behind the robot, between goals too."""
         self._tell(name)
         if name == self._types['image'][1]:
             newest = self.sensors.moment(('image',))
@@ -216,7 +214,7 @@ class PlannerInputs:
             return
         moment = self.sensors.moment(('image', 'mask'))
         if moment is not None:
-            with suppress(TapError):  # who looks at it is told
+            with suppress(TapError):  # look() reports it
                 self._without_robot(moment)
 
     def _decode(self, moment: Moment, topics: Collection[str], times: dict[str, Any]) -> Seen:
@@ -243,16 +241,14 @@ class PlannerInputs:
         return Seen(image, gripper, names, pixels, moment.stamp_ns, **times)
 
     def _lacking(self, topics: Collection[str]) -> str:
-        missing = self.sensors.missing(topics)
-        if 'joints' in missing and self._useless:
-            return self._useless
-        if missing:
-            return f'nothing has come on {self.sensors.names(missing, explained=True)}'
-        ages = self.sensors.ages(topics, time.monotonic())
-        silent = [topic for topic in topics if ages[topic] > self._params['max_silence']]
+        """Return which sensors are silent and why, '' if none is."""
+        missing, ages = self.sensors.missing(topics), self.sensors.ages(topics, time.monotonic())
+        silent = missing or [
+            topic for topic in topics if ages[topic] > self._params['max_silence']]
         if 'joints' in silent and self._useless:
             return self._useless
-        return (f'nothing new has come on {self.sensors.names(silent, explained=True)}'
+        what = 'nothing' if missing else 'nothing new'
+        return (f'{what} has come on {self.sensors.names(silent, explained=True)}'
                 if silent else '')
 
     def _count_publishers(self) -> dict[str, int]:
@@ -260,7 +256,7 @@ class PlannerInputs:
                 for topic, (_, name) in self._types.items()}
 
     def _check_publishers(self) -> None:
-        """Refuse to go on by two cameras that take turns; their stamps need not differ."""
+        """Raise PlanningError if another node began to publish, such as a second camera."""
         for topic, count in self._count_publishers().items():
             if count > max(self._publishers[topic], 1):
                 raise PlanningError(

@@ -14,10 +14,15 @@ from tap_ros.contract import (
     WORLD_FRAME,
 )
 from tap_ros.errors import ConfigError
-from tap_ros.nodes.camera_topic import declare_transport
 from tap_ros.nodes.lifecycle import declare_autostart
-from tap_ros.nodes.parameters import check_device, declare_device, Parameters
-from tap_ros.nodes.planner.arm_joints import declare_arm, declare_opening
+from tap_ros.nodes.parameters import (
+    check_device,
+    declare_arm,
+    declare_device,
+    declare_opening,
+    declare_transport,
+    Parameters,
+)
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel

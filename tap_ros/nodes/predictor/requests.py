@@ -19,9 +19,8 @@ from tap_ros.images.pixels import check_image
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.objects import decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.camera_topic import camera_topic
 from tap_ros.nodes.observations import OnDemandObservations
-from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.parameters import camera_topic, Parameters
 from tap_ros.nodes.predictor.settings import check_mode, check_work
 from tap_ros.nodes.robot_view import CAMERA_MASK, GOAL_MASK, RobotView
 from tap_ros.nodes.ros_messages import encode_subgoal

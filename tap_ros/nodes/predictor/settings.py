@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 from tap_ros.errors import ConfigError
 from tap_ros.messages.images import is_empty
-from tap_ros.nodes.camera_topic import declare_transport
 from tap_ros.nodes.lifecycle import declare_autostart
-from tap_ros.nodes.parameters import declare_device, Parameters
+from tap_ros.nodes.parameters import declare_device, declare_transport, Parameters
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.prediction.methods import MODES
 from tap_ros.text import escaped

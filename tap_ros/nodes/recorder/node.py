@@ -1,8 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Records topics into an MCAP bag, as they come off the wire."""
+"""Records topics into an MCAP bag, as serialized messages."""
 
-from importlib import import_module
 import math
 from pathlib import Path
 import sys
@@ -15,8 +14,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError, RecordingError, StorageError
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.planner.arm_joints import declare_arm, declare_opening, declared_mount
+from tap_ros.nodes.parameters import (
+    declare_arm,
+    declare_opening,
+    declared_mount,
+    Parameters,
+)
+from tap_ros.nodes.ros_messages import message_class
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import AdaptiveSubscription
 from tap_ros.nodes.topics import SERVICE_QOS
@@ -44,17 +48,17 @@ LONG = 1000  # characters of an answer
 
 class RecorderNode(Node):
     """
-    Writes serialized messages as they are; ends the bag properly on a signal.
+    Writes serialized messages unchanged, and finishes the bag on a signal.
 
-    Goal pictures and model cards are attached, too. When the disk is full or gone it says so,
-    keeps what was written readable, and stays up.
+    Goal pictures and model cards are attached, too. When the disk is full or gone the node reports
+    it, keeps what was written readable, and stays up.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__('recorder_node', **options)
         self.params = declare_parameters(self)
         self._writer: BagWriter | None = None
-        # Why what was asked for last is not recorded, or not whole.
+        # Why the last bag is missing or incomplete.
         self._failure: str | None = None
         self._count = self._unflushed = 0
         self._recorded: dict[str, AdaptiveSubscription] = {}  # by full name of the topic
@@ -76,7 +80,7 @@ class RecorderNode(Node):
             else 'ready: call recorder/record with data true to start')
 
     def close(self) -> int:
-        """Finish the bag; return the exit code, 1 when the last one is not whole."""
+        """Finish the bag; return the exit code, 1 when the last bag is incomplete."""
         self._finish()
         return int(self._failure is not None)
 
@@ -104,7 +108,7 @@ class RecorderNode(Node):
         return folder
 
     def _write_mount(self) -> None:
-        """Say where the arm stands, unless that is where the reader takes it to stand anyway."""
+        """Write where the arm stands, unless it is the place that readers assume."""
         arm = ArmMount(
             declared_mount(self.params), self.params['fixed_opening'], self.params['arm'])
         if self._writer is not None and arm != ArmMount():
@@ -114,7 +118,7 @@ class RecorderNode(Node):
                 self._give_up(error)
 
     def _finish(self) -> str:
-        """End the bag; return what became of it, for people."""
+        """Finish the bag; return a report for people."""
         self._take_waiting()
         if self._writer is None:
             return self._failure or 'nothing was being recorded'
@@ -148,7 +152,7 @@ class RecorderNode(Node):
         self._unflushed += 1
 
     def _flush(self) -> None:
-        """Bring what was written so far to the disk."""
+        """Write buffered messages to the disk."""
         self._unflushed = 0
         if self._writer is None:
             return
@@ -187,7 +191,7 @@ class RecorderNode(Node):
     # Topics
 
     def _subscribe_known(self) -> None:
-        """Subscribe to wanted topics whose type is known, here or to the running system."""
+        """Subscribe to wanted topics whose type is in TYPES or announced by a publisher."""
         found = dict(self.get_topic_names_and_types())
         for name in list(self._wanted):
             topic = self.resolve_topic_name(name)
@@ -205,7 +209,7 @@ class RecorderNode(Node):
                 self.get_logger().error(f'{escaped(topic)} is not recorded: {escaped(error)}')
 
     def _is_latched(self, topic: str) -> bool:
-        """Tell whether all who publish a topic keep messages for late joiners."""
+        """Tell whether all publishers of a topic keep messages for late joiners."""
         publishers = self.get_publishers_info_by_topic(topic)
         return {publisher.qos_profile.durability for publisher in publishers} == {
             DurabilityPolicy.TRANSIENT_LOCAL}
@@ -246,7 +250,7 @@ class RecorderNode(Node):
             self._tell('the last messages were not recorded', error)
 
     def _on_timer(self) -> None:
-        """Bring what was written to the disk, and subscribe to topics that appear or change."""
+        """Write buffered messages to the disk; subscribe to topics that appear or change."""
         try:
             if self._writer is not None and self._unflushed:
                 self._flush()
@@ -258,7 +262,7 @@ class RecorderNode(Node):
             self._tell('the topics could not be updated', error)
 
     def _tell(self, what: str, error: Exception) -> None:
-        """Log what a callback raised; not each time, for it may come with every message."""
+        """Log an error of a callback, at most once a second."""
         self.get_logger().error(
             f'{what}: {type(error).__name__}: {escaped(error)}', throttle_duration_sec=1.0)
 
@@ -285,22 +289,6 @@ def free_folder(wanted: str | Path) -> Path:
         number += 1
         folder = Path(f'{wanted}-{number}')
     return folder
-
-
-def message_class(type_name: str) -> type:
-    """
-    Import the class of a message type.
-
-    :param type_name: for example 'sensor_msgs/msg/Image'.
-    :raises ConfigError: when its package is not installed.
-    """
-    try:
-        package, _, name = type_name.split('/')
-        return getattr(import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(
-            f'message type {escaped(type_name)} is not installed; source the workspace that has it'
-        ) from error
 
 
 def main(args: list[str] | None = None) -> int:

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes where a real robot hides the scene: its URDF, projected into each picture."""
+"""Publishes masks of a real robot: its URDF, projected into each picture of the camera."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.robot_mask.settings import (
-    CameraPlace,
+    camera_pose,
     declare_parameters,
     declared_light,
     hand_link,
@@ -61,7 +61,7 @@ class RobotMaskNode(Node):
         super().__init__('robot_mask_node', **options)
         self.params = declare_parameters(self)
         self._light = declared_light(self.params)
-        self._camera = CameraPlace(self, self.params)
+        self._camera = camera_pose(self.params)
         self._hand, self._base = hand_link(self.params), self.params['base_frame']
         self._waiting: deque[Picture] = deque(maxlen=WAITING)
         self._robot: Robot | None = None
@@ -85,7 +85,7 @@ class RobotMaskNode(Node):
         self.get_logger().info(f'ready: {self.params["urdf"] or "waits for robot_description"}')
 
     def close(self) -> None:
-        """End; there is nothing to be finished."""
+        """Do nothing: there is nothing to finish."""
 
     def _use(self, robot: Robot) -> None:
         """
@@ -140,7 +140,7 @@ class RobotMaskNode(Node):
             self._waiting.remove(picture)
 
     def _give_up_waiting(self) -> None:
-        """Say why pictures that have waited for too long get no mask."""
+        """Report why pictures that have waited for too long get no mask."""
         while self._waiting and (
                 time.monotonic() - self._waiting[0].received > self.params['max_silence']):
             picture = self._waiting.popleft()
@@ -169,13 +169,13 @@ class RobotMaskNode(Node):
         for shape, label in zip(robot.shapes, self._labels):
             pose = to_base @ poses[shape.link]
             bodies.append(Body(shape.corners @ pose[:3, :3].T + pose[:3, 3], label))
-        view = View(K, size, self._camera.pose(base, info.header.frame_id))
+        view = View(K, size, self._camera)
         mask = draw_mask(bodies, view, self.params['dilation'], self._light)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'mask')
         return mask
 
     def _tell(self, error: object) -> None:
-        """Log what keeps a picture without a mask; not each time."""
+        """Log why a picture has no mask, at most every 5 s."""
         self._diagnostics.error(error)
         self.get_logger().error(
             f'no robot mask: {escaped(error, 1000)}', throttle_duration_sec=5.0)

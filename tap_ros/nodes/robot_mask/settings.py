@@ -1,14 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of robot_mask_node, the robot that they name, and where its camera is."""
+"""Parameters of robot_mask_node: the robot, its camera, and the light."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.errors import ConfigError, KinematicsError
-from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.planner.arm_joints import declare_mount, declared_mount
+from tap_ros.errors import ConfigError
+from tap_ros.nodes.parameters import declare_mount, declared_mount, Parameters
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
 from tap_ros.robots.description import robot_description
@@ -19,7 +18,6 @@ from tap_ros.text import escaped
 if TYPE_CHECKING:
     from rclpy.node import Node
 
-PLACES = ('parameters', 'tf')
 
 
 def declare_parameters(node: 'Node') -> Parameters:
@@ -36,8 +34,6 @@ def declare_parameters(node: 'Node') -> Parameters:
     parameters.declare('hand_radius', 0.06,
                        'With a named arm: radius of a cylinder around the hand, from the flange '
                        'to the fingertips, m.', low=0.001, high=1.0)
-    parameters.declare('camera_pose', 'parameters',
-                       'Where the camera is: as camera_x and so on say, or tf.', choices=PLACES)
     for axis in 'xyz':
         parameters.declare(f'camera_{axis}', 0.0,
                            f'{axis} of the camera in base_frame, m.', low=-100.0, high=100.0)
@@ -117,59 +113,21 @@ def declared_light(parameters: Parameters) -> Light | None:
     return Light(direction, parameters['table_height'])
 
 
-class CameraPlace:
+def camera_pose(parameters: Parameters) -> np.ndarray:
     """
-    The pose of the camera in base_frame.
+    Return the pose (4, 4) of the camera in base_frame.
 
-    :param node: rclpy Node.
-    :param parameters: its Parameters.
-    :raises ConfigError: for a quaternion of no direction, and for tf where it is not installed.
+    :raises ConfigError: for a quaternion of length 0.
     """
-
-    def __init__(self, node: 'Node', parameters: Parameters) -> None:
-        self._buffer = None
-        if parameters['camera_pose'] == 'tf':
-            try:
-                from tf2_ros import Buffer, TransformListener
-            except ImportError as error:
-                raise ConfigError('parameter camera_pose: tf2_ros is not installed; valid here: '
-                                  'parameters') from error
-            self._buffer = Buffer()
-            self._listener = TransformListener(self._buffer, node)
-            return
-        self._pose = _pose([parameters[f'camera_{axis}'] for axis in 'xyz'],
-                           [parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')])
-
-    def pose(self, base: str, camera: str) -> np.ndarray:
-        """
-        Return the pose (4, 4).
-
-        :param base: frame in which it is wanted.
-        :param camera: optical frame, as the pictures name it.
-        :raises KinematicsError: when tf does not know it.
-        """
-        if self._buffer is None:
-            return self._pose
-        from rclpy.time import Time
-        from tf2_ros import TransformException
-        try:
-            found = self._buffer.lookup_transform(base, camera, Time()).transform
-        except TransformException as error:
-            raise KinematicsError(f'tf: {escaped(error)}') from error
-        place, turn = found.translation, found.rotation
-        return _pose([place.x, place.y, place.z], [turn.x, turn.y, turn.z, turn.w])
-
-
-def _pose(place: list[float], quaternion: list[float]) -> np.ndarray:
-    """Return a pose (4, 4) from a place (3,) and a quaternion x, y, z, w of any length."""
+    quaternion = np.array([parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')])
     length = float(np.linalg.norm(quaternion))
     if length < 0.1:
         raise ConfigError('parameters camera_qx to camera_qw: a quaternion of no direction')
-    x, y, z, w = np.array(quaternion) / length
+    x, y, z, w = quaternion / length
     pose = np.eye(4)
     pose[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
-    pose[:3, 3] = place
+    pose[:3, 3] = [parameters[f'camera_{axis}'] for axis in 'xyz']
     return pose
