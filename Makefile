@@ -23,7 +23,7 @@ $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 # Two processes share two cores best when each takes one.
 paper: export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo explore test mutants paper faults build lint bench ros2 clean
+.PHONY: help demo explore test paper faults build lint bench ros2 clean
 
 help:
 	@echo 'make demo    push objects to where a goal picture shows them, predict a stack'
@@ -31,8 +31,6 @@ help:
 	@echo 'make explore a page in the browser: move objects of the goal picture, see what is predicted'
 	@echo '             and planned, push; ARGS="--task push3"'
 	@echo 'make test    all tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'
-	@echo 'make mutants change the code a little, thousands of times, and see whether a test fails, in'
-	@echo '             docs/results: hours; goes on; ARGS="--sample 300": so many, drawn at random'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
 	@echo 'make faults  inject every fault into real nodes and files, in docs/results: five hours;'
@@ -55,9 +53,6 @@ explore: build
 
 test: build
 	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) $(ARGS)
-
-mutants: build
-	@$(ENTER); $(DOMAIN); python -m experiments.mutants.run $(ARGS)
 
 paper: build
 	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(if $(SCALE),--scale $(SCALE)) $(ARGS)

@@ -17,7 +17,7 @@ from pathlib import Path
 import sys
 from typing import Annotated, Any, cast, TypeAlias
 
-from tap_ros.errors import ConfigError, TapError, UsageError
+from tap_ros.errors import ConfigError, TapError
 from tap_ros.options import parse
 from tap_ros.text import escaped
 from tyro import conf
@@ -68,8 +68,6 @@ EXTRAS = {  # what only some commands need, and what pip installs for it
     '-r requirements-hub.txt', 'jinja2': '-r requirements-experiments.txt',
     'pandas': '-r requirements-experiments.txt', 'pyarrow': "'.[lerobot]'"}
 PROG = 'python -m tap_ros'
-_COMPLETION = ('--tyro-print-completion', '--tyro-write-completion')
-_SHELLS = (['bash'], ['zsh'], ['fish'])
 
 
 @dataclass(frozen=True)
@@ -87,8 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Run one command.
 
     :param arguments: list of strings; by default those of the process.
-    :return: exit code: 0, 1 after an error that was named, 2 for words that are no command or
-        option, 130 when interrupted.
+    :return: exit code: 0, 1 after an error that was named, 130 when interrupted.
+    :raises SystemExit: as options.parse, for words that are no command or option and for --help.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
@@ -96,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(options) or 0
     except TapError as error:
         print(f'error: {escaped(error, 2000)}', file=sys.stderr)
-        return 2 if isinstance(error, UsageError) else 1
+        return 1
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
@@ -122,12 +120,10 @@ def read(arguments: Sequence[str]) -> tuple[Run, Any]:
 
     :param arguments: list of strings.
     :return: its function, and the options to call it with.
-    :raises UsageError: for words that are no command or option.
+    :raises SystemExit: as options.parse.
     """
     words = list(arguments)
-    completion = bool(words) and words[0] in _COMPLETION
-    if completion and words[1:2] not in _SHELLS:
-        raise UsageError(f'{words[0]}: expected bash, zsh or fish after it')
+    completion = bool(words) and words[0].startswith('--tyro-')
     runs: dict[Any, Run] = {All: _run_all}
     kinds = [_command(name, *about, None if completion else words, runs)
              for name, about in COMMANDS.items()]

@@ -15,10 +15,6 @@ class ConfigError(TapError):
     """A setting, parameter or command-line argument cannot be used."""
 
 
-class UsageError(TapError):
-    """A command is called with words that it cannot be called with."""
-
-
 class ImageError(TapError):
     """A picture has the wrong type, shape, size, encoding or length."""
 

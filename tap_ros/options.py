@@ -11,12 +11,9 @@ does. Options of a field that is a dataclass itself stand in a box of their own 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from types import GenericAlias
-from typing import Annotated, Any, cast, get_args, NoReturn
+from typing import Annotated, Any, cast, get_args
 
-from tap_ros.errors import UsageError
-from tap_ros.text import escaped, listing
 import tyro
-from tyro import _errors as failures
 from tyro import conf
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
@@ -49,12 +46,11 @@ def parse(kind: Any, words: Sequence[str], prog: str = 'python -m tap_ros',
     :param description: what it does, in --help; by default the summary of the dataclass.
     :param default: what stands for words that are missing, an object of that kind.
     :return: an object of that kind.
-    :raises UsageError: for words that it cannot be made from.
-    :raises SystemExit: after --help, and after what prints shell completion.
+    :raises SystemExit: with code 2 for words that it cannot be made from, which are printed; with
+        code 0 after --help, and after what prints shell completion.
     """
-    with failures.on_parse_error(_refuse):
-        return tyro.cli(kind, args=words, prog=prog, description=description, config=_STYLE,
-                        registry=_RULES, **({} if default is None else {'default': default}))
+    return tyro.cli(kind, args=words, prog=prog, description=description, config=_STYLE,
+                    registry=_RULES, default=tyro.MISSING_NONPROP if default is None else default)
 
 
 def one_of(choices: Iterable[str]) -> PrimitiveConstructorSpec[str]:
@@ -90,38 +86,3 @@ def _at_least_one(info: PrimitiveTypeInfo) -> Any:
     one = spec.metavar[1:-1].split(' [')[0]
     return replace(spec, metavar=f'{one} [{one} ...]', instance_from_str=convert,
                    is_instance=lambda values: isinstance(values, tuple))
-
-
-def _refuse(event: Any) -> NoReturn:
-    """Raise what is wrong with the words as one line; tyro says it in a box of ten."""
-    raise UsageError(f'{_reason(event)}; --help says what is valid')
-
-
-def _reason(event: Any) -> str:
-    """Say what is wrong."""
-    match event:
-        case failures.MissingArgs():
-            missing = [each.arg for each in event.missing_arguments]
-            unknown = event.unrecognized_tokens
-            return (f'missing: {listing(map(_name, missing))}'
-                    + (f'; unknown: {listing(unknown)}' if unknown else ''))
-        case failures.UnrecognizedArgs():
-            return f'unknown: {listing(event.tokens)}'
-        case failures.InvalidChoice():
-            return (f'{_name(event.argument)}: expected one of {", ".join(event.choices)}, '
-                    f'got {event.value!r}')
-        case failures.BadValue():
-            return f'{_name(event.argument)}: expected {event.argument.lowered.metavar} after it'
-        case failures.MissingSubcommand():
-            return f'expected one of {", ".join(event.subcommand_spec.parser_from_name)}'
-        case failures.InstantiationFailure():
-            argument, message = event.argument, escaped(event.message)
-            return f'{_name(argument)}: expected {argument.lowered.metavar} ({message})' if (
-                argument) else message
-    return escaped(event)
-
-
-def _name(argument: Any) -> str:
-    """Return how an option is spelled, or what stands for a word without one."""
-    return argument.lowered.metavar if argument.is_positional() else (
-        argument.lowered.name_or_flags[-1])

