@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 import os
 from typing import Annotated, Any, TypeVar
 
-from tap_ros.errors import UsageError
+from tap_ros.errors import ConfigError
 from tap_ros.options import default_text
 from tap_ros.recording.reading import Reading
 from tap_ros.training.recipes import DEFAULT, find_recipe, Model
@@ -41,7 +41,7 @@ def with_recipe(model: Model, args: Options) -> Options:
     """
     given = settings_of(args)
     if not given['recordings']:
-        raise UsageError('missing: BAG; name the recordings, or see --help')
+        raise ConfigError('missing: BAG; name the recordings, or see --help')
     recipe = args.recipe or recipe_of(model, given['recordings'], Reading(**{
         field.name: given[field.name] for field in fields(Reading)}))
     settings = find_recipe(model, recipe).settings
