@@ -233,7 +233,9 @@ def test_an_import_goes_on_with_the_files_that_are_missing(tmp_path, data_set):
     after = (out / 'train' / 'train_0.mcap').stat()
     assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
     assert len(open_recordings(out)) == 5
+    (out / 'train' / 'metadata.yaml').write_text('left behind')
     assert import_bair([data_set], out, progress=False) == 0
+    assert len(open_recordings(out / 'train')) == 4
 
 
 def test_what_does_not_belong_to_the_data_set_is_refused(tmp_path, data_set):

@@ -98,7 +98,8 @@ def import_bair(paths: Iterable[str | Path], folder: str | Path, progress: bool 
     """
     done = 0
     with only_writer(folder), storage_errors(folder):
-        missing = [each for each in find_shards(paths) if not each.target(folder).exists()]
+        shards = find_shards(paths)
+        missing = [shard for shard in shards if not shard.target(folder).exists()]
         with tqdm(total=sum(len(shard.numbers) for shard in missing), unit='episode',
                   disable=not progress) as bar:
             for shard in missing:
@@ -107,6 +108,8 @@ def import_bair(paths: Iterable[str | Path], folder: str | Path, progress: bool 
                 _import_shard(shard, target, bar)
                 write_metadata(target.parent)
                 done += len(shard.numbers)
+        for bag in {shard.target(folder).parent for shard in shards}:
+            write_metadata(bag)  # a process that was killed may have left it behind its files
     return done
 
 
