@@ -76,8 +76,8 @@ class SimNode(Node):
     Paused or stopped: commands are refused, and what came before or meanwhile is not made up for.
     """
 
-    def __init__(self) -> None:
-        super().__init__('sim_node')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('sim_node', **options)
         self.params = declare_parameters(self)
         task = self.params['task']
         self._sim = self._make_world(task)

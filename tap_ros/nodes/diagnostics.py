@@ -3,7 +3,7 @@
 """The state of a node, once a second on /diagnostics, where rqt and Foxglove read it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import math
 import threading
 import time
@@ -69,23 +69,19 @@ def percentiles(values: np.ndarray) -> np.ndarray:
 
 
 @dataclass
-class Input:
-    """State of an input topic; times in seconds of the monotonic clock."""
+class _Record:
+    """What is known of an input or of a kind of work; times of the monotonic clock, in s."""
 
-    max_age_s: float
+    recent: RollingWindow
+    max_age_s: float = math.inf
     count: int = 0
     newest: float = -math.inf
-    arrivals: RollingWindow = field(
-        default_factory=lambda: RollingWindow(RATE_SECONDS, RATE_LIMIT))
 
-
-@dataclass
-class Work:
-    """Statistics of one kind of work."""
-
-    count: int = 0
-    durations: RollingWindow = field(
-        default_factory=lambda: RollingWindow(WORK_SECONDS, WORK_LIMIT))
+    def add(self, value: float = 0.0) -> None:
+        """Count an event of now."""
+        self.newest = time.monotonic()
+        self.count += 1
+        self.recent.add(self.newest, value)
 
 
 class Diagnostics:
@@ -109,11 +105,13 @@ class Diagnostics:
         self._node = node
         self._queue, self._idle = queue, idle
         self._lock = threading.Lock()
-        self._inputs = {node.resolve_topic_name(topic): Input(max_age_s)
-                        for topic, max_age_s in inputs.items()}
+        self._inputs = {
+            node.resolve_topic_name(topic): _Record(
+                RollingWindow(RATE_SECONDS, RATE_LIMIT), max_age_s)
+            for topic, max_age_s in inputs.items()}
         self._by_name = self._inputs | {
             topic: self._inputs[node.resolve_topic_name(topic)] for topic in inputs}
-        self._work: dict[str, Work] = {}  # what -> Work
+        self._work: dict[str, _Record] = {}  # what -> Work
         self._errors, self._last_error, self._error_time = 0, '', -math.inf
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         # Its own group: it goes on while the node works, where there are threads enough.
@@ -126,12 +124,8 @@ class Diagnostics:
 
         :param topic: one of the inputs, by the name given or by the resolved one.
         """
-        now = time.monotonic()
         with self._lock:
-            source = self._by_name[topic]
-            source.count += 1
-            source.newest = now
-            source.arrivals.add(now)
+            self._by_name[topic].add()
 
     def took(self, ms: float, what: str) -> None:
         """
@@ -140,11 +134,10 @@ class Diagnostics:
         :param ms: milliseconds.
         :param what: name of this kind of work, for example 'predict_subgoal'.
         """
-        now = time.monotonic()
         with self._lock:
-            work = self._work.setdefault(what, Work())
-            work.count += 1
-            work.durations.add(now, ms)
+            if what not in self._work:
+                self._work[what] = _Record(RollingWindow(WORK_SECONDS, WORK_LIMIT))
+            self._work[what].add(ms)
 
     def error(self, text: object) -> None:
         """
@@ -170,7 +163,7 @@ class Diagnostics:
     def _describe_work(self, queue: int | None, now: float) -> DiagnosticStatus:
         values: dict[str, int | str] = {} if queue is None else {'queue': queue}
         for what, work in self._work.items():
-            p50, p99 = percentiles(work.durations.newest(now)[1])
+            p50, p99 = percentiles(work.recent.newest(now)[1])
             values |= {f'{what} calls': work.count,
                        f'{what} p50_ms': f'{p50:.2f}', f'{what} p99_ms': f'{p99:.2f}'}
         values['errors'] = self._errors
@@ -185,7 +178,7 @@ class Diagnostics:
             return self._status('service', DiagnosticStatus.WARN, idle, values)
         return self._status('service', DiagnosticStatus.OK, 'OK', values)
 
-    def _describe_input(self, topic: str, source: Input, now: float) -> DiagnosticStatus:
+    def _describe_input(self, topic: str, source: _Record, now: float) -> DiagnosticStatus:
         age = now - source.newest
         if not source.count:
             level, status, age = DiagnosticStatus.WARN, 'NotReceived', math.nan
@@ -195,7 +188,7 @@ class Diagnostics:
             level, status = DiagnosticStatus.OK, 'OK'
         return self._status(topic, level, status, {
             'status': status, 'age_s': f'{age:.3f}', 'max_age_s': f'{source.max_age_s:g}',
-            'rate_hz': f'{rate(source.arrivals.newest(now)[0]):.2f}', 'count': source.count})
+            'rate_hz': f'{rate(source.recent.newest(now)[0]):.2f}', 'count': source.count})
 
     def _status(self, name: str, level: bytes, text: str,
                 values: Mapping[str, Any]) -> DiagnosticStatus:
