@@ -21,6 +21,7 @@ _EXPORTS = {
     'ForwardModel': 'tap_ros.planning.protocols',
     'iter_episodes': 'tap_ros.recording.reader',
     'open_recordings': 'tap_ros.recording.cache',
+    'Predictor': 'tap_ros.prediction.protocol',
     'Simulator': 'sim_bridge.simulator',
     'Solver': 'tap_ros.planning.protocols',
     'SubgoalPredictor': 'tap_ros.prediction.predictor',

@@ -23,7 +23,9 @@ BUILT_IN: dict[str, dict[str, str]] = {
     'tap_ros.forward_models': {
         'learned': 'tap_ros.planning.forward_model:LearnedForwardModel',
         'true': 'tap_ros.planning.true_model:TrueModel'},
-    'tap_ros.predictors': {},
+    'tap_ros.predictors': {
+        'nearest_keyframe': 'tap_ros.prediction.nearest_keyframe:NearestKeyframe',
+        'tap': 'tap_ros.prediction.predictor:SubgoalPredictor'},
     'tap_ros.solvers': {'cem': 'tap_ros.planning.solvers.cem:cem',
                         'icem': 'tap_ros.planning.solvers.icem:icem'},
     'tap_ros.worlds': {'metaworld': 'sim_bridge.gym_world:metaworld',

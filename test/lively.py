@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predictors that move and blend visibly without being trained."""
 
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 import torch
 from torch import nn
 
@@ -15,7 +15,7 @@ def lively_network(seed=0, **config):
     """
     torch.manual_seed(seed)
     config = PredictorConfig(**{'image_size': 32, 'base_width': 4, 'new_pixels': False, **config})
-    network = Predictor(config)
+    network = PredictorNetwork(config)
     nn.init.normal_(network.flow_decoder[-1].weight, 0.0, 0.02)
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):

@@ -33,7 +33,7 @@ from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.options import Bags, Flag, Folder, Topic
 from tap_ros.prediction.batches import Batch, make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
-from tap_ros.prediction.networks import Predictor
+from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
@@ -123,7 +123,7 @@ class EpisodeScores:
                 **{name: interval.value for name, interval in self.intervals().items()}}
 
 
-def evaluate(network: Predictor, store: EpisodeStore, episodes: Sequence[int] | np.ndarray,
+def evaluate(network: PredictorNetwork, store: EpisodeStore, episodes: Sequence[int] | np.ndarray,
              margin: int = 0, goal_picture: str = 'last', seed: int = 0,
              filled: Filled | None = None) -> dict[str, EpisodeScores]:
     """
@@ -132,7 +132,7 @@ def evaluate(network: Predictor, store: EpisodeStore, episodes: Sequence[int] | 
     Without a goal picture in its context the targets are all frames after the start, the last one
     included. With z one sample of each episode is measured, as the paper's genmin + vae.
 
-    :param network: Predictor in eval mode.
+    :param network: PredictorNetwork in eval mode.
     :param store: the EpisodeStore.
     :param episodes: indices of at least one episode, each of at least 3 frames.
     :param margin: frames beside the context pictures that do not count as matches.
@@ -184,7 +184,7 @@ def _changed_l1(images: torch.Tensor, batch: Batch, match: torch.Tensor,
     return error / changed.sum((1, 2, 3))  # 0 / 0 is NaN
 
 
-def write_pictures(path: str | Path, network: Predictor, store: EpisodeStore,
+def write_pictures(path: str | Path, network: PredictorNetwork, store: EpisodeStore,
                    episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
                    scale: int = 2, filled: Filled | None = None) -> None:
     """
@@ -194,7 +194,7 @@ def write_pictures(path: str | Path, network: Predictor, store: EpisodeStore,
     without new pixels the same with its object maps.
 
     :param path: .png file to write.
-    :param network: Predictor in eval mode.
+    :param network: PredictorNetwork in eval mode.
     :param store: the EpisodeStore.
     :param episodes: indices of episodes.
     :param goal_picture: see batches.make_batch.

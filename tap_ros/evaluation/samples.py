@@ -11,7 +11,7 @@ from tap_ros.evaluation.bottleneck import context_pixels
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
-from tap_ros.prediction.networks import Prediction, Predictor
+from tap_ros.prediction.networks import Prediction, PredictorNetwork
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps
 import torch
 
@@ -64,7 +64,7 @@ def draw_latents(episodes: Iterable[int], count: int, size: int, seed: int = 0) 
         for i in episodes]))
 
 
-def score_samples(network: Predictor, store: 'EpisodeStore', episodes: Iterable[int],
+def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: Iterable[int],
                   margin: int = 0, goal_picture: str = 'last', count: int = SAMPLES,
                   seed: int = 0, filled: 'Filled | None' = None) -> SampleScores:
     """
@@ -72,7 +72,7 @@ def score_samples(network: Predictor, store: 'EpisodeStore', episodes: Iterable[
 
     The first sample is the one that prediction.evaluate measures.
 
-    :param network: Predictor with z, in eval mode.
+    :param network: PredictorNetwork with z, in eval mode.
     :param store: the EpisodeStore.
     :param episodes: indices of at least one episode.
     :param margin: frames beside the context pictures that do not count as matches.

@@ -8,7 +8,7 @@ import contextlib
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import l1_error
-from tap_ros.prediction.networks import Prediction, Predictor
+from tap_ros.prediction.networks import Prediction, PredictorNetwork
 from tap_ros.prediction.selection import Targets
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.training.devices import Autocast
@@ -16,12 +16,12 @@ import torch
 
 
 @torch.no_grad()
-def matched(network: Predictor, batch: Batch, config: TrainingConfig,
+def matched(network: PredictorNetwork, batch: Batch, config: TrainingConfig,
             autocast: Autocast = contextlib.nullcontext) -> tuple[Prediction, torch.Tensor]:
     """
     Predict, with z at 0, and find the frames that the method chooses.
 
-    :param network: Predictor in eval mode.
+    :param network: PredictorNetwork in eval mode.
     :param batch: batches.Batch, on the network's device.
     :param config: TrainingConfig.
     :param autocast: makes the context manager to run the network in.
@@ -35,12 +35,12 @@ def matched(network: Predictor, batch: Batch, config: TrainingConfig,
 
 
 @torch.no_grad()
-def held_out_scores(network: Predictor, batches: Iterable[Batch], config: TrainingConfig,
+def held_out_scores(network: PredictorNetwork, batches: Iterable[Batch], config: TrainingConfig,
                     autocast: Autocast = contextlib.nullcontext) -> dict[str, float]:
     """
     Measure a network by the error at the frames that its method chooses; z is 0.
 
-    :param network: Predictor in eval mode.
+    :param network: PredictorNetwork in eval mode.
     :param batches: iterable of batches.Batch, on the network's device.
     :param config: TrainingConfig.
     :param autocast: makes the context manager to run the network in.

@@ -151,7 +151,7 @@ def initialise(module: nn.Module) -> None:
         nn.init.zeros_(module.bias)
 
 
-class Predictor(nn.Module):
+class PredictorNetwork(nn.Module):
     """
     Predict one frame between context pictures: warped pictures and new pixels, blended by masks.
 

@@ -19,7 +19,7 @@ from tap_ros.prediction.losses import (
     remaining_targets,
     total,
 )
-from tap_ros.prediction.networks import Prediction, Predictor
+from tap_ros.prediction.networks import Prediction, PredictorNetwork
 from tap_ros.prediction.recognition import kl_divergence, Recognition, sample_latent
 from tap_ros.prediction.selection import outer_error, selection_errors, Targets
 from tap_ros.prediction.training_config import ObjectiveSettings
@@ -40,7 +40,7 @@ class Networks:
     :param posterior_discriminator: D'_t (Eq. 10), which judges those from the posterior, or None.
     """
 
-    predictor: Predictor
+    predictor: PredictorNetwork
     recognition: Recognition | None = None
     discriminator: torch.nn.Module | None = None
     posterior_discriminator: torch.nn.Module | None = None

@@ -49,7 +49,8 @@ class Options:
     goal: Annotated[conf.Positional[str], conf.arg(
         metavar='GOAL', help_behavior_hint='(default: none)')] = ''
     weights: Annotated[str, conf.arg(
-        metavar='FILE', help=f'a file, or shipped ones: {", ".join(PREDICTORS)}.'
+        metavar='FILE', help='a file; shipped ones: ' + ', '.join(PREDICTORS)
+        + '; or another predictor, such as nearest_keyframe:bags/push2.'
     )] = DEFAULT_PREDICTOR
     objects: Annotated[tuple[str, ...], _Pixels] = ()
     goal_objects: Annotated[tuple[str, ...], _Pixels] = ()
@@ -65,12 +66,12 @@ def run(args: Options) -> None:
 
     :raises TapError: for a file, pixels or weights that cannot be used, saying why.
     """
-    from tap_ros.prediction.predictor import SubgoalPredictor  # torch takes seconds
+    from tap_ros.prediction.protocol import load_predictor
     if Path(args.out).suffix.lower() != '.png':
         raise ConfigError(f'--out {escaped(args.out)}: expected a .png file')
     if Path(args.out).resolve() in (Path(args.start).resolve(), Path(args.goal).resolve()):
         raise ConfigError(f'--out {escaped(args.out)}: is a picture to predict from; give another')
-    predictor = SubgoalPredictor.load(args.weights)
+    predictor = load_predictor(args.weights)
     size = predictor.image_size
     pictures = {'start': read_picture(args.start)}
     if args.goal:

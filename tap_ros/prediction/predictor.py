@@ -3,16 +3,16 @@
 """The trained predictor: arrays in, arrays out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from tap_ros.errors import ConfigError, ImageError, WeightsError
+from tap_ros.errors import ConfigError, WeightsError
 from tap_ros.images.crop import trained_crop
-from tap_ros.images.pixels import check_image, check_pixels, to_float, to_uint8
+from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
+from tap_ros.prediction.protocol import check_question, Predictor, Question
 from tap_ros.prediction.warp import expected_pixels, one_hot_maps, warp_object_maps, WarpedMaps
 from tap_ros.text import escaped
 from tap_ros.training.devices import placed
@@ -21,20 +21,7 @@ from tap_ros.weights import find_predictor
 import torch
 
 
-@dataclass(frozen=True)
-class Question:
-    """What SubgoalPredictor.predict is asked; it says what the fields are."""
-
-    start: np.ndarray
-    goal: np.ndarray | None = None
-    start_pixels: np.ndarray | None = None
-    goal_pixels: np.ndarray | None = None
-    num_samples: int = 1
-    recursion_depth: int = 1
-    seed: int = 0
-
-
-class SubgoalPredictor:
+class SubgoalPredictor(Predictor):
     """
     Predict the bottleneck between a start and a goal picture, or one to come after the start.
 
@@ -46,12 +33,12 @@ class SubgoalPredictor:
     :ivar camera_crop: TrainedCrop: what to make of a camera's pictures before it sees them.
     """
 
-    def __init__(self, network: Predictor, training: dict[str, Any] | None = None,
+    def __init__(self, network: PredictorNetwork, training: dict[str, Any] | None = None,
                  source: str | Path = 'predictor') -> None:
         """
         Take a network into service, and run it once, so that the first request is not slow.
 
-        :param network: Predictor, on the device it shall run on.
+        :param network: PredictorNetwork, on the device it shall run on.
         :param training: dict saying how the weights were made.
         :param source: how errors call it, for example the file of its weights.
         :raises ConfigError: if it takes more than a start and a goal picture.
@@ -91,48 +78,24 @@ class SubgoalPredictor:
         """
         return cls(*load_network(path, device), source=path)
 
-    def predict(self, start: np.ndarray, goal: np.ndarray | None = None,
-                start_pixels: np.ndarray | None = None, goal_pixels: np.ndarray | None = None,
-                num_samples: int = 1, recursion_depth: int = 1, seed: int = 0) -> list[Subgoal]:
-        """
-        Predict subgoals.
-
-        In recursive prediction (section 3.1) each prediction takes the place of the last context
-        picture of the next one: of the goal, so that the next one lies between the start and it;
-        or, forward, of the start, G(G(c)), so that the next one comes after it. The objects are
-        followed through the maps.
-
-        :param start: uint8 (H, W, 3).
-        :param goal: uint8 (H, W, 3); None with forward weights.
-        :param start_pixels: (K, 2) object positions (u, v) in the start picture; None: K = 0.
-        :param goal_pixels: (K, 2), of the same objects in the goal picture; None with forward
-            weights.
-        :param num_samples: how many to draw, each level of each with a z of its own; weights
-            without z predict one sample whatever this says, for all would be the same.
-        :param recursion_depth: how many subgoals in a row, at least 1.
-        :param seed: of z.
-        :return: list of Subgoal; each sample's subgoals follow each other, earliest first.
-        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
-        :raises ConfigError: if num_samples or recursion_depth is below 1, or there is a goal
-            that the weights do not take, or none that they need.
-        """
-        return self.predict_together([Question(
-            start, goal, start_pixels, goal_pixels, num_samples, recursion_depth, seed)])[0]
-
     @torch.inference_mode()
     def predict_together(self, questions: Sequence[Question]) -> list[list[Subgoal]]:
         """
         Answer several questions at once, which takes less time than one after the other.
 
-        Those with equally many objects go through the network in one batch, where the last digits
-        of an answer may differ from those of the question alone.
+        In recursive prediction (section 3.1) each prediction takes the place of the last context
+        picture of the next one: of the goal, so that the next one lies between the start and it;
+        or, forward, of the start, G(G(c)), so that the next one comes after it. The objects are
+        followed through the maps. Each level of each sample has a z of its own; weights without z
+        predict one sample, for all would be the same. Questions with equally many objects go
+        through the network in one batch, where the last digits of an answer may differ from those
+        of the question alone. Mind the memory: all their samples are held at once.
 
-        :param questions: list of Question; mind the memory, all their samples are held at once.
-        :return: for each question what `predict` returns.
-        :raises ImageError: if a question has one, as `predict` does.
-        :raises ConfigError: likewise.
+        :param questions: list of Question.
+        :return: see Predictor.
+        :raises ImageError: likewise; ConfigError: likewise.
         """
-        scenes = [self._check(question) for question in questions]
+        scenes = [check_question(question, self.mode, self.image_size) for question in questions]
         alike: dict[int, list[int]] = {}  # number of objects: [index of a question]
         for index, (_, pixels) in enumerate(scenes):
             alike.setdefault(pixels.shape[1], []).append(index)
@@ -179,50 +142,20 @@ class SubgoalPredictor:
         return [[subgoals[n] for n in range(N) for subgoals in chain]
                 for N, chain in zip(counts, levels)]
 
-    def _check(self, question: Question) -> tuple[np.ndarray, np.ndarray]:
-        """Check a question; return its pictures (C, H, W, 3) and pixels (C, K, 2)."""
-        for name in ('num_samples', 'recursion_depth'):
-            if getattr(question, name) < 1:
-                raise ConfigError(
-                    f'{name}: expected at least 1, got {getattr(question, name)}')
-        return self._check_context(
-            question.start, question.goal, question.start_pixels, question.goal_pixels)
-
-    def _check_context(self, start: np.ndarray, goal: np.ndarray | None,
-                       start_pixels: np.ndarray | None,
-                       goal_pixels: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Check what a prediction is conditioned on: pictures (C, H, W, 3), pixels (C, K, 2)."""
-        check_image(start, 'start', self.image_size)
-        start_pixels = check_pixels(start_pixels, 'start_pixels')
-        if self.mode == 'forward':
-            if goal is not None or goal_pixels is not None:
-                raise ConfigError('goal: these weights predict forward, from the start alone; '
-                                  'leave it out, or use weights for 2 context pictures')
-            return start[None], start_pixels[None]
-        if goal is None:
-            raise ConfigError('goal: these weights predict between a start and a goal picture; '
-                              'give one, or use weights for 1 context picture')
-        check_image(goal, 'goal', self.image_size)
-        goal_pixels = check_pixels(goal_pixels, 'goal_pixels')
-        if len(start_pixels) != len(goal_pixels):
-            raise ImageError(f'goal_pixels: expected {len(start_pixels)} objects as in '
-                             f'start_pixels, got {len(goal_pixels)}')
-        return np.stack([start, goal]), np.stack([start_pixels, goal_pixels])
-
 
 def load_network(path: str | Path,
-                 device: torch.device | str = 'cpu') -> tuple[Predictor, dict[str, Any]]:
+                 device: torch.device | str = 'cpu') -> tuple[PredictorNetwork, dict[str, Any]]:
     """
     Load the network of a weights file, in eval mode.
 
     :param path: written by training, or the name of shipped weights, see weights.PREDICTORS.
     :param device: where to run it.
-    :return: (Predictor, dict saying how the weights were made).
+    :return: (PredictorNetwork, dict saying how the weights were made).
     :raises WeightsError: if the file is missing, damaged or for something else.
     """
     path = find_predictor(path)
     values, state, training = load_weights(path, 'predictor')
-    network = make_network(Predictor, PredictorConfig, values, state, path)
+    network = make_network(PredictorNetwork, PredictorConfig, values, state, path)
     network.eval().requires_grad_(False)
     return placed(network, device), training
 

@@ -21,7 +21,7 @@ from tap_ros.prediction.batches import Batch, episode_order, make_batch, Samplin
 from tap_ros.prediction.discriminator import Discriminator
 from tap_ros.prediction.held_out import held_out_scores, matched
 from tap_ros.prediction.methods import todays_settings
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import (
     discriminators_loss,
     Draws,
@@ -93,7 +93,7 @@ def _train(config: TrainingConfig, device: torch.device, processes: Processes, s
         store, split_episodes(store, config.test_fraction), config.robot_mask)
     warn_if_none(held_out)
     torch.manual_seed(config.seed)
-    network = Predictor(network_config(config, store.image_size))
+    network = PredictorNetwork(network_config(config, store.image_size))
     checkpoint = Path(config.out) / 'checkpoint.safetensors'
     if config.initial_weights and not checkpoint.exists():
         _begin_with(network, config.initial_weights)
@@ -187,7 +187,7 @@ def network_config(config: TrainingConfig, image_size: tuple[int, int]) -> Predi
                            skips=config.skips)
 
 
-def _begin_with(network: Predictor, weights: str) -> None:
+def _begin_with(network: PredictorNetwork, weights: str) -> None:
     """Copy the weights of another training into a fresh network."""
     other, _ = load_network(weights)
     if other.config != network.config:
@@ -198,7 +198,7 @@ def _begin_with(network: Predictor, weights: str) -> None:
     network.load_state_dict(other.state_dict())
 
 
-def _step(state: TrainingState[Predictor], networks: Networks, batch: Batch,
+def _step(state: TrainingState[PredictorNetwork], networks: Networks, batch: Batch,
           augmentation: Augmentation, draws: Draws, config: TrainingConfig, processes: Processes,
           autocast: Autocast) -> tuple[Outcome, torch.Tensor]:
     """Do one step of the predictor, then one of the discriminators; return (Outcome, norm)."""
@@ -297,7 +297,7 @@ def _log(curves: SummaryWriter, bar: tqdm, step: int, values: dict[str, float], 
     bar.set_postfix(loss=f'{values["loss"]:.4f}', match=f'{values["match_fraction"]:.2f}')
 
 
-def _report(state: TrainingState[Predictor], curves: SummaryWriter, config: TrainingConfig,
+def _report(state: TrainingState[PredictorNetwork], curves: SummaryWriter, config: TrainingConfig,
             store: EpisodeStore, frames: Frames, filled: Filled | None, training: np.ndarray,
             held_out: np.ndarray, autocast: Autocast) -> None:
     """Score the averaged network on held-out episodes; write weights, scores and pictures."""

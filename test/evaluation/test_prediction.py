@@ -22,7 +22,7 @@ from tap_ros.evaluation.samples import draw_latents, score_samples
 from tap_ros.images.pixels import to_float
 from tap_ros.options import parse
 from tap_ros.prediction.batches import fixed_time, make_batch, Sampling
-from tap_ros.prediction.networks import Prediction, Predictor, PredictorConfig
+from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.training.weights import save_weights
 import torch
@@ -173,7 +173,7 @@ def test_episodes_in_which_an_object_stays_do_not_count_as_bottlenecks():
 
 def network(**options):
     torch.manual_seed(0)
-    made = Predictor(PredictorConfig(**{
+    made = PredictorNetwork(PredictorConfig(**{
         'image_size': SIZE, 'base_width': 4, 'new_pixels': False, **options})).eval()
     for name, weight in made.named_parameters():
         # With fresh weights z would hardly matter.

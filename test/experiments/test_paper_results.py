@@ -20,7 +20,7 @@ from made_runs import EPISODES, made_run, save_runs, scores
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.weights import save_weights
 import torch
@@ -326,7 +326,7 @@ def test_grids_show_each_method_that_has_weights(tmp_path):
                                      num_context=1 if run['mode'] == 'forward' else 2,
                                      latent_size=8 if 'vae' in run['method'] else 0)
             save_weights(tmp_path / 'weights' / run['name'] / 'predictor.safetensors',
-                         Predictor(config), 'predictor', asdict(config), {})
+                         PredictorNetwork(config), 'predictor', asdict(config), {})
         write_grids(tmp_path, runs, tmp_path / 'weights')
 
     write(runs[0])

@@ -14,7 +14,7 @@ from fault_report import fault
 import numpy as np
 import pytest
 from tap_ros.errors import TapError
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.recording.writer import write_metadata
 from tap_ros.training.weights import load_tensors, save_weights
 
@@ -97,7 +97,7 @@ def test_disk_full_train(trials, tmp_path):
     source.mkdir()
     write_recording(source / 'source_0.mcap', episodes=8, length=8, size=64)
     write_metadata(source)
-    network, old = Predictor(PredictorConfig(base_width=1)), tmp_path / 'old.safetensors'
+    network, old = PredictorNetwork(PredictorConfig(base_width=1)), tmp_path / 'old.safetensors'
     save_weights(old, network, 'predictor', network.config, {})
     for trial in trials:
         disk = tmp_path / f'disk{trial}'

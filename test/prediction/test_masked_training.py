@@ -14,7 +14,7 @@ from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.discriminator import Discriminator
 from tap_ros.prediction.held_out import held_out_scores
 from tap_ros.prediction.methods import method_fields
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import discriminators_loss, Draws, Networks, predictor_loss
 from tap_ros.prediction.recognition import Recognition
 from tap_ros.prediction.selection import Targets
@@ -62,7 +62,7 @@ def networks(settings, images=4):
     config = PredictorConfig(image_size=32, base_width=4, num_context=2,
                              latent_size=3 if vae else 0, new_pixels=True)
     return Networks(
-        Predictor(config), Recognition(config, images) if vae else None,
+        PredictorNetwork(config), Recognition(config, images) if vae else None,
         Discriminator(config, 12) if settings.gan else None,
         Discriminator(config, 12) if settings.gan and vae else None)
 

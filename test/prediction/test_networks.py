@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from tap_ros.errors import ConfigError
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 import torch
 
 SMALL = PredictorConfig(base_width=4)
@@ -22,7 +22,7 @@ def contexts(batch, config=SMALL, seed=0):
 
 
 def test_blocks_have_the_sizes_of_appendix_c():
-    network, sizes = Predictor(PredictorConfig()), []
+    network, sizes = PredictorNetwork(PredictorConfig()), []
     convolutions = [layer for part in (network.encoder, network.head, network.mask_decoder)
                     for layer in part
                     if isinstance(layer, (torch.nn.Conv2d, torch.nn.ConvTranspose2d))]
@@ -41,7 +41,7 @@ def test_blocks_have_the_sizes_of_appendix_c():
 @pytest.mark.parametrize('image_size', [32, 64])
 def test_outputs_have_the_promised_shapes(new_pixels, image_size, config):
     config = replace(config, image_size=image_size, new_pixels=new_pixels)
-    answer = Predictor(config)(contexts(3, config))
+    answer = PredictorNetwork(config)(contexts(3, config))
     S = image_size
     assert answer.image.shape == (3, 3, S, S)
     assert answer.flow.shape == (3, 2, 2, S, S)
@@ -56,20 +56,20 @@ def test_outputs_have_the_promised_shapes(new_pixels, image_size, config):
 
 @EVERY
 def test_fresh_weights_hardly_move_anything(config):
-    assert Predictor(config)(contexts(4)).flow.abs().mean() < 1
+    assert PredictorNetwork(config)(contexts(4)).flow.abs().mean() < 1
 
 
 @EVERY
 def test_equal_context_pictures_are_all_that_a_warp_only_network_can_show(config):
     # Blending warped copies of one flat colour gives that colour.
-    network = Predictor(replace(config, new_pixels=False))
+    network = PredictorNetwork(replace(config, new_pixels=False))
     context = torch.full((2, 2, 3, 64, 64), 0.3)
     assert network(context).image.allclose(torch.full((2, 3, 64, 64), 0.3), atol=1e-5)
 
 
 @EVERY
 def test_one_at_a_time_equals_a_batch_in_eval_mode(config):
-    network = Predictor(config)
+    network = PredictorNetwork(config)
     for seed in range(3):
         network(contexts(8, seed=seed))  # statistics of batch norm
     network.eval()
@@ -83,7 +83,7 @@ def test_one_at_a_time_equals_a_batch_in_eval_mode(config):
 
 @EVERY
 def test_memory_format_changes_no_number(config):
-    network = Predictor(config).eval()
+    network = PredictorNetwork(config).eval()
     expected = network(contexts(2)).image
     network.to(memory_format=torch.channels_last)
     assert network(contexts(2)).image.allclose(expected, atol=1e-5)
@@ -92,7 +92,7 @@ def test_memory_format_changes_no_number(config):
 @EVERY
 def test_z_makes_a_difference_and_its_mean_is_the_default(config):
     config = replace(config, latent_size=32)
-    network = Predictor(config).eval()
+    network = PredictorNetwork(config).eval()
     firsts = [layer for layer in network.modules() if isinstance(layer, torch.nn.ConvTranspose2d)]
     assert {layer.in_channels for layer in firsts} == {160}  # section App. C: 128 + 32
     context = contexts(2, config)
@@ -103,7 +103,7 @@ def test_z_makes_a_difference_and_its_mean_is_the_default(config):
 
 @EVERY
 def test_every_weight_gets_a_gradient(config):
-    network = Predictor(config)
+    network = PredictorNetwork(config)
     network(contexts(2)).image.square().mean().backward()
     without = [name for name, weight in network.named_parameters()
                if weight.grad is None or not weight.grad.abs().sum() > 0]
@@ -120,7 +120,7 @@ def set_outputs(network, bias):
 
 @pytest.mark.parametrize('config', [SHARED, SKIPS], ids=['shared', 'skips'])
 def test_outputs_of_the_shared_decoder_are_flow_then_masks_then_new_pixels(config):
-    network, context = Predictor(config).eval(), contexts(2)
+    network, context = PredictorNetwork(config).eval(), contexts(2)
     flow, start, goal, painted = [0.0] * 4, [30.0, 0, 0], [0, 30.0, 0], [0, 0, 30.0]
     for masks, expected in ((start, context[:, 0]), (goal, context[:, 1])):
         set_outputs(network, flow + masks + [0.0] * 3)
@@ -134,7 +134,7 @@ def test_outputs_of_the_shared_decoder_are_flow_then_masks_then_new_pixels(confi
 
 @pytest.mark.parametrize('config', [SHARED, SKIPS], ids=['shared', 'skips'])
 def test_one_pixel_reaches_the_outputs_past_the_code_by_skips_alone(config):
-    network = Predictor(config).eval()
+    network = PredictorNetwork(config).eval()
     with torch.no_grad():
         network.head[-1].weight.zero_()  # the code says nothing
     context = contexts(1)
@@ -147,7 +147,7 @@ def test_one_pixel_reaches_the_outputs_past_the_code_by_skips_alone(config):
 
 def test_a_shared_decoder_has_fewer_weights_than_those_of_the_paper():
     def weights(config):
-        return sum(weight.numel() for name, weight in Predictor(config).named_parameters()
+        return sum(weight.numel() for name, weight in PredictorNetwork(config).named_parameters()
                    if 'decoder' in name)
     assert weights(SHARED) < weights(SMALL) / 3
 

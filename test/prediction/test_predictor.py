@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, ImageError, WeightsError
 from tap_ros.images.pixels import to_float, to_uint8
-from tap_ros.prediction.networks import Predictor, PredictorConfig
-from tap_ros.prediction.predictor import Question, SubgoalPredictor
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.protocol import Question
 from tap_ros.prediction.warp import one_hot_maps, warp_object_maps
 from tap_ros.training.weights import save_weights
 import torch
@@ -213,7 +214,7 @@ def test_next_good_request_works_after_a_bad_one(predictor):
 
 def test_a_saved_predictor_answers_the_same(tmp_path):
     torch.manual_seed(1)
-    network = Predictor(CONFIG)
+    network = PredictorNetwork(CONFIG)
     path = tmp_path / 'predictor.safetensors'
     save_weights(path, network, 'predictor', CONFIG, {'steps': 7})
     loaded = SubgoalPredictor.load(path)
@@ -224,7 +225,7 @@ def test_a_saved_predictor_answers_the_same(tmp_path):
 
 
 def test_weights_that_predict_nonsense_are_refused(tmp_path):
-    path, network = tmp_path / 'predictor.safetensors', Predictor(CONFIG)
+    path, network = tmp_path / 'predictor.safetensors', PredictorNetwork(CONFIG)
     for weight in network.parameters():
         weight.data.fill_(3e38)  # finite, unlike what comes of it
     save_weights(path, network, 'predictor', CONFIG, {})
@@ -234,10 +235,10 @@ def test_weights_that_predict_nonsense_are_refused(tmp_path):
 
 def test_weights_of_something_else_are_refused(tmp_path):
     path = tmp_path / 'weights.safetensors'
-    save_weights(path, Predictor(CONFIG), 'forward_model', CONFIG, {})
+    save_weights(path, PredictorNetwork(CONFIG), 'forward_model', CONFIG, {})
     with pytest.raises(WeightsError, match='forward_model'):
         SubgoalPredictor.load(path)
     video = replace(CONFIG, num_context=3)
-    save_weights(path, Predictor(video), 'predictor', video, {})
+    save_weights(path, PredictorNetwork(video), 'predictor', video, {})
     with pytest.raises(ConfigError, match='2 context pictures'):
         SubgoalPredictor.load(path)

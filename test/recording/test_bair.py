@@ -11,7 +11,7 @@ import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.prediction.batches import make_batch
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats.bair import find_shards, import_bair
 from tap_ros.recording.formats.tfrecord import parse_example
@@ -260,7 +260,7 @@ def test_prediction_is_evaluated_without_objects(tmp_path, data_set):
     store = open_recordings(tmp_path / 'bair')
     batch = make_batch(store, range(5))
     assert batch.context.shape == (5, 2, 64, 64, 3)
-    network = Predictor(PredictorConfig(image_size=64, base_width=4)).eval()
+    network = PredictorNetwork(PredictorConfig(image_size=64, base_width=4)).eval()
     for scores in evaluate(network, store, range(5)).values():
         assert np.isfinite(scores.min_l1).all() and np.isnan(scores.bottleneck).all()
         assert scores.summary()['bottleneck_episodes'] == 0

@@ -12,7 +12,7 @@ import pytest
 from safetensors.torch import save_file
 from tap_ros.errors import WeightsError
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.prediction.networks import Predictor, PredictorConfig
+from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.training.weights import (
     load_tensors,
@@ -33,18 +33,18 @@ CONFIG = PredictorConfig(base_width=4, image_size=16, new_pixels=False)
 @pytest.fixture
 def path(tmp_path):
     path = tmp_path / 'folder' / 'weights.safetensors'
-    save_weights(path, Predictor(CONFIG).to(memory_format=torch.channels_last), 'predictor',
+    save_weights(path, PredictorNetwork(CONFIG).to(memory_format=torch.channels_last), 'predictor',
                  CONFIG, {'seed': 3})
     return path
 
 
 def test_weights_round_trip(path):
-    network = Predictor(CONFIG)
+    network = PredictorNetwork(CONFIG)
     save_weights(path, network, 'predictor', CONFIG, {'seed': 3, 'scores': {'min_l1': 0.5}})
     values, state, training = load_weights(path, 'predictor')
     assert make_config(PredictorConfig, values, path) == CONFIG
     assert training == {'seed': 3, 'scores': {'min_l1': 0.5}}
-    other = make_network(Predictor, PredictorConfig, values, state, path)
+    other = make_network(PredictorNetwork, PredictorConfig, values, state, path)
     for name, tensor in network.state_dict().items():
         assert other.state_dict()[name].equal(tensor), name
 
@@ -56,7 +56,7 @@ def test_nothing_else_is_left_in_the_folder(path):
 def test_failed_writing_leaves_the_old_file(path):
     before = path.read_bytes()
     with pytest.raises(TypeError):
-        save_weights(path, Predictor(CONFIG), 'predictor', CONFIG, {'unstorable': object()})
+        save_weights(path, PredictorNetwork(CONFIG), 'predictor', CONFIG, {'unstorable': object()})
     assert path.read_bytes() == before
     assert len(list(path.parent.iterdir())) == 1
 
@@ -87,7 +87,7 @@ def test_somebody_elses_safetensors(tmp_path):
 @pytest.mark.parametrize('config', [
     CONFIG, replace(CONFIG, decoder='shared'), replace(CONFIG, decoder='shared', skips=True)])
 def test_a_network_comes_back_with_its_decoder(tmp_path, config):
-    network = Predictor(config).eval()
+    network = PredictorNetwork(config).eval()
     save_weights(tmp_path / 'weights', network, 'predictor', config, {})
     other, _ = load_network(tmp_path / 'weights')
     context = torch.rand(1, 2, 3, 16, 16)
@@ -128,9 +128,9 @@ def test_unknown_configuration(path):
 def test_wrong_size(path):
     values, state, _ = load_weights(path, 'predictor')
     with pytest.raises(WeightsError, match='encoder.0.weight has size'):
-        make_network(Predictor, PredictorConfig, values | {'base_width': 8}, state, path)
+        make_network(PredictorNetwork, PredictorConfig, values | {'base_width': 8}, state, path)
     with pytest.raises(WeightsError, match='missing.*pixel_decoder'):
-        make_network(Predictor, PredictorConfig, values | {'new_pixels': True}, state, path)
+        make_network(PredictorNetwork, PredictorConfig, values | {'new_pixels': True}, state, path)
 
 
 def test_a_pickle_is_not_loaded(tmp_path):

@@ -19,6 +19,7 @@ from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.images.drawing import overlay
+from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.parameters import check_device
@@ -40,10 +41,8 @@ from tap_ros.nodes.services import (
     take_pending_requests,
 )
 from tap_ros.nodes.topics import LATCHED
-from tap_ros.prediction.predictor import Subgoal as PredictedSubgoal
-from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
 from tap_ros.prediction.request_queue import Busy, RequestQueue, THREAD_NAME
-from tap_ros.weights import find_predictor
 
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 Send = Callable[[PredictSubgoal.Response], object]
@@ -68,7 +67,7 @@ class PredictorNode(LifecycleBase):
     def __init__(self, **options: Any) -> None:
         super().__init__('predictor_node', **options)
         self.params = declare_parameters(self)
-        self._predictor: SubgoalPredictor | None = None
+        self._predictor: Predictor | None = None
         self._queue: RequestQueue[Task, Found] | None = None
         self.autostart('configure')
         topics = request_topics(self.params)
@@ -102,7 +101,7 @@ class PredictorNode(LifecycleBase):
         def prepare() -> Callable[[list[Task]], list[Found]]:
             # OpenMP is slow where two threads have begun parallel work on few cores.
             check_device(self.params['device'])
-            self._predictor = SubgoalPredictor.load(self.params['weights'], self.params['device'])
+            self._predictor = load_predictor(self.params['weights'], self.params['device'])
             return partial(predict, self._predictor)
 
         self._queue = RequestQueue(
@@ -127,7 +126,7 @@ class PredictorNode(LifecycleBase):
 
     def files(self) -> list[Path]:
         """Return the file of the weights."""
-        return [find_predictor(self.params['weights'])]
+        return predictor_files(self.params['weights'])
 
     # In the executor
 
@@ -202,7 +201,7 @@ class PredictorNode(LifecycleBase):
             log_error(self, 'predict_subgoal: a response cannot be sent', error)
 
 
-def predict(predictor: SubgoalPredictor, tasks: list[Task]) -> list[Found]:
+def predict(predictor: Predictor, tasks: list[Task]) -> list[Found]:
     """Predict a batch; return subgoals and ms for each Task."""
     begin = time.perf_counter()
     found = predictor.predict_together([task.question for task in tasks])

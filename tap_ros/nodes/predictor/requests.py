@@ -19,13 +19,14 @@ from tap_ros.images.pixels import check_image
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.objects import decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.subgoals import Subgoal
 from tap_ros.nodes.observations import OnDemandObservations
 from tap_ros.nodes.parameters import camera_topic, Parameters
 from tap_ros.nodes.predictor.settings import check_mode, check_work
 from tap_ros.nodes.robot_view import CAMERA_MASK, GOAL_MASK, RobotView
 from tap_ros.nodes.ros_messages import encode_subgoal
 from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.prediction.predictor import Question, Subgoal, SubgoalPredictor
+from tap_ros.prediction.protocol import Predictor, Question
 from tap_ros.text import listing
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class RequestReader:
                 with suppress(TapError):  # a request for this picture is refused with it
                     self._robot.see(found['image'], found['mask'], start.jumps)
 
-    def read(self, request: PredictSubgoal.Request, predictor: SubgoalPredictor) -> Task:
+    def read(self, request: PredictSubgoal.Request, predictor: Predictor) -> Task:
         """
         Check and decode a request.
 

@@ -17,7 +17,7 @@ from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 if TYPE_CHECKING:
     from rclpy.node import Node
     from tap_msgs.srv import PredictSubgoal
-    from tap_ros.prediction.predictor import SubgoalPredictor
+    from tap_ros.prediction.protocol import Predictor
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
@@ -35,8 +35,10 @@ def declare_parameters(node: 'Node') -> Parameters:
     declare_autostart(parameters)
     shipped = ', '.join(PREDICTORS)
     parameters.declare('weights', DEFAULT_PREDICTOR,
-                       f'Weights of a subgoal predictor: shipped ones ({shipped}), or a file '
-                       '(.safetensors). Can be changed while the node is unconfigured.',
+                       f'A subgoal predictor: shipped weights ({shipped}), a file '
+                       '(.safetensors), or NAME:ARGUMENT of another one, such as '
+                       'nearest_keyframe:bags/push2. Can be changed while the node is '
+                       'unconfigured.',
                        read_only=False)
     declare_device(parameters)
     declare_transport(parameters)
@@ -44,7 +46,7 @@ def declare_parameters(node: 'Node') -> Parameters:
     return parameters
 
 
-def unlike_training(predictor: 'SubgoalPredictor', robot_mask: str) -> str:
+def unlike_training(predictor: 'Predictor', robot_mask: str) -> str:
     """
     Return how the pictures differ from those of the training, '' if they do not.
 

@@ -1,0 +1,143 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a predictor of subgoals is: arrays in, arrays out.
+
+predictor_node, `predict` and planning take any. Another package adds one by the entry point group
+tap_ros.predictors: a class with `load(argument, device)`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, cast, Protocol
+
+import numpy as np
+from tap_ros.errors import ConfigError, ImageError, WeightsError
+from tap_ros.images.crop import TrainedCrop
+from tap_ros.images.pixels import check_image, check_pixels
+from tap_ros.messages.subgoals import Subgoal
+from tap_ros.plugins import load_plugin, names
+from tap_ros.text import escaped
+from tap_ros.weights import find_predictor, PREDICTORS
+
+GROUP = 'tap_ros.predictors'
+
+
+@dataclass(frozen=True)
+class Question:
+    """
+    What a predictor is asked.
+
+    :param start: uint8 (H, W, 3).
+    :param goal: uint8 (H, W, 3); None in mode 'forward'.
+    :param start_pixels: (K, 2) object positions (u, v) in the start picture; None: K = 0.
+    :param goal_pixels: (K, 2), of the same objects in the goal picture; None in mode 'forward'.
+    :param num_samples: how many to draw; a predictor without random numbers answers one.
+    :param recursion_depth: how many subgoals in a row, at least 1.
+    :param seed: of what is random.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray | None = None
+    start_pixels: np.ndarray | None = None
+    goal_pixels: np.ndarray | None = None
+    num_samples: int = 1
+    recursion_depth: int = 1
+    seed: int = 0
+
+
+class Predictor(Protocol):
+    """
+    Predict the bottleneck between a start and a goal picture, or one to come after the start.
+
+    :ivar mode: 'bidirectional', from start and goal, or 'forward', from the start alone.
+    :ivar image_size: (height, width) of the pictures it takes.
+    :ivar camera_crop: what to make of a camera's pictures before it sees them.
+    :ivar training: how it was made, in the form of a weights file; may be empty.
+    """
+
+    mode: str
+    image_size: tuple[int, int]
+    camera_crop: TrainedCrop
+    training: Mapping[str, Any]
+
+    def predict_together(self, questions: Sequence[Question]) -> list[list[Subgoal]]:
+        """
+        Answer questions.
+
+        :param questions: list of Question.
+        :return: for each a list of Subgoal: sample after sample, of each its subgoals in a row,
+            earliest first.
+        :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
+        :raises ConfigError: if a count is below 1, or a goal is missing or too much.
+        """
+        ...
+
+    def predict(self, start: np.ndarray, goal: np.ndarray | None = None,
+                start_pixels: np.ndarray | None = None, goal_pixels: np.ndarray | None = None,
+                num_samples: int = 1, recursion_depth: int = 1, seed: int = 0) -> list[Subgoal]:
+        """Answer one question: the fields of Question; the rest as predict_together."""
+        return self.predict_together([Question(
+            start, goal, start_pixels, goal_pixels, num_samples, recursion_depth, seed)])[0]
+
+
+def load_predictor(text: str | Path, device: Any = 'cpu') -> Predictor:
+    """
+    Load a predictor by name or file.
+
+    :param text: name of shipped weights, such as 'push2'; a weights file; or NAME:ARGUMENT of
+        another predictor, such as 'nearest_keyframe:bags/push2'.
+    :param device: torch device or its name.
+    :raises WeightsError: if weights are missing, damaged or for something else.
+    :raises TapError: as the predictor's own load.
+    """
+    name, _, argument = str(text).partition(':')
+    if name in names(GROUP):
+        return cast(Predictor, load_plugin(GROUP, name).load(argument, device))
+    if not find_predictor(text).exists() and Path(text).name == str(text) == Path(text).stem:
+        near = get_close_matches(name, [*PREDICTORS, *names(GROUP)], 1)
+        raise WeightsError(
+            f'{escaped(text)}: no such weights file' + f'; did you mean {near[0]!r}?' * len(near)
+            + f' Valid: {", ".join(PREDICTORS)}, a .safetensors file, or NAME:ARGUMENT with '
+            f'NAME one of {", ".join(names(GROUP))}')
+    return cast(Predictor, load_plugin(GROUP, 'tap').load(text, device))
+
+
+def predictor_files(text: str) -> list[Path]:
+    """Return the weights files that a text of load_predictor names; none of other predictors."""
+    return [] if text.partition(':')[0] in names(GROUP) else [find_predictor(text)]
+
+
+def check_question(question: Question, mode: str,
+                   image_size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Check a question.
+
+    :param question: Question.
+    :param mode: of the predictor; image_size: likewise.
+    :return: pictures (C, H, W, 3) and positions (C, K, 2): of the start, and of the goal if the
+        mode is bidirectional.
+    :raises ImageError: as Predictor.predict_together; ConfigError: likewise.
+    """
+    for name in ('num_samples', 'recursion_depth'):
+        if getattr(question, name) < 1:
+            raise ConfigError(f'{name}: expected at least 1, got {getattr(question, name)}')
+    start, goal = question.start, question.goal
+    check_image(start, 'start', image_size)
+    start_pixels = check_pixels(question.start_pixels, 'start_pixels')
+    if mode == 'forward':
+        if goal is not None or question.goal_pixels is not None:
+            raise ConfigError('goal: these weights predict forward, from the start alone; '
+                              'leave it out, or use weights for 2 context pictures')
+        return start[None], start_pixels[None]
+    if goal is None:
+        raise ConfigError('goal: these weights predict between a start and a goal picture; '
+                          'give one, or use weights for 1 context picture')
+    check_image(goal, 'goal', image_size)
+    goal_pixels = check_pixels(question.goal_pixels, 'goal_pixels')
+    if len(start_pixels) != len(goal_pixels):
+        raise ImageError(f'goal_pixels: expected {len(start_pixels)} objects as in '
+                         f'start_pixels, got {len(goal_pixels)}')
+    return np.stack([start, goal]), np.stack([start_pixels, goal_pixels])
