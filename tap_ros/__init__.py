@@ -16,6 +16,7 @@ if 'OMP_WAIT_POLICY' not in os.environ:
 
 # What most users need; each is imported when it is asked for, so that nodes stay light.
 _EXPORTS = {
+    'Arm': 'tap_ros.robots.arm',
     'Client': 'tap_ros.nodes.client',
     'EpisodeWriter': 'tap_ros.recording.writer',
     'ForwardModel': 'tap_ros.planning.protocols',

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The public client with real nodes: what it does, and who it says is silent."""
 
+from pathlib import Path
+import re
 import threading
 
 import numpy as np
@@ -58,3 +60,10 @@ def test_it_names_who_is_silent():
                 (lambda: client.wait_until_ready('sim_node', timeout_s=0.2), 'sim_node')):
             with pytest.raises(CallError, match=silent):
                 ask()
+
+
+def test_the_example_of_its_page_runs(loop, capsys):
+    page = (Path(__file__).parents[2] / 'docs' / 'python.md').read_text()
+    block, = re.findall(r'^```python\n(from tap_ros import Client.*?)^```$', page, re.M | re.S)
+    exec(block, {})
+    assert re.findall('^[123] (?:sub)?goal', capsys.readouterr().out, re.M)
