@@ -16,12 +16,10 @@ import time
 from typing import Any
 
 import numpy as np
-from sim_bridge.simulator import Observation, Simulator
-from sim_bridge.tasks.expert import default_config, ExpertConfig, run_episode
-from sim_bridge.tasks.grasp_expert import GraspConfig
-from sim_bridge.tasks.tasks import get_task
-from sim_bridge.tasks.timing import TIMINGS
+from sim_bridge.simulator import Simulator
+from sim_bridge.tasks.tasks import get_task, run_episode, TIMINGS
 from sim_bridge.world.looks import DEFAULT_LOOK
+from sim_bridge.world_protocol import Observation
 from tap_ros.engines.run import run_tasks
 from tap_ros.engines.task import Engine, LOCAL, Task
 from tap_ros.errors import ConfigError, RecordingError
@@ -45,7 +43,7 @@ class CollectSettings:
     """
     What to collect.
 
-    :param task: name of a task, see tasks.TASKS.
+    :param task: name of a task, see tasks.task_names.
     :param episodes: how many in all; a larger number later adds to the same folder.
     :param seed: of the first episode; the others count on from it.
     :param image_size: width and height in pixels.
@@ -83,7 +81,7 @@ class CollectConfig(CollectSettings):
     :param expert: what it is collected with; None: as is usual for the task.
     """
 
-    expert: ExpertConfig | GraspConfig | None = None
+    expert: Any = None
 
 
 def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
@@ -109,7 +107,7 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
         raise ConfigError(f'misses is {config.misses:g}; expected a share from 0 to 1')
     if config.misses and task.kind != 'push':
         raise ConfigError(f'misses are of tasks of pushing, not of {task.name}')
-    config = replace(config, expert=config.expert or default_config(task, config.timing))
+    config = replace(config, expert=config.expert or task.default_config(config.timing))
     if min(config.episodes, config.episodes_per_file) < 1:
         raise ConfigError('episodes and episodes_per_file must be at least 1')
     if config.frames and not MIN_FRAMES <= config.frames <= MAX_FRAMES:
@@ -258,7 +256,7 @@ def make_episode(simulator: Simulator, observations: Sequence[Observation], acti
     :return: Episode.
     """
     goal = observations[-1]
-    if simulator.task.kind in ('push', 'stack'):
+    if simulator.task.photographed:
         goal = simulator.photograph(goal.object_poses)
     return Episode(
         frames=np.stack([o.image for o in observations]),

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from sim_bridge.collect import collect, CollectConfig, CollectSettings
-from sim_bridge.tasks.tasks import TASKS
-from sim_bridge.tasks.timing import TIMINGS
+from sim_bridge.tasks.tasks import task_names, TIMINGS
 from sim_bridge.world.appearance import CHOICES
 from sim_bridge.world.looks import LOOKS
 from tap_ros.engines.options import EngineOptions
@@ -19,7 +18,7 @@ from tap_ros.plugins import names
 class Recording(CollectSettings):
     """What to collect."""
 
-    task: Annotated[str, one_of(TASKS)] = CollectSettings.task
+    task: Annotated[str, one_of(task_names())] = CollectSettings.task
     timing: Annotated[str, one_of(TIMINGS)] = CollectSettings.timing
     look: Annotated[str, one_of(LOOKS)] = CollectSettings.look
     appearance: Annotated[str, one_of(CHOICES)] = CollectSettings.appearance

@@ -1,104 +1,28 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The MuJoCo table, a World: reset, step, observe. Knows nothing of ROS."""
+"""The MuJoCo table with its tasks, a World: reset, step, observe. Knows nothing of ROS."""
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import replace
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.tasks.stack_tasks import is_tower, levels
-from sim_bridge.tasks.tasks import get_task, sample_scene
-from sim_bridge.world.appearance import choose_appearance, USUAL
-from sim_bridge.world.entities import check_free, check_pose, check_velocity
-from sim_bridge.world.grasping import grasp_place
-from sim_bridge.world.looks import DEFAULT_LOOK, get_look, GRIP_SPREAD, OBSERVER
-from sim_bridge.world.moved_goal import check_apart, check_places, places_from
-from sim_bridge.world.places import gripper_away_from
-from sim_bridge.world.scene import (
-    build_scene,
-    FINGER_GAP,
-    FINGER_TRAVEL,
-    HALF_HEIGHT,
-    object_names,
-    TIMESTEP,
-)
-from sim_bridge.world.studio import Studio
+from sim_bridge.tasks.tasks import get_task, sample_scene, task_names
+from sim_bridge.world.looks import DEFAULT_LOOK, GRIP_SPREAD
+from sim_bridge.world.scene import object_names
+from sim_bridge.world.table import lifted, Table
 from sim_bridge.world_protocol import Observation
-from tap_ros.contract import (
-    ACTION_LIMIT,
-    CONTROL_PERIOD,
-    SUCCESS_DISTANCE,
-    WORKSPACE_HIGH,
-    WORKSPACE_LOW,
-)
 from tap_ros.errors import SceneError
-from tap_ros.robots.arm import DEFAULT_ARM, get_arm
-from tap_ros.text import escaped
-
-SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
-if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
-    raise SceneError(f'the control period {CONTROL_PERIOD} s is no multiple of {TIMESTEP} s')
-RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time to catch up
-BENT = 0.1  # share of the fingers' travel that they may be beyond their ends
-GRASP_HEIGHT = 0.012  # m of the gripper when it holds an object on the table, in the goal picture
-LEAVE_HEIGHT = 0.12  # m of the gripper when it has put the object down, in the goal picture
-OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
+from tap_ros.robots.arm import DEFAULT_ARM
+from tap_ros.text import listing
 
 
-def clip_action(action: ArrayLike, limit: Sequence[float] = ACTION_LIMIT) -> np.ndarray:
+class Simulator(Table):
     """
-    Limit an action to what the arm does in one control period.
+    The World 'mujoco_table'.
 
-    :param action: (4,) displacement x, y, z in m and gripper opening in [0, 1].
-    :param limit: (3,) m, of the displacement.
-    :return: (4,) float64.
-    :raises SceneError: for another shape or values that are not finite.
-    """
-    action = np.asarray(action, np.float64)
-    if action.shape != (4,) or not np.isfinite(action).all():
-        raise SceneError(f'action {action}: expected 4 finite numbers (dx, dy, dz, opening)')
-    return np.append(clip_moves(action[:3], limit), np.clip(action[3], 0, 1))
-
-
-def clip_moves(moves: np.ndarray, limit: Sequence[float] = ACTION_LIMIT) -> np.ndarray:
-    """Limit displacements (..., 3), in m, to what the arm does in one control period."""
-    return np.clip(moves, np.negative(limit), limit)
-
-
-def ramp_controls(target: np.ndarray, actions: np.ndarray,
-                  low: Sequence[float] = WORKSPACE_LOW, high: Sequence[float] = WORKSPACE_HIGH,
-                  ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Turn actions into servo targets for every physics step.
-
-    :param target: (4,) the present target: x, y, z, opening.
-    :param actions: (..., T, 4) actions within the limits.
-    :param low: (3,) m, where the gripper may be, least; high: greatest.
-    :return: controls (..., T * SUBSTEPS, 5) and the targets after each action (..., T, 4).
-    """
-    targets = np.empty(actions.shape)
-    targets[..., 3] = actions[..., 3]
-    position = np.broadcast_to(target[:3], actions[..., 0, :3].shape)
-    for t in range(actions.shape[-2]):
-        position = np.clip(position + actions[..., t, :3], low, high)
-        targets[..., t, :3] = position
-    first = np.broadcast_to(target, targets[..., :1, :].shape)
-    before = np.concatenate([first, targets[..., :-1, :]], axis=-2)
-    share = np.minimum(np.arange(1, SUBSTEPS + 1) / RAMP_SUBSTEPS, 1)[:, None]
-    path = before[..., None, :] + share * (targets - before)[..., None, :]  # (..., T, S, 4)
-    fingers = path[..., 3:] * FINGER_TRAVEL
-    controls = np.concatenate([path[..., :3], fingers, fingers], axis=-1)
-    return controls.reshape(*actions.shape[:-2], -1, 5), targets
-
-
-class Simulator:
-    """
-    A table with a gripper, objects and a camera: the World 'mujoco_table'.
-
-    :param task: name of a task, see tasks.TASKS.
+    :param task: name of a task, see tasks.task_names.
     :param image_size: pixels of the square picture.
     :param look: name of a look, see looks.LOOKS.
     :param appearance: name of an appearance, see appearance.CHOICES.
@@ -110,31 +34,13 @@ class Simulator:
 
     def __init__(self, task: str = 'push2', image_size: int = 64, look: str = DEFAULT_LOOK,
                  appearance: str = 'usual', arm: str = DEFAULT_ARM) -> None:
-        self.task, self.look, self.arm = get_task(task), get_look(look), get_arm(arm)
-        if not 16 <= image_size <= 1024:
-            raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')
-        choose_appearance(appearance, 0)  # refuses what there is not
-        self._appearance = appearance
-        self._usual_camera = self.look.camera(self.task.gripping, image_size, image_size)
-        self.camera = self._usual_camera
-        self._renderer: Studio | None = None
-        self._observer: Studio | None = None
-        self._worn = USUAL  # the appearance of the present scene
+        self.task = get_task(task)
+        super().__init__(image_size, self.task.gripping, look, appearance, arm)
 
     @property
     def task_name(self) -> str:
         """Return the name of the task."""
         return self.task.name
-
-    @property
-    def camera_matrix(self) -> np.ndarray:
-        """Return the intrinsics (3, 3) in pixels."""
-        return self.camera.K
-
-    @property
-    def camera_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) of the camera's optical frame in the world."""
-        return self.camera.pose
 
     def reset(self, seed: int) -> Observation:
         """
@@ -144,46 +50,16 @@ class Simulator:
         :return: Observation.
         :raises SceneError: for a bad seed.
         """
-        gripping = self.task.gripping
+        task = self.task
         self.scene = sample_scene(
-            self.task, seed, GRIP_SPREAD if gripping else 1.0, self.arm.low, self.arm.high)
-        self.model = build_scene(self.scene.shapes, gripping)
-        self.data = mujoco.MjData(self.model)
-        self._prepare_camera()
-        self.target = np.append(self.scene.gripper_start, 0.0)
-        self._place(_lift(self.scene.start_poses), self.scene.gripper_start)
-        poses = _lift(self.scene.goal_poses, levels(self.task.num_objects)
-                      if self.task.kind == 'stack' else self.task.lift)
-        gripper = {
-            'push': self._after_last_push, 'grasp': self._holding, 'pick_place': self._leaving,
-            'stack': self._releasing}[self.task.kind]()
+            task, seed, GRIP_SPREAD if task.gripping else 1.0, self.arm.low, self.arm.high)
+        self.load(self.scene.shapes, lifted(self.scene.start_poses), self.scene.gripper_start,
+                  self.scene.seed)
+        poses = lifted(self.scene.goal_poses, task.goal_heights)
+        gripper = task.goal_gripper(self, self.scene)
         self._goal = [self.photograph(poses, gripper, hide_arm) for hide_arm in (False, True)]
+        self.goal_poses = self.goal().object_poses
         return self.observe()
-
-    def photograph(self, object_poses: np.ndarray, gripper: np.ndarray | None = None,
-                   hide_arm: bool = False) -> Observation:
-        """
-        Observe the objects at other places; nothing moves.
-
-        :param object_poses: (K, 7) x, y, z in m, quaternion x, y, z, w.
-        :param gripper: (3,) where the arm is to be seen, m, or (4,) with its opening; by default
-            closed and somewhere beside the objects, drawn from the scene's seed.
-        :param hide_arm: leave the arm out of the picture.
-        :return: Observation.
-        """
-        state, controls = self.state(), self.data.ctrl.copy()
-        if gripper is None:
-            rng = np.random.default_rng([self.scene.seed, 7])
-            gripper = gripper_away_from(
-                rng, object_poses[:, :2], self.arm.low[:2], self.arm.high[:2])
-        self._place(object_poses, gripper)
-        observation = self.observe(hide_arm)
-        mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_setState(
-            self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        self.data.ctrl[:] = controls
-        mujoco.mj_forward(self.model, self.data)
-        return observation
 
     def goal(self, hide_arm: bool = False) -> Observation:
         """
@@ -209,14 +85,15 @@ class Simulator:
             Task.object_range, and objects that would overlap; then the goal stays as it was.
         """
         places = np.asarray(places, np.float64)
-        check_places(self.task, places)
+        self._check_places(places)
         poses = self.goal().object_poses.copy()
         poses[:, :2] = places
         before = copy(self.data)  # photograph keeps the state, but not the solver's warm start
         try:
-            self._place(poses, self.target)
-            check_apart(self.model, self.data, object_names(self.task.num_objects))
+            self.place(poses, self.target)
+            self._check_apart()
             self._goal = [self.photograph(poses, hide_arm=hide_arm) for hide_arm in (False, True)]
+            self.goal_poses = self.goal().object_poses
         finally:
             mujoco.mj_copyData(self.data, self.model, before)
 
@@ -225,213 +102,50 @@ class Simulator:
         Put the goals of some objects where pixels of its picture show the table, see set_goal.
 
         :param names: of the objects that move; the others' goals stay.
-        :param pixels: (len(names), 2) (u, v).
-        :raises SceneError: as set_goal does, and for names that no object has.
+        :param pixels: (len(names), 2) (u, v), where their origins shall be seen.
+        :raises SceneError: as set_goal does, without names, and for one that no object has.
         """
-        self.set_goal(places_from(self.camera, self.goal().object_poses, names, pixels))
-
-    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike = (0,) * 6) -> None:
-        """
-        Put an object elsewhere, as a hand would; no time passes, `scene` and goal stay.
-
-        :param name: one of the object_names of an Observation.
-        :param pose: (7,) x, y, z in m, quaternion x, y, z, w.
-        :param velocity: (6,) m/s and rad/s along the axes of the world.
-        :raises PoseError: for a pose that is none or out of reach, and where the object would
-            reach into something; then it stays where it was.
-        :raises SceneError: for a velocity that is not finite or too fast; likewise.
-        """
-        if name not in object_names(self.task.num_objects):
-            raise SceneError(f'{escaped(name)} is not in the scene')
-        pose, velocity = check_pose(pose), check_velocity(velocity)
-        # Of a free joint MuJoCo turns the angular velocity with the body.
-        turning = np.empty(3)
-        mujoco.mju_rotVecQuat(turning, velocity[3:], pose[[6, 3, 4, 5]] * (1, -1, -1, -1))
-        before = copy(self.data)
-        joint = self.data.joint(name)
-        joint.qpos, joint.qvel = pose[[0, 1, 2, 6, 3, 4, 5]], [*velocity[:3], *turning]
-        mujoco.mj_forward(self.model, self.data)
-        try:
-            check_free(self.model, self.data, name)
-        except SceneError:
-            mujoco.mj_copyData(self.data, self.model, before)
-            raise
-
-    def step(self, action: ArrayLike) -> Observation:
-        """
-        Act for one control period.
-
-        :param action: (4,) displacement x, y, z in m, limited to ACTION_LIMIT and to the
-            workspace, and gripper opening from 0 (closed) to 1.
-        :return: Observation.
-        :raises SceneError: for another shape, values that are not finite, or what the arm
-            cannot do; then nothing moves.
-        """
-        controls, self.target = self._ramp(action)
-        for control in controls:
-            self.data.ctrl[:] = control
-            mujoco.mj_step(self.model, self.data)
-        return self.observe()
-
-    def check_action(self, action: ArrayLike) -> None:
-        """
-        Accept an action or say why it cannot be done; nothing moves.
-
-        :param action: as for step.
-        :raises SceneError: as step does.
-        """
-        self._ramp(action)
-
-    def _ramp(self, action: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Return the servo targets of an action (SUBSTEPS, 5) and the last one (4,)."""
-        arm = self.arm
-        controls, targets = ramp_controls(
-            self.target, clip_action(action, arm.action_limit)[None], arm.low, arm.high)
-        arm.check_motion(
-            arm.joints_at(self.target), arm.joints_at(targets[0]), CONTROL_PERIOD)
-        return controls, targets[0]
-
-    def observe(self, hide_arm: bool = False) -> Observation:
-        """Return the Observation of this moment."""
-        assert self._renderer is not None, 'reset comes first'
-        mujoco.mj_forward(self.model, self.data)
-        poses = self.object_poses()
-        # Contact can press the fingers beyond closed or open, as it bends those of a real hand.
-        opening = np.clip(self.data.qpos[3:5].mean() / FINGER_TRAVEL, -BENT, 1 + BENT)
-        view = self._renderer.render(self.data, hide_arm)
-        return Observation(
-            image=view.picture,
-            stamp_ns=round(self.data.time * 1e9),
-            gripper=np.append(self.data.qpos[:3], opening).astype(np.float32),
-            object_names=object_names(self.task.num_objects),
-            object_pixels=self.camera.project(poses[:, :3]).astype(np.float32),
-            object_poses=poses, robot_mask=view.robot_mask, arm_joints=view.arm_joints)
-
-    def observer_picture(self) -> np.ndarray:
-        """Take a picture from the side, for people: uint8 (360, 480, 3) rgb."""
-        if self._observer is None:
-            self._observer = Studio(OBSERVER, self.arm, links=True)
-        self._observer.dress(replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
-        self._observer.use(self.model)
-        return self._observer.render(self.data).picture
-
-    def object_poses(self) -> np.ndarray:
-        """Return (K, 7): x, y, z in m, quaternion x, y, z, w."""
-        poses = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
-        return poses[:, [0, 1, 2, 4, 5, 6, 3]].copy()
-
-    def object_motions(self) -> np.ndarray:
-        """
-        Return (K, 2, 2, 3): velocities and accelerations along the axes of the world.
-
-        Of each the linear one in m/s, m/s^2 and the angular one in rad/s, rad/s^2.
-        """
-        rates = np.stack([self.data.qvel, self.data.qacc])[:, OBJECT_QPOS_START:]
-        motions = rates.reshape(2, -1, 2, 3).swapaxes(0, 1).copy()
-        for name, motion in zip(object_names(self.task.num_objects), motions):
-            motion[:, 1] = motion[:, 1] @ self.data.body(name).xmat.reshape(3, 3).T
-        return motions
-
-    def distances(self) -> np.ndarray:
-        """Return (K,) metres from each object's origin to its goal, in three dimensions."""
-        return np.linalg.norm(
-            self.object_poses()[:, :3] - self.goal().object_poses[:, :3], axis=1)
+        known = object_names(self.task.num_objects)
+        if not names:
+            raise SceneError(f'objects: is empty; name those that move, of {listing(known)}')
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise SceneError(
+                f'objects: {listing(unknown)} not in the scene; it has {listing(known)}')
+        places = self.goal_poses[:, :2].copy()
+        moved = [known.index(name) for name in names]
+        places[moved] = self.camera.on_table(pixels, self.goal_poses[moved, 2])
+        self.set_goal(places)
 
     def outcome(self) -> str:
-        """
-        Return 'success' or 'failure'.
+        """Return 'success' or 'failure', see Task.succeeds."""
+        return 'success' if self.task.succeeds(self) else 'failure'
 
-        An object is in place within SUCCESS_DISTANCE of its goal; to be grasped is to be held by
-        the fingers, that high above the table; to be stacked is to stand on the one below, let go.
-        """
-        if self.task.lift:
-            high = self.object_poses()[:, 2] - HALF_HEIGHT > SUCCESS_DISTANCE
-            good = high.all() and self._touching()
-        elif self.task.kind == 'stack':
-            good = is_tower(self.object_poses()) and not self._touching()
-        else:
-            good = (self.distances() < SUCCESS_DISTANCE).all()
-        return 'success' if good else 'failure'
+    def _check_places(self, places: np.ndarray) -> None:
+        """Raise SceneError for a task without pushing, another shape, and places out of reach."""
+        task = self.task
+        if task.kind != 'push':
+            push = [name for name in task_names() if get_task(name).kind == 'push']
+            raise SceneError(f'the goal of task {task.name} cannot be moved; only those of tasks '
+                             f'that push: {listing(push)}')
+        if places.shape != (task.num_objects, 2):
+            raise SceneError(
+                f'places: expected shape ({task.num_objects}, 2), got {places.shape}')
+        limit = task.object_range
+        for name, place in zip(object_names(task.num_objects), places):
+            if not (np.abs(place) <= limit).all():  # not a number is no place either
+                raise SceneError(
+                    f'{name}: its goal would be at x {place[0]:.3f} m, y {place[1]:.3f} m, out '
+                    f'of reach; in {task.name} objects are pushed to |x| and |y| of at most '
+                    f'{limit:g} m')
 
-    def state(self) -> np.ndarray:
-        """Return the full physics state, as mujoco.rollout takes it."""
-        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        state = np.empty(mujoco.mj_stateSize(self.model, kind))
-        mujoco.mj_getState(self.model, self.data, state, kind)
-        return state
-
-    def close(self) -> None:
-        """Free the OpenGL contexts."""
-        for renderer in (self._renderer, self._observer):
-            if renderer is not None:
-                renderer.close()
-        self._renderer = self._observer = None
-
-    def _prepare_camera(self) -> None:
-        """Let the camera see the scene, as it looks with its seed."""
-        if self._renderer is None:
-            self._renderer = Studio(self._usual_camera, self.arm, self.look.arm)
-        self._worn = choose_appearance(self._appearance, self.scene.seed)
-        self._renderer.dress(self._worn)
-        self._renderer.use(self.model)
-        self.camera = self._usual_camera.moved(self._worn)
-
-    def _fingers(self) -> list[int]:
-        """Return the numbers of the fingers' geoms."""
-        return [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
-
-    def _touching(self) -> bool:
-        """Tell whether a finger touches anything."""
-        return bool(np.isin(self.data.contact.geom, self._fingers()).any())
-
-    def _after_last_push(self) -> np.ndarray:
-        """Return where the gripper touches the object that it has pushed to its goal last."""
-        starts, goals = self.scene.start_poses[:, :2], self.scene.goal_poses[:, :2]
-        k = self.scene.order[-1]
-        along = (goals[k] - starts[k]) / np.linalg.norm(goals[k] - starts[k])
-        state = self.state()
-        for behind in np.arange(0.04, 0.16, 0.005):
-            gripper = np.append(goals[k] - behind * along, 0.01)
-            self._place(_lift(self.scene.goal_poses), gripper)
-            if not self._touching():
-                break
-        mujoco.mj_setState(self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        return gripper
-
-    def _holding(self) -> np.ndarray:
-        """Return where the gripper holds the lifted object, and its opening."""
-        place, _, half_gap = grasp_place(self.scene.shapes[0], self.scene.start_poses[0, 2])
-        return np.array([
-            *self.scene.goal_poses[0, :2] + place, self.task.lift + GRASP_HEIGHT,
-            (half_gap - FINGER_GAP) / FINGER_TRAVEL])
-
-    def _leaving(self) -> np.ndarray:
-        """Return where the open gripper is above the object that it has just put down."""
-        place, _, _ = grasp_place(self.scene.shapes[0], self.scene.start_poses[0, 2])
-        return np.array([*self.scene.goal_poses[0, :2] + place, LEAVE_HEIGHT, 1])
-
-    def _releasing(self) -> np.ndarray:
-        """Return where the open gripper has just let go of the top of the tower."""
-        top = levels(self.task.num_objects)[-1]
-        return np.array([*self.scene.goal_poses[-1, :2], top + GRASP_HEIGHT, 1])
-
-    def _place(self, object_poses: np.ndarray, gripper: np.ndarray) -> None:
-        """Put objects at poses (K, 7) and the gripper at (3,), closed, or (4,), all at rest."""
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:3] = gripper[:3]
-        self.data.ctrl[:3] = gripper[:3]
-        if len(gripper) == 4:
-            self.data.qpos[3:5] = self.data.ctrl[3:5] = gripper[3] * FINGER_TRAVEL
-        objects = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
-        objects[:] = object_poses[:, [0, 1, 2, 6, 3, 4, 5]]
-        mujoco.mj_forward(self.model, self.data)
-
-
-def _lift(planar_poses: np.ndarray, height: float | np.ndarray = 0.0) -> np.ndarray:
-    """Turn (K, 3) x, y, yaw into (K, 7) poses at a height, or (K,), above the table in metres."""
-    poses = np.zeros((len(planar_poses), 7))
-    poses[:, :2] = planar_poses[:, :2]
-    poses[:, 2] = HALF_HEIGHT + height
-    poses[:, 5] = np.sin(planar_poses[:, 2] / 2)
-    poses[:, 6] = np.cos(planar_poses[:, 2] / 2)
-    return poses
+    def _check_apart(self) -> None:
+        """Raise SceneError, naming two objects, where objects reach into each other."""
+        names = object_names(self.task.num_objects)
+        bodies = {self.model.body(name).id: name for name in names}
+        for geoms, distance in zip(self.data.contact.geom, self.data.contact.dist):
+            pair = [bodies[body] for body in self.model.geom_bodyid[geoms].tolist()
+                    if body in bodies]
+            if distance < 0 and len(pair) == 2:
+                raise SceneError(
+                    f'{pair[0]} and {pair[1]} would overlap; put them farther apart')

@@ -21,11 +21,6 @@ LOW = 0.012  # at which the arm pushes
 CLEAR = 0.1  # above which no object is touched
 LIFTED = 0.13  # at which the arm travels
 
-# The longest recorded episode of each task in frames, one a control period; as in the authors'
-# data where they have such a task.
-EPISODE_FRAMES = {
-    'push2': 50, 'push3': 85, 'order2': 55, 'order3': 90, 'grasp': 15, 'pick_place': 20,
-    'stack2': 36, 'stack3': 60}
 SUCCESS_DISTANCE = 0.05  # m; an episode succeeds when every object ends nearer to its goal
 GOAL_TOLERANCE = 1.0  # px; the planner takes a goal or subgoal for reached within this distance
 

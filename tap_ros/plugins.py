@@ -28,6 +28,11 @@ BUILT_IN: dict[str, dict[str, str]] = {
         'tap': 'tap_ros.prediction.predictor:SubgoalPredictor'},
     'tap_ros.solvers': {'cem': 'tap_ros.planning.solvers.cem:cem',
                         'icem': 'tap_ros.planning.solvers.icem:icem'},
+    'tap_ros.tasks': {
+        'grasp': 'sim_bridge.tasks.grasp:GRASP', 'pick_place': 'sim_bridge.tasks.grasp:PICK_PLACE',
+        'push2': 'sim_bridge.tasks.push:PUSH2', 'push3': 'sim_bridge.tasks.push:PUSH3',
+        'order2': 'sim_bridge.tasks.order:ORDER2', 'order3': 'sim_bridge.tasks.order:ORDER3',
+        'stack2': 'sim_bridge.tasks.stack:STACK2', 'stack3': 'sim_bridge.tasks.stack:STACK3'},
     'tap_ros.worlds': {'metaworld': 'sim_bridge.gym_world:metaworld',
                        'mujoco_table': 'sim_bridge.simulator:Simulator'},
 }

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.tasks.tasks import task_names
 from tap_ros.engines.task import Engine
 from tap_ros.options import one_of
 
@@ -26,7 +26,7 @@ class Options:
     :param workers: processes; 0: one a core.
     """
 
-    task: Annotated[str, one_of(TASKS)] = 'push2'
+    task: Annotated[str, one_of(task_names())] = 'push2'
     episodes: int = 60
     workers: int = 0
 

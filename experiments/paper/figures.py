@@ -10,7 +10,7 @@ from experiments.paper.rows import lower_hull, select
 from experiments.paper.runs import OURS
 from matplotlib.figure import Figure
 import numpy as np
-from tap_ros.contract import EPISODE_FRAMES
+from sim_bridge.tasks.tasks import get_task
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
 COLOURS = {'copy': '#8c8c8c', 'fix': '#0072b2', 'min': '#e69f00', 'genmin': '#d55e00',
@@ -108,7 +108,7 @@ def forward_scatter(rows, task='grasp'):
             name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
     figure, axes = new_figure(3.9, len(panels))
     for axis, (title, points) in zip(axes[0], panels):
-        _scatter(axis, points, EPISODE_FRAMES[task])
+        _scatter(axis, points, get_task(task).num_frames)
         axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
         axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
     axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)

@@ -33,7 +33,7 @@ def _recording(task, small, full, **options):
     return Recording(task, {'small': small, 'full': full}, options)
 
 
-# When the first object comes home and the others are untouched, see sim_bridge.tasks.timing.
+# When the first object comes home and the others are untouched, see sim_bridge.tasks.push.
 TIMINGS = ('early', 'middle', 'late', 'mixed')
 TIMED = tuple(f'push2_{timing}' for timing in TIMINGS)
 # Scenes of push2 whose pictures differ from all that is trained on.

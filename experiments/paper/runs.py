@@ -11,7 +11,7 @@ from pathlib import Path
 import shlex
 
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED, TIMED
-from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.tasks.tasks import get_task
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.training_config import TrainingConfig
@@ -185,7 +185,7 @@ class PaperRun:
         :param runs: folder of all runs.
         :return: TrainingConfig.
         """
-        pushing = TASKS[RECORDINGS[self.task].task].kind == 'push'
+        pushing = get_task(RECORDINGS[self.task].task).kind == 'push'
         settings = {**SCALES[self.scale].settings, **_PAPER, **({} if pushing else _GRIPPING)}
         method = method_fields(self.method)
         if method['selection'] == 'progress':

@@ -13,8 +13,8 @@ from experiments.planning.episode import shown_mask, View
 from experiments.planning.reading import Move, PictureReader, read_moves
 import mujoco.rollout
 import numpy as np
-from sim_bridge.tasks.expert import run_episode as run_expert
-from sim_bridge.tasks.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
+from sim_bridge.tasks.stack import on_table, PickAndPlace, STACK_CONFIG
+from sim_bridge.tasks.tasks import run_episode as run_expert
 from tap_ros.contract import LIFTED, SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError
 

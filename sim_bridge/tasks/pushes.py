@@ -1,18 +1,24 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pushes as actions, and where they lead in the true simulator."""
+"""Pushes as actions, where they lead in the true simulator, and which order of them is best."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations
 
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.simulator import OBJECT_QPOS_START, ramp_controls, Simulator, SUBSTEPS
+from sim_bridge.world.table import OBJECT_QPOS_START, ramp_controls, SUBSTEPS, Table
 from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
 
 MAX_PUSH_STEPS = 24  # longest macro action, in control periods
 UPRIGHT = 0.9  # cosine, an object that is tilted more than this is about to topple
+# The search for an order: pushes of each object at each place in it; the first goes straight.
+SAMPLES = 10
+ANGLE_STD, OFFSET_STD, OVERSHOOT_STD = 0.25, 0.015, 0.02  # rad, m, m
+SPEED, TRAVEL_SPEED = 0.05, 0.08  # m per control period
+TILT_COST = 0.2  # m, of an object that topples
 
 
 @dataclass(frozen=True)
@@ -28,16 +34,16 @@ class Push:
 
 @dataclass(frozen=True)
 class Moment:
-    """The state of a simulator, from which pushes are rolled out."""
+    """The state of a table, from which pushes are rolled out."""
 
-    state: np.ndarray  # as Simulator.state
-    target: np.ndarray  # (4,) as Simulator.target
+    state: np.ndarray  # as Table.state
+    target: np.ndarray  # (4,) as Table.target
     places: np.ndarray  # (K, 3) m, of the objects
 
     @classmethod
-    def of(cls, simulator: Simulator) -> 'Moment':
-        """Return the present moment of a simulator."""
-        return cls(simulator.state(), simulator.target, simulator.object_poses()[:, :3])
+    def of(cls, table: Table) -> 'Moment':
+        """Return the present moment of a table."""
+        return cls(table.state(), table.target, table.object_poses()[:, :3])
 
 
 def push_actions(push: Push, hand: np.ndarray, place: np.ndarray, goal: np.ndarray,
@@ -75,15 +81,15 @@ def push_actions(push: Push, hand: np.ndarray, place: np.ndarray, goal: np.ndarr
 
 class PushRollouts:
     """
-    Rolls out pushes from any moment of a scene in its true physics; the simulator stays.
+    Rolls out pushes from any moment of a scene in its true physics; the table stays.
 
-    :param simulator: Simulator, already reset.
+    :param table: Table, already reset.
     :param rollout: mujoco.rollout.Rollout.
     """
 
-    def __init__(self, simulator: Simulator, rollout: mujoco.rollout.Rollout) -> None:
-        self._model, self._rollout = simulator.model, rollout
-        self._scratch = mujoco.MjData(simulator.model)  # rollouts overwrite it
+    def __init__(self, table: Table, rollout: mujoco.rollout.Rollout) -> None:
+        self._model, self._rollout, self._arm = table.model, rollout, table.arm
+        self._scratch = mujoco.MjData(table.model)  # rollouts overwrite it
 
     def __call__(self, moment: Moment,
                  plans: Sequence[np.ndarray]) -> tuple[list[Moment], np.ndarray]:
@@ -97,7 +103,7 @@ class PushRollouts:
         actions = np.zeros((len(plans), lengths.max(), 4))
         for plan, padded in zip(plans, actions):
             padded[:len(plan)] = plan
-        controls, targets = ramp_controls(moment.target, actions)
+        controls, targets = ramp_controls(moment.target, actions, self._arm.low, self._arm.high)
         states, _ = self._rollout.rollout(
             self._model, self._scratch, np.tile(moment.state, (len(plans), 1)), controls)
         numbers = np.arange(len(plans))
@@ -106,3 +112,44 @@ class PushRollouts:
         upright = 1 - 2 * (objects[..., 4] ** 2 + objects[..., 5] ** 2) >= UPRIGHT
         return [Moment(*moment) for moment in zip(
             last, targets[numbers, lengths - 1], objects[..., :3])], upright
+
+
+def find_order(rollouts: PushRollouts, moment: Moment, goals: np.ndarray, todo: Sequence[int],
+               rng: np.random.Generator) -> tuple[int, ...]:
+    """
+    Try all orders of pushing objects, one push for each, and return the best.
+
+    :param moment: from which it is pushed.
+    :param goals: (K, 3) m, of all objects.
+    :param todo: the objects to be pushed.
+    :param rng: numpy Generator.
+    :return: todo in the order after which all objects lie nearest to their goals.
+    """
+    after: dict[tuple[int, ...], tuple[Moment, float]] = {(): (moment, 0.0)}
+    orders = list(permutations(int(k) for k in todo))
+    for order in orders:
+        for n in range(1, len(order) + 1):
+            if order[:n] not in after:
+                before, _ = after[order[:n - 1]]
+                after[order[:n]] = best_push(rollouts, before, goals, order[n - 1], rng)
+    return min(orders, key=lambda order: after[order][1])
+
+
+def best_push(rollouts: PushRollouts, moment: Moment, goals: np.ndarray, k: int,
+              rng: np.random.Generator) -> tuple[Moment, float]:
+    """
+    Sample pushes of object k and take the one after which least is missing.
+
+    :return: the moment after it, and what then is missing: m, summed over all objects.
+    """
+    gap = goals[k, :2] - moment.places[k, :2]
+    spread = rng.normal(size=(SAMPLES, 3)) * (ANGLE_STD, OFFSET_STD, OVERSHOOT_STD)
+    spread[0] = 0
+    moments, upright = rollouts(moment, [
+        push_actions(Push(np.arctan2(gap[1], gap[0]) + angle, offset, overshoot, SPEED,
+                          TRAVEL_SPEED), moment.target, moment.places[k, :2], goals[k, :2])
+        for angle, offset, overshoot in spread])
+    missing = np.linalg.norm(np.array([m.places for m in moments]) - goals, axis=-1)  # (N, K)
+    missing = missing + TILT_COST * ~upright
+    best = int(missing.sum(1).argmin())
+    return moments[best], float(missing[best].sum())

@@ -1,95 +1,119 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The tasks: how many objects, how many frames, and where starts and goals may lie.
+What a task is: how its scenes are drawn, its goal, and its expert.
 
-The rules are those of the paper's authors (their cartgripper environment): object origins within
-0.35 m of the middle, starts at least 0.35 m apart (0.3 m with three objects), every goal exactly
-0.2 m from its start and at least 0.2 m from the other goals, yaw changed by at most 0.2 rad.
-Doing nothing therefore ends 20 cm from the goals. Where the order matters, objects stand on the
-goals of others, see order_tasks.py.
-
-The tasks with a grasp have one object of a shape that the gripper can hold. To grasp is to lift it
-from where it stands; to pick and place is to carry it to a place within 0.2 m of the middle, with
-the arm starting about 0.3 m from the object. To stack is to build a tower of blocks on the first
-one, see stack_tasks.py.
+push.py, order.py, grasp.py and stack.py have a family each. Another package adds a task by the
+entry points 'tap_ros.tasks'; their names stand for Task objects.
 """
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+import time
+from typing import Any, ClassVar, NamedTuple
 
+import mujoco.rollout
 import numpy as np
-from sim_bridge.tasks.order_tasks import draw_chain, draw_shapes, EDGE_RANGE, ORDER_SEPARATION
-from sim_bridge.tasks.stack_tasks import BLOCK_SEPARATION, draw_block, draw_blocks
-from sim_bridge.world.grasping import grasp_place, graspable_shape, graspable_yaw
-from sim_bridge.world.places import (
-    apart,
-    GOAL_DISTANCE,
-    GOAL_YAW_RANGE,
-    gripper_beside_one,
-    GRIPPER_HEIGHT,
-    nearest_first,
-    OBJECT_RANGE,
-)
-from sim_bridge.world.scene import ObjectShape, random_shape
-from tap_ros.contract import EPISODE_FRAMES, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.errors import SceneError
+from sim_bridge.world.scene import ObjectShape
+from sim_bridge.world.table import Table
+from sim_bridge.world_protocol import Observation
+from tap_ros.contract import SUCCESS_DISTANCE, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.errors import ConfigError, SceneError
+from tap_ros.plugins import load_plugin, names
 
-GOAL_SEPARATION = 0.2  # m between goals
-GRASP_RANGE = 0.2  # m, |x| and |y| of the start of an object to be grasped
-GRASP_REACH_RANGE = 0.3  # m, |x| and |y| of the gripper's start before a grasp, all in view
-PLACE_RANGE = 0.2  # m, |x| and |y| of the place where a picked object goes
-PLACE_DISTANCE = (0.12, 0.36)  # m, from the start of an object to its place
-LIFT_HEIGHT = 0.11  # m, of the goal of a grasp
 Place = tuple[float, float, float]
+TIMINGS = ('natural', 'early', 'middle', 'late', 'mixed')  # of bottlenecks, see push.py
+
+
+class Drawn(NamedTuple):
+    """What follows from the seed of a scene of K objects; planar poses are x, y (m), yaw (rad)."""
+
+    shapes: tuple[ObjectShape, ...]
+    start_poses: np.ndarray  # (K, 3)
+    goal_poses: np.ndarray  # (K, 3)
+    gripper_start: np.ndarray  # (3,) m
+    order: tuple[int, ...]  # objects, as they should be moved; the last one is moved last
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """
+    How an expert is to act.
+
+    :param config: of the expert; None: Task.default_config.
+    :param rollout: mujoco.rollout.Rollout to share between episodes.
+    :param num_frames: of the longest episode; 0: the task's.
+    :param timing: one of TIMINGS, when the first of several pushed objects is home.
+    :param misses: share of the pushes that are at random, so that objects are missed, too.
+    """
+
+    config: Any
+    rollout: mujoco.rollout.Rollout
+    num_frames: int = 0
+    timing: str = 'natural'
+    misses: float = 0.0
+
+
+# Observations, (T, 4) float32 actions (the last row is zero), outcome, and seconds spent in the
+# search and in stepping and rendering.
+EpisodeRun = tuple[list[Observation], np.ndarray, str, dict[str, float]]
 
 
 @dataclass(frozen=True)
 class Task:
-    """A kind of episode."""
+    """
+    A kind of episode.
+
+    :param name: by which it is asked for.
+    :param num_objects: K.
+    :param num_frames: of the longest episode, one a control period.
+    :param stream: of random numbers, besides the seed; no two tasks have the same.
+    :cvar kind: 'push', 'grasp', 'pick_place', 'stack' or another family.
+    :cvar gripping: whether the gripper has to hold the object.
+    :cvar ordered: whether the wrong order of pushes makes it hard.
+    :cvar photographed: the goal of a recorded episode is a picture of where its objects ended,
+        with the arm elsewhere; else its last frame.
+    """
 
     name: str
     num_objects: int
-    start_separation: float  # m between object origins at the start
-    kind: str = 'push'  # or 'grasp', 'pick_place', 'stack'
-    reach: tuple[float, float] = (0.0, 0.0)  # m, nearest and farthest start, for grasps
-    lift: float = 0.0  # m, height of the goal above the table
-    ordered: bool = False  # the wrong order of pushes makes it hard
-    stream: int = 0  # of random numbers, besides the seed; no two tasks have the same
+    num_frames: int
+    stream: int
+    kind: ClassVar[str] = ''
+    gripping: ClassVar[bool] = False
+    ordered: ClassVar[bool] = False
+    photographed: ClassVar[bool] = True
+
+    def draw(self, rng: np.random.Generator, spread: float) -> Drawn:
+        """Draw a scene; spread is a factor of the ranges in which things to be gripped lie."""
+        raise NotImplementedError
 
     @property
-    def num_frames(self) -> int:
-        """Number of frames of the longest episode."""
-        return EPISODE_FRAMES[self.name]
+    def goal_heights(self) -> float | np.ndarray:
+        """Return how high above the table the goals are, m, or (K,) of each object."""
+        return 0.0
 
-    @property
-    def gripping(self) -> bool:
-        """Whether the gripper has to hold the object."""
-        return self.kind != 'push'
+    def goal_gripper(self, table: Table, scene: 'Scene') -> np.ndarray | None:
+        """
+        Return where the arm is seen in the goal picture: (3,) m, or (4,) with its opening.
 
-    @property
-    def object_range(self) -> float:
-        """Return the largest |x| and |y| in m of objects that are pushed, at start and goal."""
-        return EDGE_RANGE[1] if self.ordered else OBJECT_RANGE
+        :param table: with the objects at their start; it may be moved and is put back.
+        :return: None: somewhere beside the objects.
+        """
+        return None
 
+    def succeeds(self, table: Table) -> bool:
+        """Tell whether every object is within SUCCESS_DISTANCE of its goal."""
+        return bool((table.distances() < SUCCESS_DISTANCE).all())
 
-TASKS = {
-    'push2': Task('push2', num_objects=2, start_separation=0.35, stream=2),
-    'push3': Task('push3', num_objects=3, start_separation=0.3, stream=3),
-    'order2': Task(
-        'order2', num_objects=2, start_separation=ORDER_SEPARATION, ordered=True, stream=6),
-    'order3': Task(
-        'order3', num_objects=3, start_separation=ORDER_SEPARATION, ordered=True, stream=7),
-    'grasp': Task(
-        'grasp', num_objects=1, start_separation=0.0, kind='grasp',
-        reach=(0.13, 0.32), lift=LIFT_HEIGHT, stream=4),
-    'pick_place': Task(
-        'pick_place', num_objects=1, start_separation=0.0, kind='pick_place',
-        reach=(0.27, 0.33), stream=5),
-    'stack2': Task(
-        'stack2', num_objects=2, start_separation=BLOCK_SEPARATION, kind='stack', stream=8),
-    'stack3': Task(
-        'stack3', num_objects=3, start_separation=BLOCK_SEPARATION, kind='stack', stream=9),
-}
+    def default_config(self, timing: str = 'natural') -> Any:
+        """Return what the expert does unless it is told otherwise, a dataclass."""
+        return None
+
+    def demonstrate(self, table: Table, scene: 'Scene', first: Observation,
+                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+        """Let the expert act from the start of a scene, of which `first` is seen."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -102,7 +126,12 @@ class Scene:
     start_poses: np.ndarray  # (K, 3)
     goal_poses: np.ndarray  # (K, 3)
     gripper_start: np.ndarray  # (3,) m
-    order: tuple[int, ...]  # objects, as they should be moved; the last one is moved last
+    order: tuple[int, ...]
+
+
+def task_names() -> list[str]:
+    """Return the names of all tasks."""
+    return names('tap_ros.tasks')
 
 
 def get_task(name: str) -> Task:
@@ -111,9 +140,10 @@ def get_task(name: str) -> Task:
 
     :raises SceneError: for an unknown name.
     """
-    if name not in TASKS:
-        raise SceneError(f'task {name!r} is unknown; valid tasks: {", ".join(TASKS)}')
-    return TASKS[name]
+    try:
+        return load_plugin('tap_ros.tasks', name)
+    except ConfigError as error:
+        raise SceneError(str(error)) from error
 
 
 def sample_scene(task: Task, seed: int, spread: float = 1.0, low: Place = WORKSPACE_LOW,
@@ -134,7 +164,7 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0, low: Place = WORKSP
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.stream])
     while True:
-        scene = _draw(task, seed, rng, spread)
+        scene = Scene(task, int(seed), *task.draw(rng, spread))
         starts, goals = scene.start_poses[:, :2], scene.goal_poses[:, :2]
         needed = np.concatenate(
             [starts, starts - (goals - starts) / 2, goals, scene.gripper_start[None, :2]])
@@ -142,92 +172,54 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0, low: Place = WORKSP
             return scene
 
 
-def _draw(task: Task, seed: int, rng: np.random.Generator, spread: float) -> Scene:
-    """Draw a scene wherever its objects are."""
-    if task.kind == 'stack':
-        return _sample_stack(task, seed, rng, spread)
-    if task.gripping:
-        return _sample_grasp(task, seed, rng, spread)
-    if task.ordered:
-        return _sample_ordered(task, seed, rng)
-    shapes = tuple(random_shape(rng) for _ in range(task.num_objects))
-    # Separated starts may leave no room for separated goals: then both are drawn anew.
-    goals = None
-    while goals is None:
-        starts = _draw_starts(rng, task)
-        goals = _draw_goals(rng, starts)
-    start_poses, goal_poses = _with_yaws(rng, starts, goals)
-    hand = gripper_beside_one(rng, starts)
-    return Scene(
-        task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
-        gripper_start=hand, order=tuple(nearest_first(hand[:2], starts, goals)))
+def run_episode(
+        simulator: Any, seed: int, config: Any = None,
+        rollout: mujoco.rollout.Rollout | None = None, num_frames: int = 0,
+        timing: str = 'natural', misses: float = 0.0) -> EpisodeRun:
+    """
+    Run one episode of a task's expert.
+
+    :param simulator: Simulator; reset here.
+    :param seed: of the scene and of the expert.
+    :param config: and the others: see Demonstration.
+    :return: EpisodeRun.
+    """
+    task, first = simulator.task, simulator.reset(seed)
+    how = Demonstration(config or task.default_config(timing),
+                        rollout or mujoco.rollout.Rollout(nthread=0), num_frames, timing, misses)
+    rng = np.random.default_rng([seed, task.stream, 1])
+    return task.demonstrate(simulator, simulator.scene, first, rng, how)
 
 
-def _sample_ordered(task: Task, seed: int, rng: np.random.Generator) -> Scene:
-    """Draw a scene in which the order of pushes matters."""
-    shapes = draw_shapes(rng, task.num_objects)
-    starts, goals, hand = draw_chain(rng, task.num_objects)
-    # So that a name, or a place in a list, does not tell the order.
-    names = rng.permutation(task.num_objects)
-    starts[names], goals[names] = starts.copy(), goals.copy()
-    start_poses, goal_poses = _with_yaws(rng, starts, goals)
-    return Scene(
-        task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
-        gripper_start=hand, order=tuple(int(k) for k in names[::-1]))
+def carry_out(table: Table, succeeds: Callable[[Table], bool], first: Observation,
+              plans: Iterable[np.ndarray], num_frames: int) -> EpisodeRun:
+    """
+    Carry out plans until there are no more, or so many frames.
+
+    :param succeeds: as Task.succeeds.
+    :param first: Observation at the start.
+    :param plans: of (n, 4) actions; each is asked for when those before are carried out.
+    :param num_frames: T at most.
+    :return: EpisodeRun.
+    """
+    observations, actions = [first], []
+    seconds = {'search': 0.0, 'step': 0.0}
+    begin = time.perf_counter()
+    for plan in plans:
+        planned = time.perf_counter()
+        seconds['search'] += planned - begin
+        for action in plan[:num_frames - len(observations)]:
+            observations.append(table.step(action))
+            actions.append(action)
+        begin = time.perf_counter()
+        seconds['step'] += begin - planned
+        if len(observations) == num_frames:
+            break
+    done = np.array([*actions, np.zeros(4)], np.float32)
+    return observations, done, 'success' if succeeds(table) else 'failure', seconds
 
 
-def _with_yaws(rng: np.random.Generator, starts: np.ndarray,
-               goals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Draw any yaw at the start, and one near it at the goal; (K, 3) each."""
-    yaws = rng.uniform(0, 2 * np.pi, len(starts))
-    goal_yaws = yaws + rng.uniform(-GOAL_YAW_RANGE, GOAL_YAW_RANGE, len(starts))
-    return np.column_stack([starts, yaws]), np.column_stack([goals, goal_yaws])
-
-
-def _sample_stack(task: Task, seed: int, rng: np.random.Generator, spread: float) -> Scene:
-    """Draw blocks to be stacked; all but the first one are moved."""
-    shapes = tuple(draw_block(rng) for _ in range(task.num_objects))
-    start_poses, goal_poses, hand = draw_blocks(rng, task.num_objects, spread)
-    return Scene(
-        task=task, seed=int(seed), shapes=shapes, start_poses=start_poses, goal_poses=goal_poses,
-        gripper_start=hand, order=tuple(range(1, task.num_objects)))
-
-
-def _sample_grasp(task: Task, seed: int, rng: np.random.Generator, spread: float) -> Scene:
-    """Draw a scene with one object that can be held; its goal is lifted, or elsewhere."""
-    shape = graspable_shape(rng)
-    yaw = graspable_yaw(shape, rng)
-    start = spread * rng.uniform(-GRASP_RANGE, GRASP_RANGE, 2)
-    goal = start
-    if task.kind == 'pick_place':
-        nearest, farthest = PLACE_DISTANCE[0] * spread, PLACE_DISTANCE[1] * spread
-        while not nearest <= np.linalg.norm(goal - start) <= farthest:
-            goal = spread * rng.uniform(-PLACE_RANGE, PLACE_RANGE, 2)
-    gripper = np.full(2, np.inf)
-    while (np.abs(gripper) > spread * GRASP_REACH_RANGE).any():
-        angle = rng.uniform(0, 2 * np.pi)
-        reach = spread * rng.uniform(*task.reach)
-        gripper = start + reach * np.array([np.cos(angle), np.sin(angle)])
-    return Scene(
-        task=task, seed=int(seed), shapes=(shape,), start_poses=np.array([[*start, yaw]]),
-        goal_poses=np.array([[*goal, grasp_place(shape, yaw)[1]]]),
-        gripper_start=np.append(gripper, rng.uniform(0, GRIPPER_HEIGHT)), order=(0,))
-
-
-def _draw_starts(rng: np.random.Generator, task: Task) -> np.ndarray:
-    """Draw object origins (K, 2) that are far enough apart."""
-    while True:
-        starts = rng.uniform(-OBJECT_RANGE, OBJECT_RANGE, (task.num_objects, 2))
-        if apart(starts, task.start_separation):
-            return starts
-
-
-def _draw_goals(rng: np.random.Generator, starts: np.ndarray,
-                attempts: int = 1000) -> np.ndarray | None:
-    """Draw a goal at the fixed distance from each start; None when there seems to be no room."""
-    for _ in range(attempts):
-        angles = rng.uniform(0, 2 * np.pi, len(starts))
-        goals = starts + GOAL_DISTANCE * np.column_stack([np.cos(angles), np.sin(angles)])
-        if (np.abs(goals) <= OBJECT_RANGE).all() and apart(goals, GOAL_SEPARATION):
-            return goals
-    return None
+def apart(positions: np.ndarray, separation: float) -> bool:
+    """Tell whether all pairs of positions (K, 2) are at least so far apart."""
+    gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
+    return (gaps[np.triu_indices(len(positions), 1)] >= separation).all()

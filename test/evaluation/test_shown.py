@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sim_bridge.collect import make_episode
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.expert import run_episode
+from sim_bridge.tasks.tasks import run_episode
 from tap_ros.evaluation.shown import ShownScorer
 from tap_ros.training.robot_mask import fill_in_time
 

@@ -17,7 +17,7 @@ from experiments.paper.runs import (
     SINGLE,
 )
 import pytest
-from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.tasks.tasks import get_task
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.methods import method_fields, todays_settings
 from tap_ros.prediction.training_config import DEFAULTS
@@ -125,7 +125,7 @@ def test_rows_of_a_task_and_mode_differ_in_the_method_and_network_only():
             values['steps'] /= LONG.get(run.variant, 1)
             first = settings.setdefault((run.task, run.mode), values)
             changed = {name for name in values if values[name] != first[name]}
-            gripping = TASKS[RECORDINGS[run.task].task].gripping  # these have no such changes
+            gripping = get_task(RECORDINGS[run.task].task).gripping  # these have none
             assert changed == set(others.get(run.variant, ())) - set(gripping * colours)
 
 

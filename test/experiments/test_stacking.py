@@ -10,7 +10,7 @@ from experiments.planning.stacking import stack, what_is_below
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.stack_tasks import is_tower
+from sim_bridge.tasks.stack import is_tower
 from sim_bridge.world.scene import HALF_HEIGHT
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.expert import run_episode
-from tap_ros.contract import EPISODE_FRAMES
+from sim_bridge.tasks.tasks import get_task, run_episode
 from tap_ros.engines.task import Engine
 from tap_ros.errors import ConfigError, StorageError
 from tap_ros.files import only_writer
@@ -41,10 +40,10 @@ def test_the_expert_pushes_objects_to_their_goals(episodes):
 
 def test_no_episode_ends_idle_or_is_too_long(episodes):
     for observations, actions, _, _ in episodes:
-        assert len(actions) == len(observations) <= EPISODE_FRAMES['push2']
+        assert len(actions) == len(observations) <= get_task('push2').num_frames
         positions = np.array([o.object_poses[:, :3] for o in observations])
         assert np.abs(actions[0, :3]).max() > 0.005, 'the arm moves at once'
-        if len(observations) < EPISODE_FRAMES['push2']:
+        if len(observations) < get_task('push2').num_frames:
             last = np.linalg.norm(positions[-1] - positions[-2], axis=-1).max()
             assert last > 1e-5, 'an object still moves at the end'
 

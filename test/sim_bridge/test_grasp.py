@@ -7,10 +7,8 @@ import pytest
 from sim_bridge.collect import collect, CollectConfig, make_episode
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks import grasp_expert
-from sim_bridge.tasks.expert import run_episode
-from sim_bridge.tasks.grasp_expert import GraspConfig
-from sim_bridge.tasks.tasks import LIFT_HEIGHT
-from sim_bridge.world.grasping import grasp_place, graspable_shape, graspable_yaw
+from sim_bridge.tasks.grasp import grasp_place, graspable_shape, graspable_yaw, GraspConfig
+from sim_bridge.tasks.tasks import LIFT_HEIGHT, run_episode
 from tap_ros.errors import ConfigError
 
 NUM_FRAMES = {'grasp': 15, 'pick_place': 20}

@@ -8,15 +8,15 @@ import mujoco.rollout
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.expert import run_episode
-from sim_bridge.tasks.order_tasks import EDGE_RANGE, NEAR, ORDER_SEPARATION
-from sim_bridge.tasks.push_order import best_push, find_order
-from sim_bridge.tasks.pushes import Moment, PushRollouts
-from sim_bridge.tasks.tasks import sample_scene, TASKS
-from sim_bridge.world.places import GOAL_DISTANCE, GRIPPER_MARGIN, GRIPPER_RANGE, nearest_first
+from sim_bridge.tasks.order import EDGE_RANGE, NEAR, ORDER_SEPARATION
+from sim_bridge.tasks.push import GOAL_DISTANCE, nearest_first
+from sim_bridge.tasks.pushes import best_push, find_order, Moment, PushRollouts
+from sim_bridge.tasks.tasks import get_task, run_episode, sample_scene, task_names
+from sim_bridge.world.table import GRIPPER_MARGIN, GRIPPER_RANGE
 from tap_ros.contract import SUCCESS_DISTANCE
 
-ORDERED = [task for task in TASKS.values() if task.ordered]
+TASKS = [get_task(name) for name in task_names()]
+ORDERED = [task for task in TASKS if task.ordered]
 SEEDS = range(6)
 
 
@@ -54,7 +54,7 @@ def test_each_object_stands_on_the_goal_of_the_one_after_it(task):
     assert len(orders) >= 2, 'the number of an object does not tell its turn'
 
 
-@pytest.mark.parametrize('task', [t for t in TASKS.values() if t.kind == 'push' and not t.ordered],
+@pytest.mark.parametrize('task', [t for t in TASKS if t.kind == 'push' and not t.ordered],
                          ids=lambda task: task.name)
 def test_where_the_order_is_free_the_nearest_comes_first(task):
     for seed in range(5):

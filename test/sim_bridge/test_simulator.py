@@ -4,9 +4,10 @@
 
 import numpy as np
 import pytest
-from sim_bridge.simulator import ramp_controls, Simulator, SUBSTEPS
+from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import sample_scene
 from sim_bridge.world.scene import FINGER_TRAVEL
+from sim_bridge.world.table import ramp_controls, SUBSTEPS
 from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 from tap_ros.planning.mpc_inputs import GRIPPER_HIGH, GRIPPER_LOW

@@ -7,19 +7,20 @@ import numpy as np
 import pytest
 from sim_bridge.collect import make_episode
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.expert import run_episode
-from sim_bridge.tasks.pick_and_place import on_table, PickAndPlace, STACK_CONFIG
-from sim_bridge.tasks.stack_tasks import (
+from sim_bridge.tasks.stack import (
     BLOCK_RANGE,
     BLOCK_SEPARATION,
     HAND_MARGIN,
     is_tower,
     levels,
+    on_table,
+    PickAndPlace,
+    STACK_CONFIG,
 )
-from sim_bridge.tasks.tasks import sample_scene, TASKS
+from sim_bridge.tasks.tasks import get_task, run_episode, sample_scene, task_names
 from sim_bridge.world.scene import HALF_HEIGHT
 
-STACKING = [task for task in TASKS.values() if task.kind == 'stack']
+STACKING = [task for task in map(get_task, task_names()) if task.kind == 'stack']
 SEEDS = range(8)
 
 

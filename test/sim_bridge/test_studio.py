@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.expert import run_episode
+from sim_bridge.tasks.tasks import run_episode
 from sim_bridge.world.appearance import Appearance, choose_appearance, USUAL
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.looks import LOOKS, OBSERVER

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig, make_episode
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.expert import run_episode
-from sim_bridge.tasks.timing import draw_share, SHARES, TIMINGS
+from sim_bridge.tasks.push import draw_share, SHARES
+from sim_bridge.tasks.tasks import run_episode, TIMINGS
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.bottleneck import bottleneck_share
 from tap_ros.recording.reader import iter_episodes

@@ -24,8 +24,7 @@ from typing import Annotated, Any, TYPE_CHECKING
 import numpy as np
 from sensor_msgs.msg import Image
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.expert import run_episode
-from sim_bridge.tasks.tasks import get_task, TASKS
+from sim_bridge.tasks.tasks import get_task, run_episode, task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import step_budget
@@ -194,7 +193,7 @@ class Options:
 
     scenes: int = 2
     seed: int = FIRST_SCENE
-    tasks: tuple[Annotated[str, one_of(TASKS)], ...] = ()
+    tasks: tuple[Annotated[str, one_of(task_names())], ...] = ()
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     step_budget: Annotated[int, conf.arg(
         help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0

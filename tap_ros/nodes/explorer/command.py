@@ -8,7 +8,7 @@ import re
 import time
 from typing import Annotated
 
-from sim_bridge.tasks.tasks import TASKS
+from sim_bridge.tasks.tasks import task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.nodes.demo.command import new_folder
@@ -35,7 +35,7 @@ class Options:
     :param logs: folder for the nodes' logs; a number is added when it exists.
     """
 
-    task: Annotated[str, one_of(TASKS)] = 'push2'
+    task: Annotated[str, one_of(task_names())] = 'push2'
     seed: int = 1_000_000
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     host: str = '127.0.0.1'

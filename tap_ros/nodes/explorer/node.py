@@ -19,7 +19,6 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.contract import EPISODE_FRAMES
 from tap_ros.errors import TapError
 from tap_ros.images.drawing import grid, overlay, png_bytes
 from tap_ros.messages.images import decode_image
@@ -37,6 +36,7 @@ from tap_ros.nodes.parameters import camera_topic, declare_transport, Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
 from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.plugins import names
 from tap_ros.text import escaped
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
@@ -242,7 +242,7 @@ class ExplorerNode(Node):
         now = time.monotonic()
         ages = {kind: now - came for kind, (_, came) in newest.items()}
         self._board.put('state', json.dumps({
-            'kind': 'state', 'task': self._task, 'tasks': list(EPISODE_FRAMES),
+            'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
             'simulator': self._calls.offered('reset'),
             'movable': self._calls.offered('set_goal') and bool(goals) and not running,
             'camera': {**self._size('camera'), 'objects': _listed(objects),

@@ -1,25 +1,26 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Draw scenes in which the order of the pushes matters: each object stands on the next one's goal.
+Pushing where the order matters: each object stands on the next one's goal.
 
 The objects are a chain. The last one of it stands near an edge of the workspace and goes along the
 edge; the one before goes outwards, to where the last one stood, and with three objects the first
 goes to where the second stood. The gripper begins beside the first, away from the others. Whoever
 begins with that one pushes what stands on its goal outwards, where the gripper cannot get behind
 it any more.
+
+Before each push the expert tries all orders in the simulator, see pushes.find_order.
 """
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
-from sim_bridge.world.places import (
-    apart,
-    GOAL_DISTANCE,
-    GRIPPER_HEIGHT,
-    GRIPPER_MARGIN,
-    GRIPPER_RANGE,
-    OBJECT_RANGE,
-)
+from sim_bridge.tasks.push import Expert, GOAL_DISTANCE, OBJECT_RANGE, PushTask, with_yaws
+from sim_bridge.tasks.pushes import find_order, Moment
+from sim_bridge.tasks.tasks import apart, Drawn
 from sim_bridge.world.scene import ObjectShape, random_shape
+from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE
 from tap_ros.contract import WORKSPACE_HIGH
 
 EDGE_RANGE = (0.35, 0.38)  # m from the middle, where the object at the edge stands
@@ -30,6 +31,33 @@ ORDER_SEPARATION = 0.17  # m between object origins at the start, and between go
 FREE_WAY = 0.13  # m, least from a way to the objects that stand beside it, in the right order
 BEHIND = 0.13  # m, where a push begins
 HAND_DISTANCE = (GRIPPER_MARGIN, 0.24)  # m from the first object of the chain to the gripper
+
+
+@dataclass(frozen=True)
+class OrderTask(PushTask):
+    """Push every object to its goal, in the right order."""
+
+    start_separation: float = ORDER_SEPARATION
+    ordered: ClassVar[bool] = True
+    object_range: ClassVar[float] = EDGE_RANGE[1]
+
+    def draw(self, rng: np.random.Generator, spread: float) -> Drawn:
+        """Draw a scene in which the order of pushes matters."""
+        shapes = draw_shapes(rng, self.num_objects)
+        starts, goals, hand = draw_chain(rng, self.num_objects)
+        # So that a name, or a place in a list, does not tell the order.
+        names = rng.permutation(self.num_objects)
+        starts[names], goals[names] = starts.copy(), goals.copy()
+        start_poses, goal_poses = with_yaws(rng, starts, goals)
+        return Drawn(shapes, start_poses, goal_poses, hand, tuple(int(k) for k in names[::-1]))
+
+    def next_object(self, expert: Expert, todo: list[int], now: Moment) -> int:
+        """Choose the first object in the best order."""
+        return find_order(expert.rollouts, now, expert.goals, todo, expert.rng)[0]
+
+
+ORDER2 = OrderTask('order2', num_objects=2, num_frames=55, stream=6)
+ORDER3 = OrderTask('order3', num_objects=3, num_frames=90, stream=7)
 
 
 def draw_shapes(rng: np.random.Generator, count: int) -> tuple[ObjectShape, ...]:

@@ -1,0 +1,218 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Stacking blocks: a tower on the first one, and the expert that builds it.
+
+The expert grasps one block after another, as grasp.py's does, and puts it on the one below. The
+episode ends when the last block is let go: frames after that would show the goal already.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
+
+import mujoco
+import mujoco.rollout
+import numpy as np
+from sim_bridge.tasks.grasp import GRASP_HEIGHT, GRASP_YAW, GraspConfig, GraspExpert, straight
+from sim_bridge.tasks.tasks import (
+    apart,
+    carry_out,
+    Demonstration,
+    Drawn,
+    EpisodeRun,
+    Scene,
+    Task,
+)
+from sim_bridge.world.scene import HALF_HEIGHT, ObjectShape
+from sim_bridge.world.table import GRIPPER_HEIGHT, Table
+from sim_bridge.world_protocol import Observation
+from tap_ros.contract import CLEAR
+
+BLOCK_HALF_WIDTH = (0.026, 0.032)  # m
+BLOCK_RANGE = 0.2  # m, |x| and |y| of the blocks
+BLOCK_SEPARATION = 0.14  # m between blocks: the open fingers come down between them
+HAND_RANGE = 0.3  # m, |x| and |y| of the gripper's start, all in view
+HAND_MARGIN = 0.12  # m between the gripper and any block at the start
+STACK_OFFSET = 0.025  # m, most between the origins of a block and the one below, seen from above
+LEVEL_TOLERANCE = 0.01  # m, of the height of a block above the one below
+SETTLE_STEPS = 2  # control periods after the last frame, then it counts whether the tower stands
+# High enough to carry a block over a tower of two, and no place at random: towers are to stand.
+STACK_CONFIG = GraspConfig(
+    explore=0.0, hover=(0.14, 0.148), low=(0.01, 0.014), lift=(0.132, 0.135),
+    travel_speed=(0.045, 0.075))
+HELD = 0.09  # m, an object whose origin is lower was missed
+GAP = 0.003  # m, from an object that is let go to what is below it
+TRIES = 2  # grasps of an object
+
+
+@dataclass(frozen=True)
+class StackTask(Task):
+    """Build a tower of all blocks."""
+
+    kind: ClassVar[str] = 'stack'
+    gripping: ClassVar[bool] = True
+
+    def draw(self, rng: np.random.Generator, spread: float) -> Drawn:
+        """Draw blocks to be stacked; all but the first one are moved."""
+        shapes = tuple(draw_block(rng) for _ in range(self.num_objects))
+        starts, goals, hand = draw_blocks(rng, self.num_objects, spread)
+        return Drawn(shapes, starts, goals, hand, tuple(range(1, self.num_objects)))
+
+    @property
+    def goal_heights(self) -> np.ndarray:
+        """Return how high above the table the blocks of a tower stand, (K,) m."""
+        return levels(self.num_objects)
+
+    def goal_gripper(self, table: Table, scene: Scene) -> np.ndarray:
+        """Return where the open gripper has just let go of the top of the tower."""
+        top = levels(self.num_objects)[-1]
+        return np.array([*scene.goal_poses[-1, :2], top + GRASP_HEIGHT, 1])
+
+    def succeeds(self, table: Table) -> bool:
+        """Tell whether every block stands on the one below, let go."""
+        return is_tower(table.object_poses()) and not table.touching()
+
+    def default_config(self, timing: str = 'natural') -> GraspConfig:
+        """Return how hard the expert searches."""
+        return STACK_CONFIG
+
+    def demonstrate(self, table: Table, scene: Scene, first: Observation,
+                    rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
+        """Act until the last block is let go; the outcome is that after SETTLE_STEPS more."""
+        mover = PickAndPlace(table, rng, how.config, how.rollout)
+        observations, actions, _, seconds = carry_out(
+            table, self.succeeds, first, _plans(table, scene, mover),
+            how.num_frames or self.num_frames)
+        for _ in range(SETTLE_STEPS):
+            table.step([0, 0, 0, table.target[3]])
+        return observations, actions, 'success' if self.succeeds(table) else 'failure', seconds
+
+
+STACK2 = StackTask('stack2', num_objects=2, num_frames=36, stream=8)
+STACK3 = StackTask('stack3', num_objects=3, num_frames=60, stream=9)
+
+
+def draw_block(rng: np.random.Generator) -> ObjectShape:
+    """Draw a block with a square base that the fingers can hold."""
+    width = rng.uniform(*BLOCK_HALF_WIDTH)
+    colour = tuple(rng.uniform(0.3, 1.0, 3))
+    return ObjectShape('bar', ((width, width, HALF_HEIGHT),), ((0, 0),), (colour,))
+
+
+def draw_blocks(rng: np.random.Generator, count: int,
+                spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """
+    Draw where K blocks stand, the tower and the gripper.
+
+    :param rng: numpy Generator.
+    :param count: K.
+    :param spread: factor of the ranges of blocks and gripper.
+    :return: start poses (K, 3) and goal poses (K, 3), all on the first block's start and, as the
+        closing fingers turn what they hold, in line with x and y; (3,) of the gripper in m.
+    """
+    places = np.zeros((count, 2))
+    while not apart(places, BLOCK_SEPARATION):
+        places = spread * rng.uniform(-BLOCK_RANGE, BLOCK_RANGE, (count, 2))
+    yaws = rng.uniform(-GRASP_YAW, GRASP_YAW, count)
+    hand = places[0]
+    while np.linalg.norm(places - hand, axis=1).min() < HAND_MARGIN:
+        hand = spread * rng.uniform(-HAND_RANGE, HAND_RANGE, 2)
+    goals = np.column_stack([np.tile(places[0], (count, 1)), np.zeros(count)])
+    goals[0, 2] = yaws[0]
+    return (np.column_stack([places, yaws]), goals,
+            np.append(hand, rng.uniform(0, GRIPPER_HEIGHT)))
+
+
+def levels(count: int) -> np.ndarray:
+    """Return how high above the table the blocks of a tower stand, (K,) m."""
+    return 2 * HALF_HEIGHT * np.arange(count)
+
+
+def is_tower(poses: np.ndarray) -> bool:
+    """Tell whether blocks stand on each other; poses (K, 3 or more) m, from the lowest on."""
+    up = np.diff(poses[:, :3], axis=0)
+    return bool((np.linalg.norm(up[:, :2], axis=1) < STACK_OFFSET).all()
+                and (np.abs(up[:, 2] - 2 * HALF_HEIGHT) < LEVEL_TOLERANCE).all()
+                and abs(poses[0, 2] - HALF_HEIGHT) < LEVEL_TOLERANCE)
+
+
+class PickAndPlace:
+    """
+    Plans the moves of one episode.
+
+    :param table: Table with a scene and a gripper that holds.
+    :param rng: numpy Generator; every whim of this planner comes from it.
+    :param config: GraspConfig.
+    :param rollout: mujoco.rollout.Rollout to share between episodes.
+    """
+
+    def __init__(self, table: Table, rng: np.random.Generator, config: GraspConfig,
+                 rollout: mujoco.rollout.Rollout) -> None:
+        self._table, self._rng, self._config = table, rng, config
+        self._rollout = rollout
+
+    def move(self, k: int, below: Callable[[], np.ndarray]) -> Iterator[np.ndarray]:
+        """
+        Yield (n, 4) actions, each to be carried out before the next is asked for.
+
+        :param k: the object to be moved.
+        :param below: says (3,) m where the origin of what is to be below it is now, see on_table.
+        """
+        table = self._table
+        grasp = GraspExpert(table, self._rng, self._config, self._rollout, k)
+        for _ in range(TRIES):
+            yield self._rise(grasp)
+            yield grasp.pick_and_lift()
+            if table.object_poses()[k, 2] > HELD:
+                break
+        yield self._carry(k, below())
+        yield self._lower(k, below())
+        yield np.array([[0, 0, 0, 0.5], [0, 0, 0, 1]])
+
+    def _rise(self, grasp: GraspExpert) -> np.ndarray:
+        """Go straight up from among the objects, if the gripper is there."""
+        here = self._table.target
+        if here[2] >= CLEAR:
+            return np.empty((0, 4))
+        return np.array([[0, 0, grasp.hover - here[2], here[3]]])
+
+    def _carry(self, k: int, below: np.ndarray) -> np.ndarray:
+        """Carry object k above its place."""
+        speed = self._rng.uniform(*self._config.travel_speed)
+        gap = self._gap(k, below)
+        path = straight(np.zeros(3), gap, max(1, int(np.ceil(np.linalg.norm(gap) / speed))))
+        return _moves([np.zeros(3), *path])
+
+    def _lower(self, k: int, below: np.ndarray) -> np.ndarray:
+        """Bring object k, as it hangs now, down onto what is below it and hold still."""
+        down = below[2] + 2 * HALF_HEIGHT + GAP - self._table.object_poses()[k, 2]
+        above = self._gap(k, below)
+        path = straight(above, above + [0, 0, down], int(self._rng.integers(2, 4)))
+        return _moves([np.zeros(3), above, *path, path[-1]])
+
+    def _gap(self, k: int, below: np.ndarray) -> np.ndarray:
+        """Return the way (3,), level, from object k to above its place."""
+        return np.append(below[:2] - self._table.object_poses()[k, :2], 0)
+
+
+def on_table(place: np.ndarray) -> np.ndarray:
+    """Return the origin (3,) of what would be below an object on the table at (2,) m."""
+    return np.append(place, -HALF_HEIGHT)
+
+
+def _moves(path: list[np.ndarray]) -> np.ndarray:
+    """Return the actions along points (3,), with closed fingers."""
+    return np.column_stack([np.diff(path, axis=0), np.zeros(len(path) - 1)])
+
+
+def _plans(table: Table, scene: Scene, mover: PickAndPlace) -> Iterator[np.ndarray]:
+    """Yield the actions of one episode; each waits until those before are carried out."""
+    for k in scene.order:
+        yield from mover.move(k, partial(_place_of, table, k - 1))
+
+
+def _place_of(table: Table, k: int) -> np.ndarray:
+    """Return where the origin of object k is now, (3,) m."""
+    return table.object_poses()[k, :3]

@@ -1,0 +1,325 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The MuJoCo table: gripper, objects and a camera, without a task. Knows nothing of ROS."""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+from sim_bridge.world.appearance import choose_appearance, USUAL
+from sim_bridge.world.entities import check_free, check_pose, check_velocity
+from sim_bridge.world.looks import DEFAULT_LOOK, get_look, OBSERVER
+from sim_bridge.world.scene import (
+    build_scene,
+    FINGER_TRAVEL,
+    HALF_HEIGHT,
+    object_names,
+    ObjectShape,
+    TIMESTEP,
+)
+from sim_bridge.world.studio import Studio
+from sim_bridge.world_protocol import Observation
+from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.errors import SceneError
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm
+from tap_ros.text import escaped
+
+SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
+if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
+    raise SceneError(f'the control period {CONTROL_PERIOD} s is no multiple of {TIMESTEP} s')
+RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time to catch up
+BENT = 0.1  # share of the fingers' travel that they may be beyond their ends
+GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
+GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
+GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the start
+OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
+
+
+def clip_action(action: ArrayLike, limit: Sequence[float] = ACTION_LIMIT) -> np.ndarray:
+    """
+    Limit an action to what the arm does in one control period.
+
+    :param action: (4,) displacement x, y, z in m and gripper opening in [0, 1].
+    :param limit: (3,) m, of the displacement.
+    :return: (4,) float64.
+    :raises SceneError: for another shape or values that are not finite.
+    """
+    action = np.asarray(action, np.float64)
+    if action.shape != (4,) or not np.isfinite(action).all():
+        raise SceneError(f'action {action}: expected 4 finite numbers (dx, dy, dz, opening)')
+    return np.append(clip_moves(action[:3], limit), np.clip(action[3], 0, 1))
+
+
+def clip_moves(moves: np.ndarray, limit: Sequence[float] = ACTION_LIMIT) -> np.ndarray:
+    """Limit displacements (..., 3), in m, to what the arm does in one control period."""
+    return np.clip(moves, np.negative(limit), limit)
+
+
+def ramp_controls(target: np.ndarray, actions: np.ndarray,
+                  low: Sequence[float] = WORKSPACE_LOW, high: Sequence[float] = WORKSPACE_HIGH,
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Turn actions into servo targets for every physics step.
+
+    :param target: (4,) the present target: x, y, z, opening.
+    :param actions: (..., T, 4) actions within the limits.
+    :param low: (3,) m, where the gripper may be, least; high: greatest.
+    :return: controls (..., T * SUBSTEPS, 5) and the targets after each action (..., T, 4).
+    """
+    targets = np.empty(actions.shape)
+    targets[..., 3] = actions[..., 3]
+    position = np.broadcast_to(target[:3], actions[..., 0, :3].shape)
+    for t in range(actions.shape[-2]):
+        position = np.clip(position + actions[..., t, :3], low, high)
+        targets[..., t, :3] = position
+    first = np.broadcast_to(target, targets[..., :1, :].shape)
+    before = np.concatenate([first, targets[..., :-1, :]], axis=-2)
+    share = np.minimum(np.arange(1, SUBSTEPS + 1) / RAMP_SUBSTEPS, 1)[:, None]
+    path = before[..., None, :] + share * (targets - before)[..., None, :]  # (..., T, S, 4)
+    fingers = path[..., 3:] * FINGER_TRAVEL
+    controls = np.concatenate([path[..., :3], fingers, fingers], axis=-1)
+    return controls.reshape(*actions.shape[:-2], -1, 5), targets
+
+
+class Table:
+    """
+    A table with a gripper, objects and a camera.
+
+    :param image_size: pixels of the square picture.
+    :param gripping: the hand is one that grips, and the camera near.
+    :param look: name of a look, see looks.LOOKS.
+    :param appearance: name of an appearance, see appearance.CHOICES.
+    :param arm: name of an arm, see robots.arm.get_arm.
+    :ivar goal_poses: (K, 7) where the objects shall be, as object_poses.
+    :raises ConfigError: for an unknown arm.
+    :raises SceneError: for an unknown look or appearance, a bad size, or when nothing can be
+        rendered.
+    """
+
+    goal_poses: np.ndarray
+
+    def __init__(self, image_size: int = 64, gripping: bool = False, look: str = DEFAULT_LOOK,
+                 appearance: str = 'usual', arm: str = DEFAULT_ARM) -> None:
+        self.look, self.arm = get_look(look), get_arm(arm)
+        if not 16 <= image_size <= 1024:
+            raise SceneError(f'image_size {image_size}: expected 16 to 1024 pixels')
+        choose_appearance(appearance, 0)  # refuses what there is not
+        self._appearance, self._gripping = appearance, gripping
+        self._usual_camera = self.look.camera(gripping, image_size, image_size)
+        self.camera = self._usual_camera
+        self._renderer: Studio | None = None
+        self._observer: Studio | None = None
+        self._worn = USUAL  # the appearance of the present scene
+
+    @property
+    def camera_matrix(self) -> np.ndarray:
+        """Return the intrinsics (3, 3) in pixels."""
+        return self.camera.K
+
+    @property
+    def camera_pose(self) -> np.ndarray:
+        """Return the pose (4, 4) of the camera's optical frame in the world."""
+        return self.camera.pose
+
+    def load(self, shapes: Sequence[ObjectShape], poses: np.ndarray, gripper: np.ndarray,
+             seed: int) -> None:
+        """
+        Put objects and the gripper at their start.
+
+        :param shapes: K shapes.
+        :param poses: (K, 7) x, y, z in m, quaternion x, y, z, w.
+        :param gripper: (3,) m.
+        :param seed: of the scene.
+        """
+        self._seed, self._names = seed, object_names(len(shapes))
+        self.model = build_scene(shapes, self._gripping)
+        self.data = mujoco.MjData(self.model)
+        if self._renderer is None:
+            self._renderer = Studio(self._usual_camera, self.arm, self.look.arm)
+        self._worn = choose_appearance(self._appearance, seed)
+        self._renderer.dress(self._worn)
+        self._renderer.use(self.model)
+        self.camera = self._usual_camera.moved(self._worn)
+        self.target = np.append(gripper, 0.0)
+        self.place(poses, gripper)
+
+    def photograph(self, object_poses: np.ndarray, gripper: np.ndarray | None = None,
+                   hide_arm: bool = False) -> Observation:
+        """
+        Observe the objects at other places; nothing moves.
+
+        :param object_poses: (K, 7) x, y, z in m, quaternion x, y, z, w.
+        :param gripper: (3,) where the arm is to be seen, m, or (4,) with its opening; by default
+            closed and somewhere beside the objects, drawn from the scene's seed.
+        :param hide_arm: leave the arm out of the picture.
+        :return: Observation.
+        """
+        state, controls = self.state(), self.data.ctrl.copy()
+        if gripper is None:
+            gripper = self._beside(object_poses[:, :2])
+        self.place(object_poses, gripper)
+        observation = self.observe(hide_arm)
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_setState(
+            self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self.data.ctrl[:] = controls
+        mujoco.mj_forward(self.model, self.data)
+        return observation
+
+    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike = (0,) * 6) -> None:
+        """
+        Put an object elsewhere, as a hand would; no time passes, `scene` and goal stay.
+
+        :param name: one of the object_names of an Observation.
+        :param pose: (7,) x, y, z in m, quaternion x, y, z, w.
+        :param velocity: (6,) m/s and rad/s along the axes of the world.
+        :raises PoseError: for a pose that is none or out of reach, and where the object would
+            reach into something; then it stays where it was.
+        :raises SceneError: for a velocity that is not finite or too fast; likewise.
+        """
+        if name not in self._names:
+            raise SceneError(f'{escaped(name)} is not in the scene')
+        pose, velocity = check_pose(pose), check_velocity(velocity)
+        # Of a free joint MuJoCo turns the angular velocity with the body.
+        turning = np.empty(3)
+        mujoco.mju_rotVecQuat(turning, velocity[3:], pose[[6, 3, 4, 5]] * (1, -1, -1, -1))
+        before = copy(self.data)
+        joint = self.data.joint(name)
+        joint.qpos, joint.qvel = pose[[0, 1, 2, 6, 3, 4, 5]], [*velocity[:3], *turning]
+        mujoco.mj_forward(self.model, self.data)
+        try:
+            check_free(self.model, self.data, name)
+        except SceneError:
+            mujoco.mj_copyData(self.data, self.model, before)
+            raise
+
+    def step(self, action: ArrayLike) -> Observation:
+        """
+        Act for one control period.
+
+        :param action: (4,) displacement x, y, z in m, limited to ACTION_LIMIT and to the
+            workspace, and gripper opening from 0 (closed) to 1.
+        :return: Observation.
+        :raises SceneError: for another shape, values that are not finite, or what the arm
+            cannot do; then nothing moves.
+        """
+        controls, self.target = self._ramp(action)
+        for control in controls:
+            self.data.ctrl[:] = control
+            mujoco.mj_step(self.model, self.data)
+        return self.observe()
+
+    def check_action(self, action: ArrayLike) -> None:
+        """
+        Accept an action or say why it cannot be done; nothing moves.
+
+        :param action: as for step.
+        :raises SceneError: as step does.
+        """
+        self._ramp(action)
+
+    def _ramp(self, action: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the servo targets of an action (SUBSTEPS, 5) and the last one (4,)."""
+        arm = self.arm
+        controls, targets = ramp_controls(
+            self.target, clip_action(action, arm.action_limit)[None], arm.low, arm.high)
+        arm.check_motion(
+            arm.joints_at(self.target), arm.joints_at(targets[0]), CONTROL_PERIOD)
+        return controls, targets[0]
+
+    def observe(self, hide_arm: bool = False) -> Observation:
+        """Return the Observation of this moment."""
+        assert self._renderer is not None, 'reset comes first'
+        mujoco.mj_forward(self.model, self.data)
+        poses = self.object_poses()
+        # Contact can press the fingers beyond closed or open, as it bends those of a real hand.
+        opening = np.clip(self.data.qpos[3:5].mean() / FINGER_TRAVEL, -BENT, 1 + BENT)
+        view = self._renderer.render(self.data, hide_arm)
+        return Observation(
+            image=view.picture,
+            stamp_ns=round(self.data.time * 1e9),
+            gripper=np.append(self.data.qpos[:3], opening).astype(np.float32),
+            object_names=self._names,
+            object_pixels=self.camera.project(poses[:, :3]).astype(np.float32),
+            object_poses=poses, robot_mask=view.robot_mask, arm_joints=view.arm_joints)
+
+    def observer_picture(self) -> np.ndarray:
+        """Take a picture from the side, for people: uint8 (360, 480, 3) rgb."""
+        if self._observer is None:
+            self._observer = Studio(OBSERVER, self.arm, links=True)
+        self._observer.dress(replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
+        self._observer.use(self.model)
+        return self._observer.render(self.data).picture
+
+    def object_poses(self) -> np.ndarray:
+        """Return (K, 7): x, y, z in m, quaternion x, y, z, w."""
+        poses = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
+        return poses[:, [0, 1, 2, 4, 5, 6, 3]].copy()
+
+    def object_motions(self) -> np.ndarray:
+        """
+        Return (K, 2, 2, 3): velocities and accelerations along the axes of the world.
+
+        Of each the linear one in m/s, m/s^2 and the angular one in rad/s, rad/s^2.
+        """
+        rates = np.stack([self.data.qvel, self.data.qacc])[:, OBJECT_QPOS_START:]
+        motions = rates.reshape(2, -1, 2, 3).swapaxes(0, 1).copy()
+        for name, motion in zip(self._names, motions):
+            motion[:, 1] = motion[:, 1] @ self.data.body(name).xmat.reshape(3, 3).T
+        return motions
+
+    def state(self) -> np.ndarray:
+        """Return the full physics state, as mujoco.rollout takes it."""
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        state = np.empty(mujoco.mj_stateSize(self.model, kind))
+        mujoco.mj_getState(self.model, self.data, state, kind)
+        return state
+
+    def close(self) -> None:
+        """Free the OpenGL contexts."""
+        for renderer in (self._renderer, self._observer):
+            if renderer is not None:
+                renderer.close()
+        self._renderer = self._observer = None
+
+    def touching(self) -> bool:
+        """Tell whether a finger touches anything."""
+        fingers = [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
+        return bool(np.isin(self.data.contact.geom, fingers).any())
+
+    def distances(self) -> np.ndarray:
+        """Return (K,) metres from each object's origin to its goal, in three dimensions."""
+        return np.linalg.norm(self.object_poses()[:, :3] - self.goal_poses[:, :3], axis=1)
+
+    def place(self, object_poses: np.ndarray, gripper: np.ndarray) -> None:
+        """Put objects at poses (K, 7) and the gripper at (3,), closed, or (4,), all at rest."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:3] = gripper[:3]
+        self.data.ctrl[:3] = gripper[:3]
+        if len(gripper) == 4:
+            self.data.qpos[3:5] = self.data.ctrl[3:5] = gripper[3] * FINGER_TRAVEL
+        objects = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
+        objects[:] = object_poses[:, [0, 1, 2, 6, 3, 4, 5]]
+        mujoco.mj_forward(self.model, self.data)
+
+    def _beside(self, positions: np.ndarray) -> np.ndarray:
+        """Draw a place of the gripper, (3,) m, that touches no object; positions (K, 2) m."""
+        rng, arm = np.random.default_rng([self._seed, 7]), self.arm
+        while True:
+            place = rng.uniform(-GRIPPER_RANGE, GRIPPER_RANGE, 2)
+            if np.linalg.norm(positions - place, axis=1).min() > GRIPPER_MARGIN and (
+                    place >= arm.low[:2]).all() and (place <= arm.high[:2]).all():
+                return np.append(place, rng.uniform(0, GRIPPER_HEIGHT))
+
+
+def lifted(planar_poses: np.ndarray, height: float | np.ndarray = 0.0) -> np.ndarray:
+    """Turn (K, 3) x, y, yaw into (K, 7) poses at a height, or (K,), above the table in metres."""
+    poses = np.zeros((len(planar_poses), 7))
+    poses[:, :2] = planar_poses[:, :2]
+    poses[:, 2] = HALF_HEIGHT + height
+    poses[:, 5] = np.sin(planar_poses[:, 2] / 2)
+    poses[:, 6] = np.cos(planar_poses[:, 2] / 2)
+    return poses
