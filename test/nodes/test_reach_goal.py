@@ -168,9 +168,12 @@ def test_an_arm_that_refuses_is_waited_for_and_then_the_goal_ends(loop):
     call(loop.pause_client, SetBool.Request(data=True), 10)
     try:
         with loop.set('visual_mpc_node', image_timeout=2.0):
-            aborted(loop, 'refused', 'paused', mode='direct', step_budget=10)
+            status, result = loop.reach(mode='direct', step_budget=10)
     finally:
         call(loop.pause_client, SetBool.Request(data=False), 10)
+    assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+    assert 'refused' in result.message and 'paused' in result.message
+    assert loop.stopped()
 
 
 def test_when_images_stop_coming_the_arm_is_stopped_and_no_goal_begins(loop):

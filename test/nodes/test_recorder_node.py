@@ -143,10 +143,10 @@ def test_no_bag_is_overwritten_and_each_has_the_goal_and_the_cards(client, recor
     node = record()
     arrived(goal, cards)
     for stamp in (2, 2):
-        until(lambda: node.node._count >= 2)
+        until(lambda: node.node._bags.count >= 2)
         goal.publish(random_image(stamp))
         arrived(goal)
-    until(lambda: node.node._count == 4)
+    until(lambda: node.node._bags.count == 4)
     assert 'bag-2' in ask(client, False)
     assert 'bag-3' in ask(client, True)  # with what holds by now
     assert node.end() == 0
@@ -173,7 +173,7 @@ def test_topics_of_any_type_can_be_recorded_and_where_the_arm_stands(client, rec
     until(joints.get_subscription_count)
     joints.publish(JointState(name=['a'], position=[1.5]))
     arrived(joints, robot)
-    until(lambda: node.node._count == 2)
+    until(lambda: node.node._bags.count == 2)
     assert node.end() == 0
     found = {topic: (kind, message) for topic, kind, message in read(tmp_path / 'bag')}
     assert sorted(found) == ['/elsewhere/joints', '/robot_description']
