@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """predict_subgoal and the states of its node, asked over DDS, with small untrained networks."""
 
+from pathlib import Path
 import signal
 import time
 
@@ -21,6 +22,7 @@ from tap_ros.nodes.clients import call, Newest, wait_for_future
 from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
+from tap_ros.prediction.protocol import load_predictor
 from tap_ros.training.weights import save_weights, stored_digest
 from tap_ros.weights import PREDICTORS
 
@@ -372,6 +374,23 @@ def test_the_model_card_is_that_of_the_weights_in_use(client, managed, tmp_path)
     text = card.wait(20).data
     assert text.startswith(shipped.with_suffix('.md').read_text().rstrip())
     assert stored_digest(shipped) in text
+
+
+def test_another_predictor_is_served_by_its_name(client):
+    name = f'nearest_keyframe:{Path(__file__).parents[2] / "bags/sample_push2"}'
+    service, predictor = Service(client, 'keyframe', weights=name), load_predictor(name)
+    try:
+        rng = np.random.default_rng(0)
+        start, goal = rng.integers(0, 256, (2, *predictor.image_size, 3), np.uint8)
+        response = service.answer(start=encode_image(start, STAMP, 'eye'),
+                                  goal=encode_image(goal, STAMP, 'eye'), recursion_depth=2,
+                                  start_objects=START_OBJECTS, goal_objects=GOAL_OBJECTS)
+        pixels = np.array([(8, 9), (20, 21)], np.float32)
+        wanted = predictor.predict(start, goal, pixels, pixels, recursion_depth=2)
+        assert np.array_equal(pictures(response), [subgoal.image for subgoal in wanted])
+        assert list(response.level) == [2, 1] and len(response.subgoals[0].object_maps) == 2
+    finally:
+        assert service.end() == 0
 
 
 @pytest.mark.slow
