@@ -25,6 +25,7 @@ from tap_ros.nodes.topics import STREAM
 
 CALL_S = 20.0
 START_S = 90.0
+MOVING_S = 60.0  # a plan takes seconds where other programs run
 STOP_S = 0.5
 SIM_MODES = {'lock-step': {'lock_step': True}, 'real': {'lock_step': False}}
 
@@ -158,7 +159,7 @@ class Commands:
         with self._changed:
             self._kept.clear()
 
-    def wait_for_moves(self, moment, count, timeout_s=CALL_S):
+    def wait_for_moves(self, moment, count, timeout_s=MOVING_S):
         """Wait until so many moves have come after a moment; tell whether they have."""
         with self._changed:
             return self._changed.wait_for(
@@ -299,7 +300,7 @@ class Rig:
         begin = time.monotonic()
         reaching = self.begin(**fields)
         if not self.commands.wait_for_moves(begin, moves):
-            raise TapError(f'nothing moved within {CALL_S:g} s; the goal {self.finish(reaching)}')
+            raise TapError(f'nothing moved within {MOVING_S:g} s; the goal {self.finish(reaching)}')
         return reaching
 
     def finish(self, reaching):
