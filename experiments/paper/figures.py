@@ -15,7 +15,7 @@ from sim_bridge.tasks.tasks import get_task
 # Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
 COLOURS = {'copy': '#8c8c8c', 'fix': '#0072b2', 'min': '#e69f00', 'genmin': '#d55e00',
            'ours': '#009e73', 'vae': '#cc79a7'}
-_INK = '#333333'
+INK = '#333333'
 _WIDTH = 9.0  # inches
 
 
@@ -54,7 +54,7 @@ def new_figure(height, columns, rows=1, **options):
             axis.spines[side].set_visible(False)
         for side in ('left', 'bottom'):
             axis.spines[side].set_color('#a0a0a0')
-        axis.tick_params(colors=_INK, labelsize=8, length=3)
+        axis.tick_params(colors=INK, labelsize=8, length=3)
         axis.set_axisbelow(True)
     return figure, axes
 
@@ -109,9 +109,9 @@ def forward_scatter(rows, task='grasp'):
     figure, axes = new_figure(3.9, len(panels))
     for axis, (title, points) in zip(axes[0], panels):
         _scatter(axis, points, get_task(task).num_frames)
-        axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=_INK)
-        axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=_INK)
-    axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=_INK)
+        axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=INK)
+        axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=INK)
+    axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=INK)
     return to_png(figure)
 
 
@@ -183,10 +183,10 @@ def timing(rows):
     axis.set_xticks(range(len(TIMED_TITLES)), TIMED_TITLES.values())
     axis.grid(axis='y', color='#f0f0f0')
     axis.set_xlabel('when the first object is home and the other untouched', fontsize=9,
-                    color=_INK)
-    axis.set_ylabel('bottlenecks at 2 px, %', fontsize=9, color=_INK)
+                    color=INK)
+    axis.set_ylabel('bottlenecks at 2 px, %', fontsize=9, color=INK)
     axis.set_title('Pushing two objects: whether the time has to be known', fontsize=10,
-                   loc='left', color=_INK)
+                   loc='left', color=INK)
     return to_png(figure)
 
 

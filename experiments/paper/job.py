@@ -16,7 +16,6 @@ import time
 import traceback
 
 from experiments.paper.places import (
-    collect_command,
     collected_episodes,
     file_hash,
     read_json,
@@ -159,9 +158,7 @@ def score(run, config, weights, places):
                  'shifted': {name: recording_hash(places.recording(name))
                              for name in run.shifted},
                  **({'initial_weights': file_hash(find_predictor(config.initial_weights))}
-                    if config.initial_weights else {}),
-                 'command': '; '.join(filter(None, (collect_command(
-                     places.recording(task)) for task in (run.task, *run.shifted))))},
+                    if config.initial_weights else {})},
         'training': {name: about[name]
                      for name in ('steps', 'seconds', 'machine', 'torch', 'python')},
         'evaluation': {'margin': 0, 'goal_picture': 'last', 'seconds': seconds, **scores}}

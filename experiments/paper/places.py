@@ -6,14 +6,12 @@ from dataclasses import dataclass
 import hashlib
 import json
 from pathlib import Path
-import shlex
 
 from tap_ros.errors import RecordingError
 from tap_ros.recording.bags import find_bags
 from tap_ros.recording.writer import count_episodes
 
 _SETTINGS = 'collection.json'  # as sim_bridge.collect leaves it
-_USUAL = {'seed': 0, 'frames': 0, 'timing': 'natural', 'appearance': 'usual'}
 
 
 @dataclass(frozen=True)
@@ -74,19 +72,6 @@ def is_collected(folder, episodes):
 def collected_episodes(folder):
     """Say how many episodes a folder was asked to hold, 0 if `collect` never wrote to it."""
     return (read_json(Path(folder) / _SETTINGS) or {'episodes': 0})['episodes']
-
-
-def collect_command(folder):
-    """Say which command makes a recording again; '' if `collect` did not make it."""
-    settings = read_json(Path(folder) / _SETTINGS)
-    if settings is None:
-        return ''
-    words = ['python', '-m', 'tap_ros', 'collect', '--task', settings['task'], '--out',
-             str(folder), '--episodes', str(settings['episodes'])]
-    for option, usual in _USUAL.items():
-        if settings.get(option, usual) != usual:
-            words += [f'--{option}', str(settings[option])]
-    return shlex.join(words)
 
 
 def file_hash(path):

@@ -9,9 +9,6 @@ others than ours: only how its methods stand to each other carries over.
 
 TITLES = {'grasp': 'Grasping', 'pick_place': 'Pick-and-place', 'push2': 'Pushing two objects',
           'push3': 'Pushing three objects', 'stack2': 'Stacking two blocks'}
-ORDER_TITLES = {'order2': 'Two objects, one on the goal of the other',
-                'order2_late': 'Two objects, one on the goal of the other, late',
-                'order3': 'Three objects, two on goals of others'}
 # Of recordings whose bottleneck comes at another time.
 TIMED_TITLES = {'push2_early': 'early', 'push2_middle': 'in the middle', 'push2_late': 'late',
                 'push2_mixed': 'any of these'}
@@ -37,9 +34,6 @@ TABLE_2 = {
     ('push2', 'direct'): (12.9, 0.6), ('push2', 'fix'): (12.5, 0.5),
     ('push2', 'genmin'): (11.9, 0.6), ('push3', 'direct'): (15.8, 0.6),
     ('push3', 'fix'): (17.6, 0.6), ('push3', 'genmin'): (12.9, 0.7)}
-# Of doing nothing, as goals are 20 cm from the starts, and of each object alone (section 4).
-PLANNING_BOUNDS = {'nothing': '20', 'one_object': 'about 5'}
-
 # How much lower genmin's error is than fix's (section 4).
 GAINS = {'grasp': 0.21, 'pick_place': 0.265, 'push2': 0.532}
 

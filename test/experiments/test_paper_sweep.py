@@ -16,8 +16,6 @@ from experiments.paper import command
 from experiments.paper import sweep as sweep_module
 from experiments.paper.job import BUSY, DONE, perform, UNFINISHED
 from experiments.paper.places import (
-    collect_command,
-    file_hash,
     is_collected,
     Places,
     recording_hash,
@@ -36,7 +34,6 @@ from tap_ros.options import parse
 from tap_ros.prediction.methods import method_fields
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.split import split_episodes
-from tap_ros.weights import find_predictor
 
 ROOT = Path(__file__).parents[2]
 SEEDS = (122, 142, *range(4), 6, 8)  # the first two are held out
@@ -90,8 +87,7 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places, small):
     assert held_out == 2
     assert result['data'] == {
         'hash': store.data_hash, 'episodes': EPISODES - held_out, 'held_out': held_out,
-        'shifted': {name: recording_hash(places.recording(name)) for name in SHIFTED},
-        'command': ''}
+        'shifted': {name: recording_hash(places.recording(name)) for name in SHIFTED}}
     scores = result['evaluation']
     assert (scores['margin'], scores['goal_picture']) == (0, 'last')
     for method in ('prediction', 'copy-start', 'copy-goal'):
@@ -105,18 +101,6 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places, small):
     assert result['training']['steps'] == 2
     assert method_fields(RUN.method).items() <= result['config'].items()
     assert result['name'] == RUN.name and RUN.name in result['command']
-
-
-def test_a_run_that_begins_with_shipped_weights_tells_which(tmp_path, monkeypatch):
-    monkeypatch.setitem(SCALES, 'small', replace(SCALES['small'], settings={
-        'base_width': 16, 'batch_size': 4, 'threads': 1}))
-    write_squares(tmp_path / 'bags' / 'order2', SEEDS, size=64)
-    places = Places(*(str(tmp_path / name) for name in ('bags', 'runs', 'results')))
-    run = replace(RUN, task='order2', variant='+skips')
-    assert perform(run, places) == DONE
-    found = json.loads(places.result(run).read_text())
-    assert found['config']['initial_weights'] == 'push2'
-    assert found['data']['initial_weights'] == file_hash(find_predictor('push2'))
 
 
 def test_samples_and_forward_prediction_are_scored(places, small):
@@ -175,23 +159,6 @@ def test_nobody_trains_what_another_process_is_at(places):
         assert mine
 
 
-def test_the_hash_is_that_of_the_opened_recording(places):
-    store = open_recordings([str(places.recording('push2'))])
-    assert recording_hash(places.recording('push2')) == store.data_hash
-
-
-def test_a_recording_is_complete_when_all_its_episodes_are_there(places):
-    folder = places.recording('push2')
-    assert is_collected(folder, 10 ** 6)  # not made by collect: taken as it is
-    settings = {'task': 'push2', 'episodes': EPISODES, 'episodes_per_file': 50, 'seed': 3}
-    (folder / 'collection.json').write_text(json.dumps(settings))
-    assert is_collected(folder, EPISODES) and not is_collected(folder, EPISODES + 1)
-    assert collect_command(folder).endswith(f'--out {folder} --episodes {EPISODES} --seed 3')
-    (folder / 'collection.json').write_text(json.dumps(settings | {'episodes': EPISODES + 1}))
-    assert not is_collected(folder, EPISODES)
-    assert not is_collected(places.recording('grasp'), 1)
-
-
 @pytest.mark.slow
 def test_one_failed_run_does_not_stop_the_others(places):
     write_squares(Path(places.recordings) / 'grasp', [0])  # one episode: none can be held out
@@ -204,17 +171,6 @@ def test_one_failed_run_does_not_stop_the_others(places):
     failed = next(end for end in ends if end.kind == 'failed')
     assert failed.reason.startswith('error: ') and 'grasp' in failed.reason
     assert sweep([RUN], places, progress=False) == []
-
-
-def test_what_cannot_be_collected_fails_and_is_tried_once(places):
-    settings = {'task': 'push3', 'episodes': 1, 'episodes_per_file': 1, 'seed': 5}
-    folder = places.recording('push3')
-    folder.mkdir()
-    (folder / 'collection.json').write_text(json.dumps(settings))
-    runs = [replace(RUN, task='push3', method=method) for method in ('fix', 'min')]
-    ends = sweep(runs, places, progress=False)
-    assert [(end.name, end.kind) for end in ends] == [('push3', 'failed')]
-    assert 'other settings' in ends[0].reason
 
 
 def test_recursion_is_scored_where_the_network_paints(places, small):

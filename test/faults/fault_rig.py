@@ -300,7 +300,8 @@ class Rig:
         begin = time.monotonic()
         reaching = self.begin(**fields)
         if not self.commands.wait_for_moves(begin, moves):
-            raise TapError(f'nothing moved within {MOVING_S:g} s; the goal {self.finish(reaching)}')
+            end = self.finish(reaching)
+            raise TapError(f'nothing moved within {MOVING_S:g} s; the goal {end}')
         return reaching
 
     def finish(self, reaching):
