@@ -74,43 +74,44 @@ class Target:
         return {'pixels': np.where(self.free[:, None], pixels, self.pixels)}
 
 
+@dataclass(frozen=True)
 class Itinerary:
     """
     Say at every step what to plan to.
 
     Target i of n lasts until step (i + 1) B / n at most.
 
-    :param targets: list of Target, the last one is the goal.
+    :param targets: of hierarchy.Target, the last one is the goal.
     :param step_budget: B.
     :param switch: 'half': a target gets its whole share of the budget; 'reached': goes on to the
         next one as soon as it is reached.
     :param reached: px of Target.distance; nearer than this is there. 0: never.
-    :ivar switches: steps at which the second, third ... target began; may be set back.
     """
 
-    def __init__(self, targets: Iterable[Target], step_budget: int, switch: str = 'reached',
-                 reached: float = GOAL_TOLERANCE) -> None:
-        if switch not in SWITCHES:
-            raise ConfigError(f'switch {switch!r} is unknown; expected one of {SWITCHES}')
-        self._targets, self._budget = list(targets), step_budget
-        self._switch, self._reached = switch, reached
-        self.switches: tuple[int, ...] = ()
+    targets: Sequence[Target]
+    step_budget: int
+    switch: str = 'reached'
+    reached: float = GOAL_TOLERANCE
 
-    def target(self, step: int, pixels: np.ndarray) -> Target:
+    def __post_init__(self) -> None:
+        if self.switch not in SWITCHES:
+            raise ConfigError(f'switch {self.switch!r} is unknown; expected one of {SWITCHES}')
+
+    def stage(self, step: int, pixels: np.ndarray, stage: int = 0) -> int:
         """
-        Return the Target of this step.
+        Return the index of the target of this step.
 
         :param step: control periods that have passed.
         :param pixels: (K, 2), where the objects are.
+        :param stage: of the step before.
         """
-        while (stage := len(self.switches)) < len(self._targets) - 1:
-            late = step >= (stage + 1) * self._budget // len(self._targets)
-            there = (self._switch != 'half'
-                     and self._targets[stage].distance(pixels) <= self._reached)
-            if not late and not there:
+        while stage < len(self.targets) - 1:
+            late = step >= (stage + 1) * self.step_budget // len(self.targets)
+            if not late and (self.switch == 'half'
+                             or not self.targets[stage].distance(pixels) <= self.reached):
                 break
-            self.switches += step,
-        return self._targets[len(self.switches)]
+            stage += 1
+        return stage
 
 
 def targets_by(subgoals: Iterable['Subgoal'], goal_pixels: np.ndarray) -> list[Target]:
@@ -125,12 +126,12 @@ def targets_by(subgoals: Iterable['Subgoal'], goal_pixels: np.ndarray) -> list[T
 
 def choose_sample(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
                   subgoals: Iterable['Subgoal'], seed: int = 0, limits: Limits = FULL,
-                  before_plan: Callable[[], object] | None = None) -> list['Subgoal']:
+                  before_plan: Callable[[], object] = lambda: None) -> list['Subgoal']:
     """
-    Take the predicted subgoals of one sample; of several samples by choose_subgoals.
+    Take the predicted subgoals of one sample, that of least chain_cost; the first of equals.
 
-    :param subgoals: list of prediction.predictor.Subgoal of any samples, earliest first in each.
-    :return: those of the sample taken, earliest first. The other parameters are choose_subgoals'.
+    :param subgoals: of any samples, earliest first in each.
+    :return: those of the sample taken, earliest first. The other parameters are chain_cost's.
     """
     samples: dict[int, list[Subgoal]] = {}
     for subgoal in subgoals:
@@ -138,40 +139,31 @@ def choose_sample(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
     chains = list(samples.values())
     if len(chains) == 1:
         return chains[0]
-    best, _ = choose_subgoals(mpc, scene, goal_pixels, chains, seed, limits, before_plan)
-    return chains[best]
+    return min(chains, key=lambda chain: chain_cost(
+        mpc, scene, goal_pixels, chain, seed, limits, before_plan))
 
 
-def choose_subgoals(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
-                    candidates: Sequence[Sequence['Subgoal']], seed: int = 0,
-                    limits: Limits = FULL,
-                    before_plan: Callable[[], object] | None = None) -> tuple[int, np.ndarray]:
+def chain_cost(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray, chain: Iterable['Subgoal'],
+               seed: int = 0, limits: Limits = FULL,
+               before_plan: Callable[[], object] = lambda: None) -> float:
     """
-    Choose among sampled subgoals by what the planner itself expects them to cost.
+    Sum what the planner itself expects the legs of a chain of subgoals to cost.
 
-    The cost of a chain of subgoals is what the planner minimises, summed over its legs: to the
-    first subgoal from what is seen, then from each predicted picture to the next target, the arm
-    standing where the plan before left it.
+    To the first subgoal from what is seen, then from each predicted picture to the next target,
+    the arm standing where the plan before left it.
 
-    :param mpc: VisualMPC.
     :param scene: mpc_inputs.Scene, what is seen now.
-    :param goal_pixels: (K, 2).
-    :param candidates: list of lists of prediction.predictor.Subgoal, earliest first.
+    :param goal_pixels: (K, 2); chain: earliest first.
     :param seed: of the planner; limits: of its actions.
     :param before_plan: called before every plan; what it raises ends the choice.
-    :return: index of the candidate of least cost, the first of equals; costs (N,).
     """
-    costs, goal = [], mpc.goal(goal_pixels)
-    for chain in candidates:
-        seen, total = scene, 0.0
-        for subgoal in [*chain, None]:
-            if before_plan is not None:
-                before_plan()
-            target = goal if subgoal is None else mpc.goal(maps=subgoal.object_maps)
-            plan = mpc.plan(seen, target, Memory(seed), limits)
-            total += plan.cost
-            if subgoal is not None:
-                hand = gripper_after(seen.gripper, plan.actions)
-                seen = Scene(subgoal.image, hand, subgoal.expected_pixels)
-        costs.append(total)
-    return int(np.argmin(costs)), np.array(costs)
+    total = 0.0
+    for subgoal in [*chain, None]:
+        before_plan()
+        target = mpc.goal(goal_pixels) if subgoal is None else mpc.goal(maps=subgoal.object_maps)
+        plan = mpc.plan(scene, target, Memory(seed), limits)
+        total += plan.cost
+        if subgoal is not None:
+            hand = gripper_after(scene.gripper, plan.actions)
+            scene = Scene(subgoal.image, hand, subgoal.expected_pixels)
+    return total

@@ -103,19 +103,16 @@ class End:
 
 
 @dataclass(frozen=True)
-class _Round:
-    """The targets of one answer to an Aim."""
+class _State:
+    """What a plan changes; it counts once the command is sent."""
 
-    number: int  # from 1
-    earlier: tuple[Target, ...]  # subgoals passed in the rounds before
-    switches: tuple[int, ...]  # steps at which those ended
-    first_step: int
-    targets: tuple[Target, ...]
-    itinerary: Itinerary
-
-
-# What a plan changes: the planner's Memory, the round, its switches, memory of ObjectTracker.
-_Kept = tuple[Memory, _Round, tuple[int, ...], tuple[np.ndarray, np.ndarray] | None]
+    memory: Memory
+    itinerary: Itinerary  # of this round, that is, of the last answer to an Aim
+    round: int = 1
+    first_step: int = 0  # of this round
+    earlier: tuple[Target, ...] = ()  # subgoals passed in the rounds before
+    switches: tuple[int, ...] = ()  # steps at which the targets after the first one began
+    tracked: tuple[np.ndarray, np.ndarray] | None = None  # ObjectTracker.memory
 
 
 class Reach:
@@ -139,16 +136,16 @@ class Reach:
     def __init__(self, mpc: VisualMPC, config: ReachConfig, seed: int = 0,
                  now: float = 0.0) -> None:
         self._mpc, self._config, self._seed = mpc, config, seed
-        self._round: _Round | None = None
         self._tracker: ObjectTracker | None = None
         self._tabulated: tuple[Target, Goal] | None = None
         self._first: Seen | None = None
         self._planned: Command | None = None
         self._answered: Command | None = None
         self._after_ns = -1  # pictures count that are stamped later than this
-        # Memories: after the last command, and before it with what was answered and sent then.
-        self._kept: _Kept | None = None
-        self._before: tuple[_Kept, Command | None, float] | None = None
+        # After the last command; before it, with what was answered and sent then; after the next.
+        self._state: _State | None = None
+        self._before: tuple[_State, Command | None, float] | None = None
+        self._next: _State | None = None
         self._refusal = ''
         self._sent_at = now  # of the last command, or when there was reason to wait
         self.steps, self.distance = 0, float('nan')
@@ -157,20 +154,17 @@ class Reach:
     @property
     def aimed(self) -> bool:
         """Tell whether head_for has been called."""
-        return self._round is not None
+        return self._next is not None
 
     @property
     def targets(self) -> list[Target]:
         """Return the subgoals of all rounds so far, then the goal; empty before head_for."""
-        return [*self._round.earlier, *self._round.targets] if self._round else []
+        return [*self._next.earlier, *self._next.itinerary.targets] if self._next else []
 
     @property
     def switches(self) -> list[int]:
         """Return the steps at which the targets after the first one began."""
-        if self._round is None:
-            return []
-        first = self._round.first_step
-        return [*self._round.switches, *(first + step for step in self._round.itinerary.switches)]
+        return list(self._next.switches) if self._next else []
 
     def step(self, seen: Seen | None, now: float = 0.0,
              lacking: str = '') -> Aim | Command | Wait | End:
@@ -204,7 +198,7 @@ class Reach:
         if self._planned is not None and self._planned.seen.stamp_ns == seen.stamp_ns:
             return self._planned
         self._first = self._first or seen
-        return Aim(seen) if self._round is None else self._plan(seen)
+        return Aim(seen) if self._state is None else self._plan(seen, self._state)
 
     def interrupted(self, seen: Seen | None) -> End | None:
         """
@@ -225,25 +219,23 @@ class Reach:
         :param targets: list of hierarchy.Target, the last one is the goal.
         :param now: deciding may have taken time, which does not count as silence.
         """
-        config, before = self._config, self._round
+        config, passed = self._config, self._next
         self._budget = config.step_budget or step_budget(len(targets[-1].pixels))
-        itinerary = Itinerary(
-            targets, self._budget - self.steps, config.switch, config.reached)
-        if before is None:
-            self._round = _Round(1, (), (), 0, tuple(targets), itinerary)
-        else:
-            self._round = _Round(
-                before.number + 1, (*before.earlier, *before.targets[:-1]),
-                tuple(self.switches), self.steps, tuple(targets), itinerary)
-        if config.follower is not None and self._tracker is None:
+        state = _State(Memory(self._seed), Itinerary(
+            targets, self._budget - self.steps, config.switch, config.reached))
+        if passed is not None and self._state is not None:
+            # The tracker has seen the picture of the Aim, which is yet to be planned from: it
+            # goes back to the picture before.
+            state = replace(state, round=passed.round + 1, first_step=self.steps,
+                            earlier=(*passed.earlier, *passed.itinerary.targets[:-1]),
+                            switches=passed.switches, tracked=self._state.tracked)
+        elif config.follower is not None:
             first = self._first
             assert first is not None and first.pixels is not None, 'an Aim comes first'
             self._tracker = ObjectTracker(
                 config.follower, first.image, first.gripper, first.pixels)
-        kept = self._memory(Memory(self._seed))
-        # In a later round the tracker has seen the picture of the Aim, which is yet to be planned
-        # from: it goes back to the picture before.
-        self._kept = (*kept[:3], self._kept[3]) if self._kept else kept
+            state = replace(state, tracked=self._tracker.memory)
+        self._state = self._next = state
         self._sent_at = now
 
     def sent(self, after_ns: int | None = None, now: float = 0.0) -> None:
@@ -255,10 +247,10 @@ class Reach:
         :param now: s.
         """
         command, self._planned = self._planned, None
-        assert command is not None and self._kept is not None, 'a Command comes first'
-        self._before = self._kept, self._answered, self._sent_at
+        assert command is not None and self._state is not None, 'a Command comes first'
+        self._before = self._state, self._answered, self._sent_at
         self._sent_at = now
-        self._kept, self._answered = self._memory(command.plan.memory), command
+        self._state, self._answered = self._next, command
         self._after_ns = command.seen.stamp_ns if after_ns is None else after_ns
         self.steps += 1
         self._refusal = ''
@@ -274,7 +266,8 @@ class Reach:
         refused = self._answered
         if self._before is None or refused is None or refused.seen.stamp_ns != stamp_ns:
             return False
-        (self._kept, self._answered, self._sent_at), self._before = self._before, None
+        (self._state, self._answered, self._sent_at), self._before = self._before, None
+        self._next = self._state
         self._after_ns, self._planned = refused.seen.stamp_ns, None
         self.steps -= 1
         self._refusal = reason
@@ -292,27 +285,35 @@ class Reach:
             return f'what was seen is {age:.1f} s old' + (f': {lacking}' if lacking else '')
         return ''
 
-    def _plan(self, seen: Seen) -> Aim | Command | End:
+    def _plan(self, seen: Seen, state: _State) -> Aim | Command | End:
         """Plan the next command from a new picture."""
-        config = self._config
-        assert self._first is not None and self._kept is not None
-        memory, current = self._recall(self._kept)
-        self.pixels = pixels = self._find_objects(seen)
-        self.distance = current.targets[-1].distance(pixels)
+        config, itinerary = self._config, state.itinerary
+        self._next = state
+        # where the objects are
+        self.pixels = pixels = self._find_objects(seen, state)
+        self.distance = itinerary.targets[-1].distance(pixels)
         if self.distance <= config.reached:
             return End('reached', f'{self.distance:.1f} px from the goal, reached')
         if self.steps >= self._budget:
             return End('spent', f'{self.distance:.1f} px from the goal, '
                                 f'step budget of {self._budget} spent')
-        target = current.itinerary.target(self.steps - current.first_step, pixels)
-        if (target is current.targets[-1] and len(current.targets) > 1
-                and current.number < config.rounds and self.steps > current.first_step):
+        # what to go to
+        before = len(state.switches) - len(state.earlier)
+        stage = itinerary.stage(self.steps - state.first_step, pixels, before)
+        self._next = state = replace(
+            state, switches=state.switches + (self.steps,) * (stage - before),
+            tracked=None if self._tracker is None else self._tracker.memory)
+        if (0 < stage == len(itinerary.targets) - 1 and state.round < config.rounds
+                and self.steps > state.first_step):
+            assert self._first is not None
             return Aim(replace(seen, names=self._first.names, pixels=pixels))
+        # plan
         limit = np.array(seen.image.shape[1::-1]) - 1
-        goal = self._goal(target, np.clip(pixels, 0, limit))
+        goal = self._goal(itinerary.targets[stage], np.clip(pixels, 0, limit))
         plan = self._mpc.plan(
-            Scene(seen.image, seen.gripper, pixels), goal, memory, config.limits)
-        return Command(plan, len(self.switches), seen)
+            Scene(seen.image, seen.gripper, pixels), goal, state.memory, config.limits)
+        self._next = replace(state, memory=plan.memory)
+        return Command(plan, len(state.switches), seen)
 
     def _goal(self, target: Target, pixels: np.ndarray) -> Goal:
         """Return the planner's Goal for a target, tabulated once unless objects are free."""
@@ -321,30 +322,17 @@ class Reach:
             known = self._tabulated = target, self._mpc.goal(**target.goal(pixels))
         return known[1]
 
-    def _find_objects(self, seen: Seen) -> np.ndarray:
+    def _find_objects(self, seen: Seen, state: _State) -> np.ndarray:
         """Return where the objects are, (K, 2)."""
-        if self._tracker is None:
+        if self._tracker is None or state.tracked is None:
             assert seen.pixels is not None, 'without a follower objects are looked for'
             return seen.pixels
+        self._tracker.memory = state.tracked
         if self._answered is None:
             return self._tracker.pixels
         before = self._answered
         return self._tracker.update(
             before.seen.image, before.seen.gripper, before.plan.action, seen.image, seen.gripper)
-
-    def _memory(self, planned: Memory) -> _Kept:
-        """Return all that a plan changes: the planner's Memory, and what is set back."""
-        assert self._round is not None
-        return (planned, self._round, self._round.itinerary.switches,
-                None if self._tracker is None else self._tracker.memory)
-
-    def _recall(self, memory: _Kept) -> tuple[Memory, _Round]:
-        """Set back what a plan has changed; return the planner's Memory and the round."""
-        planned, self._round, passed, tracked = memory
-        self._round.itinerary.switches = passed
-        if self._tracker is not None and tracked is not None:
-            self._tracker.memory = tracked
-        return planned, self._round
 
 
 def scene_change(first: Seen, seen: Seen) -> str:

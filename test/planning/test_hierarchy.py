@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of hierarchical planning: which target comes when, and how subgoals are chosen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.planning.action_sequences import FULL, gripper_after, Limits
 from tap_ros.planning.hierarchy import (
+    chain_cost,
     choose_sample,
-    choose_subgoals,
     Itinerary,
     Target,
     targets_by,
@@ -30,10 +32,10 @@ def targets(count):
 
 def stages(itinerary, path):
     """Return the number of the target at each step, the objects being at path (T, K, 2)."""
-    found = []
+    found, stage = [], 0
     for step, pixels in enumerate(path):
-        itinerary.target(step, pixels)
-        found.append(len(itinerary.switches))
+        stage = itinerary.stage(step, pixels, stage)
+        found.append(stage)
     return found
 
 
@@ -55,7 +57,7 @@ def test_reached_goes_on_at_once_but_not_later_than_half():
 
 def test_several_targets_that_are_reached_are_passed_at_once():
     same = [Target(PLACES)] * 3
-    assert Itinerary(same, 12).target(0, PLACES) is same[2]
+    assert Itinerary(same, 12).stage(0, PLACES) == 2
 
 
 def test_free_objects_count_for_nothing_and_shall_stay_where_they_are():
@@ -98,9 +100,7 @@ def test_an_undecided_map_is_reached_in_either_place_an_uneven_one_in_the_likeli
     away = np.array([[15.0, 20.0]])
     expected = np.linalg.norm(places - away, axis=1).mean() - 7.5
     assert evenly.distance(away) == pytest.approx(expected, abs=0.05)
-    way = Itinerary([evenly, Target(places[:1])], 12)
-    way.target(0, places[1:])
-    assert way.switches == (0,)
+    assert Itinerary([evenly, Target(places[:1])], 12).stage(0, places[1:]) == 1
 
 
 def test_unknown_switches_are_named():
@@ -129,28 +129,27 @@ def test_the_subgoal_on_the_way_is_chosen_and_the_first_of_equals(model):
     start, goal = PLACES, PLACES + [4.0, 0.0]
     between, astray = start + [2.0, 0.0], np.array([[28.0, 28.0], [3.0, 3.0]])
     chains = [[subgoal(astray)], [subgoal(between)], [subgoal(between)]]
-    best, costs = choose_subgoals(mpc, scene(start), goal, chains)
-    assert best == 1 and costs[1] == costs[2] < costs[0]
-    again, _ = choose_subgoals(mpc, scene(start), goal, chains[::-1])
-    assert again == 0
+    costs = [chain_cost(mpc, scene(start), goal, chain) for chain in chains]
+    assert costs[1] == costs[2] < costs[0]
+    found = [replace(chain[0], sample=i) for i, chain in enumerate(chains)]
+    assert choose_sample(mpc, scene(start), goal, found) == found[1:2]
+    assert choose_sample(mpc, scene(start), goal, found[::-1]) == found[2:]
 
 
 def test_samples_are_judged_by_plans_with_the_seed_and_the_limits_that_are_given(model):
-    mpc, chains = small_planner(model), [[subgoal(PLACES + 2.0)]] * 2
-
-    def costs(*given):
-        return choose_subgoals(mpc, scene(PLACES), PLACES + 4.0, chains, *given)[1]
+    mpc, chain = small_planner(model), [subgoal(PLACES + 2.0)]
 
     def cost(seed, limits):
-        goal = mpc.goal(maps=chains[0][0].object_maps)
+        goal = mpc.goal(maps=chain[0].object_maps)
         first = mpc.plan(scene(PLACES), goal, Memory(seed), limits)
         hand = gripper_after(np.zeros(4, np.float32), first.actions)
-        seen = Scene(chains[0][0].image, hand, PLACES + 2.0)
+        seen = Scene(chain[0].image, hand, PLACES + 2.0)
         return first.cost + mpc.plan(seen, mpc.goal(PLACES + 4.0), Memory(seed), limits).cost
 
     slow = Limits(0.01, 0.02)
     for seed, limits in ((0, FULL), (1, FULL), (0, slow)):
-        assert (costs(seed, limits) == cost(seed, limits)).all()
+        assert cost(seed, limits) == chain_cost(
+            mpc, scene(PLACES), PLACES + 4.0, chain, seed, limits)
     assert len({cost(0, FULL), cost(1, FULL), cost(0, slow)}) == 3
     given = []
     mpc.plan = lambda seen, goal, *rest: given.append(rest) or VisualMPC.plan(
@@ -177,7 +176,7 @@ def test_subgoals_are_divided_by_their_sample_and_one_sample_needs_no_plan(model
 
 
 def test_a_choice_can_be_broken_off_between_two_plans(model):
-    chains, plans = [[subgoal(PLACES)]] * 5, []
+    found, plans = [subgoal(PLACES, sample) for sample in range(5)], []
 
     def before_plan():
         plans.append(0)
@@ -185,6 +184,6 @@ def test_a_choice_can_be_broken_off_between_two_plans(model):
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        choose_subgoals(small_planner(model), scene(PLACES), PLACES + 4, chains,
-                        before_plan=before_plan)
+        choose_sample(small_planner(model), scene(PLACES), PLACES + 4, found,
+                      before_plan=before_plan)
     assert len(plans) == 3
