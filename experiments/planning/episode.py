@@ -8,7 +8,6 @@ same.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE
@@ -75,7 +74,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
         shown, start_picture = view.see(seen), asked.see(seen).image
         answer = reach.step(as_seen(shown))
         while isinstance(answer, Aim):
-            pictures = Pictures(start_picture, asked.fill(goal).image, shown.image)
+            pictures = start_picture, asked.fill(goal).image, shown.image
             targets, found = make_targets(
                 simulator, mpc, method, replace(seen, object_pixels=answer.seen.pixels),
                 goal, predictor, seed, pictures)
@@ -133,31 +132,25 @@ def shown_mask(predictor):
     return robot_mask if share else 'none'
 
 
-class Pictures(NamedTuple):
-    """What networks see of an episode now, uint8 (H, W, 3), filled as each was trained."""
-
-    start: np.ndarray  # for the predictor
-    goal: np.ndarray  # for the predictor
-    planned_from: np.ndarray  # for the planner's model
-
-
-def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=None):
+def make_targets(simulator, mpc, method, seen, goal, predictor, seed, pictures=()):
     """
     Decide what is planned to from what is seen, at the start of each round.
 
     :param mpc: VisualMPC, which chooses among samples.
     :param seen: Observation of now; goal: of the goal.
-    :param pictures: Pictures, for methods that predict.
+    :param pictures: for methods that predict, uint8 (H, W, 3), filled as each network was
+        trained: of the start and of the goal for the predictor, of now for the planner's model.
     :return: list of Target, the goal last, and the list of the Subgoals that were predicted.
     """
     start, end = seen.object_pixels, goal.object_pixels
     last = Target(end)
     if method.predicted:
+        first, last_picture, now = pictures
         found = predictor.predict(
-            pictures.start, pictures.goal, start, end, num_samples=method.samples,
+            first, last_picture, start, end, num_samples=method.samples,
             recursion_depth=method.recursion, seed=seed)
         subgoals = choose_sample(
-            mpc, Scene(pictures.planned_from, seen.gripper, start), end, found, seed)
+            mpc, Scene(now, seen.gripper, start), end, found, seed)
         return targets_by(subgoals, end), subgoals
     if method.base not in ('oracle_order', 'true_subgoal'):
         return [last], []

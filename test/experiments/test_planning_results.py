@@ -6,7 +6,6 @@ from dataclasses import asdict, replace
 import json
 from pathlib import Path
 
-from experiments.planning.claims import claims_table
 from experiments.planning.command import Options
 from experiments.planning.evaluate import make_jobs
 from experiments.planning.films import pick_scenes
@@ -181,27 +180,6 @@ def test_results_of_other_settings_are_not_subtracted():
     assert any('against' in row for row in make_rows(results))
     results['push2', 'genmin'][0]['predictor_weights'] = 'others'
     assert not any('against' in row for row in make_rows(results))
-
-
-def test_claims_follow_the_numbers():
-    rows = make_rows(dict([stored('direct', [3.0, 4.0, 9.0]), stored('shipped', [2.0, 2.0, 3.0])]))
-
-    def cells(rows, start):
-        table = claims_table(rows)
-        line, = table[table['claim'].str.startswith(start)].itertuples(index=False)
-        return list(line)[1:]
-
-    assert cells(rows, 'final distance via the subgoal, two') == [
-        '11.9 cm', 'at most 2.5 cm', '2.3 cm (2.0 to 3.0), 3 scenes', 'yes']
-    less = cells(rows, 'the same, minus direct, two objects')
-    assert less[0] == '-1.0 cm' and less[2].startswith('-3.0 cm (') and less[3] == 'yes'
-    assert cells(rows, 'final distance via the subgoal, three')[2:] == ['', '*not run*']
-    ordered = [{**row, 'task': 'order2'} for row in rows]
-    more = cells(ordered, 'success via the subgoal minus direct, two, one on')
-    assert more[2].startswith('+33 points (') and more[3] == 'no', 'the interval begins at 0'
-    twice = [{**row, 'task': 'order3', 'method': row['method'].replace(
-        'shipped', 'shipped:rounds2')} for row in rows]
-    assert cells(twice, 'success via the subgoal minus direct, three')[2].startswith('+33 points')
 
 
 def test_forward_models_are_scored_beside_standing_still(tmp_path, capsys):
