@@ -66,12 +66,6 @@ def test_each_goal_picture_is_attached_when_it_comes(tmp_path):
         np.testing.assert_array_equal(pixels, np.full((8, 8, 3), value))
 
 
-def test_training_sets_carry_none(tmp_path, episodes):
-    bag = write_bag(tmp_path / 'bag', episodes[:2])
-    file, = bag.glob('*.mcap')
-    assert list(read_attachments(file)) == []
-
-
 def test_other_readers_find_messages_and_attachments(tmp_path):
     file = goals(tmp_path / 'bag', 5, 6, 7)
     ours = list(read_attachments(file))

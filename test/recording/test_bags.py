@@ -95,19 +95,6 @@ def test_a_killed_recorder_leaves_a_readable_bag(tmp_path):
     assert episode.frames[:, 0, 0, 0].tolist() == [t % 256 for t in range(len(episode))]
 
 
-def test_a_bag_in_progress_is_readable_after_a_flush(tmp_path):
-    writer = BagWriter(tmp_path / 'bag', flush_seconds=1e9)
-    for t in range(3):
-        writer.write_raw(*picture(t))
-    writer.flush()
-    with pytest.warns(RecordingWarning):
-        (episode,) = iter_episodes(tmp_path / 'bag')
-    assert episode.frames[:, 0, 0, 0].tolist() == [0, 1, 2]
-    writer.close()
-    (episode,) = iter_episodes(tmp_path / 'bag')
-    assert len(episode) == 3
-
-
 def test_bag_writer_splits_files(tmp_path):
     writer = BagWriter(tmp_path / 'bag', flush_seconds=-1.0, split_bytes=2000, compression='none')
     for t in range(40):

@@ -220,16 +220,6 @@ def test_a_damaged_summary_is_told_and_what_it_described_is_read(chunked):
     assert len(texts) == 1 and 'its summary is damaged' in texts[0]
 
 
-def test_a_wrong_index_of_messages_does_no_harm(chunked):
-    path, episodes = chunked
-    data = bytearray(path.read_bytes())
-    for kind, start, _ in records(data):
-        if kind == MESSAGE_INDEX:
-            data[start + 9 + 14] ^= 0x5a  # the offset of the first entry
-    path.write_bytes(data)
-    assert_all_equal(iter_episodes(path), episodes)
-
-
 def rewrite(path, other, **options):
     """Copy the messages of a file as another writer would write them."""
     with open(other, 'wb') as out, open(path, 'rb') as stream:
