@@ -33,6 +33,7 @@ setup(
     extras_require={  # what only some commands need; `colcon test` runs pytest because of the last
         'bair': ['google-crc32c', 'protobuf'],
         'lerobot': ['pyarrow'],
+        'ray': ['ray'],
         'test': ['pytest'],
     },
     zip_safe=False,

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulator as a ROS node: camera, objects and clock out, twist commands in."""
 
+from importlib.util import find_spec
 import math
 import sys
 import time
@@ -16,8 +17,8 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
+from sim_bridge.ros.run_state import MAX_PERIODS, RunState
 from sim_bridge.ros.tf_publisher import TransformPublisher
-from sim_bridge.tasks.run_state import MAX_PERIODS, RunState
 from sim_bridge.world.appearance import CHOICES
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from sim_bridge.world.transforms import arm_transforms, fixed_arm_transforms, Transform
@@ -111,11 +112,8 @@ class SimNode(Node):
                                    (StepScene, 'sim/step', self._on_step),
                                    (SetBool, 'sim/pause', self._on_pause)):
             self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
-        try:
+        if find_spec('simulation_interfaces') is not None:  # no wheel has it
             from sim_bridge.ros.standard_services import StandardServices
-        except ImportError:
-            pass  # no wheel has simulation_interfaces
-        else:
             StandardServices(self)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         if self.params['lock_step']:

@@ -23,8 +23,8 @@ class RayWorkers:
         try:
             import ray
         except ImportError as error:
-            raise ConfigError('engine: Ray is not installed; type `pip install ray`, or choose '
-                              '--engine local') from error
+            raise ConfigError("engine: Ray is not installed; type `pip install '.[ray]'`, or "
+                              'choose --engine local') from error
         self._ray, self._engine, self._count = ray, engine, count
         self.running: dict[Any, Task] = {}  # by reference
 

@@ -1,14 +1,15 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Engines and their tasks.
+Run many independent tasks on an engine.
 
 A task is a function of a module and its arguments. It must be idempotent: it leaves whole files or
 returns a value, and gives the same when it is run again, since the task of a worker that was
 killed runs again. Which tasks are done already, and so are left out, their caller says.
 """
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, get_args, Literal, NoReturn, Protocol, Self
 
@@ -25,7 +26,7 @@ class Engine:
     """
     Where tasks run.
 
-    :param name: local: processes of this machine; ray: Ray, which needs `pip install ray`.
+    :param name: local: processes of this machine; ray: Ray, which needs `pip install '.[ray]'`.
     :param workers: tasks at a time, a process each; 0: one a core, of the cluster with an address.
     :param address: of a Ray cluster to join, such as 'auto' or '10.0.0.1:6379'; empty: Ray is
         started on this machine. Its machines need this package in the same place, and the folders
@@ -37,7 +38,7 @@ class Engine:
     address: str = ''
 
     def __post_init__(self) -> None:
-        """Refuse an engine that there is not."""
+        """Raise ConfigError for an unknown engine, or options that do not fit it."""
         if self.name not in ENGINES:
             raise ConfigError(f'engine: expected one of {", ".join(ENGINES)}, got {self.name!r}')
         if self.workers < 0:
@@ -64,7 +65,7 @@ class Task:
     args: tuple[Any, ...] = ()
 
 
-Ended = Iterator[tuple[Task, Callable[[], Any]]]  # see run.run_tasks
+Ended = Iterator[tuple[Task, Callable[[], Any]]]  # see run_tasks
 
 
 class Workers(Protocol):
@@ -105,3 +106,41 @@ def raising(error: BaseException) -> Callable[[], NoReturn]:
 def lost(task: Task) -> EngineError:
     return EngineError(f'{task.name}: its worker process was killed {TRIES} times, perhaps for '
                        'want of memory; start again with fewer workers: what is done is kept')
+
+
+def run_tasks(
+        tasks: Iterable[Task], engine: Engine = LOCAL, stop: Callable[[], bool] = lambda: False,
+        tick: Callable[[], object] = lambda: None) -> Ended:
+    """
+    Run tasks, in their order as far as there are workers.
+
+    :param tasks: iterable of Task.
+    :param engine: Engine.
+    :param stop: asked before each task; once it says True, no other begins.
+    :param tick: called about twice a second meanwhile.
+    :return: generator of (Task, get), in the order in which they end: get() returns what the
+        task returned, or raises what it raised. Tasks in progress are ended where the generator
+        is closed or interrupted.
+    :raises ConfigError: where Ray is asked for and not installed, or does not answer.
+    :raises EngineError: by get, when workers were killed TRIES times while the task ran.
+    """
+    waiting = deque(tasks)
+    if not waiting:
+        return
+    with _workers(engine, len(waiting)) as workers:
+        while waiting or workers.running:
+            while waiting and len(workers.running) < workers.room and not stop():
+                workers.begin(waiting.popleft())
+            if not workers.running:
+                return
+            yield from workers.ended()
+            tick()
+
+
+def _workers(engine: Engine, count: int) -> Workers:
+    """Return what runs so many tasks; Ray is imported only when it is asked for."""
+    if engine.name == 'ray':
+        from tap_ros.engines.ray_cluster import RayWorkers
+        return RayWorkers(engine, count)
+    from tap_ros.engines.local import LocalWorkers
+    return LocalWorkers(engine, count)

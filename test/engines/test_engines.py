@@ -10,8 +10,7 @@ import sys
 import time
 
 import pytest
-from tap_ros.engines.run import run_tasks
-from tap_ros.engines.task import Engine, Task, TRIES
+from tap_ros.engines.task import Engine, run_tasks, Task, TRIES
 from tap_ros.errors import ConfigError, EngineError, RecordingError
 
 ROOT = Path(__file__).parents[2]
@@ -90,8 +89,7 @@ def hear_interrupts():
 def test_an_interrupted_run_leaves_no_worker(tmp_path):
     script = ('import sys; sys.path[:0] = [sys.argv[2], sys.argv[2] + "/test/engines"]\n'
               'from test_engines import write_slowly\n'
-              'from tap_ros.engines.run import run_tasks\n'
-              'from tap_ros.engines.task import Engine, Task\n'
+              'from tap_ros.engines.task import Engine, run_tasks, Task\n'
               'if __name__ == "__main__":\n'
               '    list(run_tasks([Task("slow", write_slowly, (sys.argv[1], 300.0))], Engine()))')
     (tmp_path / 'script.py').write_text(script)

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 from sim_bridge.collect import collect, CollectConfig, make_episode
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks import grasp_expert
-from sim_bridge.tasks.grasp import grasp_place, graspable_shape, graspable_yaw, GraspConfig
-from sim_bridge.tasks.tasks import LIFT_HEIGHT, run_episode
+from sim_bridge.tasks import grasp
+from sim_bridge.tasks.grasp import (
+    grasp_place,
+    graspable_shape,
+    graspable_yaw,
+    GraspConfig,
+    LIFT_HEIGHT,
+)
+from sim_bridge.tasks.tasks import run_episode
 from tap_ros.errors import ConfigError
 
 NUM_FRAMES = {'grasp': 15, 'pick_place': 20}
@@ -180,7 +186,7 @@ def test_the_object_is_held_near_its_centre_where_that_is_possible(monkeypatch):
         return np.mean(distances)
 
     near = mean_distance()
-    monkeypatch.setattr(grasp_expert, 'OFF_CENTRE', 0.0)
+    monkeypatch.setattr(grasp, 'OFF_CENTRE', 0.0)
     assert near < 0.75 * mean_distance()
     simulator.close()
 

@@ -45,6 +45,8 @@ from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.topics import STREAM
 from tap_ros.options import Flag, Folder, one_of
 from tap_ros.planning.mpc_config import FIRST_SCENE
+from tap_ros.plugins import names
+from tap_ros.robots.arm import DEFAULT_ARM
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tqdm import tqdm
 from tyro import conf
@@ -127,12 +129,12 @@ def push(client: Client, watch: Watch, mode: str, seed: int, step_budget: int,
 
 
 def run_scene(client: Client, watch: Watch, task: str, seed: int, step_budget: int,
-              look: str) -> SceneRuns:
+              world: dict[str, str]) -> SceneRuns:
     """
     Predict a subgoal of one scene; push it in every mode, or show how the expert does it.
 
     :param step_budget: the most steps of a run.
-    :param look: of the world.
+    :param world: options of the Simulator.
     :return: SceneRuns.
     """
     runs: dict[str, Run] = {}
@@ -150,12 +152,12 @@ def run_scene(client: Client, watch: Watch, task: str, seed: int, step_budget: i
         task=task, seed=seed, start=start.image, goal=goal.image, start_pixels=start.pixels,
         goal_pixels=goal.pixels, subgoal=subgoal.image, object_maps=subgoal.object_maps,
         runs=runs, side_goal_pixels=OBSERVER.project(goal.positions),
-        expert=() if runs else film_expert(task, seed, look))
+        expert=() if runs else film_expert(task, seed, world))
 
 
-def film_expert(task: str, seed: int, look: str) -> list[np.ndarray]:
+def film_expert(task: str, seed: int, world: dict[str, str]) -> list[np.ndarray]:
     """Return pictures from the side of the expert doing a task, without ROS."""
-    simulator = Simulator(task, look=look)
+    simulator = Simulator(task, **world)
     try:
         _, actions, _, _ = run_episode(simulator, seed)
         simulator.reset(seed)
@@ -168,10 +170,11 @@ def film_expert(task: str, seed: int, look: str) -> list[np.ndarray]:
         simulator.close()
 
 
-def start_nodes(processes: NodeProcesses, folder: Path, task: str, look: str) -> None:
+def start_nodes(processes: NodeProcesses, folder: Path, task: str,
+                world: dict[str, str]) -> None:
     """Start simulator, predictor, recorder and, for tasks that push, the planner."""
     processes.start('recorder_node', folder=folder / 'recording' / task)
-    processes.start('sim_node', lock_step=True, task=task, look=look, observer=True)
+    processes.start('sim_node', lock_step=True, task=task, observer=True, **world)
     processes.start('predictor_node', weights=task if task in PREDICTORS else DEFAULT_PREDICTOR)
     if not get_task(task).gripping:
         processes.start('visual_mpc_node')
@@ -187,6 +190,7 @@ class Options:
     :param tasks: what is to be done in them; none named: push2, order2 and stack2, or with attach
         push2.
     :param look: of the world, see sim_node.
+    :param arm: at the table, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
     :param attach: use nodes that run already, for example those of demo.launch.py.
     """
@@ -195,6 +199,7 @@ class Options:
     seed: int = FIRST_SCENE
     tasks: tuple[Annotated[str, one_of(task_names())], ...] = ()
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
+    arm: Annotated[str, one_of(names('tap_ros.arms'))] = DEFAULT_ARM
     step_budget: Annotated[int, conf.arg(
         help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0
     out: Folder = 'runs/demo'
@@ -251,13 +256,13 @@ def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
     nodes = ['sim_node', 'predictor_node']
     nodes += [] if get_task(task).gripping else ['visual_mpc_node']
     with NodeProcesses(folder / 'logs' / task) as processes, Client() as client:
-        watch = Watch(client.node)
+        watch, world = Watch(client.node), {'look': args.look, 'arm': args.arm}
         if args.attach:
             print(f'{task}: waiting for the nodes that run already', flush=True)
         else:
             print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
                   flush=True)
-            start_nodes(processes, folder, task, args.look)
+            start_nodes(processes, folder, task, world)
         for name in nodes:
             client.wait_until_ready(name, check=processes.check)
             print(f'  {name} is ready', flush=True)
@@ -265,7 +270,7 @@ def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
         for i in range(args.scenes):
             print(f'  scene {args.seed + i} ({i + 1} of {args.scenes})', flush=True)
             scenes.append(run_scene(
-                client, watch, task, args.seed + i, _budget(args, task), args.look))
+                client, watch, task, args.seed + i, _budget(args, task), world))
             processes.check()
         return scenes
 
