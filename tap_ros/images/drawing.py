@@ -3,9 +3,14 @@
 """Pictures for people: object maps over a frame, panels side by side, film strips."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from tap_ros.images.pixels import to_uint8
+
+if TYPE_CHECKING:
+    import torch
 
 OBJECT_COLOURS = (  # rgb, one per object; colour-blind readers tell them apart too
     (255, 176, 0), (100, 143, 255), (220, 38, 127), (0, 158, 115))
@@ -122,3 +127,13 @@ def png_bytes(image: np.ndarray) -> bytes:
     :return: bytes of a PNG file.
     """
     return cv2.imencode('.png', np.ascontiguousarray(image[..., ::-1]))[1].tobytes()
+
+
+def grey_panels(maps: 'torch.Tensor') -> list[np.ndarray]:
+    """
+    Show numbers from 0 to 1 as grey.
+
+    :param maps: tensor (N, H, W).
+    :return: list of N uint8 (H, W, 3).
+    """
+    return list(to_uint8(maps[:, None].expand(-1, 3, -1, -1) * 2 - 1))

@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 from tap_ros.images.crop import check_trainable
-from tap_ros.images.drawing import grid
+from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_uint8
 from tap_ros.planning.forward_data import draw_windows, Windows
 from tap_ros.planning.forward_loss import draw_arm_like, forward_loss
@@ -25,12 +25,18 @@ from tap_ros.planning.table import fit_arm, fit_shift, fit_table
 from tap_ros.recording.bags import check_first_picture
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.reading import reading_of
-from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
+from tap_ros.training.checkpoints import (
+    describe_run,
+    load_checkpoint,
+    run_facts,
+    run_folder,
+    save_checkpoint,
+    start,
+    TrainingState,
+)
 from tap_ros.training.devices import pick_device
 from tap_ros.training.inpainted import Episodes, FilledStore, with_masks
-from tap_ros.training.panels import grey_panels
 from tap_ros.training.robot_mask import fill_from_past
-from tap_ros.training.run_folder import describe_run, run_facts, run_folder
 from tap_ros.training.split import split_episodes, warn_if_none
 from tap_ros.training.weights import save_weights
 import torch

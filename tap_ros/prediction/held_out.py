@@ -1,11 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What a network scores by its own method while it is trained."""
+"""What a network scores by its own method while it is trained, and how that looks."""
 
 from collections.abc import Iterable
 import contextlib
 
-from tap_ros.images.pixels import to_float
+import numpy as np
+from tap_ros.images.drawing import grey_panels, grid
+from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.batches import Batch
 from tap_ros.prediction.losses import l1_error
 from tap_ros.prediction.networks import Prediction, PredictorNetwork
@@ -57,3 +59,26 @@ def held_out_scores(network: PredictorNetwork, batches: Iterable[Batch], config:
     return {'loss': torch.cat(losses).mean().item(),
             'match_fraction': fractions.mean().item(),
             'match_fraction_std': fractions.std(correction=0).item()}
+
+
+@torch.no_grad()
+def sample_grid(batch: Batch, prediction: Prediction, match: torch.Tensor) -> np.ndarray:
+    """
+    Show a batch: context, prediction, matched frame, one mask for each source, new pixels.
+
+    :param batch: batches.Batch.
+    :param prediction: networks.Prediction of it.
+    :param match: int64 (B,), the matched targets as indices into T.
+    :return: uint8 (height, width, 3).
+    """
+    context = batch.context.cpu().numpy()
+    images = to_uint8(prediction.image)
+    match = match.cpu()
+    rows = []
+    for b in range(len(context)):
+        row = [*context[b], images[b], batch.targets[b, match[b]].cpu().numpy()]
+        row += grey_panels(prediction.masks[b, :, 0].float())
+        if prediction.new_pixels is not None:
+            row.append(to_uint8(prediction.new_pixels[b]))
+        rows.append(row)
+    return grid(rows)

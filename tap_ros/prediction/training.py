@@ -19,7 +19,7 @@ from tap_ros.images.crop import check_trainable
 from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import Batch, episode_order, make_batch, Sampling
 from tap_ros.prediction.discriminator import Discriminator
-from tap_ros.prediction.held_out import held_out_scores, matched
+from tap_ros.prediction.held_out import held_out_scores, matched, sample_grid
 from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import (
@@ -29,19 +29,25 @@ from tap_ros.prediction.objective import (
     Outcome,
     predictor_loss,
 )
-from tap_ros.prediction.pictures import sample_grid
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.recognition import Recognition
 from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
 from tap_ros.recording.bags import check_first_picture
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.reading import reading_of
-from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
+from tap_ros.training.checkpoints import (
+    describe_run,
+    load_checkpoint,
+    run_facts,
+    run_folder,
+    save_checkpoint,
+    start,
+    TrainingState,
+)
 from tap_ros.training.devices import Autocast, make_autocast, pick_device, pick_precision
 from tap_ros.training.frames import Frames, MappedFrames, ResidentFrames
 from tap_ros.training.inpainted import fill, Filled, with_masks
 from tap_ros.training.parallel import joined, Processes, share_batch_norm
-from tap_ros.training.run_folder import describe_run, run_facts, run_folder
 from tap_ros.training.split import split_episodes, warn_if_none
 from tap_ros.training.weights import save_weights
 import torch

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 import os
-from typing import Any
 
 from tap_ros.errors import ConfigError
 import torch
@@ -92,12 +91,17 @@ def joined(device: torch.device) -> Iterator[Processes]:
 
     :param device: torch device of this process.
     :return: context manager of Processes; one alone where torchrun started none.
+    :raises ConfigError: for several processes without GPUs; batches are normalised over all
+        processes on GPUs only (torch.nn.SyncBatchNorm).
     """
     count = int(os.environ.get('WORLD_SIZE', 1))
     if count == 1:
         yield ALONE
         return
-    distributed.init_process_group('nccl' if device.type == 'cuda' else 'gloo')
+    if device.type != 'cuda':
+        raise ConfigError(f'device: {count} processes train on a GPU each, not on {device.type}; '
+                          'start one process, with threads')
+    distributed.init_process_group('nccl')
     try:
         yield Processes(distributed.get_rank(), count)
     finally:
@@ -116,41 +120,5 @@ def share_batch_norm(module: nn.Module, processes: Processes) -> None:
     :param module: changed in place; its weights and their names stay.
     :param processes: Processes.
     """
-    for part in module.modules():
-        if processes.count > 1 and type(part) is nn.BatchNorm2d:
-            part.__class__ = _SharedBatchNorm2d
-
-
-class _Sum(torch.autograd.Function):
-    """Add up a tensor over the processes; what comes back is added up, too."""
-
-    @staticmethod
-    def forward(_: Any, value: torch.Tensor) -> torch.Tensor:
-        value = value.clone()
-        distributed.all_reduce(value)
-        return value
-
-    @staticmethod
-    def backward(_: Any, gradient: torch.Tensor) -> torch.Tensor:
-        return _Sum.forward(_, gradient.contiguous())
-
-
-class _SharedBatchNorm2d(nn.BatchNorm2d):
-    """Batch normalisation over all processes; torch's own exists for GPUs only."""
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        if not self.training:
-            return super().forward(x)
-        count = x.numel() / x.size(1) * distributed.get_world_size()
-        values = x.float()
-        mean = _Sum.apply(values.sum((0, 2, 3))) / count
-        centred = values - mean[:, None, None]
-        variance = _Sum.apply(centred.square().sum((0, 2, 3))) / count
-        with torch.no_grad():
-            assert self.running_mean is not None and self.running_var is not None
-            assert self.num_batches_tracked is not None and self.momentum is not None
-            self.num_batches_tracked += 1
-            self.running_mean.lerp_(mean, self.momentum)
-            self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)
-        scale = self.weight * (variance + self.eps).rsqrt()
-        return (centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
+    if processes.count > 1:
+        nn.SyncBatchNorm.convert_sync_batchnorm(module)

@@ -63,16 +63,12 @@ def fill_in_time(frames: np.ndarray, masks: np.ndarray,
     :return: uint8 (T, H, W, 3); bool (H, W), False where a pixel is hidden and never free: such
         ones stay as they are.
     """
-    hidden, free = hidden_pixels(masks, robot_mask), masks == ROBOT_MASK_FREE
+    free = masks == ROBOT_MASK_FREE
     now = np.arange(len(frames), dtype=np.int32)[:, None, None]
     past = np.maximum.accumulate(np.where(free, now, -_FAR), 0)
     future = np.minimum.accumulate(np.where(free, now, _FAR)[::-1], 0)[::-1]
-    source = np.where(now - past <= future - now, past, future)
-    known = np.asarray(free.any(0))
-    filled = np.array(frames)
-    t, v, u = np.nonzero(hidden & known)
-    filled[t, v, u] = frames[source[t, v, u], v, u]
-    return filled, known | ~hidden.any(0)
+    return _filled(frames, hidden_pixels(masks, robot_mask),
+                   np.where(now - past <= future - now, past, future))
 
 
 def fill_from_past(frames: np.ndarray, masks: np.ndarray,
@@ -86,13 +82,19 @@ def fill_from_past(frames: np.ndarray, masks: np.ndarray,
     :return: uint8 (T, H, W, 3); bool (H, W), False where a pixel is hidden before it is ever free:
         until then such ones stay as they are.
     """
-    hidden, free = hidden_pixels(masks, robot_mask), masks == ROBOT_MASK_FREE
     now = np.arange(len(frames), dtype=np.int32)[:, None, None]
-    past = np.maximum.accumulate(np.where(free, now, -1), 0)
+    past = np.maximum.accumulate(np.where(masks == ROBOT_MASK_FREE, now, -_FAR), 0)
+    return _filled(frames, hidden_pixels(masks, robot_mask), past)
+
+
+def _filled(frames: np.ndarray, hidden: np.ndarray,
+            source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fill hidden pixels (T, H, W) from the frames `source` (T, H, W), if there are such."""
+    there = (source >= 0) & (source < len(frames))
     filled = np.array(frames)
-    t, v, u = np.nonzero(hidden & (past >= 0))
-    filled[t, v, u] = frames[past[t, v, u], v, u]
-    return filled, np.logical_not((hidden & (past < 0)).any(0))
+    t, v, u = np.nonzero(hidden & there)
+    filled[t, v, u] = frames[source[t, v, u], v, u]
+    return filled, np.logical_not((hidden & ~there).any(0))
 
 
 def last_free(frames: np.ndarray, masks: np.ndarray) -> np.ndarray:

@@ -7,8 +7,8 @@ import json
 
 import numpy as np
 import pytest
-from tap_ros.images.pixels import to_float
 from tap_ros.prediction import training
+from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.training_config import TrainingConfig
@@ -224,63 +224,39 @@ def store(bag, tmp_path_factory):
 
 
 @pytest.fixture
-def drawn(config, store):
-    """Return the (Batch, Augmentation) of some steps of a training with some options."""
+def drawn(config, store, monkeypatch):
+    """Return (Batch, Augmentation, Sampling) of some steps of a training with some options."""
     def draw(steps=6, **options):
-        settings = replace(config, steps=steps, **{
-            'batch_size': 8, 'goal_picture': 'last', **options})
-        return [(batch, augmentation) for _, batch, augmentation in training._batches(
+        settings, used = replace(config, steps=steps, **{
+            'batch_size': 8, 'goal_picture': 'last', **options}), []
+
+        def make(store, chosen, sampling, *others):
+            used.append(sampling)
+            return make_batch(store, chosen, sampling, *others)
+
+        monkeypatch.setattr(training, 'make_batch', make)
+        found = [(batch, augmentation) for _, batch, augmentation in training._batches(
             store, MappedFrames(store), None, np.arange(len(store.lengths)), settings,
             Processes(0, 1), 0, steps)]
+        return [(*each, sampling) for each, sampling in zip(found, used, strict=True)]
     return draw
 
 
-def test_a_batch_has_so_many_episodes(drawn):
-    assert {len(batch.context) for batch, _ in drawn(batch_size=5)} == {5}
-
-
-def test_margins_are_kept(drawn):
-    for margin in (0, 2):
-        batches = [batch for batch, _ in drawn(margin=margin)]
-        assert {batch.first.min().item() for batch in batches} == {1 + margin}
-        assert all((batch.last == batch.end - 1 - margin).all() for batch in batches)
-
-
-def test_so_many_targets_are_drawn(drawn):
-    assert {batch.targets.shape[1] for batch, _ in drawn(num_targets=2)} == {2}
-    assert max(batch.valid.sum(1).max() for batch, _ in drawn(num_targets=0)) > 5
-
-
-def test_episodes_are_cut_to_pieces_of_at_least_the_share_given(drawn):
-    whole = {tuple(batch.end[:, 0].tolist()) for batch, _ in drawn()}
-    ends = torch.cat([batch.end for batch, _ in drawn(12, min_crop=0.6)])
-    assert min(min(end) for end in whole) == 6
-    assert 2 <= ends.min() < 6 and ends.float().mean() < 8
-
-
-def test_the_goal_picture_is_the_one_asked_for(drawn, store):
-    def recorded(**options):
-        """Tell for each episode drawn whether its goal is the inverted one of these recordings."""
-        return torch.cat([(to_float(batch.context[:, 1]).mean((1, 2, 3)) > 0)
-                          for batch, _ in drawn(**options)]).float().mean()
-    assert recorded(goal_picture='last') == 0
-    assert recorded(goal_picture='recorded') == 1
-    assert 0.2 < recorded(goal_picture='mixed') < 0.8
-
-
-def test_forward_prediction_sees_the_start_alone(drawn):
-    assert {batch.context.shape[1] for batch, _ in drawn(mode='forward')} == {1}
-
-
-def test_the_video_has_so_many_moments_and_is_made_where_it_is_needed(drawn):
-    assert all(batch.video is None for batch, _ in drawn(2))
-    videos = [batch.video for batch, _ in drawn(2, **method_fields('genmin-vae'), video_frames=7)]
-    assert {video.shape[1] for video in videos} == {7}
+def test_what_is_taken_from_episodes_is_what_the_settings_say(drawn):
+    same = {'margin': 2, 'num_targets': 3, 'min_crop': 0.7, 'start_crop': 0.2,
+            'goal_picture': 'mixed', 'fill_context': 0.4}
+    options = {**same, 'robot_mask': 'all', 'batch_size': 5}
+    batch, _, sampling = drawn(2, **options)[0]
+    assert sampling == Sampling(**same) and len(batch.context) == 5
+    assert drawn(2, **options, mode='forward', video_frames=7, latent='vae', loss='fix',
+                 fraction=0.3, gan=True)[0][2] == Sampling(
+        **same, forward=True, video_frames=7, fraction=0.3, num_others=1)
+    assert drawn(2, latent='vae', posterior='frame')[0][2].video_frames == 0
 
 
 def test_pictures_change_as_asked_for_and_not_at_all_without(drawn):
     def looks(**options):
-        augmentations = [augmentation for _, augmentation in drawn(20, **options)]
+        augmentations = [augmentation for _, augmentation, _ in drawn(20, **options)]
         return (torch.cat([a.flip for a in augmentations]).float().mean().item(),
                 torch.cat([a.order for a in augmentations]).unique(dim=0).tolist(),
                 (torch.cat([a.gain for a in augmentations]) - 1).abs().max().item())
