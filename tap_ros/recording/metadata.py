@@ -123,8 +123,11 @@ def bag_files(folder: str | Path) -> list[Path]:
     path = folder / FILE_NAME
     if not path.exists():
         return files_by_number(folder)
+    if not path.is_file():  # opening a FIFO would wait for its writer
+        raise RecordingError(f'{path}: not a regular file')
     try:
-        information = _from_yaml(_read(path))[_KEY]
+        with open(path, 'rb') as stream:
+            information = _from_yaml(stream.read(MAX_BYTES + 1).decode())[_KEY]
         storage = information['storage_identifier']
         names = information['relative_file_paths']
         compression = information.get('compression_format') or ''
@@ -134,6 +137,8 @@ def bag_files(folder: str | Path) -> list[Path]:
             raise ValueError('storage_identifier and compression_format are no texts')
         if len(set(names)) < len(names):
             raise ValueError('relative_file_paths names a file twice')
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     except _UNUSABLE as error:
         raise RecordingError(
             f'{path}: not the metadata of a rosbag2 bag ({escaped(" ".join(str(error).split()))});'
@@ -162,17 +167,6 @@ def _convert(folder: Path) -> str:
     name = shlex.quote(escaped(folder))
     return (f'convert it: rosbags-convert --src {name} --dst {shlex.quote(escaped(folder))}_mcap '
             '--dst-storage mcap')
-
-
-def _read(path: Path) -> str:
-    """Return the text of a file, a character too much when it is too long."""
-    if not _is_file(path):  # opening a FIFO would wait for its writer
-        raise RecordingError(f'{path}: not a regular file')
-    try:
-        with open(path, 'rb') as stream:
-            return stream.read(MAX_BYTES + 1).decode()
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
 
 
 def _is_file(path: Path) -> bool:
