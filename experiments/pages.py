@@ -66,12 +66,7 @@ def interval(rows, digits=4, unit=1, sign='', after='', form='{}{} ({} to {})'):
     return parts[0].mask(parts[0].notna(), texts)
 
 
-def percent(row):
-    """Write a share and its interval."""
-    return f'{row["value"]:.0%} ({row["ci_low"]:.0%} to {row["ci_high"]:.0%})'
-
-
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined, trim_blocks=True,
     lstrip_blocks=True)
-_ENVIRONMENT.filters.update(markdown=markdown, percent=percent)
+_ENVIRONMENT.filters.update(markdown=markdown)

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.ros
 AGES_S = (0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0, 60.0)
 ABSURD = (5.4e8, 5000.0, -7000.0, float('inf'), float('-inf'), float('nan'), 1e308, -1e30, 70.0,
           -10.0)
-BOUNDS = re.compile(r'expected (finite numbers|(u from )?-?[\d.]+ to -?[\d.]+)')
+BOUNDS = re.compile(r'expected (finite numbers|(u from )?-?[\d.]+ to |[\w ]+, at most )-?[\d.]*')
 
 
 @pytest.mark.parametrize('topic', ['image', 'objects', 'joints'])
