@@ -266,5 +266,6 @@ def make_episode(simulator: Simulator, observations: Sequence[Observation], acti
         object_pixels=np.stack([o.object_pixels for o in observations]),
         object_poses=np.stack([o.object_poses for o in observations]),
         goal_frame=goal.image, goal_pixels=goal.object_pixels, goal_poses=goal.object_poses,
-        task=simulator.task.name, seed=simulator.scene.seed, outcome=outcome,
+        object_source='ground_truth', task=simulator.task.name, seed=simulator.scene.seed,
+        outcome=outcome,
         robot_masks=np.stack([o.robot_mask for o in observations]), goal_mask=goal.robot_mask)

@@ -24,7 +24,8 @@ def make_episode(seed=0, T=5, K=2, size=(8, 12), start=10**9, **changes):
         object_poses=random.normal(size=(T, K, 7)),
         goal_frame=random.integers(0, 256, (*size, 3), np.uint8),
         goal_pixels=random.uniform(0, 8, (K, 2)).astype(np.float32),
-        goal_poses=random.normal(size=(K, 7)), task='push2', seed=seed, outcome='success')
+        goal_poses=random.normal(size=(K, 7)), object_source='tracked' if K else '',
+        task='push2', seed=seed, outcome='success')
     return dataclasses.replace(episode, **changes)
 
 

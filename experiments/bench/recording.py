@@ -19,15 +19,15 @@ import time
 
 from mcap.reader import make_reader
 import numpy as np
+from tap_ros.messages.topics import IMAGE, TOPICS
 from tap_ros.options import Folder
-from tap_ros.recording import topics
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.messages import typestore
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import EpisodeWriter
 
-DECODED = frozenset(topics.TYPES) - {topics.CAMERA_INFO, topics.CLOCK}
+DECODED = frozenset(topic.recorded for topic in TOPICS if topic.becomes)
 
 
 def measure(recording='', episodes=400, files=4, repeats=3, image_size=64):
@@ -70,7 +70,7 @@ def _clocks():
 def _contenders():
     """Return dict name -> function(paths, scratch folder) -> number of frames."""
     return {
-        'mcap + rosbags CDR, images only': lambda p, _: _read_rosbags(p, {topics.IMAGE}),
+        'mcap + rosbags CDR, images only': lambda p, _: _read_rosbags(p, {IMAGE.recorded}),
         'mcap + rosbags CDR, what we decode': lambda p, _: _read_rosbags(p, DECODED),
         'tap_ros cache, new': lambda p, scratch: _build_cache(p, scratch),
     }
@@ -116,7 +116,7 @@ def _make_episode(seed, size, T=41, K=2):
         object_names=tuple(f'object_{k}' for k in range(K)), object_pixels=pixels,
         object_poses=random.normal(size=(T, K, 7)), goal_frame=frames[-1],
         goal_pixels=pixels[-1], goal_poses=random.normal(size=(K, 7)),
-        task='push2', seed=seed, outcome='success')
+        object_source='ground_truth', task='push2', seed=seed, outcome='success')
 
 
 def _read_rosbags(paths, wanted):
@@ -128,7 +128,7 @@ def _read_rosbags(paths, wanted):
             for schema, channel, message in make_reader(stream).iter_messages(
                     topics=sorted(wanted), log_time_order=False):
                 value = typestore().deserialize_cdr(message.data, schema.name)
-                if channel.topic == topics.IMAGE:
+                if channel.topic == IMAGE.recorded:
                     images.append(value.data.reshape(value.height, value.width, 3))
         frames += len(np.stack(images))
     return frames

@@ -24,7 +24,6 @@ from tap_ros.recording.damage import seconds
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.reading import Reading, reading_of
 from tap_ros.recording.reading_options import ReadingOptions
-from tap_ros.recording.topics import IMAGE
 from tap_ros.text import escaped, listing
 from tap_ros.training.split import split_episodes, warn_if_none
 from tyro import conf
@@ -82,7 +81,7 @@ def run(args: Options) -> None:
             if size is not None and max(reading.cut.cut_size(size)) > LARGE:  # gigabytes
                 shown = replace(reading, crop=reading.crop or CENTRE, size=64)
     store = open_recordings([args.path], reading=shown)
-    cameras = {find_topics(bag, reading.image_topic)[IMAGE] for bag in find_bags(args.path)}
+    cameras = {find_topics(bag, reading.image_topic)['frame'] for bag in find_bags(args.path)}
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})

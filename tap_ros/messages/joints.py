@@ -168,13 +168,11 @@ class JointHistory:
         return JointsAt(np.array([position for position, _ in found]),
                         min((received for _, received in found), default=math.inf))
 
-    def newest(self, stamp_ns: int) -> np.ndarray | None:
-        """Return the positions told last until then, else first; None where one is unknown."""
+    def newest(self, name: str, stamp_ns: int) -> float | None:
+        """Return the position of a joint that was told last until then, None if none was."""
         with self._lock:
-            if not all(self._states.values()):
-                return None
-            return np.array([states[max(_count_until(states, stamp_ns) - 1, 0)][1]
-                             for states in self._states.values()])
+            count = _count_until(self._states[name], stamp_ns)
+            return self._states[name][count - 1][1] if count else None
 
     def missing(self) -> list[str]:
         """Return the joints of which nothing is known."""
@@ -225,7 +223,8 @@ class GripperHistory:
     """
     Find the gripper at the moment of a picture, from joint states with times of their own.
 
-    States may tell its place, as the simulator's do; else it follows from the arm's joints.
+    States may tell its place, as the simulator's do; else it follows from the arm's joints. An
+    opening that is not told together with the place is that of the newest states that tell it.
 
     :param arm: Arm, with the Mount where it stands.
     :param prefix: of the names of its joints.
@@ -234,7 +233,8 @@ class GripperHistory:
 
     def __init__(self, arm: Arm, prefix: str, opening: float) -> None:
         self._kind, self._fixed_opening = arm, opening
-        self._told, self._opening = JointHistory(PLACE), JointHistory([OPENING])
+        self._told, self._beside = JointHistory(PLACE), JointHistory([OPENING])
+        self._openings = JointHistory([OPENING])  # of whatever states
         self._arm = JointHistory([prefix + name for name in arm.joints])
 
     @property
@@ -263,7 +263,9 @@ class GripperHistory:
                 f'has neither {", ".join(PLACE)} nor {", ".join(self._arm.names)}; it has '
                 f'{listing(known) or "no joints"}')
         if math.isfinite(known.get(OPENING, 0.0)):
-            self._opening.add(message, received)
+            self._openings.add(message, received)
+            if source is self._told:
+                self._beside.add(message, received)
         return source.add(message, received)
 
     def at(self, stamp_ns: int, max_gap_s: float) -> tuple[np.ndarray, float]:
@@ -275,17 +277,14 @@ class GripperHistory:
         """
         source = self._source
         found = source.at(stamp_ns, max_gap_s)
-        place = found.positions if source is self._told else (
-            self._kind.gripper_at(found.positions))
-        opening: float | np.ndarray = self._fixed_opening
-        try:
-            opening, = self._opening.at(stamp_ns, max_gap_s).positions
-        except KinematicsError:  # it is told only now and then: the newest holds
-            newest = self._opening.newest(stamp_ns)
-            if newest is not None:
-                opening, = newest
-            elif source is self._told:
-                raise
+        if source is self._told:
+            place, opening = found.positions, self._openings.newest(OPENING, stamp_ns)
+            if opening is None or not self._beside.missing():
+                opening, = self._beside.at(stamp_ns, max_gap_s).positions
+        else:
+            place = self._kind.gripper_at(found.positions)
+            opening = self._openings.newest(OPENING, stamp_ns)
+        opening = self._fixed_opening if opening is None else opening
         return np.array([*place, opening], np.float32), found.received
 
 

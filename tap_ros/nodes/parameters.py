@@ -14,7 +14,6 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
-from sensor_msgs.msg import CompressedImage, Image
 from tap_ros.errors import ConfigError
 from tap_ros.plugins import names
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
@@ -22,10 +21,6 @@ from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
 if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.parameter import Parameter
-
-_TRANSPORTS: dict[str, tuple[type, str]] = {
-    'raw': (Image, 'camera/image_raw'),
-    'compressed': (CompressedImage, 'camera/image_raw/compressed')}
 
 
 class Parameters:
@@ -111,12 +106,7 @@ def declare_transport(parameters: Parameters) -> None:
         'image_transport', 'raw',
         'How the camera sends pictures: sensor_msgs/Image on camera/image_raw (raw), or '
         'CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).',
-        choices=tuple(_TRANSPORTS))
-
-
-def camera_topic(parameters: Parameters) -> tuple[type, str]:
-    """Return message type and name of the camera's topic by the parameter image_transport."""
-    return _TRANSPORTS[parameters['image_transport']]
+        choices=('raw', 'compressed'))
 
 
 def declare_arm(parameters: Parameters) -> None:

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from tap_ros.nodes.parameters import Parameters
     from tap_ros.training.robot_mask import RobotMask
 
-CAMERA_MASK = {'mask': (Image, 'camera/robot_mask')}
-GOAL_MASK = {'mask': (Image, 'goal/robot_mask')}
 
 
 def declare_robot_mask(parameters: 'Parameters') -> None:

@@ -14,7 +14,8 @@ from typing import cast
 import warnings
 
 import numpy as np
-from numpy.typing import DTypeLike
+from tap_ros.messages.joints import positions_at
+from tap_ros.messages.stamps import MAX_GAP
 from tap_ros.recording.columns import Columns, pad_objects
 from tap_ros.recording.damage import EVERYTHING, FAR, seconds
 from tap_ros.recording.episode import Episode, RecordingWarning
@@ -35,7 +36,7 @@ _EMPTY = {
     'twist': ((0, 3), np.float32),
     'command_log': ((0,), np.int64), 'command': ((0,), np.float32),
     'joint_log': ((0,), np.int64), 'joint_stamp': ((0,), np.int64),
-    'joint': ((0, 4), np.float32),
+    'joint': ((0, 4), np.float64),
     'arm_log': ((0,), np.int64), 'arm_stamp': ((0,), np.int64),
     'arm': ((0, MOST_JOINTS), np.float64),
     'object_log': ((0,), np.int64), 'object_stamp': ((0,), np.int64),
@@ -61,6 +62,7 @@ class EpisodeTable:
     actions: np.ndarray  # (F, 4) float32
     grippers: np.ndarray  # (F, 4) float32
     objects: np.ndarray  # (F, K, 9) float64: u, v, pose
+    sources: list[str]  # E, of the objects
     names: list[tuple[str, ...]]  # E
     goals: list[tuple[int, int] | None]  # E: index into parts, index into goal_frames
     goal_masks: list[tuple[int, int] | None]  # E: index into parts, index into goal_masks
@@ -103,6 +105,7 @@ class EpisodeTable:
         return Episode(
             frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
             grippers=self.grippers[rows], object_names=self.names[i],
+            object_source=self.sources[i],
             object_pixels=pixels, object_poses=objects[..., 2:],
             goal_frame=goal_frame, goal_pixels=goal_pixels, goal_poses=goal_objects[:, 2:],
             task=span.task, seed=span.seed, outcome=span.outcome or '',
@@ -166,10 +169,11 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
         file=data['frame_file'][order], row=data['frame_row'][order],
         mask_file=mask_file, mask_row=mask_row, stamps=stamps,
         actions=_actions(data, clock, data['frame_log'][order]),
-        grippers=_grippers(data, clock, arm),
+        grippers=_grippers(data, clock, arm, data['frame_log'][order]),
         objects=_by_name(*clock.nearest_rows(data['object_log'], data['object_stamp']),
                          data['object'], data['object_names'], names, picked[clock.owner]),
-        names=[names[i] if i >= 0 else () for i in picked.tolist()],
+        sources=[names[i][0] if i >= 0 else '' for i in picked.tolist()],
+        names=[names[i][1:] if i >= 0 else () for i in picked.tolist()],
         goals=[None if g < 0 or data['goal_index'][g] < 0
                else (int(data['goal_file'][g]), int(data['goal_index'][g])) for g in goals],
         goal_masks=[_goal_mask(data, span, goal) for span, goal in zip(spans, goals)],
@@ -188,8 +192,8 @@ class _Clock:
         self.match = max(int(np.median(steps)) // 2 if len(steps) else 0, MIN_MATCH_NS)
         self.first, last = stamps[starts[:-1]], stamps[starts[1:] - 1]
         self.length = last - self.first
-        room = self.length + 4 * self.match
-        self.base = np.cumsum(room) - room
+        self.room = 4 * max(self.match, int(MAX_GAP * 1e9))  # ns between two episodes
+        self.base = np.cumsum(self.length + self.room) - self.length - self.room
         self.frames = self.base[self.owner] + stamps - self.first[self.owner]  # (F,) increasing
 
     def rows(self, log: np.ndarray, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -216,13 +220,38 @@ class _Clock:
         best = np.where(nearer, after, before)
         return rows[best], np.abs(times[best] - self.frames) <= self.match
 
-    def nearest(self, log: np.ndarray, stamps: np.ndarray, values: np.ndarray,
-                dtype: DTypeLike) -> np.ndarray:
-        """Return the nearest values, NaN where none is near."""
-        rows, found = self.nearest_rows(log, stamps)
-        out = np.full((len(rows), *values.shape[1:]), np.nan, dtype)
-        out[found] = values[rows[found]]
-        return out
+    def positions(self, log: np.ndarray, stamps: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """
+        Return where joints were at each frame, (F, J) float64, NaN where it is unknown.
+
+        :param log, stamps: (N,) ns.
+        :param values: (N, J) float64, NaN for a joint that a message does not tell of.
+        """
+        times, rows = self._around(log, stamps)
+        columns = []
+        for column in values[rows].T:
+            told = np.isfinite(column)
+            columns.append(positions_at(times[told], column[told], self.frames, self.match))
+        return np.stack(columns, 1)
+
+    def _around(self, log: np.ndarray, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the same as rows, also of messages a little before and after the episodes."""
+        starts, ends = np.array(
+            [(s.start_log, s.end_log) for s in self.spans], np.int64).reshape(-1, 2).T
+        inside, reach = np.searchsorted(starts, log, 'right') - 1, self.room // 2
+        times, rows = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+        for owner in (inside - 1, inside, inside + 1):  # what lies between two belongs to both
+            kept = np.flatnonzero((owner >= 0) & (owner < len(self.spans)))
+            own = owner[kept]
+            since = stamps[kept] - self.first[own]
+            near = ((since >= -reach) & (since <= self.length[own] + reach)
+                    & (log[kept] >= starts[own] - MAX_JITTER_NS)
+                    & (log[kept] <= ends[own] + MAX_JITTER_NS))
+            times.append(self.base[own[near]] + since[near])
+            rows.append(kept[near])
+        at, found = np.concatenate(times), np.concatenate(rows)
+        order = np.lexsort((found, at))
+        return at[order], found[order]
 
 
 def _join(parts: Sequence[Columns]) -> tuple[
@@ -318,21 +347,28 @@ def _actions(data: dict[str, np.ndarray], clock: _Clock, frame_log: np.ndarray) 
     return actions
 
 
-def _grippers(data: dict[str, np.ndarray], clock: _Clock, arm: ArmMount) -> np.ndarray:
+def _grippers(data: dict[str, np.ndarray], clock: _Clock, arm: ArmMount,
+              frame_log: np.ndarray) -> np.ndarray:
     """
     Return (F, 4) float32: the gripper's state at each frame, NaN where unknown.
 
-    Where it is not told, it follows from the arm's joints that are nearest in time.
+    As messages.joints.GripperHistory has it live: where it is not told, it follows from the arm's
+    joints, and an opening that is told now and then holds.
     """
-    grippers = clock.nearest(data['joint_log'], data['joint_stamp'], data['joint'], np.float32)
-    rows, found = clock.nearest_rows(data['arm_log'], data['arm_stamp'])
-    found &= np.isnan(grippers[:, :3]).all(1)
-    if found.any():
-        kind = get_arm(arm.arm)
-        joints = data['arm'][rows[found]]
-        grippers[found, :3] = kind.gripper_at(joints[:, :len(kind.joints)], arm.mount)
-        grippers[found & np.isnan(grippers[:, 3]), 3] = arm.opening
-    return grippers
+    beside = np.isfinite(data['joint'][:, :3]).any(1)  # the opening beside the place
+    told = clock.positions(data['joint_log'], data['joint_stamp'], np.where(
+        beside[:, None], data['joint'], np.nan))
+    arms = clock.positions(data['arm_log'], data['arm_stamp'], data['arm'])
+    found = np.isnan(told[:, :3]).all(1) & np.isfinite(arms).all(1)
+    kind = get_arm(arm.arm)
+    told[found, :3] = kind.gripper_at(arms[found, :len(kind.joints)], arm.mount)
+    opened = np.flatnonzero(np.isfinite(data['joint'][:, 3]))
+    newest = np.searchsorted(data['joint_log'][opened], frame_log, 'right') - 1
+    held = np.append(data['joint'][opened, 3], np.nan)[newest]  # -1: nothing tells it
+    unknown = np.isnan(told[:, 3]) & np.isfinite(told[:, :3]).all(1)
+    told[unknown, 3] = np.where(
+        np.isnan(held) & found, arm.opening, held)[unknown]
+    return told.astype(np.float32)
 
 
 def _begins(clock: _Clock, frame_log: np.ndarray) -> np.ndarray:
@@ -425,7 +461,7 @@ def _by_name(rows: np.ndarray, found: np.ndarray, values: np.ndarray, numbers: n
 
     :param rows, found: (N,) row of the message and whether there is one.
     :param values, numbers: (M, K, 9) of all messages, and (M,) the number of their names.
-    :param names, wanted: tuples by number, and (N,) the number of the wanted names.
+    :param names, wanted: tuples by number, as in Columns, and (N,) the number of the wanted names.
     """
     out = np.full((len(rows), *values.shape[1:]), np.nan)
     out[found] = values[rows[found]]
@@ -433,8 +469,8 @@ def _by_name(rows: np.ndarray, found: np.ndarray, values: np.ndarray, numbers: n
     for i in np.flatnonzero(found)[numbers[rows[found]] != wanted[found]].tolist():
         key = int(numbers[rows[i]]), int(wanted[i])
         if key not in orders:
-            place = {name: k for k, name in reversed(list(enumerate(names[key[0]])))}
-            pairs = [(k, place[n]) for k, n in enumerate(names[key[1]]) if n in place]
+            place = {name: k for k, name in reversed(list(enumerate(names[key[0]][1:])))}
+            pairs = [(k, place[n]) for k, n in enumerate(names[key[1]][1:]) if n in place]
             orders[key] = np.array(pairs, np.int64).reshape(-1, 2).T
         to, of = orders[key]
         out[i] = np.nan

@@ -18,7 +18,7 @@ from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import ImageError, RecordingError
 from tap_ros.files import storage_errors
 from tap_ros.messages.images import decode_image, is_empty
-from tap_ros.recording import topics
+from tap_ros.messages.topics import GOAL_IMAGE
 from tap_ros.recording.damage import describe
 from tap_ros.recording.mcap_file import McapFile, read_record
 from tap_ros.recording.messages import decode
@@ -136,9 +136,8 @@ class NewAttachments:
         """
         created = 0
         try:
-            if topic.endswith(topics.GOAL_IMAGE) and (
-                    type_name == topics.TYPES[topics.GOAL_IMAGE]):
-                name, kind = f'{topic.removesuffix(topics.GOAL_IMAGE)}/goal.png', 'image/png'
+            if GOAL_IMAGE.is_called(topic) and type_name == GOAL_IMAGE.type:
+                name, kind = f'{topic.removesuffix(GOAL_IMAGE.recorded)}/goal.png', 'image/png'
                 content, created = _goal(data)
             elif topic.endswith(CARD) and type_name == CARD_TYPE:
                 name, kind = f'{topic}.md', 'text/markdown'
@@ -157,7 +156,7 @@ class NewAttachments:
 
 def _goal(data: bytes) -> tuple[bytes, int]:
     """Return the picture of a message as PNG and its stamp, ns; b'' without one to be shown."""
-    message = decode(topics.TYPES[topics.GOAL_IMAGE], data)
+    message = decode(GOAL_IMAGE.type, data)
     if len(message.data) > MAX_PICTURE_BYTES or max(message.height, message.width) > MAX_SIDE:
         return b'', 0
     if is_empty(message):

@@ -11,7 +11,7 @@ import warnings
 
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.images.crop import CENTRE, check_trainable
-from tap_ros.recording import topics
+from tap_ros.messages import topics
 from tap_ros.recording.columns import Columns, first_size
 from tap_ros.recording.damage import describe
 from tap_ros.recording.episode import RecordingWarning

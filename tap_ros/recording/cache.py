@@ -34,7 +34,7 @@ from tap_ros.recording.mounts import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tqdm import tqdm
 
-FORMAT = 5  # of a cache folder; another number makes all files be decoded again
+FORMAT = 6  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
 _GOALS = ('goal_frames', 'goal_masks')  # of Columns, kept among the arrays

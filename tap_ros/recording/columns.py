@@ -21,7 +21,9 @@ import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ImageError, RecordingError
 from tap_ros.messages.images import decode_image, decode_mask, is_empty
-from tap_ros.recording import topics
+from tap_ros.messages.joints import decode_positions, PLACE
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.topics import BY_COLUMNS, COMPRESSED_TYPE, IMAGE
 from tap_ros.recording.damage import describe, EVERYTHING, FAR, FRAMES, gaps, Loss, NOTHING
 from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.messages import decode
@@ -32,15 +34,16 @@ from tap_ros.text import escaped
 
 _ENDINGS = ('_log', '_stamp', '_names', '_event', '_index')  # of column names
 _NUMBERS = {'twist': ((3,), np.float32), 'command': ((), np.float32),
-            'joint': ((4,), np.float32), 'arm': ((MOST_JOINTS,), np.float64)}
+            'joint': ((4,), np.float64), 'arm': ((MOST_JOINTS,), np.float64)}
 # Messages that are no pictures cost time to decode: so many bytes in any file, and so many for
 # each byte of it.
 _FREE_STATES, _STATES_PER_BYTE = 2**24, 64
 _MAX_STATE = 2**20  # bytes of one of them
 _PADDED_BYTES, _PADDING = 2**28, 16  # objects may be padded to so much, or so many times theirs
-_CUTS = {topics.IMAGE: FRAMES, topics.TWIST: FRAMES, topics.GRIPPER_COMMAND: FRAMES,
-         topics.EPISODE: EVERYTHING}  # what may be missing where one is; else NOTHING
-_GOALS = {topics.GOAL_IMAGE: 'goal', topics.GOAL_ROBOT_MASK: 'goal_mask'}  # names of columns
+# What may be missing where one is; else NOTHING.
+_CUTS = {'frame': FRAMES, 'twist': FRAMES, 'command': FRAMES, 'mark': EVERYTHING}
+_GOALS = ('goal', 'goal_mask')
+_PICTURES = ('frame', 'mask', *_GOALS)
 
 
 @dataclass
@@ -53,7 +56,7 @@ class Columns:
             picture
         mask_index (N,) int64, row of masks
         twist (N, 3) float32 linear; command (N,) float32 gripper opening
-        joint (N, 4) float32 gripper state, NaN where unknown
+        joint (N, 4) float64 gripper state, NaN where unknown
         arm (N, 6) float64 rad, joints of a UR10e where the gripper's place is not told
         object, goal_object (N, K, 9) float64 u, v, pose; object_names, goal_object_names (N,)
             int64, row of names
@@ -69,7 +72,7 @@ class Columns:
     masks: np.ndarray | None = None  # (M, H, W) uint8, of the robot; see mask_index
     goal_masks: np.ndarray | None = None  # (N, H, W) uint8
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
-    names: list[tuple[str, ...]] = field(default_factory=list)  # of objects
+    names: list[tuple[str, ...]] = field(default_factory=list)  # source of objects, then theirs
     marks: list[Mark] = field(default_factory=list)  # by row of mark_log
     damage: list[str] = field(default_factory=list)  # lines: what could not be used, and why
 
@@ -91,7 +94,7 @@ def decode_file(path: str | Path, found: dict[str, str],
     used.
 
     :param path: of the file.
-    :param found: dict from the names in topics to the file's topics, as topics.resolve gives it.
+    :param found: dict from names of columns to the file's topics, as topics.resolve gives it.
     :param write_frame: called with the pixels of one camera image after the other, (H, W, 3)
         uint8, in the order of the file; they are not to be kept.
     :param write_mask: called likewise with robot masks, (H, W) uint8.
@@ -128,10 +131,10 @@ def first_size(paths: Iterable[str | Path], found: dict[str, str]) -> tuple[int,
     :raises RecordingError: when nothing can be read.
     """
     for file in map(McapFile, paths):
-        for *_, data in file.messages({found[topics.IMAGE]}):
+        for *_, data in file.messages({found['frame']}):
             compressed = _is_compressed(file, found)
             with suppress(RecordingError, ImageError):
-                kind = topics.COMPRESSED if compressed else topics.TYPES[topics.IMAGE]
+                kind = COMPRESSED_TYPE if compressed else IMAGE.type
                 height, width, _ = decode_image(decode(kind, data)).shape
                 return height, width
     return None
@@ -139,8 +142,8 @@ def first_size(paths: Iterable[str | Path], found: dict[str, str]) -> tuple[int,
 
 def _is_compressed(file: McapFile, found: dict[str, str]) -> bool:
     """Tell whether the camera's pictures are compressed; known once a message has come."""
-    return any(channel.type_name == topics.COMPRESSED for channel in file.channels.values()
-               if channel.topic == found[topics.IMAGE])
+    return any(channel.type_name == COMPRESSED_TYPE for channel in file.channels.values()
+               if channel.topic == found['frame'])
 
 
 class _Decoder:
@@ -171,15 +174,13 @@ class _Decoder:
         self.state_bytes = 0  # of messages that are no pictures
         self.most_state_bytes = _FREE_STATES + _STATES_PER_BYTE * file.size
         decoders = {
-            topics.IMAGE: self._image, topics.ROBOT_MASK: self._mask,
-            topics.GOAL_IMAGE: lambda *a: self._goal_picture(
-                'goal', decode_image, reading.cut.image, *a),
-            topics.GOAL_ROBOT_MASK: lambda *a: self._goal_picture(
+            'frame': self._image, 'mask': self._mask,
+            'goal': lambda *a: self._goal_picture('goal', decode_image, reading.cut.image, *a),
+            'goal_mask': lambda *a: self._goal_picture(
                 'goal_mask', decode_mask, reading.cut.mask, *a),
-            topics.TWIST: self._twist, topics.GRIPPER_COMMAND: self._command,
-            topics.JOINT_STATES: self._joints, topics.EPISODE: self._mark,
-            topics.OBJECTS: lambda *a: self._objects('object', *a),
-            topics.GOAL_OBJECTS: lambda *a: self._objects('goal_object', *a)}
+            'twist': self._twist, 'command': self._command, 'joint': self._joints,
+            'mark': self._mark, 'object': lambda *a: self._objects('object', *a),
+            'goal_object': lambda *a: self._objects('goal_object', *a)}
         self.decoders = defaultdict(list)  # topic -> (name, function)
         for name, topic in found.items():
             self.decoders[topic].append((name, decoders[name]))
@@ -187,21 +188,21 @@ class _Decoder:
     def take(self, topic: str, log: int, data: memoryview) -> None:
         """Take a message; note it when it cannot be used."""
         for name, decoder in self.decoders[topic]:
-            state = name not in topics.PICTURES
+            state = name not in _PICTURES
             if state:
                 self._charge(len(data))
             try:
                 if state and len(data) > _MAX_STATE:
                     raise RecordingError(f'a message of more than {_MAX_STATE} bytes')
-                kind = topics.COMPRESSED if (
-                    name == topics.IMAGE and self.compressed) else topics.TYPES[name]
+                kind = COMPRESSED_TYPE if (
+                    name == 'frame' and self.compressed) else BY_COLUMNS[name].type
                 decoder(log, decode(kind, data))
             except (RecordingError, ImageError) as error:
                 self._lose(name, log, error)
                 if name in _GOALS:  # what was said before holds no more
-                    self._add(_GOALS[name], log, stamp=0, index=-1)
-                elif name == topics.GOAL_OBJECTS:
-                    self._add_objects('goal_object', log, 0, (), ())
+                    self._add(name, log, stamp=0, index=-1)
+                elif name == 'goal_object':
+                    self._add_objects('goal_object', log, 0, ('',), ())
 
     @cached_property
     def compressed(self) -> bool:
@@ -216,14 +217,14 @@ class _Decoder:
         if 2 * count <= self.sizes.total():
             listing = ', '.join(f'{n} of {w}x{h}' for (h, w), n in self.sizes.most_common(3))
             raise RecordingError(
-                f'topic {escaped(self.found[topics.IMAGE])}: images of different sizes (width x '
+                f'topic {escaped(self.found["frame"])}: images of different sizes (width x '
                 f'height): {listing}; one recording has one size')
         return size
 
     def finish(self) -> Columns:
         """Make arrays, rows in the order of their log times."""
-        for topic, name in _GOALS.items():
-            self._drop_goals(topic, name)
+        for name in _GOALS:
+            self._drop_goals(name)
         columns = self.columns
         if columns.camera_size is not None:
             columns.image_size = self.reading.cut.cut_size(columns.camera_size)
@@ -241,7 +242,7 @@ class _Decoder:
                     np.array(self.numbers[name]).reshape(-1, 9), arrays.pop(f'{name}_count'))
                 if columns.camera_size is not None:
                     arrays[name][..., :2] = self.reading.cut.pixels(
-                        arrays[name][..., :2], columns.camera_size)
+                        arrays[name][..., :2].astype(np.float32), columns.camera_size)
         for name in [key.removesuffix('_log') for key in arrays if key.endswith('_log')]:
             order = np.argsort(arrays[f'{name}_log'], kind='stable')
             for key in (name, *(name + end for end in _ENDINGS)):
@@ -261,7 +262,7 @@ class _Decoder:
             for pictures in self.goals.values())
         return columns
 
-    def _drop_goals(self, topic: str, name: str) -> None:
+    def _drop_goals(self, name: str) -> None:
         """Take back goal pictures that are not of the size of the others, or of the camera's."""
         goals = self.goals[name]
         size = self.columns.camera_size or (goals[0][1] if goals else None)
@@ -275,7 +276,7 @@ class _Decoder:
             good = goals[old][1] == size
             index[row], number = (number, number + 1) if good else (-1, number)
             if not good:
-                self._lose(topic, logs[row], RecordingError(
+                self._lose(name, logs[row], RecordingError(
                     f'a goal of another size than {size[1]}x{size[0]} pixels'))
         self.goals[name] = kept
 
@@ -299,7 +300,7 @@ class _Decoder:
         self.numbers[name].extend(numbers)
 
     def _image(self, log: int, message: Any) -> None:
-        if not self._is_due(_stamp(message) or log):
+        if not self._is_due(to_nanoseconds(message.header.stamp) or log):
             return
         pixels = decode_image(message)
         columns, size = self.columns, pixels.shape[:2]
@@ -311,7 +312,7 @@ class _Decoder:
             raise RecordingError('a picture of {1}x{0} pixels among those of {3}x{2}'.format(
                 *size, *columns.camera_size))
         self.write_frame(cut)
-        self._add('frame', log, stamp=_stamp(message))
+        self._add('frame', log, stamp=to_nanoseconds(message.header.stamp))
 
     def _is_due(self, time: int) -> bool:
         """Tell whether a picture of this time, ns, is taken, so that no more than the rate are."""
@@ -332,50 +333,53 @@ class _Decoder:
                 *mask.shape, *size))
         self.mask_size = self.mask_size or mask.shape
         self.write_mask(self.reading.cut.mask(mask))
-        self._add('mask', log, stamp=_stamp(message), index=self.num_masks)
+        self._add('mask', log, stamp=to_nanoseconds(message.header.stamp), index=self.num_masks)
         self.num_masks += 1
 
     def _goal_picture(self, name: str, read: Callable[[Any], np.ndarray],
                       cut: Callable[[np.ndarray], np.ndarray], log: int, message: Any) -> None:
         if is_empty(message):
-            self._add(name, log, stamp=_stamp(message), index=-1)
+            self._add(name, log, stamp=to_nanoseconds(message.header.stamp), index=-1)
         else:
             pixels = read(message)
             picture = np.array(cut(pixels)), pixels.shape[:2]
-            self._add(name, log, stamp=_stamp(message), index=len(self.goals[name]))
+            self._add(name, log, stamp=to_nanoseconds(message.header.stamp),
+                      index=len(self.goals[name]))
             self.goals[name].append(picture)
 
     def _twist(self, log: int, message: Any) -> None:
         linear = message.twist.linear
-        self._add('twist', log, (linear.x, linear.y, linear.z), stamp=_stamp(message))
+        self._add('twist', log, (linear.x, linear.y, linear.z),
+                  stamp=to_nanoseconds(message.header.stamp))
 
     def _command(self, log: int, message: Any) -> None:
         self._add('command', log, (message.data,))
 
     def _joints(self, log: int, message: Any) -> None:
-        known = dict(zip(message.name, message.position.tolist(), strict=False))
+        known = decode_positions(message)
         if known.keys() & set(GRIPPER_JOINTS):
             self._add('joint', log, [known.get(name, np.nan) for name in GRIPPER_JOINTS],
-                      stamp=_stamp(message))
-        arm = None if known.keys() & set(GRIPPER_JOINTS[:3]) else find_joints(known)
+                      stamp=to_nanoseconds(message.header.stamp))
+        arm = None if known.keys() & set(PLACE) else find_joints(known)
         if arm is not None and np.isfinite(arm).all():
-            self._add('arm', log, np.pad(arm, (0, MOST_JOINTS - len(arm))), stamp=_stamp(message))
+            self._add('arm', log, np.pad(arm, (0, MOST_JOINTS - len(arm))),
+                      stamp=to_nanoseconds(message.header.stamp))
 
     def _objects(self, column: str, log: int, message: Any) -> None:
         numbers: list[float] = []
         for one in message.objects:
             place, turn = one.pose.position, one.pose.orientation
             numbers += (one.u, one.v, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
-        names = tuple(one.name for one in message.objects)
-        self._add_objects(column, log, _stamp(message), names, numbers)
+        names = (message.source, *(one.name for one in message.objects))
+        self._add_objects(column, log, to_nanoseconds(message.header.stamp), names, numbers)
 
     def _add_objects(self, column: str, log: int, stamp: int, names: tuple[str, ...],
                      numbers: Sequence[float]) -> None:
         number = self.names.setdefault(names, len(self.names))
-        self._add(column, log, numbers, stamp=stamp, names=number, count=len(names))
+        self._add(column, log, numbers, stamp=stamp, names=number, count=len(names) - 1)
 
     def _mark(self, log: int, message: Any) -> None:
-        self._add('mark', log, stamp=_stamp(message), event=message.event)
+        self._add('mark', log, stamp=to_nanoseconds(message.header.stamp), event=message.event)
         self.columns.marks.append((message.task, message.seed, message.outcome))
 
 
@@ -397,8 +401,3 @@ def pad_objects(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
     padded = np.full((N, K, 9), np.nan)
     padded[np.arange(K) < counts[:, None]] = values
     return padded
-
-
-def _stamp(message: Any) -> int:
-    """Return the time in the header of a message, ns."""
-    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec

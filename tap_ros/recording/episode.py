@@ -34,6 +34,7 @@ class Episode:
     goal_frame: np.ndarray | None  # (H, W, 3) uint8: the picture of the goal
     goal_pixels: np.ndarray  # (K, 2) float32; NaN where unknown
     goal_poses: np.ndarray  # (K, 7) float64; NaN where unknown
+    object_source: str = ''  # of the objects: ground_truth, tracked or imported; '': unknown
     task: str = ''  # for example 'push2'; '' when unknown
     seed: int = 0
     outcome: str = ''  # one of OUTCOMES

@@ -15,7 +15,8 @@ from typing import Any
 from mcap.writer import CompressionType, IndexType, Writer
 from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
-from tap_ros.recording import metadata, topics
+from tap_ros.messages import topics
+from tap_ros.recording import metadata
 from tap_ros.recording.attachments import NewAttachments
 from tap_ros.recording.messages import schema_text, type_hash
 

@@ -6,7 +6,6 @@ Write recordings: MCAP files and bags as rosbag2 would write them with `ros2 bag
 `BagWriter` writes the messages of a running system, `EpisodeWriter` finished episodes.
 """
 
-from collections.abc import Sequence
 from contextlib import suppress
 import os
 from pathlib import Path
@@ -18,16 +17,15 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import (
-    CAMERA_FRAME,
-    GRIPPER_JOINTS,
-    MASK_ENCODING,
-    PICTURE_ENCODING,
-    WORLD_FRAME,
-)
+from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.errors import RecordingError, StorageError
 from tap_ros.files import storage_errors
-from tap_ros.recording import metadata, topics
+from tap_ros.messages import topics
+from tap_ros.messages.images import camera_info_fields, image_fields, mask_fields
+from tap_ros.messages.joints import joint_fields
+from tap_ros.messages.objects import objects_fields
+from tap_ros.messages.stamps import header_fields, stamp_fields
+from tap_ros.recording import metadata
 from tap_ros.recording.episode import check_episode, Episode
 from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode, typestore
@@ -136,12 +134,10 @@ class EpisodeWriter:
         with storage_errors(self.path):
             self._part.unlink(missing_ok=True)
         self._file = FileWriter(self._part, self.path.name, compression)
-        K = np.zeros((3, 3)) if camera_matrix is None else np.asarray(camera_matrix, float)
-        self._camera = {
-            'distortion_model': 'plumb_bob', 'd': np.zeros(5), 'k': K, 'r': np.eye(3),
-            'p': np.hstack([K, np.zeros((3, 1))])}
+        self._camera_matrix = np.zeros((3, 3)) if camera_matrix is None else np.asarray(
+            camera_matrix, float)
         self._last_log: int | None = None
-        self._goal_known = self._goal_mask_known = self._goal_objects_known = False
+        self._goals: set[topics.Topic] = set()  # topics of the goal that hold
 
     def __enter__(self) -> Self:
         return self
@@ -180,54 +176,51 @@ class EpisodeWriter:
     def _step(self, episode: Episode, t: int, stamp: int) -> None:
         """Write all messages of one time step."""
         frame = episode.frames[t]
-        camera = {
-            'header': _header(stamp, CAMERA_FRAME),
-            'height': frame.shape[0], 'width': frame.shape[1]}
-        self._put(topics.CLOCK, stamp, {'clock': _time(stamp)})
-        self._put(topics.CAMERA_INFO, stamp, {**camera, **self._camera})
-        self._put(topics.IMAGE, stamp, _image(frame, stamp))
+        self._put(topics.CLOCK, stamp, {'clock': stamp_fields(stamp)})
+        self._put(topics.CAMERA_INFO, stamp, camera_info_fields(
+            self._camera_matrix, frame.shape[:2], stamp, CAMERA_FRAME))
+        self._put(topics.IMAGE, stamp, image_fields(frame, stamp, CAMERA_FRAME))
         if episode.robot_masks is not None:
-            self._put(topics.ROBOT_MASK, stamp, _image(episode.robot_masks[t], stamp))
+            self._put(topics.ROBOT_MASK, stamp, mask_fields(
+                episode.robot_masks[t], stamp, CAMERA_FRAME))
         if episode.object_names:
-            self._put(topics.OBJECTS, stamp, _objects(
-                stamp, episode.object_names, episode.object_pixels[t], episode.object_poses[t]))
+            self._put(topics.OBJECTS, stamp, objects_fields(
+                episode.object_names, episode.object_pixels[t], episode.object_poses[t], stamp,
+                WORLD_FRAME, episode.object_source))
         if not np.isnan(episode.grippers[t]).all():
-            self._put(topics.JOINT_STATES, stamp, {
-                'header': _header(stamp, WORLD_FRAME), 'name': GRIPPER_JOINTS,
-                'position': episode.grippers[t]})
+            self._put(topics.JOINT_STATES, stamp, joint_fields(
+                episode.grippers[t], stamp, WORLD_FRAME))
         if t < len(episode.stamps) - 1:
             x, y, z, opening = episode.actions[t].tolist()
             self._put(topics.TWIST, stamp, {
-                'header': _header(stamp, WORLD_FRAME),
+                'header': header_fields(stamp, WORLD_FRAME),
                 'twist': {'linear': {'x': x, 'y': y, 'z': z}}})
             self._put(topics.GRIPPER_COMMAND, stamp, {'data': opening})
 
     def _goal(self, episode: Episode, stamp: int) -> None:
         """Write the goal; an empty one takes back that of the episode before."""
-        known = episode.goal_frame is not None
-        if known or self._goal_known:
-            frame = episode.goal_frame
-            self._put(topics.GOAL_IMAGE, stamp, _image(
-                np.zeros((0, 0, 3), np.uint8) if frame is None else frame, stamp))
-        masked = episode.goal_mask is not None
-        if masked or self._goal_mask_known:
-            mask = episode.goal_mask
-            self._put(topics.GOAL_ROBOT_MASK, stamp, _image(
-                np.zeros((0, 0), np.uint8) if mask is None else mask, stamp))
-        if episode.object_names or self._goal_objects_known:
-            self._put(topics.GOAL_OBJECTS, stamp, _objects(
-                stamp, episode.object_names, episode.goal_pixels, episode.goal_poses))
-        self._goal_known, self._goal_mask_known = known, masked
-        self._goal_objects_known = bool(episode.object_names)
+        for topic, fields, picture in (
+                (topics.GOAL_IMAGE, image_fields, episode.goal_frame),
+                (topics.GOAL_ROBOT_MASK, mask_fields, episode.goal_mask)):
+            if picture is not None or topic in self._goals:
+                self._put(topic, stamp, fields(picture, stamp, CAMERA_FRAME))
+            (self._goals.discard if picture is None else self._goals.add)(topic)
+        if episode.object_names or topics.GOAL_OBJECTS in self._goals:
+            self._put(topics.GOAL_OBJECTS, stamp, objects_fields(
+                episode.object_names, episode.goal_pixels, episode.goal_poses, stamp,
+                WORLD_FRAME, episode.object_source))
+            self._goals.add(topics.GOAL_OBJECTS)
+            if not episode.object_names:
+                self._goals.discard(topics.GOAL_OBJECTS)
 
     def _mark(self, episode: Episode, stamp: int, event: int) -> None:
         self._put(topics.EPISODE, stamp, {
-            'header': _header(stamp, ''), 'event': event, 'task': episode.task,
+            'header': header_fields(stamp, ''), 'event': event, 'task': episode.task,
             'seed': int(episode.seed), 'outcome': episode.outcome if event else ''})
 
-    def _put(self, topic: str, stamp: int, message: dict[str, Any]) -> None:
-        kind = topics.TYPES[topic]
-        self._file.write_raw(topic, kind, encode(kind, message), stamp + self._shift)
+    def _put(self, topic: topics.Topic, stamp: int, message: dict[str, Any]) -> None:
+        self._file.write_raw(
+            topic.recorded, topic.type, encode(topic.type, message), stamp + self._shift)
 
 
 def write_metadata(folder: str | Path) -> None:
@@ -249,7 +242,7 @@ def count_episodes(path: Path) -> int:
 
     :raises RecordingError: when the file is not finished.
     """
-    marks = _describe(path)['topics'].get(topics.EPISODE, {'count': 0})
+    marks = _describe(path)['topics'].get(topics.EPISODE.recorded, {'count': 0})
     return marks['count'] // 2
 
 
@@ -276,31 +269,3 @@ def _describe(path: Path) -> dict[str, Any]:
         'path': path.name, 'start': summary.statistics.message_start_time,
         'end': summary.statistics.message_end_time,
         'message_count': summary.statistics.message_count, 'topics': found}
-
-
-def _time(stamp: int) -> dict[str, int]:
-    return {'sec': stamp // 10**9, 'nanosec': stamp % 10**9}
-
-
-def _header(stamp: int, frame_id: str) -> dict[str, Any]:
-    return {'stamp': _time(stamp), 'frame_id': frame_id}
-
-
-def _image(frame: np.ndarray, stamp: int) -> dict[str, Any]:
-    """Return the message of a picture (H, W, 3) or a mask (H, W)."""
-    height, width, *channels = frame.shape
-    return {
-        'header': _header(stamp, CAMERA_FRAME), 'height': height, 'width': width,
-        'encoding': PICTURE_ENCODING if channels else MASK_ENCODING,
-        'step': width * (channels or [1])[0], 'data': frame}
-
-
-def _objects(stamp: int, names: Sequence[str], pixels: np.ndarray,
-             poses: np.ndarray) -> dict[str, Any]:
-    states = []
-    for name, (u, v), pose in zip(names, pixels.tolist(), poses.tolist(), strict=True):
-        states.append({
-            'name': name, 'u': u, 'v': v,
-            'pose': {'position': dict(zip('xyz', pose[:3], strict=True)),
-                     'orientation': dict(zip('xyzw', pose[3:], strict=True))}})
-    return {'header': _header(stamp, WORLD_FRAME), 'source': 'ground_truth', 'objects': states}

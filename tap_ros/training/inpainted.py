@@ -11,9 +11,9 @@ import warnings
 import numpy as np
 from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
+from tap_ros.messages.topics import ROBOT_MASK
 from tap_ros.recording.cache import cache_folder
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.topics import ROBOT_MASK
 from tap_ros.training.frames import Frames, MappedFrames
 from tap_ros.training.robot_mask import fill_in_time, hidden_pixels, last_free, RobotMask
 from tqdm import tqdm
@@ -155,7 +155,7 @@ def with_masks(store: 'EpisodeStore', parts: tuple[np.ndarray, np.ndarray],
         raise RecordingError(
             f'recordings: robot_mask {robot_mask} needs a robot mask for every picture of an '
             f'episode, and {len(training)} of {len(parts[0])} to train on have them; record '
-            f'{ROBOT_MASK} beside the camera, or give --robot-mask none')
+            f'{ROBOT_MASK.recorded} beside the camera, or give --robot-mask none')
     if after < before:
         warnings.warn(
             f'recordings: {before - after} of {before} episodes are left out, as not all of their '

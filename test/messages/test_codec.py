@@ -36,28 +36,16 @@ def test_a_picture_survives_the_round_trip():
     assert np.array_equal(images.decode_image(message, 'start', (5, 7)), picture())
 
 
-@pytest.mark.parametrize('encoding, channels', [
-    ('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]), ('bgra8', [2, 1, 0, 0])])
-@pytest.mark.parametrize('padding', [0, 1, 13])
-def test_every_encoding_and_padding_gives_the_same_picture(encoding, channels, padding):
-    pixels = picture()[..., channels].reshape(5, -1)
-    rows = np.hstack([pixels, np.full((5, padding), 99, np.uint8)])
-    message = message_of(rows, encoding, 7)
-    assert np.array_equal(images.decode_image(message, 'start'), picture())
-    message.is_bigendian = 1  # means nothing for bytes
-    assert np.array_equal(images.decode_image(message, 'start'), picture())
-
-
-def test_grey_becomes_three_equal_channels():
-    grey = picture()[..., 0]
-    decoded = images.decode_image(message_of(grey, 'mono8', 7), 'start')
-    assert all(np.array_equal(decoded[..., channel], grey) for channel in range(3))
+def test_padded_rows_give_the_same_picture():
+    for padding in (0, 1, 13):
+        rows = np.pad(picture()[..., ::-1].reshape(5, -1), ((0, 0), (0, padding)))
+        message = message_of(rows, 'bgr8', 7)
+        message.is_bigendian = padding and 1  # means nothing for bytes
+        assert np.array_equal(images.decode_image(message, 'start'), picture())
 
 
 @pytest.mark.parametrize('change, words', [
     ({'encoding': 'yuv444'}, ['yuv444', 'rgb8', 'bgr8', 'mono8']),
-    ({'encoding': '16UC1'}, ['16UC1', 'more than 8 bits', 'rgb8']),
-    ({'encoding': ''}, ["''", 'rgb8']),
     ({'step': 20}, ['step', '20', '21']),
     ({'step': 22}, ['data', '105', '110']),
     ({'height': 6}, ['data', '105', '126']),

@@ -142,7 +142,8 @@ def test_the_gripper_is_where_the_mounted_arm_holds_it():
     assert not gripper.take(joints(100 * MS, gripper_opening=0.7), 3)
     assert gripper.at(101 * MS, 0.35)[0][3] == np.float32(0.7)  # the newest holds
     gripper.take(joints(102 * MS, gripper_opening=0.9), 3)
-    assert gripper.at(101 * MS, 0.35)[0][3] == np.float32(0.8)
+    assert gripper.at(101 * MS, 0.35)[0][3] == np.float32(0.7)
+    assert gripper.at(102 * MS, 0.35)[0][3] == np.float32(0.9)
     with pytest.raises(KinematicsError, match='left_shoulder_pan_joint is 0.098 s older'):
         gripper.at(200 * MS, 0.35)
 

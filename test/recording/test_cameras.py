@@ -75,74 +75,6 @@ def test_a_compressed_picture_that_cannot_be_read_is_named_and_left_out(tmp_path
     assert [len(episode.frames) for episode in episodes] == [1, 1]  # cut where one is missing
 
 
-def test_depth_pictures_are_refused_with_the_reason(tmp_path):
-    buffer = io.BytesIO()
-    Picture.fromarray(np.full((8, 8), 40000, np.uint16)).save(buffer, 'PNG')
-    bag = record(tmp_path / 'a', [buffer.getvalue()], [SECOND], text='16UC1; png compressed')
-    with pytest.raises(RecordingError, match='more than 8 bits a channel'):
-        open_recordings(bag)
-    bag = record(tmp_path / 'b', [buffer.getvalue()], [SECOND],
-                 text='16UC1; compressedDepth png')
-    with pytest.raises(RecordingError, match='name the topic of the colour camera'):
-        open_recordings(bag)
-
-
-def test_sixteen_bits_of_colour_are_refused(tmp_path):
-    good, data = cv2.imencode('.png', np.full((8, 8, 3), 40000, np.uint16))
-    assert good
-    bag = record(tmp_path / 'bag', [data.tobytes()], [SECOND], text='rgb16; png compressed')
-    with pytest.raises(RecordingError, match='more than 8 bits a channel'):
-        open_recordings(bag)
-
-
-def test_a_picture_that_would_fill_the_memory_is_refused(tmp_path):
-    bomb = packed(np.zeros((4000, 4000, 3), np.uint8), 'PNG')
-    assert len(bomb) < 100_000
-    bag = record(tmp_path / 'bag', [bomb], [SECOND])
-    with pytest.raises(RecordingError, match='4000x4000 pixels are more than'):
-        open_recordings(bag)
-
-
-@pytest.mark.parametrize('encoding, pattern', [
-    ('bayer_rggb8', 'rggb'), ('bayer_bggr8', 'bggr'), ('bayer_gbrg8', 'gbrg'),
-    ('bayer_grbg8', 'grbg')])
-def test_bayer_patterns_have_the_colours_of_the_scene(tmp_path, encoding, pattern):
-    colours = np.array([[200, 30, 60], [10, 180, 90]], np.uint8)
-    picture = np.repeat(np.repeat(colours[None], 16, 0), 12, 1)  # left red, right green
-    raw = np.empty((16, 24), np.uint8)
-    for k, letter in enumerate(pattern):
-        rows, columns = slice(k // 2, None, 2), slice(k % 2, None, 2)
-        raw[rows, columns] = picture[rows, columns, 'rgb'.index(letter)]
-    frames = read_raw(tmp_path, raw, encoding, 24)
-    np.testing.assert_array_equal(frames[0][2:-2, 2:9], picture[2:-2, 2:9])
-    np.testing.assert_array_equal(frames[0][2:-2, 15:-2], picture[2:-2, 15:-2])
-
-
-@pytest.mark.parametrize('encoding, order', [
-    ('yuv422', 'uyvy'), ('uyvy', 'uyvy'), ('yuv422_yuy2', 'yuyv'), ('yuyv', 'yuyv')])
-def test_yuv_has_the_colours_of_the_scene(tmp_path, encoding, order):
-    colour = np.array([200, 60, 30])
-    y = 16 + np.array([65.481, 128.553, 24.966]) @ colour / 255  # ITU-R BT.601
-    u = 128 + np.array([-37.797, -74.203, 112.0]) @ colour / 255
-    v = 128 + np.array([112.0, -93.786, -18.214]) @ colour / 255
-    pair = [round({'y': y, 'u': u, 'v': v}[letter]) for letter in order]
-    raw = np.tile(np.array(pair, np.uint8), (4, 3))
-    frames = read_raw(tmp_path, raw, encoding, 12)
-    assert frames.shape == (1, 4, 6, 3)
-    assert np.abs(frames.astype(int) - colour).max() <= 3
-
-
-def read_raw(tmp_path, raw, encoding, step):
-    """Return the frames of a bag with one raw picture."""
-    width = raw.shape[1] // (1 if encoding.startswith('bayer') else 2)
-    with BagWriter(tmp_path / 'bag') as writer:
-        writer.write_raw('/image_raw', IMAGE, encode(IMAGE, {
-            'header': header(SECOND), 'height': len(raw), 'width': width, 'encoding': encoding,
-            'step': step, 'data': raw}), SECOND)
-    (episode,) = open_recordings(tmp_path / 'bag')
-    return episode.frames
-
-
 def test_pictures_are_cut_and_scaled_while_they_are_decoded(tmp_path):
     pictures = [scene(t, (480, 640)) for t in range(4)]
     stamps = [SECOND * (t + 1) for t in range(4)]
@@ -228,19 +160,6 @@ def test_a_clock_that_is_set_back_a_little_begins_an_episode(tmp_path):
     first, second = open_recordings(tmp_path / 'bag')
     np.testing.assert_array_equal(first.frames, [scene(t) for t in range(6)])
     np.testing.assert_array_equal(second.frames, [scene(t) for t in range(6, 12)])
-
-
-def test_a_compressed_mosaic_has_the_colours_of_the_scene(tmp_path):
-    picture = np.full((16, 24, 3), (200, 30, 60), np.uint8)
-    raw = np.empty((16, 24), np.uint8)
-    for k, channel in enumerate((0, 1, 1, 2)):
-        raw[k // 2::2, k % 2::2] = picture[k // 2::2, k % 2::2, channel]
-    buffer = io.BytesIO()
-    Picture.fromarray(raw).save(buffer, 'PNG')
-    bag = record(tmp_path / 'bag', [buffer.getvalue()], [SECOND],
-                 text='bayer_rggb8; png compressed ')
-    (episode,) = open_recordings(bag)
-    np.testing.assert_array_equal(episode.frames[0][2:-2, 2:-2], picture[2:-2, 2:-2])
 
 
 def test_depth_beside_compressed_colour_makes_the_topic_be_named(tmp_path):

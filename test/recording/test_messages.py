@@ -11,7 +11,7 @@ import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_types_from_msg
 from tap_ros.errors import RecordingError
-from tap_ros.recording import topics
+from tap_ros.messages import topics
 from tap_ros.recording.messages import (
     check_schema,
     decode,
@@ -23,7 +23,7 @@ from tap_ros.recording.messages import (
 )
 
 MSG_FOLDER = Path(__file__).parents[2] / 'tap_msgs' / 'msg'
-NAMES = sorted({*topics.TYPES.values(), *DEFINITIONS})
+NAMES = sorted({*(topic.type for topic in topics.TOPICS), *DEFINITIONS})
 
 
 def random_message(type_name, random):

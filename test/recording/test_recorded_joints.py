@@ -6,7 +6,7 @@ from made_episodes import assert_all_equal
 import numpy as np
 import pytest
 from tap_ros.errors import RecordingError
-from tap_ros.recording import topics
+from tap_ros.messages import topics
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode
@@ -46,7 +46,7 @@ def bag(path, mount, extra=(), prefix='ur_'):
         messages.append((stamp + 20, topics.JOINT_STATES, joints(stamp, ['finger'], [0.1])))
     writer = FileWriter(path / f'{path.name}_0.mcap')
     for log, topic, values in sorted(messages, key=lambda one: one[0]):
-        writer.write_raw(topic, topics.TYPES[topic], encode(topics.TYPES[topic], values), log)
+        writer.write_raw(topic.recorded, topic.type, encode(topic.type, values), log)
     writer.close()
     write_metadata(path)
     return path

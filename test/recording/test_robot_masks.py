@@ -12,8 +12,8 @@ import pytest
 from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.evaluation import inspect_files
+from tap_ros.messages import topics
 from tap_ros.recording import cache as cache_module
-from tap_ros.recording import topics
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode
@@ -49,7 +49,7 @@ def record(path, pictures, masks, goals=()):
     writer = FileWriter(path / f'{path.name}_0.mcap')
     for log, topic, stamp, values in sorted(messages, key=lambda one: one[0]):
         height, width, *channels = values.shape
-        writer.write_raw(topic, topics.TYPES[topic], encode(topics.TYPES[topic], {
+        writer.write_raw(topic.recorded, topic.type, encode(topic.type, {
             'header': {'stamp': {'sec': stamp // 10**9, 'nanosec': stamp % 10**9}},
             'height': height, 'width': width, 'step': values[0].size if height else 0,
             'encoding': 'rgb8' if channels else 'mono8', 'data': values}), log)

@@ -32,10 +32,10 @@ from tap_ros.nodes.explorer.calls import ExplorerCalls
 from tap_ros.nodes.explorer.distances import Distances
 from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.observations import reception_time
-from tap_ros.nodes.parameters import camera_topic, declare_transport, Parameters
+from tap_ros.nodes.parameters import declare_transport, Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
-from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.nodes.topics import camera_image, LATCHED, STREAM
 from tap_ros.plugins import names
 from tap_ros.text import escaped
 
@@ -80,7 +80,7 @@ class ExplorerNode(Node):
         self._board = Board()
         self._calls = ExplorerCalls(
             self, self._tell, self._complain, self._on_answer, self._photograph)
-        kind, topic = camera_topic(self.params)
+        kind, topic = camera_image(self.params)
         self._service = Diagnostics(self, {topic: SILENT_S, 'objects': SILENT_S,
                                            'goal/image': math.inf, 'goal/objects': math.inf})
         self._heard = [

@@ -5,26 +5,17 @@
 from collections.abc import Callable
 from typing import Any, TYPE_CHECKING
 
-from sensor_msgs.msg import Image
-from tap_msgs.msg import ObjectStates
 from tap_ros.errors import PlanningError
 from tap_ros.messages.images import is_empty
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.observations import Observations
-from tap_ros.nodes.robot_view import GOAL_MASK
-from tap_ros.nodes.topics import LATCHED
+from tap_ros.nodes.topics import goal_topics, LATCHED
 
 if TYPE_CHECKING:
     from rclpy.node import Node
     from tap_msgs.action import ReachGoal
 
-TOPICS = {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}
 MASK_TIMEOUT = 0.1  # s that the robot mask of a goal picture may come after it
-
-
-def goal_topics(robot_mask: str) -> dict[str, tuple[type, str]]:
-    """Return TOPICS, and that of the robot mask when one is used."""
-    return TOPICS | (GOAL_MASK if robot_mask != 'none' else {})
 
 
 class GoalSource:

@@ -21,13 +21,14 @@ from tap_ros.errors import PlanningError, TapError
 from tap_ros.messages.images import is_empty
 from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.nodes.clients import CallError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.planner.arm import Arm
-from tap_ros.nodes.planner.goal_source import goal_topics, GoalSource
+from tap_ros.nodes.planner.goal_source import GoalSource
 from tap_ros.nodes.planner.plan_view import PlanView
-from tap_ros.nodes.planner.planner_inputs import PlannerInputs, sensor_topics
+from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import (
     check_request,
     declare_parameters,
@@ -39,7 +40,7 @@ from tap_ros.nodes.planner.subgoals import SubgoalClient
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import internal_error, log_error
 from tap_ros.nodes.subscriptions import subscribe
-from tap_ros.nodes.topics import STREAM, to_stamp
+from tap_ros.nodes.topics import camera_topics, goal_topics, STREAM, to_stamp
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.hierarchy import choose_sample, targets_by
 from tap_ros.planning.mpc_inputs import Scene
@@ -83,8 +84,9 @@ class VisualMpcNode(LifecycleBase):
         self.autostart('configure')
         robot_mask = self.params['robot_mask']
         self._diagnostics = Diagnostics(self, {
-            **dict.fromkeys((name for _, name in sensor_topics(self.params).values()), STALE_S),
-            **dict.fromkeys((name for _, name in goal_topics(robot_mask).values()), math.inf)},
+            JOINT_STATES.name: STALE_S,
+            **{name: STALE_S for _, name in camera_topics(self.params).values()},
+            **{name: math.inf for _, name in goal_topics(robot_mask).values()}},
             idle=self.why_not)
         received = self._diagnostics.received
         self._goal = GoalSource(self, robot_mask, received)

@@ -19,23 +19,18 @@ from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import GripperHistory
 from tap_ros.messages.objects import decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
-from tap_ros.nodes.parameters import camera_topic, declared_arm
-from tap_ros.nodes.robot_view import CAMERA_MASK, RobotView
+from tap_ros.nodes.parameters import declared_arm
+from tap_ros.nodes.robot_view import RobotView
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.subscriptions import subscribe
-from tap_ros.nodes.topics import STREAM
+from tap_ros.nodes.topics import camera_topics, of_topic, STREAM
 from tap_ros.planning.reach import Seen
 
 if TYPE_CHECKING:
     from rclpy.node import Node
     from tap_ros.nodes.parameters import Parameters
-
-def sensor_topics(params: 'Parameters') -> dict[str, tuple[type, str]]:
-    """Return {short name: (message type, topic name)}, with the robot mask when one is used."""
-    topics = {'image': camera_topic(params), 'objects': (ObjectStates, 'objects'),
-              'joints': (JointState, 'joint_states')}
-    return topics | (CAMERA_MASK if params['robot_mask'] != 'none' else {})
 
 
 class PlannerInputs:
@@ -62,7 +57,7 @@ class PlannerInputs:
         self._camera_size: tuple[int, int] | None = None
         self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
         self.robot = RobotView(params['robot_mask'])
-        self._types = sensor_topics(params)
+        self._types = {**camera_topics(params), 'joints': of_topic(JOINT_STATES)}
         self._tell = on_message
         self.sensors = Observations(*self._types)
         self._gripper = GripperHistory(

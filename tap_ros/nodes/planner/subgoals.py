@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from rclpy.callback_groups import CallbackGroup
     from rclpy.node import Node
     from tap_msgs.action import ReachGoal
+    from tap_ros.messages.subgoals import Subgoal
     from tap_ros.nodes.planner.planner_inputs import PlannerInputs
     from tap_ros.planning.reach import Seen
-    from tap_ros.prediction.predictor import Subgoal
 
 
 class SubgoalClient:

@@ -23,7 +23,7 @@ from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.parameters import check_device
-from tap_ros.nodes.predictor.requests import encode_answer, request_topics, RequestReader, Task
+from tap_ros.nodes.predictor.requests import encode_answer, RequestReader, Task
 from tap_ros.nodes.predictor.settings import (
     declare_parameters,
     MAX_ROWS,
@@ -40,7 +40,7 @@ from tap_ros.nodes.services import (
     refusal,
     take_pending_requests,
 )
-from tap_ros.nodes.topics import LATCHED
+from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
 from tap_ros.prediction.request_queue import Busy, RequestQueue, THREAD_NAME
 
@@ -70,10 +70,10 @@ class PredictorNode(LifecycleBase):
         self._predictor: Predictor | None = None
         self._queue: RequestQueue[Task, Found] | None = None
         self.autostart('configure')
-        topics = request_topics(self.params)
+        goal = goal_topics(self.params['robot_mask'])
         self._diagnostics = Diagnostics(
-            self, {name: STALE_S if group == 'start' else math.inf
-                   for group in topics for _, name in topics[group].values()},
+            self, {**{name: STALE_S for _, name in camera_topics(self.params).values()},
+                   **{name: math.inf for _, name in goal.values()}},
             queue=lambda: len(self._queue or ()), idle=self.why_not)
         self._reader = RequestReader(self, self.params, self._diagnostics.received)
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)

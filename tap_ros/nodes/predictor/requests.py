@@ -21,11 +21,11 @@ from tap_ros.messages.objects import decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.nodes.observations import OnDemandObservations
-from tap_ros.nodes.parameters import camera_topic, Parameters
+from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.predictor.settings import check_mode, check_work
-from tap_ros.nodes.robot_view import CAMERA_MASK, GOAL_MASK, RobotView
+from tap_ros.nodes.robot_view import RobotView
 from tap_ros.nodes.ros_messages import encode_subgoal
-from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, STREAM
 from tap_ros.prediction.protocol import Predictor, Question
 from tap_ros.text import listing
 
@@ -33,21 +33,6 @@ if TYPE_CHECKING:
     from rclpy.node import Node
 
 OBJECTS_TIMEOUT = 0.1  # s that objects and mask of the newest picture may come after it
-
-
-def request_topics(params: Parameters) -> dict[str, dict[str, tuple[type, str]]]:
-    """
-    Return the topics that replace the empty fields of a request.
-
-    :return: for 'start' and 'goal' {short name: (message type, topic name)}, with the robot masks
-        when they are used.
-    """
-    masked = params['robot_mask'] != 'none'
-    return {
-        'start': {'image': camera_topic(params), 'objects': (ObjectStates, 'objects'),
-                  **(CAMERA_MASK if masked else {})},
-        'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects'),
-                 **(GOAL_MASK if masked else {})}}
 
 
 @dataclass(frozen=True)
@@ -91,10 +76,11 @@ class RequestReader:
     def __init__(self, node: 'Node', params: Parameters,
                  on_message: Callable[[str], object]) -> None:
         self._robot = RobotView(params['robot_mask'])
-        types = request_topics(params)
         self._newest = {
-            'start': OnDemandObservations(node, types['start'], STREAM, on_message=on_message),
-            'goal': OnDemandObservations(node, types['goal'], LATCHED, True, on_message)}
+            'start': OnDemandObservations(
+                node, camera_topics(params), STREAM, on_message=on_message),
+            'goal': OnDemandObservations(
+                node, goal_topics(params['robot_mask']), LATCHED, True, on_message)}
 
     def poll(self) -> None:
         """Take what has arrived, and remember what the camera sees behind the robot."""

@@ -14,8 +14,8 @@ from tap_ros.recording.writer import BagWriter
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:
+    from tap_ros.messages.topics import Qos
     from tap_ros.nodes.parameters import Parameters
-    from tap_ros.recording.topics import Qos
 
 
 class Bags:

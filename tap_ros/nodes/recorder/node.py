@@ -12,6 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError
+from tap_ros.messages.topics import BY_NAME, Qos, Topic
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.parameters import declare_arm, declare_opening, Parameters
 from tap_ros.nodes.recorder.bags import Bags
@@ -19,22 +20,9 @@ from tap_ros.nodes.ros_messages import message_class
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import AdaptiveSubscription
 from tap_ros.nodes.topics import SERVICE_QOS
-from tap_ros.recording import topics
-from tap_ros.recording.attachments import CARD_TYPE
 from tap_ros.text import escaped
 
 DEPTH = 100  # messages that may wait while the disk is slow
-CARDS = ('predictor_node/model_card', 'visual_mpc_node/model_card')
-TYPES = {
-    **{name.lstrip('/'): kind for name, kind in topics.TYPES.items()},
-    'subgoal': 'tap_msgs/msg/Subgoal',
-    'subgoal/image': 'sensor_msgs/msg/Image',
-    'subgoal/overlay': 'sensor_msgs/msg/Image',
-    'plan/distance': 'std_msgs/msg/Float64',
-    **dict.fromkeys(CARDS, CARD_TYPE)}
-LATCHED = ('goal/image', 'goal/robot_mask', 'goal/objects', 'subgoal', 'subgoal/image',
-           'subgoal/overlay', *CARDS)
-PERIODIC = ('camera/image_raw', 'camera/camera_info', 'objects', 'joint_states')
 MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls it stale
 LONG = 1000  # characters of an answer
 
@@ -55,7 +43,8 @@ class RecorderNode(Node):
         if not self._wanted:
             raise ConfigError('parameter topics: is empty; name at least one topic')
         self._diagnostics = Diagnostics(self, {
-            name: MAX_AGE if name.lstrip('/') in PERIODIC else math.inf for name in self._wanted})
+            name: MAX_AGE if (known := _known(name)) and known.periodic else math.inf
+            for name in self._wanted})
         self._bags = Bags(self.params, self._report)
         if self.params['record_on_start']:
             self._bags.start()
@@ -102,11 +91,12 @@ class RecorderNode(Node):
     # Topics
 
     def _subscribe_known(self) -> None:
-        """Subscribe to wanted topics whose type is in TYPES or announced by a publisher."""
+        """Subscribe to wanted topics whose type is known or announced by a publisher."""
         found = dict(self.get_topic_names_and_types())
         for name in list(self._wanted):
             topic = self.resolve_topic_name(name)
-            type_name = TYPES.get(name.lstrip('/')) or next(iter(found.get(topic, [])), None)
+            known = _known(name)
+            type_name = known.type if known else next(iter(found.get(topic, [])), None)
             if type_name is None:
                 continue
             self._wanted.remove(name)
@@ -114,7 +104,7 @@ class RecorderNode(Node):
                 self._subscribe(topic, type_name, QoSProfile(
                     depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE,
                     durability=DurabilityPolicy.TRANSIENT_LOCAL
-                    if name.lstrip('/') in LATCHED or self._is_latched(topic)
+                    if (known and known.latched) or self._is_latched(topic)
                     else DurabilityPolicy.VOLATILE))
             except ConfigError as error:
                 self.get_logger().error(f'{escaped(topic)} is not recorded: {escaped(error)}')
@@ -139,7 +129,7 @@ class RecorderNode(Node):
         self._diagnostics.received(topic)
         asked = self._recorded[topic].qos
         latched = asked.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        qos = topics.Qos(
+        qos = Qos(
             depth=1 if latched else 10,
             durability='transient_local' if latched else 'volatile',
             reliability='reliable' if asked.reliability == ReliabilityPolicy.RELIABLE
@@ -165,12 +155,17 @@ class RecorderNode(Node):
             f'{what}: {type(error).__name__}: {escaped(error)}', throttle_duration_sec=1.0)
 
 
+def _known(name: str) -> Topic | None:
+    """Return the Topic of this name, None for others."""
+    return BY_NAME.get(name.lstrip('/'))
+
+
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare('folder', 'bags/recording',
                        'Folder of the bag; if it exists, a number is added to the name.')
-    parameters.declare('topics', list(TYPES), 'Topics to record.')
+    parameters.declare('topics', list(BY_NAME), 'Topics to record.')
     parameters.declare('compression', 'zstd', 'Compression of chunks.',
                        choices=['zstd', 'lz4', 'none'])
     declare_arm(parameters)

@@ -139,7 +139,7 @@ def read_episode(data: bytes, seed: int) -> Episode:
         object_names=(), object_pixels=np.zeros((FRAMES, 0, 2), np.float32),
         object_poses=np.zeros((FRAMES, 0, 7)), goal_frame=None,
         goal_pixels=np.zeros((0, 2), np.float32), goal_poses=np.zeros((0, 7)),
-        task='bair', seed=seed)
+        object_source='imported', task='bair', seed=seed)
 
 
 @dataclass(frozen=True)

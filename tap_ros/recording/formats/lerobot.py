@@ -216,7 +216,8 @@ class DataSet:
             object_pixels=crop.pixels(pixels.reshape(T, K, 2), (height, width)),
             object_poses=poses, goal_frame=None,
             goal_pixels=np.full((K, 2), np.nan, np.float32), goal_poses=poses[0],
-            task=str((row.get('tasks') or [''])[0]), seed=int(row.get(SEED, index)),
+            object_source='imported', task=str((row.get('tasks') or [''])[0]),
+            seed=int(row.get(SEED, index)),
             outcome=outcome if outcome in OUTCOMES else '')
 
     def _picture(self, cell: Any) -> np.ndarray:

@@ -1,0 +1,158 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The topics, each once: what nodes subscribe to and publish, what is recorded, and what is read.
+
+A new topic is a row of TOPICS; the recorder records it then. If recordings are to be read for it,
+its `becomes` is a group of columns, see recording/columns.py.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from tap_ros.errors import RecordingError
+from tap_ros.text import listing
+
+IMAGE_TYPE, COMPRESSED_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+
+
+@dataclass(frozen=True)
+class Topic:
+    """
+    One topic.
+
+    :param name: relative, as nodes use it; recordings have it in any namespace.
+    :param type: of its messages.
+    :param becomes: what a recording's messages become, the name of columns; '': they are not read.
+    :param latched: transient_local, depth 1: late joiners get it.
+    :param periodic: comes with every picture.
+    :param needed: a recording without it is of no use.
+    :param compressed: pictures may come compressed, on NAME/compressed.
+    """
+
+    name: str
+    type: str
+    becomes: str = ''
+    latched: bool = False
+    periodic: bool = False
+    needed: bool = False
+    compressed: bool = False
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """Types that messages may have."""
+        return (self.type, COMPRESSED_TYPE) if self.compressed else (self.type,)
+
+    @property
+    def recorded(self) -> str:
+        """Name in our recordings."""
+        return f'/{self.name}'
+
+    def is_called(self, topic: str) -> bool:
+        """Return whether a full name is this topic's in some namespace."""
+        return topic.endswith(f'/{self.name}')
+
+
+IMAGE = Topic('camera/image_raw', IMAGE_TYPE, 'frame', periodic=True, needed=True, compressed=True)
+ROBOT_MASK = Topic('camera/robot_mask', IMAGE_TYPE, 'mask')
+CAMERA_INFO = Topic('camera/camera_info', 'sensor_msgs/msg/CameraInfo', periodic=True)
+OBJECTS = Topic('objects', 'tap_msgs/msg/ObjectStates', 'object', periodic=True)
+JOINT_STATES = Topic('joint_states', 'sensor_msgs/msg/JointState', 'joint', periodic=True)
+TWIST = Topic('arm/delta_twist_cmds', 'geometry_msgs/msg/TwistStamped', 'twist')
+GRIPPER_COMMAND = Topic('gripper/command', 'std_msgs/msg/Float64', 'command')
+GOAL_IMAGE = Topic('goal/image', IMAGE_TYPE, 'goal', latched=True)
+GOAL_ROBOT_MASK = Topic('goal/robot_mask', IMAGE_TYPE, 'goal_mask', latched=True)
+GOAL_OBJECTS = Topic('goal/objects', 'tap_msgs/msg/ObjectStates', 'goal_object', latched=True)
+EPISODE = Topic('episode', 'tap_msgs/msg/Episode', 'mark')
+CLOCK = Topic('clock', 'rosgraph_msgs/msg/Clock')
+MODEL_CARDS = tuple(Topic(f'{node}/model_card', 'std_msgs/msg/String', latched=True)
+                    for node in ('predictor_node', 'visual_mpc_node'))
+TOPICS = (
+    IMAGE, ROBOT_MASK, CAMERA_INFO, OBJECTS, JOINT_STATES, TWIST, GRIPPER_COMMAND, GOAL_IMAGE,
+    GOAL_ROBOT_MASK, GOAL_OBJECTS, EPISODE, CLOCK,
+    Topic('subgoal', 'tap_msgs/msg/Subgoal', latched=True),
+    Topic('subgoal/image', IMAGE_TYPE, latched=True),
+    Topic('subgoal/overlay', IMAGE_TYPE, latched=True),
+    Topic('plan/distance', 'std_msgs/msg/Float64'), *MODEL_CARDS)
+BY_NAME = {topic.name: topic for topic in TOPICS}
+BY_COLUMNS = {topic.becomes: topic for topic in TOPICS if topic.becomes}
+
+
+@dataclass(frozen=True)
+class Qos:
+    """The quality of service that a publisher offers, as far as it differs between our topics."""
+
+    depth: int = 10
+    reliability: str = 'reliable'  # or 'best_effort'
+    durability: str = 'volatile'  # or 'transient_local'
+
+    def profile(self) -> dict[str, Any]:
+        """Return what rosbag2 writes about it."""
+        infinite = {'sec': 9223372036, 'nsec': 854775807}
+        return {
+            'history': 'keep_last', 'depth': self.depth, 'reliability': self.reliability,
+            'durability': self.durability, 'deadline': infinite, 'lifespan': infinite,
+            'liveliness': 'automatic', 'liveliness_lease_duration': infinite,
+            'avoid_ros_namespace_conventions': False}
+
+
+def default_qos(topic: str) -> Qos:
+    """Return the Qos of a topic of this package, in any namespace; others stream."""
+    if any(one.latched and one.becomes and one.is_called(topic) for one in TOPICS):
+        return Qos(depth=1, durability='transient_local')
+    return Qos()
+
+
+def resolve(available: Mapping[str, str], source: str,
+            image_topic: str = '') -> dict[str, str]:
+    """
+    Find the topics of a recording, in whatever namespace they are.
+
+    :param available: dict topic -> type of what the recording holds.
+    :param source: what messages call the recording.
+    :param image_topic: the camera's topic; by default the one that ends in /camera/image_raw, else
+        the only one of images, compressed or not; X/compressed beside X does not count.
+    :return: dict from Topic.becomes to topics of the recording; what it lacks is left out.
+    :raises RecordingError: without a topic that is needed, or when several would do.
+    """
+    known = listing((f'{t} ({k})' for t, k in sorted(available.items())), 20) or 'none'
+    if image_topic and available.get(image_topic) not in IMAGE.types:
+        raise RecordingError(
+            f'{source}: no topic {image_topic} of type {" or ".join(IMAGE.types)}; topics found: '
+            f'{known}')
+    found: dict[str, str] = {}
+    for columns, topic in BY_COLUMNS.items():
+        candidates = [name for name, kind in available.items()
+                      if kind == topic.type and _named_best(name) is topic]
+        if topic is IMAGE and image_topic:
+            candidates = [image_topic]
+        elif IMAGE.is_called(found.get('frame', '')):
+            beside = found['frame'].removesuffix(IMAGE.recorded) + topic.recorded
+            candidates = [beside] if beside in candidates else candidates
+        if len(candidates) > 1:
+            raise RecordingError(
+                f'{source}: several topics could be {topic.recorded}: '
+                f'{listing(sorted(candidates))}; name the camera topic (image_topic, '
+                '--image-topic) whose namespace is wanted')
+        if candidates:
+            found[columns] = candidates[0]
+    if 'frame' not in found:
+        images = [name for name, kind in available.items()
+                  if kind == IMAGE.type and name not in found.values()]
+        # Of a camera that is there raw, too, nothing more is learned from the compressed pictures.
+        images += [name for name, kind in available.items() if kind == COMPRESSED_TYPE
+                   and name.removesuffix('/compressed') not in images]
+        if len(images) != 1:
+            raise RecordingError(
+                f'{source}: no topic ends in {IMAGE.recorded} with type {IMAGE.type}; name the '
+                'camera topic (image_topic, --image-topic) if it is called otherwise; topics '
+                f'found: {known}')
+        found['frame'] = images[0]
+    return found
+
+
+def _named_best(name: str) -> Topic | None:
+    """Return the Topic whose name is the longest that a full name ends in."""
+    return max((topic for topic in TOPICS if topic.is_called(name)),
+               key=lambda topic: len(topic.name), default=None)

@@ -1,0 +1,97 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every encoding shows the colours of the scene; what cannot be read is refused, and why."""
+
+import io
+
+import cv2
+import numpy as np
+from PIL import Image as Picture
+import pytest
+from tap_ros.errors import ImageError
+from tap_ros.images.encodings import decompress, find_encoding, to_rgb
+
+SCENE = np.repeat(np.repeat(
+    np.array([[[200, 30, 60], [10, 180, 90]]], np.uint8), 16, 0), 12, 1)  # left red, right green
+
+
+def packed(picture, form):
+    buffer = io.BytesIO()
+    Picture.fromarray(picture).save(buffer, form)
+    return buffer.getvalue()
+
+
+def mosaic(pattern):
+    raw = np.empty(SCENE.shape[:2], np.uint8)
+    for k, letter in enumerate(pattern):
+        raw[k // 2::2, k % 2::2] = SCENE[k // 2::2, k % 2::2, 'rgb'.index(letter)]
+    return raw
+
+
+def test_bytes_in_any_order_give_the_same_picture():
+    picture = np.random.default_rng(1).integers(0, 256, (4, 6, 3), np.uint8)
+    for name, order in (('rgb8', [0, 1, 2]), ('bgr8', [2, 1, 0]), ('rgba8', [0, 1, 2, 0]),
+                        ('bgra8', [2, 1, 0, 0])):
+        assert find_encoding(name).pixel_bytes == len(order)
+        np.testing.assert_array_equal(to_rgb(picture[..., order], name), picture)
+    np.testing.assert_array_equal(
+        to_rgb(picture[..., :1], 'mono8'), picture[..., :1].repeat(3, -1))
+
+
+def test_mosaics_have_the_colours_of_the_scene_also_compressed():
+    for pattern in ('rggb', 'bggr', 'gbrg', 'grbg'):
+        raw = mosaic(pattern)
+        for found in (to_rgb(raw[..., None], f'bayer_{pattern}8'), decompress(
+                packed(raw, 'PNG'), f'bayer_{pattern}8; png compressed ')):
+            np.testing.assert_array_equal(found[2:-2, 2:9], SCENE[2:-2, 2:9])
+            np.testing.assert_array_equal(found[2:-2, 15:-2], SCENE[2:-2, 15:-2])
+
+
+def test_yuv_has_the_colours_of_the_scene():
+    colour = np.array([200, 60, 30])
+    parts = {  # ITU-R BT.601
+        'y': 16 + np.array([65.481, 128.553, 24.966]) @ colour / 255,
+        'u': 128 + np.array([-37.797, -74.203, 112.0]) @ colour / 255,
+        'v': 128 + np.array([112.0, -93.786, -18.214]) @ colour / 255}
+    for name, order in (('yuv422', 'uyvy'), ('uyvy', 'uyvy'), ('yuv422_yuy2', 'yuyv'),
+                        ('yuyv', 'yuyv')):
+        pair = np.array([round(parts[letter]) for letter in order], np.uint8)
+        found = to_rgb(np.tile(pair, (4, 3)).reshape(4, 6, 2), name)
+        assert np.abs(found.astype(int) - colour).max() <= 3
+
+
+def test_compressed_pictures_are_read():
+    smooth = cv2.resize(SCENE, (64, 48))
+    for form, error in (('PNG', 0), ('JPEG', 4), ('WEBP', 4)):
+        found = decompress(packed(smooth, form), 'rgb8; jpeg compressed bgr8')
+        assert np.abs(found.astype(int) - smooth).mean() <= error
+
+
+@pytest.mark.parametrize('name, words', [
+    ('yuv444', 'valid encodings: rgb8, bgr8'), ('', "''"), ('x\n' + 1000 * 'y', r'x\\nyyy'),
+    ('16UC1', 'more than 8 bits a channel, as depth cameras'), ('32FC1', 'more than 8 bits'),
+    ('bayer_rggb16', 'more than 8 bits')])
+def test_an_encoding_that_cannot_be_read_is_named(name, words):
+    with pytest.raises(ImageError, match=words):
+        find_encoding(name)
+
+
+def test_sizes_that_an_encoding_does_not_have_are_refused():
+    for name, height, width in (('yuv422', 2, 3), ('bayer_rggb8', 5, 6), ('bayer_rggb8', 2, 2)):
+        size = find_encoding(name).pixel_bytes
+        with pytest.raises(ImageError, match=f'{width}x{height} pixels of encoding {name}'):
+            to_rgb(np.zeros((height, width, size), np.uint8), name)
+
+
+def test_compressed_pictures_that_cannot_be_used_are_refused_with_the_reason():
+    deep = np.full((8, 8), 40000, np.uint16)
+    _, colour = cv2.imencode('.png', np.full((8, 8, 3), 40000, np.uint16))
+    for data, form, words in (
+            (packed(SCENE, 'JPEG')[:400], 'jpeg', 'damaged compressed picture'),
+            (b'no picture', 'jpeg', "format 'jpeg' cannot be used; valid are JPEG, PNG"),
+            (packed(deep, 'PNG'), '16UC1; png compressed', 'more than 8 bits a channel'),
+            (colour.tobytes(), 'rgb16; png compressed', 'more than 8 bits a channel'),
+            (packed(deep, 'PNG'), '16UC1; compressedDepth png', 'topic of the colour camera'),
+            (packed(np.zeros((4000, 4000, 3), np.uint8), 'PNG'), 'png', '4000x4000 pixels are')):
+        with pytest.raises(ImageError, match=words):
+            decompress(data, form)
