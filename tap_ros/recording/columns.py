@@ -29,7 +29,7 @@ from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.messages import decode
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.spans import Mark
-from tap_ros.robots.arm import find_joints, MOST_JOINTS
+from tap_ros.robots.arm import find_joints, known_arms, MOST_JOINTS
 from tap_ros.text import escaped
 
 _ENDINGS = ('_log', '_stamp', '_names', '_event', '_index')  # of column names
@@ -160,6 +160,7 @@ class _Decoder:
         self.write_frame, self.write_mask = write_frame, write_mask
         self.mask_size = size  # (H, W) of the first robot mask that was written
         self.num_masks = 0
+        self.arms = known_arms()
         self.columns = Columns(str(file.path), camera_size=size)
         self.sizes: Counter[tuple[int, int]] = Counter()  # (H, W) -> camera images
         self.losses: list[Loss] = []
@@ -360,7 +361,7 @@ class _Decoder:
         if known.keys() & set(GRIPPER_JOINTS):
             self._add('joint', log, [known.get(name, np.nan) for name in GRIPPER_JOINTS],
                       stamp=to_nanoseconds(message.header.stamp))
-        arm = None if known.keys() & set(PLACE) else find_joints(known)
+        arm = None if known.keys() & set(PLACE) else find_joints(known, self.arms)
         if arm is not None and np.isfinite(arm).all():
             self._add('arm', log, np.pad(arm, (0, MOST_JOINTS - len(arm))),
                       stamp=to_nanoseconds(message.header.stamp))

@@ -166,16 +166,22 @@ def get_arm(name: str) -> Arm:
     return load_plugin('tap_ros.arms', name)
 
 
-def find_joints(positions: Mapping[str, float]) -> list[float] | None:
+def known_arms() -> list[Arm]:
+    """Return all arms; looking for those of other packages takes milliseconds."""
+    return [get_arm(name) for name in names('tap_ros.arms')]
+
+
+def find_joints(positions: Mapping[str, float], arms: Sequence[Arm]) -> list[float] | None:
     """
-    Find the joints of a known arm, whatever their names begin with.
+    Find the joints of one of some arms, whatever their names begin with.
 
     :param positions: rad by the name of the joint.
+    :param arms: those that it may be.
     :return: the arm's joints in order; None when there is not one arm, or more than one.
     """
     found = []
-    for name in names('tap_ros.arms'):
-        joints = get_arm(name).joints
+    for arm in arms:
+        joints = arm.joints
         prefixes = [other.removesuffix(joints[0]) for other in positions
                     if other.endswith(joints[0])]
         found += [[positions[prefix + joint] for joint in joints] for prefix in prefixes

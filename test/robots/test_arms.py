@@ -13,7 +13,7 @@ from sim_bridge.world.transforms import arm_transforms, fixed_arm_transforms
 from tap_ros import plugins
 from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE
 from tap_ros.errors import ConfigError, KinematicsError
-from tap_ros.robots.arm import find_joints, get_arm, Mount, TIP_FRAME
+from tap_ros.robots.arm import find_joints, get_arm, known_arms, Mount, TIP_FRAME
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.silhouette import Body, draw_mask, View
 from tap_ros.robots.ur10e import inverse, UR10E
@@ -156,7 +156,8 @@ def test_out_of_reach_and_too_fast_is_refused_with_the_reason(arm):
 @each_arm
 def test_joints_are_found_whatever_their_names_begin_with(arm):
     named = {f'left_{name}': float(i) for i, name in enumerate(arm.joints)}
-    assert find_joints(dict(reversed(named.items()))) == list(range(len(arm.joints)))
-    assert find_joints(named | {f'right_{name}': 0.0 for name in arm.joints}) is None
+    assert find_joints(dict(reversed(named.items())), known_arms()) == list(range(len(arm.joints)))
+    assert find_joints(
+        named | {f'right_{name}': 0.0 for name in arm.joints}, known_arms()) is None
     named.popitem()
-    assert find_joints(named) is None
+    assert find_joints(named, known_arms()) is None
