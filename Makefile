@@ -10,8 +10,7 @@ ENTER := . scripts/environment.bash
 # A domain of its own, so that other ROS nodes on this machine neither hear nor disturb a run.
 DOMAIN := export ROS_DOMAIN_ID=$${ROS_DOMAIN_ID:-$$((1 + $$$$ % 100))}
 
-WHEELS := requirements.txt requirements-dev.txt requirements-experiments.txt requirements-ray.txt \
-  requirements-extras.txt requirements-hub.txt \
+WHEELS := requirements.txt requirements-dev.txt requirements-experiments.txt requirements-extras.txt \
   requirements-ros.txt constraints.txt scripts/setup.bash scripts/mend_wheels.py
 SOURCES := package.xml setup.py setup.cfg tap_ros/contract.py resource/tap_ros $(wildcard config/*.yaml config/layouts/* launch/*.py) \
   tap_msgs/CMakeLists.txt tap_msgs/package.xml $(wildcard tap_msgs/*/*.msg tap_msgs/*/*.srv \

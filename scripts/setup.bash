@@ -131,8 +131,7 @@ make_wheels() {
   # shellcheck disable=SC2046  # one word per option
   step 'torch' "${pip[@]}" $(torch_index) "$(grep '^torch==' requirements.txt)"
   step 'Python packages' "${pip[@]}" -r requirements.txt -r requirements-dev.txt \
-    -r requirements-experiments.txt -r requirements-ray.txt -r requirements-extras.txt \
-    -r requirements-hub.txt
+    -r requirements-experiments.txt -r requirements-extras.txt
   # Without its dependencies: it asks for an older mujoco, and works with ours.
   step 'Meta-World' "${pip[@]}" --no-deps metaworld==3.1.1
   step 'ROS 2 Jazzy' "${pip[@]}" -r requirements-ros.txt

@@ -64,9 +64,9 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                 'tap_ros.evaluation.inspect_files'),
 }
 EXTRAS = {  # what only some commands need, and what pip installs for it
-    'google': "'.[bair]'", 'google_crc32c': "'.[bair]'", 'huggingface_hub':
-    '-r requirements-hub.txt', 'jinja2': '-r requirements-experiments.txt',
-    'pandas': '-r requirements-experiments.txt', 'pyarrow': "'.[lerobot]'"}
+    'google': "'.[bair]'", 'google_crc32c': "'.[bair]'", 'huggingface_hub': "'.[hub]'",
+    'jinja2': '-r requirements-experiments.txt', 'pandas': '-r requirements-experiments.txt',
+    'pyarrow': "'.[lerobot]'", 'ray': "'.[ray]'", 'websockets': "'.[explorer]'"}
 PROG = 'python -m tap_ros'
 
 

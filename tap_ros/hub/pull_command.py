@@ -9,9 +9,9 @@ import re
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
-from tap_ros.errors import ConfigError, HubError, WeightsError
+from tap_ros.errors import ConfigError, WeightsError
 from tap_ros.files import storage_errors, write_atomically
-from tap_ros.hub.repository import COMMIT, hub_errors, open_hub, SUFFIX
+from tap_ros.hub.repository import check_weights, hub_errors, open_hub, SUFFIX
 from tap_ros.options import default_text, Flag, Folder
 from tap_ros.text import escaped, listing
 from tyro import conf
@@ -45,28 +45,24 @@ def run(args: Options) -> None:
     :raises TapError: for what cannot be had, is not what was asked for or is no weights file, and
         for a file that is there with other content. Then the folder is as it was.
     """
-    hub = open_hub(args.repo_id)
-    wanted = args.sha256.lower()
+    hub, wanted = open_hub(args.repo_id), args.sha256.lower()
     if wanted and not re.fullmatch('[0-9a-f]{64}', wanted):
         raise ConfigError(f'--sha256 {escaped(args.sha256)}: expected 64 hexadecimal digits')
-    if args.file:
-        _check_suffix(args.file)
-    with hub_errors(args.repo_id, args.revision):
-        info = hub.model_info(args.repo_id, revision=args.revision)
-        commit, names = str(info.sha), [file.rfilename for file in info.siblings or ()]
-    if not COMMIT.fullmatch(commit):
-        raise HubError(f'{args.repo_id}: the server does not say which commit '
-                       f'{escaped(args.revision)} is; see whether HF_ENDPOINT is right')
-    name = _choose(names, args.file, f'{args.repo_id} at {commit[:12]}')
-    source = f'{args.repo_id}/{escaped(name)} at {commit[:12]}'
-    from tap_ros.hub.checked import check_weights  # torch takes seconds
+    if args.file and PurePosixPath(args.file).suffix != SUFFIX:
+        raise ConfigError(f'--file {escaped(args.file)}: expected a {SUFFIX} file; others, such '
+                          'as pickles, are never loaded')
     with TemporaryDirectory(prefix='tap_ros_hub_') as folder:
         with hub_errors(args.repo_id, args.revision):
+            info = hub.model_info(args.repo_id, revision=args.revision)
+            commit = str(info.sha)
+            name = _choose([file.rfilename for file in info.siblings or ()], args.file,
+                           f'{args.repo_id} at {commit[:12]}')
             # A cache of its own: one that holds a damaged file would give it again and again.
             path = Path(hub.hf_hub_download(
                 args.repo_id, name, revision=commit, local_dir=folder, cache_dir=folder))
         with storage_errors(path):
             data = path.read_bytes()
+        source = f'{args.repo_id}/{escaped(name)} at {commit[:12]}'
         found = hashlib.sha256(data).hexdigest()
         if wanted not in ('', found):
             raise WeightsError(f'{source}: has SHA-256 {found}, --sha256 says {wanted}; nothing '
@@ -77,20 +73,14 @@ def run(args: Options) -> None:
             reason = str(error).removeprefix(f'{escaped(path)}: ')
             raise WeightsError(f'{source}: {reason}. Nothing was written') from error
     target = Path(args.out, PurePosixPath(name).name)
-    there = _content(target)
+    with storage_errors(target):
+        there = target.read_bytes() if target.exists() else None
     if there != data:
         if there is not None and not args.force:
             raise ConfigError(f'{escaped(target)}: is there already with other content; name '
                               'another --out, or replace it with --force')
         write_atomically(target, data)
     print(f'file        {escaped(target)}\ncommit      {commit}\nsha256      {found}')
-
-
-def _check_suffix(name: str) -> None:
-    """Refuse what may be a pickle, which runs code when it is loaded."""
-    if PurePosixPath(name).suffix != SUFFIX:
-        raise ConfigError(f'--file {escaped(name)}: expected a {SUFFIX} file; others, such as '
-                          'pickles, are never loaded')
 
 
 def _choose(names: list[str], wanted: str, source: str) -> str:
@@ -101,22 +91,11 @@ def _choose(names: list[str], wanted: str, source: str) -> str:
     :param source: repository and commit, for messages.
     """
     found = sorted(name for name in names if PurePosixPath(name).suffix == SUFFIX)
-    if wanted in found:
-        return wanted
+    if wanted in found or (not wanted and len(found) == 1):
+        return wanted or found[0]
     if not found:
         raise WeightsError(f'{source}: holds no {SUFFIX} file, only {listing(names) or "nothing"};'
                            ' correct REPO_ID or --revision')
-    if not wanted and len(found) == 1:
-        return found[0]
     raise ConfigError((f'--file {escaped(wanted)}: is not in {source}' if wanted else
                        f'{source}: holds several weights files')
                       + f'; name one by --file: {listing(found)}')
-
-
-def _content(path: Path) -> bytes | None:
-    """Return what a file holds; None: there is none."""
-    with storage_errors(path):
-        try:
-            return path.read_bytes()
-        except FileNotFoundError:
-            return None

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from tap_ros.errors import ConfigError
 from tap_ros.files import storage_errors
-from tap_ros.hub.repository import COMMIT, hub_errors, open_hub, SUFFIX
+from tap_ros.hub.repository import check_weights, COMMIT, hub_errors, open_hub, SUFFIX
 from tap_ros.options import default_text, Flag
 from tap_ros.text import escaped
 from tap_ros.weights import find_predictor, PREDICTORS
@@ -68,7 +68,6 @@ def run(args: Options) -> None:
     hub = open_hub(args.repo_id)
     if COMMIT.fullmatch(args.revision):
         raise ConfigError(f'--revision {args.revision}: is a commit; name a branch')
-    from tap_ros.hub.checked import check_weights  # torch takes seconds
     file = find_predictor(args.weights)
     if file.suffix != SUFFIX:
         raise ConfigError(f'{escaped(file)}: expected a {SUFFIX} file, or shipped weights: '

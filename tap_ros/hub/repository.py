@@ -1,15 +1,15 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The Hub as huggingface_hub reaches it, and its errors as one line.
+The Hub as huggingface_hub reaches it, its errors as one line, and the check of weights.
 
 Which Hub, and with which token, is left to that library: HF_ENDPOINT, HF_TOKEN, `hf auth login`.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http import HTTPStatus
 import os
+from pathlib import Path
 import re
 import sys
 from typing import TYPE_CHECKING
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 COMMIT = re.compile('[0-9a-f]{40}')
 SUFFIX = '.safetensors'
-_LOG_IN = 'log in (`hf auth login`), or set HF_TOKEN'
 
 
 def open_hub(repo: str) -> 'HfApi':
@@ -35,16 +34,11 @@ def open_hub(repo: str) -> 'HfApi':
     """
     os.environ.setdefault('HF_HUB_VERBOSITY', 'error')  # what fails in the end is said once
     from huggingface_hub import HfApi
-    from huggingface_hub.errors import HFValidationError
-    from huggingface_hub.utils import disable_progress_bars, validate_repo_id
+    from huggingface_hub.utils import disable_progress_bars
+    if not re.fullmatch(r'[\w.-]+/[\w.-]+', repo):
+        raise ConfigError(f'REPO_ID {escaped(repo)}: expected OWNER/NAME')
     if not sys.stderr.isatty():
         disable_progress_bars()
-    try:
-        validate_repo_id(repo)
-    except HFValidationError as error:
-        raise ConfigError(f'REPO_ID: {_line(error)} Give OWNER/NAME') from error
-    if '/' not in repo:
-        raise ConfigError(f'REPO_ID {repo}: expected OWNER/NAME')
     return HfApi()
 
 
@@ -56,56 +50,43 @@ def hub_errors(repo: str, revision: str) -> Iterator[None]:
     :param repo: name of the repository; revision: the branch or commit that was asked for.
     :raises HubError: for any error of the block but a TapError.
     """
-    from huggingface_hub import constants
+    from huggingface_hub import constants, errors
     try:
         yield
     except TapError:
         raise
     except Exception as error:
-        raise HubError(f'{repo} at {constants.ENDPOINT}: {_reason(error, revision)}') from error
+        cause: BaseException = error
+        while cause.__cause__ and not isinstance(cause, errors.HfHubHTTPError | ValueError):
+            cause = cause.__cause__  # the library's own words are long, those of the system not
+        said = ' '.join(str(cause).split())
+        if isinstance(cause, errors.HfHubHTTPError):
+            said = f'{cause.response.status_code} {cause.server_message or said}'
+            advice = (f'correct the name or --revision {escaped(revision)}, or log in '
+                      '(`hf auth login`, HF_TOKEN) as one who may do that')
+        elif isinstance(cause, errors.OfflineModeIsEnabled):
+            said, advice = 'HF_HUB_OFFLINE is set', 'unset it'
+        else:
+            advice = 'see whether the network is there and HF_ENDPOINT is right, then try again'
+        raise HubError(f'{repo} at {constants.ENDPOINT}: {escaped(said, 300)}; '
+                       f'{advice}') from error
 
 
-def _reason(error: BaseException, revision: str) -> str:
-    """Say what was wrong, and what would be right."""
-    from huggingface_hub import errors
-    while error.__cause__ and not isinstance(error, errors.HfHubHTTPError | ValueError):
-        error = error.__cause__  # the library's own words are long, those of the system are not
-    match error:
-        case errors.OfflineModeIsEnabled():
-            return 'HF_HUB_OFFLINE is set; unset it'
-        case errors.GatedRepoError():
-            return f'access has to be granted; ask for it on its page, then {_LOG_IN}'
-        case errors.RepositoryNotFoundError():
-            return ('no such repository, or it is private and not yours; correct the name, or '
-                    + _LOG_IN)
-        case errors.RevisionNotFoundError():
-            return (f'has no branch or commit {escaped(revision)}; see its page for those that '
-                    'it has, and correct --revision')
-        case errors.HfHubHTTPError():
-            return _refusal(error.response.status_code, _line(error.server_message or ''))
-        case ValueError():
-            return (f'{_line(error)} ({type(error).__name__}); correct what this names, or see '
-                    'whether HF_ENDPOINT is a Hugging Face Hub')
-    return (f'cannot be reached, or broke off ({_line(error)}); see whether the network is there '
-            'and HF_ENDPOINT is right, then try again')
+def check_weights(path: Path) -> dict[str, object]:
+    """
+    Load a weights file as whoever uses it would.
 
-
-def _refusal(status: int, message: str) -> str:
-    """Say what an HTTP status means here."""
-    said = f'{status} {message or HTTPStatus(status).phrase}'
-    match status:
-        case HTTPStatus.UNAUTHORIZED:
-            return f'no valid token was given ({said}); {_LOG_IN}'
-        case HTTPStatus.FORBIDDEN:
-            return (f'the token may not do that ({said}); use one with write permission, for a '
-                    'repository of yours')
-        case HTTPStatus.TOO_MANY_REQUESTS:
-            return f'too many requests ({said}); wait some minutes, then try again'
-        case _ if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
-            return f'the server failed ({said}); try again later'
-    return f'refused ({said}); correct what this names'
-
-
-def _line(text: object) -> str:
-    """Return text of the library or of a server, fit for one line."""
-    return escaped(' '.join(str(text).split()))
+    :param path: absolute, or with a suffix, so that it is no name of shipped weights.
+    :return: what the file says of itself: kind, config, training.
+    :raises WeightsError: if it is damaged, no weights file, or neither of a predictor nor of a
+        forward model.
+    """
+    from tap_ros.planning.forward_model import LearnedForwardModel  # torch takes seconds
+    from tap_ros.prediction.predictor import load_network
+    from tap_ros.training.weights import load_tensors
+    _, about = load_tensors(path)
+    if about.get('kind') == 'forward_model':
+        LearnedForwardModel.load(path)
+    else:
+        load_network(path)
+    return about

@@ -160,7 +160,7 @@ def test_a_branch_is_made_and_leaves_main_as_it_was(hub, shell):
     assert hub.repositories[REPO].private
     assert shell.refused('pull', REPO, '--out', 'a').endswith(
         'holds no .safetensors file, only .gitattributes; correct REPO_ID or --revision')
-    assert 'private' in shell.refused('pull', REPO, '--out', 'a', HF_TOKEN='')
+    assert 'hf auth login' in shell.refused('pull', REPO, '--out', 'a', HF_TOKEN='')
     for revision in ('trial', told['commit']):
         got = shell.run('pull', REPO, '--revision', revision, '--out', 'a', HF_TOKEN=READER)
         assert got['commit'] == told['commit']
@@ -208,7 +208,7 @@ class Opened:
 @pytest.mark.parametrize('case, words, named', [
     ('good', ['--sha256', 64 * '0'], f'--sha256 says {64 * "0"}; nothing was written'),
     ('good', ['--sha256', '123'], '--sha256 123: expected 64 hexadecimal digits'),
-    ('good', ['--revision', 'nix'], 'no branch or commit nix'),
+    ('good', ['--revision', 'nix'], 'correct the name or --revision nix'),
     ('good', ['--file', 'model.pt'], 'pickles, are never loaded'),
     ('good', ['--file', 'a.safetensors'], f'--file a.safetensors: is not in {REPO}'),
     ('damaged', [], 'damaged: its content has another SHA-256'),
@@ -257,7 +257,7 @@ def test_a_server_that_dies_half_way_leaves_nothing(hub, shell):
     hub.add(REPO, {NAME: FILE.read_bytes()})
     hub.cuts, hub.dies = 1, True
     line = shell.refused('pull', REPO, '--out', 'a')
-    assert hub.cuts == 0 and 'cannot be reached, or broke off' in line
+    assert hub.cuts == 0 and 'see whether the network is there' in line
     assert not any(shell.folder.iterdir()) and not any(shell.scratch.iterdir())
 
 
@@ -281,12 +281,11 @@ def test_a_pull_that_is_aborted_leaves_what_was_there(sent, hub, shell):
 
 @needs_hub
 @pytest.mark.parametrize('words, environment, named', [
-    (['push2', REPO], {'HF_TOKEN': ''}, 'no valid token was given (401'),
-    (['push2', REPO], {'HF_TOKEN': 'wrong'}, 'hf auth login'),
-    (['push2', REPO], {'HF_TOKEN': READER}, 'use one with write permission'),
-    (['push2', 'other/weights'], {}, 'for a repository of yours'),
+    (['push2', REPO], {'HF_TOKEN': 'wrong'}, '401 '),
+    (['push2', REPO], {'HF_TOKEN': READER}, 'log in (`hf auth login`'),
+    (['push2', 'other/weights'], {}, '403 '),
     (['push2', 'weights'], {}, 'REPO_ID weights: expected OWNER/NAME'),
-    (['push2', 'a/b/c'], {}, 'REPO_ID: Repo id must be in the form'),
+    (['push2', 'a/b/c'], {}, 'REPO_ID a/b/c: expected OWNER/NAME'),
     (['push2', REPO, '--private'], {}, f'{REPO}: is there already, and public'),
     (['push2', REPO, '--revision', 40 * 'a'], {}, 'is a commit; name a branch'),
     (['push2', REPO], {'HF_HUB_OFFLINE': '1'}, 'HF_HUB_OFFLINE is set; unset it'),
@@ -307,16 +306,14 @@ def test_what_cannot_be_pushed_changes_nothing(words, environment, named, hub, s
 
 
 @needs_hub
-@pytest.mark.parametrize('status, named', [
-    (429, 'too many requests (429'), (503, 'the server failed (503'), (418, 'refused (418')])
-def test_what_a_server_says_is_one_line(status, named, hub, shell):
-    hub.status = status
+def test_what_a_server_says_is_one_line(hub, shell):
+    hub.status = 418
     line = shell.refused('pull', REPO, '--out', 'a')
-    assert named in line and re.search(r'something \\x1b\[31mFORGED', line)
+    assert '418 ' in line and re.search(r'something \\x1b\[31mFORGED', line)
 
 
 def test_where_the_library_is_missing_the_command_that_installs_it_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'huggingface_hub', None)
     for words in (['push', 'push2', REPO], ['pull', REPO, '--out', 'a']):
         assert main(['hub', *words]) == 1
-        assert 'pip install -r requirements-hub.txt' in capsys.readouterr().err
+        assert "pip install '.[hub]'" in capsys.readouterr().err

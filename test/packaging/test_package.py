@@ -126,8 +126,9 @@ def undeclared(folders, *files):
 
 
 def test_everything_imported_is_declared_with_ros_or_with_pip():
-    assert not undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
-                          'requirements-extras.txt', 'requirements-hub.txt')
+    # scripts/setup.bash installs metaworld, without its dependencies.
+    assert undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
+                      'requirements-extras.txt') in ([], ['metaworld'])
     assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt',
                           'requirements-dev.txt')
 
@@ -147,14 +148,12 @@ def test_nothing_is_required_that_nobody_imports():
     assert set(requirements('requirements.txt')) <= used
     assert set(requirements('requirements-experiments.txt')) <= used
     assert set(requirements('requirements-extras.txt')) <= used
-    assert set(requirements('requirements-hub.txt')) <= used
 
 
 def test_requirements_and_constraints_agree():
     pinned = requirements('constraints.txt')
     for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-experiments.txt',
-                 'requirements-hub.txt', 'requirements-extras.txt', 'requirements-ray.txt',
-                 'requirements-ros.txt', 'requirements-ros2.txt'):
+                 'requirements-extras.txt', 'requirements-ros.txt', 'requirements-ros2.txt'):
         for distribution, version in requirements(name).items():
             assert pinned[distribution] == version, f'{name}: {distribution}'
 
