@@ -9,8 +9,9 @@ from action_msgs.msg import GoalStatus
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
+from lifecycle import Lifecycle
 import numpy as np
-from processes import Client, NodeProcess
+from processes import Client, LocalNode, NodeProcess
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
@@ -25,6 +26,7 @@ from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
+from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.planning.action_sequences import FULL
 from tap_ros.planning.mpc_inputs import Scene
@@ -131,11 +133,30 @@ class Loop:
         assert moving.wait(120)
         return handle
 
-    def restart(self, name, remaps=(), **parameters):
-        """End a node and start it anew."""
-        assert self.processes[name].end() == 0, self.processes[name].text
-        self.start(name, remaps, **parameters)
-        self.processes[name].wait_for('ready', 120)
+    def use_weights(self, name, weights):
+        """Have a node go on with other weights."""
+        states = Lifecycle(self.node, name)
+        assert states.to('deactivate') and states.to('cleanup')
+        assert states.set('weights', weights) == ''
+        assert states.to('configure') and states.to('activate')
+
+    @contextmanager
+    def other_planner(self, **parameters):
+        """Send goals to another planner, other_node, whose robot masks are those of own_mask."""
+        action = {f'{{}}/_action/{part}' for part in (
+            'send_goal', 'cancel_goal', 'get_result', 'feedback', 'status')}
+        planner = LocalNode(VisualMpcNode, num_threads=4, remaps={
+            '__node': 'other_node', 'camera/robot_mask': 'own_mask',
+            **{name.format('reach_goal'): name.format('other_goal') for name in action}},
+            **parameters)
+        before = self.reach_client
+        try:
+            self.reach_client = ActionClient(self.node, ReachGoal, 'other_goal')
+            assert self.reach_client.wait_for_server(30)
+            yield
+        finally:
+            self.reach_client = before
+            assert planner.end() == 0
 
     def moves(self):
         """Return the commands (N, 3) so far, without the stops."""

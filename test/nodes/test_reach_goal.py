@@ -87,7 +87,7 @@ def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
     network = lively_network(image_size=64, latent_size=8)
     weights = tmp_path / 'sampling.safetensors'
     save_weights(weights, network, 'predictor', network.config, {})
-    loop.restart('predictor_node', weights=weights)
+    loop.use_weights('predictor_node', weights)
     try:
         run, stages = acts_like(
             loop, 'sampling:samples3', weights, num_samples=3, step_budget=2)
@@ -98,7 +98,7 @@ def test_the_nodes_choose_among_samples_as_one_process_does(loop, tmp_path):
         status, result = wait_for_result(handle, 20)
         assert status == GoalStatus.STATUS_CANCELED and result.steps == 0
     finally:
-        loop.restart('predictor_node')
+        loop.use_weights('predictor_node', DEFAULT_PREDICTOR)
     assert stages == ['subgoal', 'goal'] and run.subgoals[0].sample > 0
 
 
@@ -215,8 +215,6 @@ def test_when_the_predictor_hangs_or_dies_the_arm_stays_and_the_planner_lives(lo
 
 
 def test_with_a_robot_mask_the_arm_moves_only_where_a_mask_comes(loop):
-    loop.restart('visual_mpc_node', ['-r camera/robot_mask:=own_mask'], robot_mask='all',
-                 image_timeout=2.0)
     masks = loop.node.create_publisher(Image, 'own_mask', STREAM)
     sending = threading.Event()
 
@@ -229,40 +227,40 @@ def test_with_a_robot_mask_the_arm_moves_only_where_a_mask_comes(loop):
 
     images = loop.node.create_subscription(Image, 'camera/image_raw', answer, STREAM)
     try:
-        loop.reset()
-        aborted(loop, '/own_mask', mode='direct', step_budget=2)
-        sending.set()
-        loop.reset()
-        served(loop, 2)
+        with loop.other_planner(robot_mask='all', image_timeout=2.0):
+            loop.reset()
+            aborted(loop, '/own_mask', mode='direct', step_budget=2)
+            sending.set()
+            loop.reset()
+            served(loop, 2)
     finally:
         loop.node.destroy_subscription(images)
         loop.node.destroy_publisher(masks)
-        loop.restart('visual_mpc_node')
 
 
 # States of the node
 
 def test_a_planner_that_is_deactivated_or_shut_down_stops_the_arm(loop):
-    states = Lifecycle(loop.node, 'visual_mpc_node')
-    card = Newest(loop.node, String, 'visual_mpc_node/model_card', LATCHED).wait(20).data
-    assert card.startswith(FORWARD_MODEL.with_suffix('.md').read_text().rstrip())
-    assert stored_digest(FORWARD_MODEL) in card
-    handle = loop.begin_moving()
-    assert states.to('deactivate')
-    status, result = wait_for_result(handle, 30)
-    assert status == GoalStatus.STATUS_ABORTED and 'deactivated' in result.message
-    assert loop.stopped()
-    aborted(loop, 'ros2 lifecycle set /visual_mpc_node activate', mode='direct', step_budget=1)
-    assert 'cleanup' in states.set('weights', loop.folder / 'none.safetensors')
-    assert states.to('cleanup') and states.set('weights', FORWARD_MODEL) == ''
-    assert states.to('configure') and states.to('activate')
-    loop.reset()
-    served(loop, 2)
-    handle = loop.begin_moving()
-    assert states.to('active_shutdown')
-    status, result = wait_for_result(handle, 30)
-    assert status == GoalStatus.STATUS_ABORTED and 'deactivated' in result.message
-    assert loop.stopped()
-    aborted(loop, 'start it again', mode='direct', step_budget=1)
-    assert 'Traceback' not in loop.processes['visual_mpc_node'].text
-    loop.restart('visual_mpc_node')
+    card = Newest(loop.node, String, 'other_node/model_card', LATCHED)
+    with loop.other_planner():
+        states = Lifecycle(loop.node, 'other_node')
+        text = card.wait(20).data
+        assert text.startswith(FORWARD_MODEL.with_suffix('.md').read_text().rstrip())
+        assert stored_digest(FORWARD_MODEL) in text
+        handle = loop.begin_moving()
+        assert states.to('deactivate')
+        status, result = wait_for_result(handle, 30)
+        assert status == GoalStatus.STATUS_ABORTED and 'deactivated' in result.message
+        assert loop.stopped()
+        aborted(loop, 'ros2 lifecycle set /other_node activate', mode='direct', step_budget=1)
+        assert 'cleanup' in states.set('weights', loop.folder / 'none.safetensors')
+        assert states.to('cleanup') and states.set('weights', FORWARD_MODEL) == ''
+        assert states.to('configure') and states.to('activate')
+        loop.reset()
+        served(loop, 2)
+        handle = loop.begin_moving()
+        assert states.to('active_shutdown')
+        status, result = wait_for_result(handle, 30)
+        assert status == GoalStatus.STATUS_ABORTED and 'deactivated' in result.message
+        assert loop.stopped()
+        aborted(loop, 'start it again', mode='direct', step_budget=1)
