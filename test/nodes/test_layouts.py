@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The layouts of viewers show topics that running nodes publish, by panels that viewers have."""
+"""The layouts of viewers show topics that running nodes publish."""
 
 from collections.abc import Iterator
 from importlib import import_module
@@ -23,17 +23,9 @@ DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 
 # What the 3D panel of Lichtblick 1.28.1 draws, by packages/suite-base/src/panels/ThreeDeeRender.
 DRAWN = (IMAGE, CAMERA_INFO, MARKERS, TEXT)
-# Panels of it, by packages/suite-base/src/panels/index.ts; Foxglove calls them the same.
-PANELS = {'3D', 'Image', 'Plot', 'DiagnosticSummary', 'CallService'}
-# Of rviz 14.1 (Jazzy), by rviz_default_plugins/plugins_description.xml, and by panel_factory.cpp.
+# Of rviz 14.1 (Jazzy), by rviz_default_plugins/plugins_description.xml.
 DISPLAYS = {'Grid': None, 'TF': None, 'RobotModel': TEXT, 'MarkerArray': MARKERS,
             'CameraInfo': CAMERA_INFO, 'Image': IMAGE}
-TOOLS = {'Interact', 'MoveCamera', 'Select', 'FocusCamera', 'Measure'}
-RVIZ_PANELS = {'rviz_common/Displays', 'rviz_common/Views', 'rviz_common/Time'}
-# Widgets of rqt's plugins, by their plugin.xml and .ui files.
-PLUGINS = {'rqt_image_view/ImageView': 'ImageViewWidget', 'rqt_plot/Plot': 'DataPlotWidget',
-           'rqt_runtime_monitor/RuntimeMonitor': 'RuntimeMonitorWidget',
-           'rqt_service_caller/ServiceCaller': 'ServiceCallerWidget'}
 
 
 @pytest.fixture(scope='module')
@@ -68,15 +60,6 @@ def numbers(path, separator, topics):
     package, kind, name = topics[topic][0].split('/')
     fields = getattr(import_module(f'{package}.{kind}'), name).get_fields_and_field_types()
     assert fields[path[len(topic) + 1:]] == 'double'
-
-
-def leaves(tree):
-    if isinstance(tree, str):
-        yield tree
-    else:
-        assert tree['direction'] in ('row', 'column') and 0 < tree['splitPercentage'] < 100
-        yield from leaves(tree['first'])
-        yield from leaves(tree['second'])
 
 
 def foxglove():
@@ -131,15 +114,6 @@ def test_foxglove_shows_topics_of_the_nodes(nodes, client):
     assert json.loads(call['requestPayload']) == {}
 
 
-def test_foxglove_accepts_the_file_and_has_its_panels():
-    layout = foxglove()
-    assert all(isinstance(layout[key], dict)
-               for key in ('configById', 'globalVariables', 'playbackConfig', 'userNodes'))
-    assert isinstance(layout['playbackConfig']['speed'], int)
-    assert sorted(leaves(layout['layout'])) == sorted(layout['configById'])
-    assert {name.split('!')[0] for name in layout['configById']} == PANELS
-
-
 def test_rviz_shows_topics_of_the_nodes_as_they_are_offered(nodes, client):
     wanted = {}
     for display in displayed():
@@ -156,22 +130,6 @@ def test_rviz_shows_topics_of_the_nodes_as_they_are_offered(nodes, client):
         assert topics['/tf'] == ['tf2_msgs/msg/TFMessage']
 
 
-def test_rviz_has_the_displays_and_a_place_for_each_picture():
-    config = rviz()
-    manager = config['Visualization Manager']
-    classes = [display['Class'] for display in manager['Displays']]
-    assert {f'rviz_default_plugins/{name}' for name in DISPLAYS} == set(classes)
-    assert {tool['Class'] for tool in manager['Tools']} == {
-        f'rviz_default_plugins/{name}' for name in TOOLS}
-    assert {panel['Class'] for panel in config['Panels']} == RVIZ_PANELS
-    assert manager['Views']['Current']['Class'] == 'rviz_default_plugins/Orbit'
-    assert manager['Global Options']['Fixed Frame'] == 'world'
-    docks = bytes.fromhex(config['Window Geometry']['QMainWindow State'])
-    for display in displayed():
-        if display['Class'].endswith('/Image'):
-            assert display['Name'].encode('utf-16-be') in docks
-
-
 def test_rqt_shows_topics_of_the_nodes(nodes, client):
     running, settings = rqt()
     images = [s['topic'] for s in settings.values() if 'topic' in s]
@@ -181,16 +139,3 @@ def test_rqt_shows_topics_of_the_nodes(nodes, client):
     numbers(settings['plugin__rqt_plot__Plot__1']['topics'], '/', topics)
     service = settings['plugin__rqt_service_caller__ServiceCaller__1']['current_service_name']
     assert found(client.get_service_names_and_types, {service})
-
-
-def test_rqt_has_the_plugins_and_a_place_for_each():
-    running, settings = rqt()
-    assert set(running) == set(PLUGINS)
-    instances = [(name, serial) for name, serials in running.items() for serial in serials]
-    names = {f'{name.replace("/", "__")}__{serial}': name for name, serial in instances}
-    assert {name.removeprefix('plugin__') for name in settings} <= set(names)
-    window = json.loads((FOLDER / 'tap_ros.perspective').read_text())['groups']['mainwindow']
-    text = window['keys']['state']['repr(QByteArray.hex)']
-    docks = bytes.fromhex(text.removeprefix("QtCore.QByteArray(b'").removesuffix("')"))
-    for name, plugin in names.items():
-        assert f'{name}__{PLUGINS[plugin]}'.encode('utf-16-be') in docks
