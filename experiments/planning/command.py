@@ -3,19 +3,16 @@
 """The command line of Table 2 and of stacking: python -m tap_ros evaluate planning."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from experiments.planning.methods import TASKS
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
-from tap_ros.contract import step_budget
 from tap_ros.engines.options import EngineOptions
 from tap_ros.options import Flag, Folder, one_of, ShippedFile
-from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES
+from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS
 from tap_ros.plugins import names
 from tap_ros.weights import FORWARD_MODEL
 from tyro import conf
-
-BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 
 
 @dataclass(frozen=True)
@@ -24,20 +21,16 @@ class Options:
     Options of the command.
 
     :param tasks: what is pushed or stacked.
-    :param methods: what is compared, see experiments/planning/methods.py, such as direct, shipped
-        or genmin:half; the names of predictors are those of the command paper, or your own. By
-        default the usual ones of each task, stacking only with weights that are there.
+    :param methods: what is compared, see experiments/planning/methods.py: direct, shipped, the
+        names of predictors of the command paper, or your own; with options behind colons: half,
+        recursion<n>, rounds<n>, samples<n>, carried, true_model, twice, steps<n>. By default the
+        usual ones of each task, stacking only with weights that are there.
     :param predictor: weights of predictors; {task} in FILE stands for the task; without it, what
         the command paper trained.
     :param look: of the world, see sim_bridge.world.looks; pictures are filled behind the robot as
         the weights' training was, by the looks' robot masks.
     :param scenes: how many.
     :param seed: of the first scene; 0: the usual one, in which nothing was trained.
-    :param switch: go on from a subgoal when it is reached, or at its share of the budget as in
-        the paper; for all methods that push, as the next three and step_budget.
-    :param recursion: subgoals in a row.
-    :param samples: subgoals to choose from, for predictors that draw.
-    :param tracking: where object pixels come from.
     :param preset: settings of the planner.
     :param solver: what searches the actions.
     :param plan_samples: samples of an iteration of the search; 0: the preset's.
@@ -57,16 +50,10 @@ class Options:
     scenes: int = 100
     seed: int = 0
     engine: EngineOptions = EngineOptions()
-    switch: Annotated[str, one_of(SWITCHES)] = 'reached'
-    recursion: int = 1
-    samples: int = 1
-    tracking: Literal['ground_truth', 'carried'] = 'ground_truth'
     preset: Annotated[str, one_of(PRESETS)] = 'default'
     solver: Annotated[str, one_of(names('tap_ros.solvers'))] = 'cem'
     plan_samples: int = 0
     plan_iterations: int = 0
-    step_budget: Annotated[int, conf.arg(
-        help=f"control periods; 0: the paper's, {BUDGETS}.")] = 0
     forward_weights: ShippedFile = str(FORWARD_MODEL)
     device: str = 'cpu'
     out: Folder = 'docs/results'

@@ -80,11 +80,7 @@ def make_jobs(args):
             raise ConfigError(f'--predictor {text}: expected NAME=FILE')
     for task in args.tasks:
         stacks = task in STACKING_TASKS
-        defaults = {name: getattr(args, name) for name in (
-            ('recursion',) if stacks else (
-                'switch', 'recursion', 'samples', 'tracking', 'step_budget'))}
-        texts = args.methods or USUAL[task]
-        for method in dict.fromkeys(parse_method(text, **defaults) for text in texts):
+        for method in dict.fromkeys(map(parse_method, args.methods or USUAL[task])):
             file = ''
             if method.predicted:
                 try:

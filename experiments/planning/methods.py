@@ -105,12 +105,11 @@ class Method:
 DEFAULTS = {field.name: field.default for field in fields(Method)}
 
 
-def parse_method(text, **defaults):
+def parse_method(text):
     """
     Read a method.
 
     :param text: base and options, for example 'fix', 'genmin:recursion2:half', 'true_model'.
-    :param defaults: fields of Method that options may change.
     :return: Method; fields that the base has no use for are at their defaults.
     :raises ConfigError: for an unknown option or an impossible combination.
     """
@@ -119,7 +118,7 @@ def parse_method(text, **defaults):
         base, options = 'direct', ['true_model', *options]
     if not re.fullmatch(r'[A-Za-z0-9_.+-]+', base):
         raise ConfigError(f'method {text!r}: expected a base and options, such as genmin:half')
-    values = {'base': base, **defaults}
+    values = {'base': base}
     for option in options:
         word, number = re.fullmatch(r'(.*?)(\d*)', option).groups()
         field, value = OPTIONS.get(word, (None, None))

@@ -231,10 +231,8 @@ def test_the_name_of_a_method_reads_as_that_method():
 
 
 def test_options_that_a_method_has_no_use_for_change_nothing():
-    assert parse_method('direct', switch='half', recursion=3) == DIRECT
-    assert parse_method('nothing', tracking='carried') == parse_method('nothing')
-    assert parse_method('genmin', switch='half').name == 'genmin:half'
-    assert parse_method('direct:recursion2') == DIRECT
+    assert parse_method('direct:half:recursion3') == DIRECT
+    assert parse_method('nothing:carried') == parse_method('nothing')
 
 
 def test_impossible_methods_are_named(simulator, mpc):

@@ -203,7 +203,7 @@ def test_films_show_the_best_the_median_and_the_worst_scene():
 def test_the_command_leaves_numbers_and_films_and_runs_nothing_again(tmp_path, capsys):
     out = tmp_path / 'results'
     words = ['evaluate', 'planning', '--tasks', 'push2', 'stack2', '--methods', 'nothing',
-             'direct', 'shipped:carried', '--scenes', '2', '--jobs', '2', '--step-budget', '2',
+             'direct:steps2', 'shipped:carried:steps2', '--scenes', '2', '--jobs', '2',
              '--out', str(out), '--plan-samples', '8', '--plan-iterations', '1',
              '--solver', 'icem']
     assert main(words) == 0
@@ -217,10 +217,10 @@ def test_the_command_leaves_numbers_and_films_and_runs_nothing_again(tmp_path, c
     assert '--methods shipped:carried:steps2 --scenes 2' in carried[0]['command']
     assert '--solver icem' in carried[0]['command']
     stacked = by_key(json.loads((out / 'stacking.json').read_text()))
-    row = stacked['shipped', 'success', None]
+    row = stacked['shipped:carried:steps2', 'success', None]
     assert row['n'] == 2 and row['first_scene'] == FIRST_SCENES['stack2']
-    films = [out / 'planning' / 'push2-direct--steps2.png', out / 'stacking/stack2-shipped.png']
-    assert all(film.read_bytes().startswith(b'\x89PNG') for film in films)
+    for film in ('planning/push2-direct--steps2.png', 'stacking/stack2-direct--steps2.png'):
+        assert (out / film).read_bytes().startswith(b'\x89PNG')
     files = {path: path.stat().st_mtime_ns for path in out.rglob('*-*.json')}
     assert main([*words, '--no-films']) == 0 and main([*words, '--results-only']) == 0
     assert files == {path: path.stat().st_mtime_ns for path in files}  # nothing is run again

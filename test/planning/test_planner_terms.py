@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.contract import LIFTED, LOW
-from tap_ros.planning.action_sequences import FULL, HORIZON, Limits, PUSH_LIMIT, SequenceShape
+from tap_ros.planning.action_sequences import FULL, HORIZON, Limits, SequenceShape
 from tap_ros.planning.cost import (
     distances_to_all_pixels,
     distances_to_pixels,
@@ -269,17 +269,6 @@ def test_candidates_keep_to_the_limits_and_use_them(model):
         extent = np.abs(actions).max((0, 1))
         np.testing.assert_allclose(extent, [move, move, climb, 0], atol=1e-6)
     assert vars(SequenceShape(Limits(1.0, 1.0))) == vars(SequenceShape())  # the contract's hold
-
-
-def test_the_arm_climbs_on_the_spot_pushes_slowly_and_a_way_takes_any_number_of_periods(model):
-    actions, heights = candidates(model)
-    climbing = np.abs(actions[..., 2]) > 0.06
-    assert climbing.any() and not actions[climbing][:, :2].any()
-    length, low = np.linalg.norm(actions[..., :2], axis=2), heights < 0.05
-    assert length[low].max() == pytest.approx(PUSH_LIMIT, abs=1e-6)
-    assert length[~low].max() > PUSH_LIMIT + 0.01
-    lifted = (heights > 0.1).sum(1)
-    assert lifted.any() and (lifted % 3 != 0).any()
 
 
 def test_a_gripper_that_stands_upon_something_goes_up_before_it_pushes(model):
