@@ -2,6 +2,5 @@
 # SPDX-License-Identifier: Apache-2.0
 """For rosdoc2, which adds its own settings; see rosdoc2.yaml."""
 
-exclude_patterns = ['docs/results/*findings.md']  # parts of pages
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.viewcode']
 myst_heading_anchors = 3

@@ -246,8 +246,9 @@ class Rig:
                 self.expect_prediction(CALL_S)
             time.sleep(0.5)  # what has no name to wait for: its subscriptions
         elif self._reaching is not None and 'visual_mpc_node' in wanted:
-            with suppress(TapError):  # it may have ended
+            with suppress(TapError):  # it may have ended, or looked dead on a busy machine
                 self.finish(self._reaching)
+            time.sleep(1.0)
         self._reaching = None
         self.commands.forget()
 
@@ -311,8 +312,8 @@ class Rig:
 
     def result(self, reaching):
         """Wait for the end of a goal; return it in words, the message behind a colon."""
-        self._reaching = None
         result = reaching.result()
+        self._reaching = None
         return f'{result.end}: {result.message}'
 
     def expect_end(self, reaching, words, within='', timeout_s=30.0):
