@@ -83,6 +83,15 @@ def test_cut_off_messages_are_refused(name):
             decode(name, data[:length])
 
 
+def test_bytes_that_a_serializer_leaves_behind_are_passed_over():
+    name = 'sensor_msgs/msg/JointState'
+    data = encode(name, {'name': ['a'], 'position': [1.5]})
+    for count in (4, 8, 16):
+        assert decode(name, data + count * b'x').position.tolist() == [1.5]
+    with pytest.raises(RecordingError, match='damaged message'):
+        decode(name, data + 40 * b'x')
+
+
 def test_huge_counts_are_refused():
     data = bytearray(encode('tap_msgs/msg/ObjectStates', {'objects': [{'name': 'a'}]}))
     where = data.rindex(b'\1\0\0\0', 0, data.index(b'a\0'))
