@@ -53,7 +53,8 @@ class NearestKeyframe(Predictor):
         if not paths:
             raise ConfigError('nearest_keyframe: name its recordings, such as '
                               'nearest_keyframe:bags/push2')
-        return cls(open_recordings(paths, progress=False))
+        store = open_recordings(paths, progress=False)
+        return cls(store[i] for i in range(len(store)))
 
     def predict_together(self, questions: Sequence[Question]) -> list[list[Subgoal]]:
         """Answer questions, see Predictor; each gets one sample."""

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the commands `train predictor` and `train forward` share."""
 
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 import os
 from typing import Annotated, Any, TypeVar
 
@@ -37,7 +37,7 @@ def with_recipe(model: Model, args: Options) -> Options:
     Put the settings of the recipe into the options of a command.
 
     :param model: 'predictor' or 'forward'.
-    :param args: options; their fields that are dataclasses hold the settings.
+    :param args: options; their fields beside `recipe` are dataclasses of settings.
     """
     given = settings_of(args)
     if not given['recordings']:
@@ -45,15 +45,16 @@ def with_recipe(model: Model, args: Options) -> Options:
     recipe = args.recipe or recipe_of(model, given['recordings'], Reading(**{
         field.name: given[field.name] for field in fields(Reading)}))
     settings = find_recipe(model, recipe).settings
-    return replace(args, **{
+    changed: dict[str, Any] = {
         name: replace(part, **{key: settings[key] for key in asdict(part).keys() & settings})
-        for name, part in vars(args).items() if is_dataclass(part)})
+        for name, part in vars(args).items() if name != 'recipe'}
+    return replace(args, **changed)
 
 
 def settings_of(args: RecipeOption) -> dict[str, Any]:
     """Return the settings of all parts of a command's options, by name."""
-    return {name: value for part in vars(args).values() if is_dataclass(part)
-            for name, value in asdict(part).items()}  # type: ignore[arg-type]
+    return {name: value for key, part in vars(args).items() if key != 'recipe'
+            for name, value in asdict(part).items()}
 
 
 def run_training(model: Model, args: RecipeOption) -> None:
