@@ -12,15 +12,13 @@ from typing import Annotated
 import numpy as np
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.errors import ConfigError, ImageError
-from tap_ros.files import storage_errors, write_atomically
+from tap_ros.files import write_atomically
 from tap_ros.images.crop import CENTRE, check_trainable
 from tap_ros.images.drawing import film_strip, grid, png_bytes
-from tap_ros.options import File, Folder
-from tap_ros.recording.attachments import read_attachments, save_attachment
+from tap_ros.options import File
 from tap_ros.recording.bags import check_first_picture, find_bags, find_topics, list_topics
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.columns import first_size
-from tap_ros.recording.damage import seconds
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.reading import Reading, reading_of
 from tap_ros.recording.reading_options import ReadingOptions
@@ -29,7 +27,6 @@ from tap_ros.training.split import split_episodes, warn_if_none
 from tyro import conf
 
 LARGE = 256  # px; pictures with a longer side are not decoded whole
-MOST_LISTED, MOST_WRITTEN = 20, 10_000  # attachments
 
 
 @dataclass(frozen=True)
@@ -41,15 +38,12 @@ class Options:
     :param picture: write film strips of the first episodes to this PNG.
     :param episodes: episodes in the picture.
     :param robot_mask: tint what the robot masks mark: the arm red, the hand blue.
-    :param attachments: write the attachments of the recording into this folder, a new or empty
-        one.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
     picture: File = ''
     episodes: int = 8
     robot_mask: bool = False
-    attachments: Folder = ''
     reading: ReadingOptions = ReadingOptions()
 
 
@@ -67,7 +61,6 @@ def run(args: Options) -> None:
     for number, (topic, kind, count) in enumerate(list_topics(args.path)):
         print(f'{"" if number else "topics":<11} {escaped(topic)}  {escaped(kind)}  '
               + ('unknown' if count is None else f'{count} messages'))
-    _show_attachments(args.path, args.attachments)
     reading = reading_of(args.reading)
     shown = reading
     try:
@@ -113,34 +106,6 @@ def run(args: Options) -> None:
     training, held_out = split_episodes(store)
     print(f'train       {len(training)} episodes to learn from, {len(held_out)} held out')
     warn_if_none(held_out)
-
-
-def _show_attachments(path: str, folder: str) -> None:
-    """
-    List what is attached to the files of recordings, and write it into a folder if one is named.
-
-    :raises ConfigError: when the folder holds something.
-    """
-    if folder:
-        with storage_errors(folder):
-            if Path(folder).exists() and any(Path(folder).iterdir()):
-                raise ConfigError(
-                    f'attachments: {escaped(folder)} is not empty; name a new folder')
-    count = written = 0
-    for attached in (each for bag in find_bags(path) for file in bag
-                     for each in read_attachments(file)):
-        place = attached.damage
-        if folder and attached.data is not None and written < MOST_WRITTEN:
-            place, written = escaped(save_attachment(attached, folder)), written + 1
-        if count < MOST_LISTED:
-            print(f'{"" if count else "attachments":<11} {escaped(attached.name) or "unnamed"}  '
-                  f'{escaped(attached.media_type) or "of unknown type"}  {attached.size} bytes  '
-                  f'log time {seconds(attached.log_time)} s{": " * bool(place)}{place}')
-        count += 1
-    if count > MOST_LISTED:
-        print(f'{"":<11} and {count - MOST_LISTED} more')
-    if folder:
-        print(f'{"" if count else "attachments":<11} {written} of {count} written')
 
 
 def _told_apart(store: EpisodeStore, reading: Reading) -> str:

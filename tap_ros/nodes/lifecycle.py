@@ -15,13 +15,14 @@ from std_msgs.msg import String
 from tap_ros.errors import WeightsError
 from tap_ros.nodes.services import log_error
 from tap_ros.nodes.topics import LATCHED
-from tap_ros.recording.attachments import MAX_CARD_BYTES
 from tap_ros.text import escaped, listing
 from tap_ros.training.weights import stored_digest
 
 if TYPE_CHECKING:
     from rclpy.parameter import Parameter
     from tap_ros.nodes.parameters import Parameters
+
+MAX_CARD_BYTES = 2**18
 
 
 def declare_autostart(parameters: 'Parameters') -> None:
@@ -211,7 +212,7 @@ def model_card(weights: Path) -> str:
     text = f'# {name}\n\nNo model card is beside this file.\n'
     card = weights.with_suffix('.md')
     with suppress(OSError, ValueError):  # ValueError: it is no text
-        if card.is_file() and card.stat().st_size <= MAX_CARD_BYTES // 4:
+        if card.is_file() and card.stat().st_size <= MAX_CARD_BYTES:
             text = card.read_text(encoding='utf-8')
     digest = 'unknown'
     with suppress(WeightsError):  # loading raises it

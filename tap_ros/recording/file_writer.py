@@ -17,7 +17,6 @@ from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
 from tap_ros.messages import topics
 from tap_ros.recording import metadata
-from tap_ros.recording.attachments import NewAttachments
 from tap_ros.recording.messages import schema_text, type_hash
 
 LIBRARY = 'tap_ros 1'
@@ -36,12 +35,11 @@ class FileWriter:
     :param name: of the file in its bag; by default the file's own.
     :param compression: 'zstd', 'lz4' or 'none', of the chunks.
     :param chunk_bytes: size at which a chunk is finished.
-    :param attach: attach the goal pictures and model cards among the messages as files, too.
     :raises RecordingError: for an unknown compression or a file that exists.
     """
 
     def __init__(self, path: str | Path, name: str | None = None, compression: str = 'zstd',
-                 chunk_bytes: int = CHUNK_BYTES, attach: bool = False) -> None:
+                 chunk_bytes: int = CHUNK_BYTES) -> None:
         if compression not in _COMPRESSIONS:
             raise RecordingError(
                 f'compression: expected zstd, lz4 or none, got {compression!r}')
@@ -59,7 +57,6 @@ class FileWriter:
         self._channels: dict[str, int] = {}  # topic -> id
         self._info: dict[str, Any] = {
             'path': self._name, 'start': 0, 'end': 0, 'message_count': 0, 'topics': {}}
-        self._attached = NewAttachments() if attach else None
 
     def write_raw(self, topic: str, type_name: str, data: bytes, log_time_ns: int,
                   publish_time_ns: int | None = None, qos: topics.Qos | None = None) -> None:
@@ -85,10 +82,6 @@ class FileWriter:
         publish = log_time_ns if publish_time_ns is None else publish_time_ns
         with storage_errors(self.path):
             self._writer.add_message(channel, int(log_time_ns), data, int(publish), info['count'])
-            file = self._attached and self._attached.new(topic, type_name, data, log_time_ns)
-            if file:
-                self._writer.add_attachment(
-                    file.create_time, file.log_time, file.name, file.media_type, file.data)
         info['count'] += 1
         total = self._info
         first = total['message_count'] == 0

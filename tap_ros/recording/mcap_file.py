@@ -132,15 +132,6 @@ class McapFile:
                     yield channel, min(log, FAR), min(publish, FAR), data
         self._conclude(wanted)
 
-    def attachments(self) -> Iterator[memoryview]:
-        """Yield the contents of attachment records, damaged or not, in the order of the file."""
-        for kind, start, end in self._walk():
-            if kind == Opcode.ATTACHMENT:
-                yield self._data[start + RECORD.size:end]
-        if self._stopped is not None and self._end < self.size:
-            self.losses.append(Loss('it is not understood; attachments behind it are not found',
-                                    'record', self._stopped))
-
     def _find_summary(self) -> Summary:
         """Return what the end of the file says it holds; nothing, where that cannot be used."""
         footer = self.size - _FOOTER.size - len(MAGIC)

@@ -111,7 +111,7 @@ class BagWriter:
     def _open(self) -> FileWriter:
         self._flushed = time.monotonic()
         name = f'{self.folder.resolve().name}_{len(self._finished)}.mcap'
-        return FileWriter(self.folder / name, compression=self._compression, attach=True)
+        return FileWriter(self.folder / name, compression=self._compression)
 
 
 class EpisodeWriter:

@@ -221,7 +221,7 @@ def test_a_damaged_summary_is_told_and_what_it_described_is_read(chunked):
 
 
 def rewrite(path, other, **options):
-    """Copy the messages of a file as another writer would write them."""
+    """Copy the messages of a file as another writer would write them, an attachment behind."""
     with open(other, 'wb') as out, open(path, 'rb') as stream:
         writer, ids = Writer(out, **options), {}
         writer.start('ros2')
@@ -232,6 +232,7 @@ def rewrite(path, other, **options):
                 ids[channel.topic] = writer.register_channel(channel.topic, 'cdr', number)
             writer.add_message(
                 ids[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.add_attachment(0, 5, 'notes.txt', 'text/plain', b'skipped')
         writer.finish()
     return other
 

@@ -31,8 +31,8 @@ class RecorderNode(Node):
     """
     Writes serialized messages unchanged, and finishes the bag on a signal.
 
-    Goal pictures and model cards are attached, too. When the disk is full or gone the node reports
-    it, keeps what was written readable, and stays up.
+    When the disk is full or gone the node reports it, keeps what was written readable, and stays
+    up.
     """
 
     def __init__(self, **options: Any) -> None:
