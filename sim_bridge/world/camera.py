@@ -134,6 +134,7 @@ class OpenGL:
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         # Dropped without close, MuJoCo would free another context's objects.
         self._finalizer = weakref.finalize(self, _free, self._gl, self._context)
+        self._finalizer.atexit = False  # when Python ends, EGL has ended before
 
     def draw(self, scene: mujoco.MjvScene, numbers: bool = False) -> np.ndarray:
         """
