@@ -59,7 +59,7 @@ def hub_errors(repo: str, revision: str) -> Iterator[None]:
         cause: BaseException = error
         while cause.__cause__ and not isinstance(cause, errors.HfHubHTTPError | ValueError):
             cause = cause.__cause__  # the library's own words are long, those of the system not
-        said = ' '.join(str(cause).split())
+        said = str(cause)
         if isinstance(cause, errors.HfHubHTTPError):
             said = f'{cause.response.status_code} {cause.server_message or said}'
             advice = (f'correct the name or --revision {escaped(revision)}, or log in '
@@ -68,6 +68,7 @@ def hub_errors(repo: str, revision: str) -> Iterator[None]:
             said, advice = 'HF_HUB_OFFLINE is set', 'unset it'
         else:
             advice = 'see whether the network is there and HF_ENDPOINT is right, then try again'
+        said = ' '.join(said.split())
         raise HubError(f'{repo} at {constants.ENDPOINT}: {escaped(said, 300)}; '
                        f'{advice}') from error
 
