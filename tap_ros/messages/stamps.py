@@ -4,6 +4,8 @@
 
 from typing import Any, Protocol
 
+import numpy as np
+
 PROOF = 3  # messages in a row that prove that the clock of a topic has jumped
 MAX_GAP = 0.35  # s; joint states farther from a picture in time do not say where the arm was
 
@@ -23,7 +25,7 @@ def to_nanoseconds(stamp: Stamp) -> int:
 def stamp_fields(stamp: Stamp | int) -> dict[str, int]:
     """Return the fields of a builtin_interfaces/Time, from one or from nanoseconds."""
     seconds, rest = divmod(
-        int(stamp) if not hasattr(stamp, 'sec') else to_nanoseconds(stamp), 10**9)
+        int(stamp) if isinstance(stamp, (int, np.integer)) else to_nanoseconds(stamp), 10**9)
     return {'sec': seconds, 'nanosec': rest}
 
 

@@ -234,7 +234,7 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
         inputs.begin(time.monotonic())
         other = encode_image(np.ascontiguousarray(START[:240, :320]), to_stamp(9 * 10**9), 'eye')
         inputs.sensors.put('image', other), inputs.sensors.put('objects', stamped(objects, 9))
-        inputs.sensors.put('joints', stamped(joints, 9))
+        inputs.sensors.attach('joints', 9 * 10**9, np.zeros(4, np.float32), time.monotonic())
         with pytest.raises(ImageError, match='320x240 pixels; the forward model was trained on '
                                              'those of 640x480'):
             inputs.look(inputs.topics())
