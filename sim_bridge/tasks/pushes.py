@@ -9,7 +9,7 @@ from itertools import permutations
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.world.table import OBJECT_QPOS_START, ramp_controls, SUBSTEPS, Table
+from sim_bridge.world.table import divided, OBJECT_QPOS_START, ramp_controls, SUBSTEPS, Table
 from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
 
 MAX_PUSH_STEPS = 24  # longest macro action, in control periods
@@ -99,6 +99,7 @@ class PushRollouts:
         :param plans: N arrays (n, 4) of actions, none empty.
         :return: the N moments after, and (N, K) bool, which objects are then upright.
         """
+        plans = [divided(plan, self._arm.action_limit) for plan in plans]
         lengths = np.array([len(plan) for plan in plans])
         actions = np.zeros((len(plans), lengths.max(), 4))
         for plan, padded in zip(plans, actions):

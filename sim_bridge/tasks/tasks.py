@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import mujoco.rollout
 import numpy as np
 from sim_bridge.world.scene import ObjectShape
-from sim_bridge.world.table import Table
+from sim_bridge.world.table import divided, Table
 from sim_bridge.world_protocol import Observation
 from tap_ros.contract import SUCCESS_DISTANCE, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import ConfigError, SceneError
@@ -208,6 +208,7 @@ def carry_out(table: Table, succeeds: Callable[[Table], bool], first: Observatio
     for plan in plans:
         planned = time.perf_counter()
         seconds['search'] += planned - begin
+        plan = divided(plan, table.arm.action_limit)
         for action in plan[:num_frames - len(observations)]:
             observations.append(table.step(action))
             actions.append(action)

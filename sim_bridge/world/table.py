@@ -23,7 +23,7 @@ from sim_bridge.world.scene import (
 from sim_bridge.world.studio import Studio
 from sim_bridge.world_protocol import Observation
 from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.errors import SceneError
+from tap_ros.errors import KinematicsError, SceneError
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 from tap_ros.text import escaped
 
@@ -31,6 +31,7 @@ SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
 if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
     raise SceneError(f'the control period {CONTROL_PERIOD} s is no multiple of {TIMESTEP} s')
 RAMP_SUBSTEPS = SUBSTEPS - 4  # the target moves evenly, then the servo has time to catch up
+SHARES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)  # of a move, to which an arm shortens what is too fast
 BENT = 0.1  # share of the fingers' travel that they may be beyond their ends
 GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
 GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
@@ -38,24 +39,30 @@ GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the star
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
 
 
-def clip_action(action: ArrayLike, limit: Sequence[float] = ACTION_LIMIT) -> np.ndarray:
+def clip_action(action: ArrayLike) -> np.ndarray:
     """
-    Limit an action to what the arm does in one control period.
+    Limit an action to what is commanded in one control period.
 
     :param action: (4,) displacement x, y, z in m and gripper opening in [0, 1].
-    :param limit: (3,) m, of the displacement.
     :return: (4,) float64.
     :raises SceneError: for another shape or values that are not finite.
     """
     action = np.asarray(action, np.float64)
     if action.shape != (4,) or not np.isfinite(action).all():
         raise SceneError(f'action {action}: expected 4 finite numbers (dx, dy, dz, opening)')
-    return np.append(clip_moves(action[:3], limit), np.clip(action[3], 0, 1))
+    return np.append(clip_moves(action[:3]), np.clip(action[3], 0, 1))
 
 
-def clip_moves(moves: np.ndarray, limit: Sequence[float] = ACTION_LIMIT) -> np.ndarray:
-    """Limit displacements (..., 3), in m, to what the arm does in one control period."""
-    return np.clip(moves, np.negative(limit), limit)
+def clip_moves(moves: np.ndarray) -> np.ndarray:
+    """Limit displacements (..., 3), in m, to what is commanded in one control period."""
+    return np.clip(moves, np.negative(ACTION_LIMIT), ACTION_LIMIT)
+
+
+def divided(actions: np.ndarray, limit: Sequence[float]) -> np.ndarray:
+    """Return actions (n, 4) with every one whose move exceeds (3,) m in several equal parts."""
+    parts = np.ceil((np.abs(actions[:, :3]) / limit).max(1, initial=0) - 1e-6).astype(int)
+    parts = np.maximum(parts, 1)
+    return np.repeat(actions / np.stack([parts, parts, parts, np.ones_like(parts)], 1), parts, 0)
 
 
 def ramp_controls(target: np.ndarray, actions: np.ndarray,
@@ -200,8 +207,8 @@ class Table:
         """
         Act for one control period.
 
-        :param action: (4,) displacement x, y, z in m, limited to ACTION_LIMIT and to the
-            workspace, and gripper opening from 0 (closed) to 1.
+        :param action: (4,) displacement x, y, z in m, limited to ACTION_LIMIT, to half of it if
+            the arm is slow, and to the workspace, and gripper opening from 0 (closed) to 1.
         :return: Observation.
         :raises SceneError: for another shape, values that are not finite, or what the arm
             cannot do; then nothing moves.
@@ -223,11 +230,17 @@ class Table:
 
     def _ramp(self, action: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the servo targets of an action (SUBSTEPS, 5) and the last one (4,)."""
-        arm = self.arm
-        controls, targets = ramp_controls(
-            self.target, clip_action(action, arm.action_limit)[None], arm.low, arm.high)
-        arm.check_motion(
-            arm.joints_at(self.target), arm.joints_at(targets[0]), CONTROL_PERIOD)
+        action, arm = clip_action(action), self.arm
+        before = arm.joints_at(self.target)
+        for share in SHARES:
+            controls, targets = ramp_controls(
+                self.target, action[None] * (share, share, share, 1), arm.low, arm.high)
+            try:
+                arm.check_motion(before, arm.joints_at(targets[0]), CONTROL_PERIOD)
+                break
+            except KinematicsError:
+                if share == SHARES[-1]:
+                    raise
         return controls, targets[0]
 
     def observe(self, hide_arm: bool = False) -> Observation:

@@ -78,7 +78,8 @@ class Arm:
     :param shapes: what it looks like.
     :param mount: where it stands at the simulated table.
     :param low: x, y, z of the fingertips that it reaches from there, least; high: greatest, m.
-    :param action_limit: m that it moves along x, y, z in a control period there, at most.
+    :param action_limit: m along x, y, z that it can move anywhere there in a control period; its
+        experts keep to that.
     """
 
     name: str

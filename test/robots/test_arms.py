@@ -112,7 +112,9 @@ def test_an_arm_limits_what_the_gripper_does_and_which_scenes_are_drawn():
         for poses in (simulator.scene.start_poses, simulator.scene.goal_poses):
             assert (np.abs(poses[:, :2]) <= arm.high[:2]).all()
     for _ in range(10):
-        gripper = simulator.step([0, 0.08, 0.15, 0]).gripper
+        before = simulator.target
+        gripper = simulator.step([0.08, 0.08, 0.15, 0]).gripper
+        arm.check_motion(arm.joints_at(before), arm.joints_at(simulator.target), CONTROL_PERIOD)
     np.testing.assert_allclose(gripper[1:3], arm.high[1:], atol=0.005)
     simulator.close()
 

@@ -91,8 +91,9 @@ def test_without_friction_the_same_motions_lift_nothing(simulator, episodes):
     simulator.reset(seed)
     simulator.model.geom_friction[:, 0] = 0.02
     simulator.model.geom('table').friction[0] = 1
-    for finger in simulator._fingers():
-        simulator.model.geom_priority[finger] = 1  # else the rougher of two surfaces counts
+    for side in ('left', 'right'):
+        # Else the rougher of two surfaces counts.
+        simulator.model.geom(f'{side}_finger').priority[:] = 1
     heights = [simulator.step(a).object_poses[0, 2] for a in actions[:-1]]
     assert max(heights) < 0.07
 
