@@ -19,7 +19,7 @@ from tap_ros.messages.stamps import MAX_GAP
 from tap_ros.recording.columns import Columns, pad_objects
 from tap_ros.recording.damage import EVERYTHING, FAR, seconds
 from tap_ros.recording.episode import Episode, RecordingWarning
-from tap_ros.recording.mounts import ArmMount
+from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.spans import assign, in_gaps, Mark, MAX_JITTER_NS, read_spans, Span
 from tap_ros.robots.arm import get_arm, MOST_JOINTS

@@ -30,7 +30,7 @@ from tap_ros.recording.align import assemble, EpisodeTable, follows
 from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_paths, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.mounts import ArmMount, read_mount
+from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tqdm import tqdm
 

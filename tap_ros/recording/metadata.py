@@ -1,9 +1,16 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The metadata.yaml of a bag: written as by rosbag2 of Jazzy (version 9), read in any version."""
+"""
+What stands beside the .mcap files of a bag: metadata.yaml, and where the recorded arm stood.
+
+metadata.yaml is written as by rosbag2 of Jazzy (version 9), and read in any version.
+"""
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import cache
+import json
+from math import isfinite
 from pathlib import Path
 import re
 import shlex
@@ -11,11 +18,13 @@ from typing import Any
 
 from tap_ros.errors import RecordingError
 from tap_ros.files import write_atomically
+from tap_ros.plugins import names
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
 from tap_ros.text import escaped, listing
 import yaml
 
-FILE_NAME = 'metadata.yaml'
-MAX_BYTES = 2**23
+FILE_NAME, MOUNT_NAME = 'metadata.yaml', 'arm_mount.json'
+MAX_BYTES, _MAX_MOUNT_BYTES = 2**23, 2**16
 MAX_DEPTH = 32
 _UNUSABLE = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
@@ -129,13 +138,13 @@ def bag_files(folder: str | Path) -> list[Path]:
         with open(path, 'rb') as stream:
             information = _from_yaml(stream.read(MAX_BYTES + 1).decode())[_KEY]
         storage = information['storage_identifier']
-        names = information['relative_file_paths']
+        paths = information['relative_file_paths']
         compression = information.get('compression_format') or ''
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
             raise ValueError('relative_file_paths is no list of names')
         if not isinstance(storage, str) or not isinstance(compression, str):
             raise ValueError('storage_identifier and compression_format are no texts')
-        if len(set(names)) < len(names):
+        if len(set(paths)) < len(paths):
             raise ValueError('relative_file_paths names a file twice')
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
@@ -153,7 +162,7 @@ def bag_files(folder: str | Path) -> list[Path]:
             f'{path}: the bag is compressed by rosbag2 ({escaped(compression, 40)}); only '
             f'compression inside mcap is read; {_convert(folder)}, or record with '
             '--storage-preset-profile zstd_fast')
-    files = [folder / Path(name).name for name in names]
+    files = [folder / Path(name).name for name in paths]
     missing = [file.name for file in files if not _is_file(file)]
     if missing:
         raise RecordingError(
@@ -189,3 +198,58 @@ def qos_from_text(text: str) -> list[Any]:
 def _natural(path: Path) -> list[int | str]:
     """Sort push2_10 behind push2_2."""
     return [int(p) if p.isdigit() else p for p in re.split(r'(\d+)', path.name)]
+
+
+@dataclass(frozen=True)
+class ArmMount:
+    """
+    The contents of arm_mount.json, which need not be there.
+
+    A driver's joint states hold angles; where the gripper was follows from them and from this.
+
+    :param mount: where the arm stood.
+    :param opening: of the gripper, 0 to 1, where no joint states tell it.
+    :param arm: its name.
+    """
+
+    mount: Mount = get_arm(DEFAULT_ARM).mount
+    opening: float = 0.0
+    arm: str = DEFAULT_ARM
+
+
+def write_mount(folder: str | Path, found: ArmMount) -> None:
+    """
+    Write arm_mount.json into the folder of a bag.
+
+    :raises StorageError: when it cannot be written.
+    """
+    values = {**asdict(found.mount), 'opening': found.opening, 'arm': found.arm}
+    write_atomically(Path(folder) / MOUNT_NAME, (json.dumps(values, indent=2) + '\n').encode())
+
+
+def read_mount(folder: str | Path) -> ArmMount:
+    """
+    Read arm_mount.json of a bag; without it, return where the simulator's arm stands.
+
+    :raises RecordingError: when the file cannot be used.
+    """
+    path = Path(folder) / MOUNT_NAME
+    if not path.exists():
+        return ArmMount()
+    expected = {**asdict(ArmMount().mount), 'opening': 0.0, 'arm': DEFAULT_ARM}
+    try:
+        if not path.is_file() or path.stat().st_size > _MAX_MOUNT_BYTES:
+            raise ValueError('no regular file, or too long')
+        values = {'arm': DEFAULT_ARM} | json.loads(path.read_bytes())  # earlier ones lack it
+        if set(values) != set(expected) or len(values['position']) != 3:
+            raise ValueError('its fields are others')
+        if values['arm'] not in names('tap_ros.arms'):
+            raise ValueError('it names an arm that is not known')
+        x, y, z = map(float, values['position'])
+        yaw, tool, opening = (float(values[name]) for name in ('yaw', 'tool', 'opening'))
+        if not all(map(isfinite, (x, y, z, yaw, tool, opening))):
+            raise ValueError('it holds infinity or NaN')
+    except (OSError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise RecordingError(f'{path}: cannot be used ({error}); expected values such as '
+                             f'{json.dumps(expected)}') from error
+    return ArmMount(Mount((x, y, z), yaw, tool), opening, values['arm'])

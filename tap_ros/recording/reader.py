@@ -12,7 +12,7 @@ from tap_ros.recording.bags import check_sizes, find_bags, find_topics, warn_of_
 from tap_ros.recording.columns import Columns, decode_file
 from tap_ros.recording.damage import EVERYTHING
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.mounts import ArmMount, read_mount
+from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 
 _NO_EVENT = np.empty(0, np.int64)

@@ -24,7 +24,7 @@ from tap_ros.nodes.recorder.node import RecorderNode
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.messages import decode
-from tap_ros.recording.mounts import ArmMount, read_mount
+from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.robots.arm import Mount
 from tap_ros.robots.ur10e import UR10E

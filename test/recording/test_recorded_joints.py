@@ -10,7 +10,7 @@ from tap_ros.messages import topics
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode
-from tap_ros.recording.mounts import ArmMount, FILE_NAME, write_mount
+from tap_ros.recording.metadata import ArmMount, MOUNT_NAME, write_mount
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import write_metadata
 from tap_ros.robots.arm import Mount
@@ -76,7 +76,7 @@ def test_the_gripper_follows_from_the_arms_joints_where_it_stood(tmp_path):
     grippers = read(path).grippers
     np.testing.assert_allclose(grippers[:, :3], places(), atol=0.16e-9 * FAST)
     np.testing.assert_array_equal(grippers[:, 3], np.float32(0.5))
-    (path / FILE_NAME).unlink()
+    (path / MOUNT_NAME).unlink()
     assert np.abs(read(path).grippers[:, :3] - places()).max() > 0.1
     assert open_recordings(path).data_hash != told  # what is trained on is another thing
 
@@ -100,9 +100,9 @@ def test_a_gripper_that_is_told_counts(tmp_path):
     '{"position": [0, 0, 0], "yaw": "left", "tool": 0, "opening": 0}'])
 def test_a_mount_that_cannot_be_used_is_refused_in_one_line(tmp_path, text):
     path = bag(tmp_path / 'bag', UR10E.mount)
-    (path / FILE_NAME).write_text(text)
-    with pytest.raises(RecordingError, match=FILE_NAME) as told:
+    (path / MOUNT_NAME).write_text(text)
+    with pytest.raises(RecordingError, match=MOUNT_NAME) as told:
         list(iter_episodes(path))
     assert '\n' not in str(told.value)
-    with pytest.raises(RecordingError, match=FILE_NAME):
+    with pytest.raises(RecordingError, match=MOUNT_NAME):
         open_recordings(path)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from tap_ros.errors import RecordingError, StorageError
 from tap_ros.nodes.parameters import declared_mount
-from tap_ros.recording.mounts import ArmMount, write_mount
+from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.recording.writer import BagWriter
 from tap_ros.text import escaped
 
