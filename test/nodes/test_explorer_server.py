@@ -17,9 +17,6 @@ from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWS
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-TOKEN = 'a token'
-HARD = 'a&b c#d/?='
-
 
 @contextmanager
 def serving(**options):
@@ -101,7 +98,7 @@ def test_a_slow_browser_holds_up_nobody_and_gets_the_newest():
         assert len(seen) < 200, 'what was replaced is not sent'
 
 
-def test_browsers_that_leave_leave_nothing_behind():
+def test_browsers_that_leave_or_vanish_leave_nothing_behind():
     with serving() as server:
         with browse(server):
             pass
@@ -110,16 +107,11 @@ def test_browsers_that_leave_leave_nothing_behind():
         for _ in range(50):
             with browse(server):
                 pass
-        wait_until(lambda: server.browsers == 0 and server.board.watched == 0)
-        wait_until(lambda: threading.active_count() <= threads)
-
-
-def test_a_browser_that_vanishes_is_let_go():
-    with serving() as server:
         with browse(server) as browser:
             wait_until(lambda: server.browsers == 1)
             browser.socket.shutdown(socket.SHUT_RDWR)
             wait_until(lambda: server.browsers == 0 and server.board.watched == 0)
+        wait_until(lambda: threading.active_count() <= threads)
 
 
 def test_too_long_a_command_ends_the_connection_alone():
@@ -132,44 +124,30 @@ def test_too_long_a_command_ends_the_connection_alone():
             assert browser.recv(5) == '{}'
 
 
-def test_another_page_of_the_same_browser_is_refused():
+def test_foreign_pages_and_foreign_names_that_lead_here_are_refused():
     with serving() as server:
         for origin in ('http://evil.example', f'http://evil.example:{server.port}', 'null'):
             with pytest.raises(InvalidStatus, match='403'), browse(server, Origin=origin):
                 pass
         with browse(server, Origin=f'http://127.0.0.1:{server.port}'):
             pass
-
-
-def test_a_foreign_name_that_leads_here_is_refused():
-    with serving() as server:
         assert get(server, Host=f'evil.example:{server.port}')[0] == 403
         for host in ('localhost', '127.0.0.1', '[::1]'):
             assert get(server, Host=f'{host}:{server.port}')[0] == 200
 
 
-def test_a_token_is_asked_for_by_page_and_socket():
-    with serving(token=TOKEN) as server:
-        assert get(server, server.url.removeprefix(f'http://127.0.0.1:{server.port}'))[0] == 200
-        assert get(server)[0] == get(server, '/?token=wrong')[0] == 401
-        assert get(server, '/?token=a%20token')[0] == 200
-        with pytest.raises(InvalidStatus, match='401'), browse(server):
-            pass
-        with browse(server, '?token=a%20token'):
-            pass
-        assert get(server, '/?token=a%20token', Host='robot.example:1')[0] == 200
-
-
-def test_any_token_stands_in_the_address_as_it_is_asked_for():
-    with serving(token=HARD) as server:
-        path = server.url.removeprefix(f'http://127.0.0.1:{server.port}')
-        assert ' ' not in path and get(server, path)[0] == 200
-
-
-def test_whoever_opens_it_to_others_gets_a_token():
-    with serving(host='0.0.0.0') as server:
-        path = server.url.removeprefix(f'http://0.0.0.0:{server.port}')
-        assert len(path) > 20 and get(server)[0] == 401 and get(server, path)[0] == 200
+def test_a_token_is_asked_for_by_page_and_socket_and_stands_in_the_address():
+    for options in ({'token': 'a token'}, {'token': 'a&b c#d/?='}, {'host': '0.0.0.0'}):
+        with serving(**options) as server:
+            path = server.url.removeprefix(
+                f'http://{options.get("host", "127.0.0.1")}:{server.port}')
+            assert ' ' not in path and len(path) > 10
+            assert get(server, path)[0] == get(server, path, Host='robot.example:1')[0] == 200
+            assert get(server)[0] == get(server, '/?token=wrong')[0] == 401
+            with pytest.raises(InvalidStatus, match='401'), browse(server):
+                pass
+            with browse(server, path.removeprefix('/')):
+                pass
 
 
 def test_so_many_browsers_and_no_more():
@@ -184,15 +162,12 @@ def test_so_many_browsers_and_no_more():
             pass
 
 
-def test_a_port_that_is_taken_is_named():
+def test_ports_and_addresses_that_cannot_be_had_are_named():
     with serving() as server, pytest.raises(ConfigError, match=f'port.*{server.port}'):
         ExplorerServer(Board(), print, port=server.port)
-
-
-@pytest.mark.parametrize('host', ['', 'a' * 70, 'a\0b', '256.0.0.1', 'no.such.host.invalid'])
-def test_an_address_that_is_none_is_refused(host):
-    with pytest.raises(ConfigError, match='host'):
-        ExplorerServer(Board(), print, host=host, port=0)
+    for host in ('', 'a' * 70, 'a\0b', '256.0.0.1', 'no.such.host.invalid'):
+        with pytest.raises(ConfigError, match='host'):
+            ExplorerServer(Board(), print, host=host, port=0)
 
 
 def test_what_ends_frees_its_port():
@@ -205,8 +180,9 @@ def test_what_ends_frees_its_port():
     again.close()
 
 
-@pytest.mark.parametrize('host, mine', [
-    ('localhost', True), ('127.0.0.1', True), ('127.9.9.9', True), ('::1', True),
-    ('0.0.0.0', False), ('192.168.0.1', False), ('localhost.evil.example', False), ('', False)])
-def test_what_leads_to_this_machine_alone(host, mine):
-    assert is_loopback(host) == mine
+def test_what_leads_to_this_machine_alone():
+    for host, mine in (
+            ('localhost', True), ('127.0.0.1', True), ('127.9.9.9', True), ('::1', True),
+            ('0.0.0.0', False), ('192.168.0.1', False), ('localhost.evil.example', False),
+            ('', False)):
+        assert is_loopback(host) == mine
