@@ -18,7 +18,7 @@ from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import JointState
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
-from tap_ros.nodes.client import Client
+from tap_ros.nodes.client import Client, PLANNER, READY
 from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.topics import STREAM
@@ -241,7 +241,8 @@ class Rig:
         for attacked in new:
             attacked.wait_for('ready')
         if new:
-            self.client.wait_until_ready(*wanted, timeout_s=CALL_S)
+            for name in wanted.keys() & {*READY, PLANNER}:
+                self.client.wait_until_ready(name, timeout_s=CALL_S)
             if 'predictor_node' in wanted:
                 self.expect_prediction(CALL_S)
             time.sleep(0.5)  # what has no name to wait for: its subscriptions
