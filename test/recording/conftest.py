@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags to read."""
 
-from made_episodes import make_episode, write_bag
+from made_episodes import cover, make_episode, write_bag
 import pytest
 
 
@@ -15,8 +15,9 @@ def cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def episodes():
-    """Make episodes of several lengths, with stamps that go on from one to the next."""
-    return [make_episode(seed, T=3 + seed % 4, start=(seed + 1) * 10**10) for seed in range(7)]
+    """Make episodes of several lengths, with robot masks; their stamps go on."""
+    return [cover(make_episode(seed, T=3 + seed % 4, start=(seed + 1) * 10**10))
+            for seed in range(7)]
 
 
 @pytest.fixture

@@ -7,25 +7,16 @@ import signal
 import subprocess
 import sys
 
+from made_bags import camera, gripper, IMAGE, read, record
 from mcap.writer import Writer
 import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.file_writer import FileWriter
 from tap_ros.recording.messages import encode, schema_text
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import BagWriter
-
-IMAGE = 'sensor_msgs/msg/Image'
-
-
-def picture(t):
-    """Return the message of a picture of one pixel, t seconds after zero."""
-    return '/camera/image_raw', IMAGE, encode(IMAGE, {
-        'header': {'stamp': {'sec': t}}, 'height': 1, 'width': 1, 'encoding': 'mono8', 'step': 1,
-        'data': bytes([t])}), t * 10**9
 
 
 def test_what_is_no_recording_is_named(tmp_path):
@@ -44,13 +35,12 @@ def test_what_is_no_recording_is_named(tmp_path):
 
 
 def test_no_image_topic_lists_the_topics_found(tmp_path):
-    file = FileWriter(tmp_path / 'a.mcap')
-    file.write_raw('/speed', 'std_msgs/msg/Float64', encode('std_msgs/msg/Float64', {}), 1)
-    file.close()
-    with pytest.raises(RecordingError, match=r'a.mcap: .*/camera/image_raw.*found: /speed \(std'):
-        open_recordings(tmp_path)
-    with pytest.raises(RecordingError, match='no topic /cam of type .*found: /speed'):
-        list(iter_episodes(tmp_path, Reading('/cam')))
+    bag = record(tmp_path / 'bag', [gripper(1, 1)])
+    for reading, words in (
+            (Reading(), r'bag_0.mcap: .*/camera/image_raw.*found: /gripper/command \(std'),
+            (Reading('/cam'), 'no topic /cam of type .*found: /gripper/command')):
+        with pytest.raises(RecordingError, match=words):
+            open_recordings(bag, reading=reading)
 
 
 def test_image_topic_without_any_image(tmp_path):
@@ -98,13 +88,11 @@ def test_a_killed_recorder_leaves_a_readable_bag(tmp_path):
 def test_bag_writer_splits_files(tmp_path):
     writer = BagWriter(tmp_path / 'bag', flush_seconds=-1.0, split_bytes=2000, compression='none')
     for t in range(40):
-        writer.write_raw(*picture(t))
+        writer.write_raw(*camera(t))
     writer.close()
     assert len(list((tmp_path / 'bag').glob('*.mcap'))) > 3
-    whole = Reading(episode_seconds=0)
-    for (episode,) in (iter_episodes(tmp_path / 'bag', whole),
-                       open_recordings(tmp_path / 'bag', reading=whole)):
-        assert episode.frames[:, 0, 0, 0].tolist() == list(range(40))
+    (episode,), _ = read(tmp_path / 'bag', reading=Reading(episode_seconds=0))
+    assert episode.frames[:, 0, 0, 0].tolist() == list(range(40))
 
 
 def test_bag_writer_keeps_what_is_there(tmp_path):

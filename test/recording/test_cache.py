@@ -27,12 +27,12 @@ def test_store_describes_its_episodes(bag, episodes):
         store[len(episodes)]
 
 
-def test_frames_are_views_of_memory_maps(bag):
-    frames = open_recordings(bag)[3].frames
-    while frames.base is not None and not isinstance(frames, np.memmap):
-        frames = frames.base
-    assert isinstance(frames, np.memmap)
-    assert not frames.flags.writeable
+def test_frames_and_masks_are_views_of_memory_maps(bag):
+    episode = open_recordings(bag)[3]
+    for pictures in (episode.frames, episode.robot_masks):
+        while pictures.base is not None and not isinstance(pictures, np.memmap):
+            pictures = pictures.base
+        assert isinstance(pictures, np.memmap) and not pictures.flags.writeable
 
 
 def test_second_opening_decodes_nothing(bag, episodes, monkeypatch):
@@ -67,9 +67,9 @@ def test_other_content_is_another_key(tmp_path, episodes):
 
 
 def test_damaged_caches_are_built_again(bag, episodes, cache):
-    for name, size in (('frames', None), ('frames', 200), ('columns.safetensors', None),
-                       ('columns.safetensors', 0), ('columns.safetensors', 100),
-                       ('columns.safetensors', -1)):
+    for name, size in (('frames', None), ('frames', 200), ('masks', None), ('masks', 200),
+                       ('columns.safetensors', None), ('columns.safetensors', 0),
+                       ('columns.safetensors', 100), ('columns.safetensors', -1)):
         open_recordings(bag)
         for folder in cache.iterdir():
             path = folder / name

@@ -4,7 +4,7 @@
 
 import dataclasses
 
-from made_episodes import assert_all_equal, make_episode
+from made_episodes import assert_all_equal, cover, make_episode
 from mcap.reader import make_reader
 import numpy as np
 import pytest
@@ -166,9 +166,14 @@ def test_unusable_episodes_are_refused_by_field(tmp_path):
             ('actions', np.ones((5, 4), np.float32), 'zeros in the last row'),
             ('stamps', np.zeros(5, np.int64), 'increase'),
             ('goal_frame', np.zeros((8, 8, 3), np.uint8), r'expected shape \(8, 12, 3\)'),
+            ('robot_masks', np.zeros((4, 8, 12), np.uint8), 'expected shape'),
+            ('robot_masks', np.ones((5, 8, 12), np.uint8), 'value 1'),
+            ('goal_mask', np.zeros((8, 8), np.uint8), 'expected shape'),
+            ('goal_frame', None, 'expected None, as there is no goal_frame'),
             ('outcome', 'won', 'success')):
-        episode = dataclasses.replace(make_episode(), **{field: value})
-        with pytest.raises(RecordingError, match=f'Episode.{field}: .*{words}'), \
+        episode = dataclasses.replace(cover(make_episode()), **{field: value})
+        named = 'goal_mask' if value is None else field
+        with pytest.raises(RecordingError, match=f'Episode.{named}: .*{words}'), \
                 EpisodeWriter(tmp_path / 'a.mcap') as writer:
             writer.write(episode)
     with pytest.raises(RecordingError, match='zstd, lz4 or none'):
