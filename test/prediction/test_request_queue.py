@@ -9,7 +9,7 @@ import threading
 import time
 
 import pytest
-from tap_ros.prediction.request_queue import Busy, RequestQueue
+from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
 
 TIMEOUT = 20.0
 

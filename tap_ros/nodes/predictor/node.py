@@ -23,6 +23,7 @@ from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.parameters import check_device
+from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue, THREAD_NAME
 from tap_ros.nodes.predictor.requests import encode_answer, RequestReader, Task
 from tap_ros.nodes.predictor.settings import (
     declare_parameters,
@@ -42,7 +43,6 @@ from tap_ros.nodes.services import (
 )
 from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
-from tap_ros.prediction.request_queue import Busy, RequestQueue, THREAD_NAME
 
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 Send = Callable[[PredictSubgoal.Response], object]
