@@ -36,20 +36,15 @@ def test_targets_are_the_frames_between_the_context_pictures(store):
     assert batch.valid.sum(1).tolist() == [5, 8]
 
 
-@pytest.mark.parametrize('end, margin, expected', [
-    (39, 0, (1, 38)), (39, 3, (4, 35)), (8, 3, (4, 4)), (4, 3, (2, 2)), (2, 3, (1, 1)),
-    (5, 9, (2, 3))])
-def test_margins_leave_at_least_one_target(end, margin, expected):
-    assert target_times(end, margin) == expected
+def test_margins_leave_at_least_one_target():
+    for end, margin, expected in ((39, 0, (1, 38)), (39, 3, (4, 35)), (8, 3, (4, 4)),
+                                  (4, 3, (2, 2)), (2, 3, (1, 1)), (5, 9, (2, 3))):
+        assert target_times(end, margin) == expected
 
 
-@pytest.mark.parametrize('end, margin, expected', [
-    (14, 0, (1, 14)), (14, 3, (4, 14)), (2, 5, (2, 2))])
-def test_forward_targets_are_all_later_frames(end, margin, expected):
-    assert target_times(end, margin, forward=True) == expected
-
-
-def test_forward_context_is_the_start_alone(store):
+def test_forward_context_is_the_start_alone_and_targets_all_later_frames(store):
+    for end, margin, expected in ((14, 0, (1, 14)), (14, 3, (4, 14)), (2, 5, (2, 2))):
+        assert target_times(end, margin, forward=True) == expected
     batch = make_batch(store, [0, 3], Sampling(forward=True))
     for b, i in enumerate([0, 3]):
         frames = store.frames(i)
@@ -64,13 +59,10 @@ def test_few_targets_are_drawn_without_repetition(store):
     assert len(batch.times.unique()) == len(store.frames(4)) - 2
 
 
-def test_middle_frame_alone_for_fixed_time(store):
+def test_fixed_time_is_a_share_of_the_episode(store):
     batch = make_batch(store, [0, 1], Sampling(fraction=0.5))
     assert batch.times.tolist() == [[3], [4]]
     assert np.array_equal(batch.targets[0, 0], store.frames(0)[3])
-
-
-def test_fixed_time_is_a_share_of_the_episode(store):
     end = store.lengths[4] - 1
     for fraction, expected in ((0.01, 1), (0.25, int(0.25 * end + 0.5)), (1.0, end)):
         batch = make_batch(store, [4], Sampling(fraction=fraction, forward=True))
@@ -147,13 +139,15 @@ def test_each_pass_has_every_episode_once():
     assert np.array_equal(episode_order(10, 4, 0, 3), steps[3])
 
 
-def test_augmentation_can_be_undone():
+def test_augmentation_can_be_undone_and_is_the_same_for_all_pictures_of_an_episode():
     augmentation = Augmentation.draw(16, True, True, 0.3, np.random.default_rng(0))
     images = torch.rand(16, 2, 3, 8, 8) * 2 - 1
     changed = augmentation.apply(images)
     assert not changed.allclose(images)
     assert augmentation.undo(changed).allclose(images, atol=1e-5)
     assert augmentation.flip.any() and not augmentation.flip.all()
+    changed = augmentation.apply(images[:, :1].expand(-1, 3, -1, -1, -1))
+    assert changed[:, 0].equal(changed[:, 2])
 
 
 def test_augmentation_of_black_stays_black_and_off_means_off():
@@ -163,13 +157,6 @@ def test_augmentation_of_black_stays_black_and_off_means_off():
     images = torch.rand(4, 2, 3, 8, 8)
     nothing = Augmentation.draw(4, False, False, 0.0, np.random.default_rng(0))
     assert nothing.apply(images).allclose(images, atol=1e-6)
-
-
-def test_all_pictures_of_an_episode_change_alike():
-    augmentation = Augmentation.draw(4, True, True, 0.3, np.random.default_rng(1))
-    images = torch.rand(4, 1, 3, 8, 8)
-    changed = augmentation.apply(images.expand(-1, 3, -1, -1, -1))
-    assert changed[:, 0].equal(changed[:, 2])
 
 
 def test_resident_frames_are_the_mapped_ones(store):

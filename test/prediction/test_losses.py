@@ -36,17 +36,13 @@ def test_genmin_with_w_1_equals_min(error):
     assert loss == minimum_loss(error)
 
 
-def test_min_equals_the_smallest_fixed_error(error):
+def test_min_is_the_smallest_fixed_error_and_never_above_genmin(error):
     row = error[:1]
     fixed = [fixed_time_loss(row, torch.tensor([t])) for t in range(row.shape[1])]
     assert minimum_loss(row) == min(fixed)
-
-
-def test_min_is_never_above_fix_nor_genmin(error):
-    minimum = minimum_loss(error)
     preference = bell_preference(torch.arange(9)[None], 0, 8)
-    assert minimum <= generalized_minimum_loss(error, preferred_error(error, preference))
-    assert minimum <= fixed_time_loss(error, torch.full((6,), 4))
+    assert minimum_loss(error) <= generalized_minimum_loss(
+        error, preferred_error(error, preference))
 
 
 def test_outer_error_is_not_weighted_by_the_preference():
@@ -64,18 +60,13 @@ def test_padding_is_never_chosen(error):
     assert minimum_loss(error, valid) == error[:, :3].min(1).values.mean()
 
 
-def test_only_the_chosen_frame_has_a_gradient(error):
-    error.requires_grad_()
-    minimum_loss(error).backward()
-    assert ((error.grad != 0).sum(1) == 1).all()
-    assert (error.grad.argmax(1) == error.argmin(1)).all()
-
-
-def test_choice_has_no_gradient(error):
+def test_only_the_chosen_frame_has_a_gradient_and_the_choice_has_none(error):
     selection = (error * 2).requires_grad_()
     outer = error.clone().requires_grad_()
     generalized_minimum_loss(outer, selection).backward()
-    assert selection.grad is None and outer.grad is not None
+    assert selection.grad is None
+    assert ((outer.grad != 0).sum(1) == 1).all()
+    assert (outer.grad.argmax(1) == selection.argmin(1)).all()
 
 
 def test_errors_may_be_computed_for_the_chosen_frames_only(error):
@@ -87,12 +78,9 @@ def test_errors_may_be_computed_for_the_chosen_frames_only(error):
             == generalized_minimum_loss(error, selection))
 
 
-def test_error_of_black_against_white_is_1():
+def test_error_of_black_against_white_is_1_and_frames_may_be_bytes():
     black, white = -torch.ones(2, 3, 8, 8), torch.ones(2, 3, 8, 8)
     assert l1_error(black, white).equal(torch.ones(2))
-
-
-def test_errors_against_recorded_frames_equal_those_of_floats():
     generator = torch.Generator().manual_seed(0)
     frames = torch.randint(0, 256, (3, 5, 3, 8, 8), generator=generator, dtype=torch.uint8)
     images = torch.rand(3, 2, 3, 8, 8, generator=generator) * 2 - 1
@@ -116,9 +104,6 @@ def test_bell_fits_each_episodes_own_length():
     times = torch.tensor([[1, 3, 5], [1, 6, 11]])
     preference = bell_preference(times, torch.tensor([[1], [1]]), torch.tensor([[5], [11]]))
     assert preference[0].equal(preference[1])
-
-
-def test_bell_of_a_single_target_is_1():
     assert bell_preference(torch.tensor([[4]]), 4, 4) == 1
 
 
@@ -137,11 +122,13 @@ def distances(B=5, T=7, seed=0):
     return torch.stack([0.2 * way + 0.01, 0.2 * (1 - way) + 0.01], 1)
 
 
-def test_progress_goes_from_minus_1_to_1_and_never_back():
+def test_progress_goes_from_minus_1_to_1_and_never_back_also_reversed():
     progress = picture_progress(distances())
     assert progress[:, 0].tolist() == pytest.approx([-1] * 5, abs=1e-5)
     assert progress[:, -1].tolist() == pytest.approx([1] * 5, abs=1e-5)
     assert (progress.diff() > 0).all()
+    reverse = picture_progress(distances().flip(1, 2))
+    assert torch.allclose(reverse, -progress.flip(1), atol=1e-5)
 
 
 def test_progress_does_not_depend_on_how_fast_the_pictures_change():
@@ -151,24 +138,20 @@ def test_progress_does_not_depend_on_how_fast_the_pictures_change():
                           picture_progress(slow), atol=1e-5)
 
 
-def test_progress_of_the_reversed_episode_is_the_opposite():
-    error = distances()
-    assert torch.allclose(picture_progress(error.flip(1, 2)), -picture_progress(error).flip(1),
-                          atol=1e-5)
-
-
 def test_half_way_between_the_pictures_is_preferred_most():
     way = torch.tensor([[0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9, 1]])  # most of it is late
     error = torch.stack([way, 1 - way], 1) + 0.01
     assert bell(picture_progress(error)).argmax().item() == 6
 
 
-def test_padding_is_not_on_the_way():
+def test_padding_is_not_on_the_way_and_no_way_at_all_is_finite():
     error, valid = distances(), torch.ones(5, 7, dtype=torch.bool)
     valid[:, 5:] = False
     padded = error.clone()
     padded[:, :, 5:] = torch.tensor([[9.0], [0.0]])
     assert picture_progress(padded, valid)[:, :5].equal(picture_progress(error[..., :5]))
+    for error in (torch.full((2, 2, 1), 0.1), torch.zeros(2, 2, 4)):
+        assert bell(picture_progress(error)).isfinite().all()
 
 
 def test_what_shows_too_little_or_too_much_of_the_way_is_beside_the_context():
@@ -182,12 +165,7 @@ def test_what_shows_too_little_or_too_much_of_the_way_is_beside_the_context():
     assert not beside_context(progress, 0).any()
 
 
-def test_a_single_target_and_pictures_that_are_all_alike_are_finite():
-    for error in (torch.full((2, 2, 1), 0.1), torch.zeros(2, 2, 4)):
-        assert bell(picture_progress(error)).isfinite().all()
-
-
-def test_copying_is_worth_the_same_everywhere():
+def test_copying_is_worth_1_everywhere_also_where_hardly_anything_changed():
     copy_error = torch.tensor([[[0.1, 0.2, 0.3], [0.3, 0.2, 0.1]]])  # start, goal
     ones = torch.ones(1, 3)
     assert relative_to_copying(copy_error.amin(1), copy_error, ones).allclose(ones)
@@ -195,9 +173,9 @@ def test_copying_is_worth_the_same_everywhere():
     error = torch.tensor([[0.08, 0.1, 0.3]])
     assert match_step(error).item() == 0
     assert match_step(relative_to_copying(error, copy_error, ones)).item() == 1
-
-
-def test_a_frame_equal_to_the_context_does_not_break_the_choice():
+    little = torch.tensor([[0.001, 0.0005]])
+    assert relative_to_copying(little, little[:, None], torch.ones(1, 2)).allclose(torch.ones(2))
+    # A frame equal to the context does not break the choice.
     copy_error, error = torch.zeros(1, 2, 3), torch.tensor([[0.0, 0.1, 0.2]])
     assert relative_to_copying(error, copy_error, torch.ones(1, 3)).isfinite().all()
 
@@ -228,14 +206,7 @@ def test_changed_pixels_differ_from_every_input():
     changed = changed_pixels(frame, torch.stack([start, goal], 1))
     assert changed.tolist() == [[[[False, True], [False, False]]]]
     assert changed_pixels(frame, start[:, None])[0, 0, 0, 0]
-
-
-def test_a_pixel_has_changed_from_a_difference_of_0_075_on():
+    # A pixel has changed from a difference of 0.075 on.
     frame = torch.zeros(1, 3, 1, 2)
     frame[..., 0], frame[..., 1] = 2 * 0.074, 2 * 0.076
     assert changed_pixels(frame, torch.zeros(1, 1, 3, 1, 2)).tolist() == [[[[False, True]]]]
-
-
-def test_copying_is_worth_1_where_hardly_anything_changed_too():
-    little = torch.tensor([[0.001, 0.0005]])
-    assert relative_to_copying(little, little[:, None], torch.ones(1, 2)).allclose(torch.ones(2))

@@ -26,31 +26,17 @@ def masks_for(weights, batch=1, size=SIZE):
     return torch.tensor(weights)[None, :, None, None, None].expand(batch, -1, 1, *size)
 
 
-def test_zero_flow_is_the_identity():
+def test_output_is_read_from_where_the_flow_points_to():
     images = torch.rand(2, 2, 3, *SIZE)
     assert warp(images, constant_flow(0, 0, 2)).allclose(images, atol=1e-5)
-
-
-def test_output_is_read_from_where_the_flow_points_to():
-    images = torch.rand(1, 2, 3, *SIZE)
+    images = images[:1]
     warped = warp(images, constant_flow(3, -2))
     assert warped[..., 2:, :-3].allclose(images[..., :-2, 3:], atol=1e-4)
-
-
-def test_half_a_pixel_is_the_mean_of_two():
-    images = torch.rand(1, 2, 3, *SIZE)
-    warped = warp(images, constant_flow(0.5, 0))
-    assert warped[..., :-1].allclose((images[..., :-1] + images[..., 1:]) / 2, atol=1e-4)
-
-
-def test_outside_is_the_border():
-    images = torch.rand(1, 2, 3, *SIZE)
-    far = warp(images, constant_flow(1000, 0))
+    half = warp(images, constant_flow(0.5, 0))
+    assert half[..., :-1].allclose((images[..., :-1] + images[..., 1:]) / 2, atol=1e-4)
+    far = warp(images, constant_flow(1000, 0))  # outside is the border
     assert far.allclose(images[..., -1:].expand_as(images), atol=1e-5)
-
-
-def test_each_context_has_its_own_flow():
-    images = torch.rand(1, 2, 3, *SIZE)
+    # Each context has its own flow.
     flow = constant_flow(0, 0)
     flow[:, 1, 0] = 4
     warped = warp(images, flow)
@@ -71,36 +57,35 @@ def test_one_hot_maps_sum_to_1_with_their_mean_at_the_pixel():
     assert maps.sum((-2, -1)).allclose(torch.ones(1, 3))
     assert expected_pixels(maps).allclose(pixels, atol=1e-5)
     assert maps[0, 0, 0, 0] == 1 and maps[0, 1, 19, 29] == 1
-
-
-def test_positions_outside_move_to_the_border():
+    # Positions outside move to the border.
     maps = one_hot_maps(torch.tensor([[-5.0, 50.0]]), SIZE)
     assert maps[0, 19, 0] == 1 and maps.sum() == 1
 
 
-@pytest.mark.parametrize('du, dv', [(3.0, -2.0), (-4.5, 1.25)])
-def test_a_translation_moves_the_expected_pixel_by_exactly_that(du, dv):
+def test_a_translation_moves_the_expected_pixel_by_exactly_that():
     pixels = torch.tensor([[10.3, 8.0], [15.0, 9.6]])
     maps = one_hot_maps(pixels, SIZE).expand(1, 2, 2, *SIZE)
-    warped = warp_object_maps(maps, constant_flow(-du, -dv), masks_for([0.4, 0.6]))
-    assert warped.maps.sum((-2, -1)).allclose(torch.ones(1, 2))
-    assert warped.mass.allclose(torch.ones(1, 2), atol=1e-4)
-    moved = expected_pixels(warped.maps)[0] - pixels
-    assert moved.allclose(torch.tensor([du, dv]).expand(2, 2), atol=1e-3)
+    for du, dv in ((3.0, -2.0), (-4.5, 1.25)):
+        warped = warp_object_maps(maps, constant_flow(-du, -dv), masks_for([0.4, 0.6]))
+        assert warped.maps.sum((-2, -1)).allclose(torch.ones(1, 2))
+        assert warped.mass.allclose(torch.ones(1, 2), atol=1e-4)
+        moved = expected_pixels(warped.maps)[0] - pixels
+        assert moved.allclose(torch.tensor([du, dv]).expand(2, 2), atol=1e-3)
+
+
+def start_and_goal():
+    """Return positions (1, 2) of an object in two context pictures, and its maps."""
+    start, goal = torch.tensor([[5.0, 5.0]]), torch.tensor([[25.0, 15.0]])
+    return start, goal, torch.stack([one_hot_maps(start, SIZE), one_hot_maps(goal, SIZE)])[None]
 
 
 def test_masks_choose_the_context_an_object_is_taken_from():
-    start, goal = torch.tensor([[5.0, 5.0]]), torch.tensor([[25.0, 15.0]])
-    maps = torch.stack([one_hot_maps(start, SIZE), one_hot_maps(goal, SIZE)])[None]
+    start, goal, maps = start_and_goal()
     for weights, expected in (([1.0, 0.0], start), ([0.0, 1.0], goal),
                               ([0.5, 0.5], (start + goal) / 2)):
         warped = warp_object_maps(maps, constant_flow(0, 0), masks_for(weights))
         assert expected_pixels(warped.maps)[0].allclose(expected, atol=1e-4)
-
-
-def test_mass_counts_an_object_that_is_seen_twice():
-    start, goal = torch.tensor([[5.0, 5.0]]), torch.tensor([[25.0, 15.0]])
-    maps = torch.stack([one_hot_maps(start, SIZE), one_hot_maps(goal, SIZE)])[None]
+    # Mass counts an object that is seen twice.
     masks = torch.zeros(1, 2, 1, *SIZE)
     masks[:, 0, :, :, :15], masks[:, 1, :, :, 15:] = 1, 1
     warped = warp_object_maps(maps, constant_flow(0, 0), masks)
@@ -108,21 +93,22 @@ def test_mass_counts_an_object_that_is_seen_twice():
     assert warped.maps.sum().allclose(torch.tensor(1.0))
 
 
-def test_an_object_that_the_flow_jumps_over_is_still_found_near_by():
-    flow = constant_flow(0, 0)
+def test_an_object_that_the_flow_jumps_over_arrives_with_what_is_around_it():
     columns = torch.arange(30.0)
-    flow[:, :, 0] = torch.where(columns >= 10, 1.0, -1.0)  # nothing reads columns 9.01..10.99
-    pixels = torch.tensor([[10.0, 8.0]])
-    maps = one_hot_maps(pixels, SIZE).expand(1, 2, 1, *SIZE)
-    warped = warp_object_maps(maps, flow, masks_for([0.5, 0.5]))
-    assert warped.mass < 0.05
-    assert warped.maps.sum().allclose(torch.tensor(1.0))
-    assert (expected_pixels(warped.maps)[0] - pixels).norm() < 1
+    maps = one_hot_maps(torch.tensor([[10.0, 8.0]]), SIZE).expand(1, 2, 1, *SIZE)
+    for jump, expected in (
+            (torch.where(columns >= 10, 1.0, -1.0), 10.0),   # nothing reads columns 9.01..10.99
+            (torch.where(columns >= 15, -4.0, -6.0), 15.0)):  # nor 8.01..10.99
+        flow = constant_flow(0, 0)
+        flow[:, :, 0] = jump
+        warped = warp_object_maps(maps, flow, masks_for([0.5, 0.5]))
+        assert warped.mass < 0.05
+        assert warped.maps.sum().allclose(torch.tensor(1.0))
+        assert (expected_pixels(warped.maps)[0] - torch.tensor([expected, 8.0])).norm() < 1
 
 
 def test_an_object_that_everything_avoids_stays_where_it_was():
-    start, goal = torch.tensor([[5.0, 5.0]]), torch.tensor([[25.0, 15.0]])
-    maps = torch.stack([one_hot_maps(start, SIZE), one_hot_maps(goal, SIZE)])[None]
+    start, goal, maps = start_and_goal()
     away = constant_flow(1000, 1000)
     warped = warp_object_maps(maps, away, masks_for([0.75, 0.25]))
     assert warped.mass == 0
@@ -156,25 +142,10 @@ def test_blur_keeps_the_mass_even_at_the_border():
     assert blurred.max() < 0.8
 
 
-def test_an_object_that_the_flow_jumps_over_on_its_way_arrives_with_what_is_around_it():
-    flow = constant_flow(0, 0)
-    columns = torch.arange(30.0)
-    flow[:, :, 0] = torch.where(columns >= 15, -4.0, -6.0)  # nothing reads columns 8.01..10.99
-    maps = one_hot_maps(torch.tensor([[10.0, 8.0]]), SIZE).expand(1, 2, 1, *SIZE)
-    warped = warp_object_maps(maps, flow, masks_for([0.5, 0.5]))
-    assert warped.mass < 0.05
-    assert (expected_pixels(warped.maps)[0] - torch.tensor([15.0, 8.0])).norm() < 1
-
-
-@pytest.mark.parametrize('sigma', [1.0, 2.0])
-def test_blur_has_its_deviation_in_both_directions(sigma):
-    blurred = blur(one_hot_maps(torch.tensor([15.0, 10.0]), SIZE), sigma)
-    for dim, middle in ((0, 15.0), (1, 10.0)):
-        share = blurred.sum(dim)
-        variance = (share * (torch.arange(len(share)) - middle) ** 2).sum()
-        assert variance.sqrt().item() == pytest.approx(sigma, abs=0.01)
-
-
-def test_blur_is_by_one_pixel_unless_told():
+def test_blur_has_its_deviation_in_both_directions_one_pixel_unless_told():
     maps = one_hot_maps(torch.tensor([15.0, 10.0]), SIZE)
-    assert blur(maps).equal(blur(maps, 1.0))
+    for sigma, blurred in ((1.0, blur(maps)), (1.0, blur(maps, 1.0)), (2.0, blur(maps, 2.0))):
+        for dim, middle in ((0, 15.0), (1, 10.0)):
+            share = blurred.sum(dim)
+            variance = (share * (torch.arange(len(share)) - middle) ** 2).sum()
+            assert variance.sqrt().item() == pytest.approx(sigma, abs=0.01)
