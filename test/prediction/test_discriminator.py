@@ -38,19 +38,13 @@ def test_labels_fall_by_a_quarter_a_step_on_both_sides():
     expected = [0, 0, .25, .5, .75, 1, .75, .5, .25, 0, 0, 0]
     assert smoothed_labels(torch.tensor(5), times - 1).tolist() == [0, *expected[:-1]]
     assert smoothed_labels(times, torch.tensor(5)).tolist() == expected
-
-
-def test_without_smoothing_only_its_own_time_is_positive():
     assert smoothed_labels(torch.tensor(2), torch.arange(4), alpha=1).tolist() == [0, 0, 1, 0]
 
 
-def test_a_discriminator_that_knows_nothing_has_a_loss_of_3_ln_2():
+def test_knowing_nothing_costs_3_ln_2_and_a_perfect_answer_nothing_where_labels_are_hard():
     nothing = torch.zeros(3, 7)
     loss = discriminator_loss(nothing, nothing, nothing, STEP, OTHER)
     assert loss.item() == pytest.approx(3 * math.log(2))
-
-
-def test_a_perfect_discriminator_has_no_loss_where_labels_are_hard():
     step, far = torch.tensor([0, 6, 2]), torch.tensor([4, 0, 6])
     yes, no = certain(step, 40.0), certain(step, -40.0)
     assert discriminator_loss(yes, no, no, step, far) < 1e-12
@@ -107,13 +101,12 @@ def test_the_generator_keeps_its_gradient_when_it_is_found_out():
     assert generated.grad.sum().item() == pytest.approx(-1)
 
 
-@pytest.mark.parametrize('num_context', [1, 2])
-@pytest.mark.parametrize('image_size', [32, 64])
-def test_there_is_a_logit_for_each_target_time(num_context, image_size):
-    config = PredictorConfig(image_size=image_size, base_width=4, num_context=num_context)
-    network = Discriminator(config, 38)
-    assert network.encoder[0].in_channels == 3 * (num_context + 1)  # appendix C: |C| + 1 images
-    assert network(*pictures(2, config)).shape == (2, 38)
+def test_there_is_a_logit_for_each_target_time():
+    for num_context, image_size in ((1, 32), (2, 64)):
+        config = PredictorConfig(image_size=image_size, base_width=4, num_context=num_context)
+        network = Discriminator(config, 38)
+        assert network.encoder[0].in_channels == 3 * (num_context + 1)  # appendix C
+        assert network(*pictures(2, config)).shape == (2, 38)
 
 
 def test_every_weight_gets_a_gradient_and_so_do_the_pictures():

@@ -13,6 +13,7 @@ SMALL = PredictorConfig(base_width=4)
 SHARED = PredictorConfig(base_width=4, decoder='shared')
 SKIPS = PredictorConfig(base_width=4, decoder='shared', skips=True)
 EVERY = pytest.mark.parametrize('config', [SMALL, SHARED, SKIPS], ids=['paper', 'shared', 'skips'])
+OURS = pytest.mark.parametrize('config', [SHARED, SKIPS], ids=['shared', 'skips'])
 
 
 def contexts(batch, config=SMALL, seed=0):
@@ -37,26 +38,18 @@ def test_blocks_have_the_sizes_of_appendix_c():
 
 
 @EVERY
-@pytest.mark.parametrize('new_pixels', [True, False])
-@pytest.mark.parametrize('image_size', [32, 64])
-def test_outputs_have_the_promised_shapes(new_pixels, image_size, config):
-    config = replace(config, image_size=image_size, new_pixels=new_pixels)
-    answer = PredictorNetwork(config)(contexts(3, config))
-    S = image_size
-    assert answer.image.shape == (3, 3, S, S)
-    assert answer.flow.shape == (3, 2, 2, S, S)
-    assert answer.masks.shape == (3, 2 + new_pixels, 1, S, S)
-    assert answer.masks.sum(1).allclose(torch.ones(3, 1, S, S))
-    if new_pixels:
-        assert answer.new_pixels.shape == (3, 3, S, S)
-        assert answer.new_pixels.abs().max() <= 1
-    else:
-        assert answer.new_pixels is None
-
-
-@EVERY
-def test_fresh_weights_hardly_move_anything(config):
-    assert PredictorNetwork(config)(contexts(4)).flow.abs().mean() < 1
+def test_outputs_have_the_promised_shapes_and_fresh_weights_hardly_move_anything(config):
+    for S, new_pixels in ((32, True), (64, False)):
+        config = replace(config, image_size=S, new_pixels=new_pixels)
+        answer = PredictorNetwork(config)(contexts(3, config))
+        assert answer.image.shape == (3, 3, S, S)
+        assert answer.flow.shape == (3, 2, 2, S, S) and answer.flow.abs().mean() < 1
+        assert answer.masks.shape == (3, 2 + new_pixels, 1, S, S)
+        assert answer.masks.sum(1).allclose(torch.ones(3, 1, S, S))
+        assert (answer.new_pixels is not None) == new_pixels
+        if new_pixels:
+            assert answer.new_pixels.shape == (3, 3, S, S)
+            assert answer.new_pixels.abs().max() <= 1
 
 
 @EVERY
@@ -68,7 +61,7 @@ def test_equal_context_pictures_are_all_that_a_warp_only_network_can_show(config
 
 
 @EVERY
-def test_one_at_a_time_equals_a_batch_in_eval_mode(config):
+def test_one_at_a_time_equals_a_batch_in_eval_mode_in_any_memory_format(config):
     network = PredictorNetwork(config)
     for seed in range(3):
         network(contexts(8, seed=seed))  # statistics of batch norm
@@ -79,14 +72,8 @@ def test_one_at_a_time_equals_a_batch_in_eval_mode(config):
         alone = network(context[b:b + 1])
         assert alone.image[0].allclose(together.image[b], atol=1e-4)
         assert alone.flow[0].allclose(together.flow[b], atol=1e-3)
-
-
-@EVERY
-def test_memory_format_changes_no_number(config):
-    network = PredictorNetwork(config).eval()
-    expected = network(contexts(2)).image
     network.to(memory_format=torch.channels_last)
-    assert network(contexts(2)).image.allclose(expected, atol=1e-5)
+    assert network(context[:2]).image.allclose(together.image[:2], atol=1e-4)
 
 
 @EVERY
@@ -118,7 +105,7 @@ def set_outputs(network, bias):
         end.bias.copy_(torch.tensor(bias))
 
 
-@pytest.mark.parametrize('config', [SHARED, SKIPS], ids=['shared', 'skips'])
+@OURS
 def test_outputs_of_the_shared_decoder_are_flow_then_masks_then_new_pixels(config):
     network, context = PredictorNetwork(config).eval(), contexts(2)
     flow, start, goal, painted = [0.0] * 4, [30.0, 0, 0], [0, 30.0, 0], [0, 0, 30.0]
@@ -132,7 +119,7 @@ def test_outputs_of_the_shared_decoder_are_flow_then_masks_then_new_pixels(confi
     assert network(context).image[..., :-2].allclose(context[:, 0, ..., 2:], atol=1e-5)
 
 
-@pytest.mark.parametrize('config', [SHARED, SKIPS], ids=['shared', 'skips'])
+@OURS
 def test_one_pixel_reaches_the_outputs_past_the_code_by_skips_alone(config):
     network = PredictorNetwork(config).eval()
     with torch.no_grad():
@@ -152,9 +139,9 @@ def test_a_shared_decoder_has_fewer_weights_than_those_of_the_paper():
     assert weights(SHARED) < weights(SMALL) / 3
 
 
-@pytest.mark.parametrize('values', [{'image_size': 48}, {'image_size': 8}, {'image_size': 0},
-                                    {'base_width': 0}, {'latent_size': -1},
-                                    {'decoder': 'none'}, {'skips': True}])
-def test_impossible_shapes_are_refused_by_name(values):
-    with pytest.raises(ConfigError, match=next(iter(values))):
-        PredictorConfig(**values)
+def test_impossible_shapes_are_refused_by_name():
+    for name, value in (('image_size', 48), ('image_size', 8), ('image_size', 0),
+                        ('base_width', 0), ('latent_size', -1), ('decoder', 'none'),
+                        ('skips', True)):
+        with pytest.raises(ConfigError, match=name):
+            PredictorConfig(**{name: value})

@@ -50,19 +50,15 @@ def test_answer_has_the_promised_types(predictor):
                        atol=1e-3)
 
 
-def test_equal_requests_get_equal_answers(predictor):
+def test_equal_requests_get_equal_answers_and_pictures_alone_will_do(predictor):
     first, = predictor.predict(START, GOAL, START_PIXELS, GOAL_PIXELS)
     second, = predictor.predict(START, GOAL, START_PIXELS, GOAL_PIXELS)
     assert np.array_equal(first.image, second.image)
     assert np.array_equal(first.object_maps, second.object_maps)
-
-
-@pytest.mark.parametrize('pixels', [None, np.zeros((0, 2)), []])
-def test_pictures_alone_will_do(predictor, pixels):
-    subgoal, = predictor.predict(START, GOAL, pixels, pixels)
-    assert subgoal.object_maps.shape == (0, 32, 32) and subgoal.expected_pixels.shape == (0, 2)
-    assert np.array_equal(subgoal.image, predictor.predict(
-        START, GOAL, START_PIXELS, GOAL_PIXELS)[0].image)
+    for pixels in (None, np.zeros((0, 2)), []):
+        alone, = predictor.predict(START, GOAL, pixels, pixels)
+        assert alone.object_maps.shape == (0, 32, 32) and alone.expected_pixels.shape == (0, 2)
+        assert np.array_equal(alone.image, first.image)
 
 
 def test_order_of_objects_does_not_matter(predictor):
@@ -120,7 +116,7 @@ def test_what_the_weights_do_not_take_or_lack_is_refused(predictor, forward):
 
 
 @pytest.mark.parametrize('num_context', [1, 2])
-def test_samples_follow_each_other_and_say_where_they_belong(num_context):
+def test_samples_differ_by_z_repeat_by_seed_and_say_where_they_belong(num_context):
     predictor = SubgoalPredictor(lively_network(num_context=num_context, latent_size=8))
     goal = (GOAL,) if num_context == 2 else ()
     chains = predictor.predict(START, *goal, num_samples=3, recursion_depth=2, seed=5)
@@ -130,6 +126,8 @@ def test_samples_follow_each_other_and_say_where_they_belong(num_context):
     assert all(differ(a.image, b.image) > 5 for a, b in zip(firsts, firsts[1:]))
     same = predictor.predict(START, *goal, num_samples=3, recursion_depth=1, seed=5)
     assert all(differ(a.image, b.image) < 0.1 for a, b in zip(firsts, same))
+    again = predictor.predict(START, *goal, num_samples=3, recursion_depth=2, seed=5)
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(chains, again, strict=True))
 
 
 def test_every_level_of_every_sample_draws_its_own_z():
@@ -141,15 +139,6 @@ def test_every_level_of_every_sample_draws_its_own_z():
     z = torch.cat(drawn)
     assert z.shape == (6, 8)
     assert torch.cdist(z, z).fill_diagonal_(9).min() > 0.5
-
-
-def test_samples_differ_by_z_and_repeat_by_seed():
-    predictor = SubgoalPredictor(lively_network(latent_size=8))
-    first = predictor.predict(START, GOAL, num_samples=3, recursion_depth=2, seed=5)
-    second = predictor.predict(START, GOAL, num_samples=3, recursion_depth=2, seed=5)
-    assert len(first) == 6
-    assert all(np.array_equal(a.image, b.image) for a, b in zip(first, second))
-    assert not np.array_equal(first[1].image, first[3].image)
 
 
 @pytest.mark.parametrize('num_context', [1, 2])
@@ -180,35 +169,24 @@ def test_without_z_all_samples_would_be_the_same(predictor):
     assert len(predictor.predict(START, GOAL, num_samples=5)) == 1
 
 
-@pytest.mark.parametrize('start, goal, message', [
-    (START[:16], GOAL, 'start: expected 32x32 pixels'),
-    (START, GOAL.astype(np.float32), 'goal: expected a uint8'),
-    (START, GOAL[..., 0], r'goal: expected shape'),
-    (None, GOAL, 'start: expected a uint8')])
-def test_unusable_pictures_are_named(predictor, start, goal, message):
-    with pytest.raises(ImageError, match=message):
-        predictor.predict(start, goal)
-
-
-@pytest.mark.parametrize('start, goal, message', [
-    ([[1, np.nan]], [[1, 2]], r'start_pixels: unknown .* objects \[0\]'),
-    ([[1, 2]], [[1, 2], [3, 4]], 'goal_pixels: expected 1 objects'),
-    ([[1, 2]], None, 'goal_pixels: expected 1 objects'),
-    ([1, 2], [[1, 2]], r'start_pixels: expected shape \(objects, 2\)')])
-def test_unusable_positions_are_named(predictor, start, goal, message):
-    with pytest.raises(ImageError, match=message):
-        predictor.predict(START, GOAL, start, goal)
-
-
-@pytest.mark.parametrize('name', ['num_samples', 'recursion_depth'])
-def test_counts_below_one_are_refused(predictor, name):
-    with pytest.raises(ConfigError, match=f'{name}: expected at least 1'):
-        predictor.predict(START, GOAL, **{name: 0})
-
-
-def test_next_good_request_works_after_a_bad_one(predictor):
-    with pytest.raises(ImageError):
-        predictor.predict(START[:5], GOAL)
+def test_what_cannot_be_used_is_named_and_the_next_request_is_answered(predictor):
+    for start, goal, message in (
+            (START[:16], GOAL, 'start: expected 32x32 pixels'),
+            (START, GOAL.astype(np.float32), 'goal: expected a uint8'),
+            (START, GOAL[..., 0], 'goal: expected shape'),
+            (None, GOAL, 'start: expected a uint8')):
+        with pytest.raises(ImageError, match=message):
+            predictor.predict(start, goal)
+    for start, goal, message in (
+            ([[1, np.nan]], [[1, 2]], r'start_pixels: unknown .* objects \[0\]'),
+            ([[1, 2]], [[1, 2], [3, 4]], 'goal_pixels: expected 1 objects'),
+            ([[1, 2]], None, 'goal_pixels: expected 1 objects'),
+            ([1, 2], [[1, 2]], r'start_pixels: expected shape \(objects, 2\)')):
+        with pytest.raises(ImageError, match=message):
+            predictor.predict(START, GOAL, start, goal)
+    for name in ('num_samples', 'recursion_depth'):
+        with pytest.raises(ConfigError, match=f'{name}: expected at least 1'):
+            predictor.predict(START, GOAL, **{name: 0})
     assert len(predictor.predict(START, GOAL)) == 1
 
 
@@ -224,17 +202,13 @@ def test_a_saved_predictor_answers_the_same(tmp_path):
     assert np.array_equal(loaded.predict(START, GOAL)[0].image, expected.image)
 
 
-def test_weights_that_predict_nonsense_are_refused(tmp_path):
+def test_weights_that_predict_nonsense_or_of_something_else_are_refused(tmp_path):
     path, network = tmp_path / 'predictor.safetensors', PredictorNetwork(CONFIG)
     for weight in network.parameters():
         weight.data.fill_(3e38)  # finite, unlike what comes of it
     save_weights(path, network, 'predictor', CONFIG, {})
     with pytest.raises(WeightsError, match='predictor.safetensors: .* damaged'):
         SubgoalPredictor.load(path)
-
-
-def test_weights_of_something_else_are_refused(tmp_path):
-    path = tmp_path / 'weights.safetensors'
     save_weights(path, PredictorNetwork(CONFIG), 'forward_model', CONFIG, {})
     with pytest.raises(WeightsError, match='forward_model'):
         SubgoalPredictor.load(path)

@@ -16,11 +16,8 @@ def draw(*shape, seed=0):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
 
 
-def test_kl_of_the_prior_is_0():
+def test_kl_is_that_of_torch_and_0_for_the_prior():
     assert kl_divergence(torch.zeros(3, 32), torch.zeros(3, 32)).tolist() == [0, 0, 0]
-
-
-def test_kl_is_that_of_torch():
     mean, log_variance = draw(5, 32), draw(5, 32, seed=1)
     expected = torch.distributions.kl_divergence(
         Normal(mean, (log_variance / 2).exp()), Normal(0.0, 1.0)).sum(1)
@@ -33,9 +30,7 @@ def test_samples_have_the_posteriors_mean_and_variance():
     assert z.mean(0).allclose(mean[0], atol=0.1)
     assert z.var(0).allclose(log_variance[0].exp(), rtol=0.05)
     assert sample_latent(mean, log_variance, torch.zeros(1, 2)).equal(mean)
-
-
-def test_samples_carry_gradients_to_both_parameters():
+    # They carry gradients to both parameters.
     mean, log_variance = draw(4, 8).requires_grad_(), draw(4, 8, seed=1).requires_grad_()
     noise = draw(4, 8, seed=2)
     sample_latent(mean, log_variance, noise).sum().backward()
@@ -43,25 +38,23 @@ def test_samples_carry_gradients_to_both_parameters():
     assert log_variance.grad.allclose(noise * (log_variance.detach() / 2).exp() / 2)
 
 
-@pytest.mark.parametrize('num_images', [2, 22])
-@pytest.mark.parametrize('image_size', [32, 64])
-def test_it_takes_the_whole_video_and_gives_z(num_images, image_size):
-    config = PredictorConfig(image_size=image_size, base_width=4, latent_size=32)
-    network = Recognition(config, num_images)
-    assert network.encoder[0].in_channels == 3 * num_images
-    mean, log_variance = network(draw(3, num_images, 3, image_size, image_size).tanh())
-    assert mean.shape == log_variance.shape == (3, 32)
+def test_it_takes_the_whole_video_and_gives_z():
+    for num_images, image_size in ((2, 32), (22, 64)):
+        config = PredictorConfig(image_size=image_size, base_width=4, latent_size=32)
+        network = Recognition(config, num_images)
+        assert network.encoder[0].in_channels == 3 * num_images
+        mean, log_variance = network(draw(3, num_images, 3, image_size, image_size).tanh())
+        assert mean.shape == log_variance.shape == (3, 32)
+    with pytest.raises(ConfigError, match='latent_size'):  # a predictor without z has none
+        Recognition(PredictorConfig(base_width=4), 6)
 
 
-def test_it_begins_near_the_prior():
-    mean, log_variance = Recognition(SMALL, 6)(draw(4, 6, 3, 64, 64).tanh())
-    assert (kl_divergence(mean, log_variance) < 1).all()
-
-
-@pytest.mark.parametrize('std', [1.0, 0.1])
-def test_its_first_spread_is_chosen(std):
-    _, log_variance = Recognition(SMALL, 6, std)(draw(4, 6, 3, 64, 64).tanh())
-    assert (log_variance / 2).exp().allclose(torch.tensor(std), rtol=0.2)
+def test_it_begins_near_the_prior_or_with_the_spread_asked_for():
+    video = draw(4, 6, 3, 64, 64).tanh()
+    assert (kl_divergence(*Recognition(SMALL, 6)(video)) < 1).all()
+    for std in (1.0, 0.1):
+        _, log_variance = Recognition(SMALL, 6, std)(video)
+        assert (log_variance / 2).exp().allclose(torch.tensor(std), rtol=0.2)
 
 
 def test_every_picture_matters():
@@ -92,8 +85,3 @@ def test_memory_format_and_half_precision_change_little():
         half = torch.stack(network(video))
     assert half.dtype == torch.float32
     assert half.allclose(expected, atol=0.02 * expected.abs().max().item())
-
-
-def test_a_predictor_without_z_has_no_recognition_network():
-    with pytest.raises(ConfigError, match='latent_size'):
-        Recognition(PredictorConfig(base_width=4), 6)
