@@ -47,8 +47,9 @@ def running(tmp_path_factory):
     context.__exit__(None, None, None)
 
 
-@pytest.fixture
-def loop(running, monkeypatch):
+@pytest.fixture(scope='module')
+def loop(running):
     """All nodes as processes, and the domain that they are in."""
-    enter_domain(monkeypatch)
-    return running
+    with pytest.MonkeyPatch.context() as patch:
+        enter_domain(patch)
+        yield running

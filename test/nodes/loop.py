@@ -11,7 +11,7 @@ from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
 from lifecycle import Lifecycle
 import numpy as np
-from processes import Client, LocalNode, NodeProcess
+from processes import Client, LocalNode, NodeProcess, until
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
@@ -166,12 +166,11 @@ class Loop:
 
     def stopped(self):
         """Tell whether the last command is zero, once it has come."""
-        for _ in range(100):
+        def zero():
             last = self.twists[-1].twist.linear if self.twists else None
-            if last and (last.x, last.y, last.z) == (0, 0, 0):
-                return True
-            threading.Event().wait(0.05)
-        return False
+            return last and (last.x, last.y, last.z) == (0, 0, 0)
+
+        return until(zero, 5)
 
 
 @contextmanager
@@ -181,7 +180,7 @@ def running_loop(folder):
         loop = Loop(node, folder)
         try:
             loop.start('recorder_node', folder=folder / 'bag')
-            loop.start('sim_node', lock_step='true')
+            loop.start('sim_node', lock_step='true', observer='true')
             loop.start('predictor_node')
             loop.start('visual_mpc_node', image_timeout=10.0)
             for process in loop.processes.values():

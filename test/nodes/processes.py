@@ -22,6 +22,14 @@ from tap_ros.nodes.heartbeat import Heartbeat
 ROOT = Path(__file__).parents[2]
 
 
+def until(accept, seconds=30.0, pause=0.02):
+    """Ask until the answer is true; return the last answer."""
+    deadline = time.monotonic() + seconds
+    while not (found := accept()) and time.monotonic() < deadline:
+        time.sleep(pause)
+    return found
+
+
 class NodeProcess:
     """
     One node in a process group of its own.
@@ -49,11 +57,11 @@ class NodeProcess:
 
     def wait_for(self, words, timeout_s=60):
         """Wait until the node prints something."""
-        deadline = time.monotonic() + timeout_s
-        while words not in self.text:
-            assert self.process.poll() is None, f'ended before {words!r}:\n{self.text}'
-            assert time.monotonic() < deadline, f'no {words!r} in time:\n{self.text}'
-            time.sleep(0.05)
+        def printed():
+            assert words in self.text or self.process.poll() is None, self.text
+            return words in self.text
+
+        assert until(printed, timeout_s), f'no {words!r} in time:\n{self.text}'
         return self
 
     def end(self, number=signal.SIGTERM, timeout_s=20):

@@ -9,7 +9,7 @@ import time
 from lively import lively_network
 import numpy as np
 from PIL import Image as Picture
-from processes import Client
+from processes import Client, until
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data, QoSProfile, ReliabilityPolicy
@@ -37,6 +37,11 @@ pytestmark = pytest.mark.slow
 STAMP = to_stamp(2_500_000_000)
 PIXELS = np.array([(200.0, 100.0), (320.0, 240.0)])  # in pictures of 640x480
 TRAINING = {'settings': {'crop': 'centre', 'size': 32}, 'camera_size': [480, 640]}
+
+
+def positions(names, pixels, stamp=STAMP):
+    return encode_objects(names, pixels, [[0, 0, 0, 0, 0, 0, 1]] * len(names), stamp, 'world',
+                          ObjectStates.SOURCE_TRACKED)
 
 
 def photograph(seed):
@@ -82,8 +87,7 @@ def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(
         encode_image(START, STAMP, 'eye'), 'camera/image_raw')
     goal = encode_image(GOAL, STAMP, 'eye')
     objects, goal_objects = (
-        encode_objects(('cup', 'box'), pixels, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP, 'world',
-                       ObjectStates.SOURCE_TRACKED) for pixels in (PIXELS, PIXELS[::-1]))
+        positions(('cup', 'box'), pixels) for pixels in (PIXELS, PIXELS[::-1]))
     with running(client, transport, weights=weights, image_transport=transport) as service:
         volatile = QoSProfile(depth=1)  # of a goal, as `ros2 topic pub` has it
         sends = [
@@ -118,8 +122,7 @@ def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(
 
 def test_what_was_latched_before_does_not_come_back(client):
     """A goal by hand, volatile, is not undone when its publisher has left."""
-    old, new = (encode_objects(('cup',), [(u, 8.0)], [[0, 0, 0, 0, 0, 0, 1]], to_stamp(u * 10**9),
-                               'world', ObjectStates.SOURCE_TRACKED) for u in (3, 5))
+    old, new = (positions(('cup',), [(u, 8.0)], to_stamp(u * 10**9)) for u in (3, 5))
     kept = client.create_publisher(ObjectStates, 'goal/objects', LATCHED)
     kept.publish(old)
     types = {'objects': (ObjectStates, 'goal/objects')}
@@ -131,23 +134,12 @@ def test_what_was_latched_before_does_not_come_back(client):
         return [found['objects'].objects[0].u if (found := each.newest('objects')) else None
                 for each in (pulled, observed)]
 
-    def until(expected):
-        deadline = time.monotonic() + 20
-        while newest() != expected and time.monotonic() < deadline:
-            time.sleep(0.1)
-        assert newest() == expected
-
-    until([3, 3])
+    assert until(lambda: newest() == [3, 3])
     by_hand = client.create_publisher(ObjectStates, 'goal/objects', QoSProfile(depth=1))
-    deadline = time.monotonic() + 20
-    while newest() != [5, 5] and time.monotonic() < deadline:
-        by_hand.publish(new)
-        time.sleep(0.2)
-    assert newest() == [5, 5]
+    assert until(lambda: by_hand.publish(new) or newest() == [5, 5], pause=0.2)
     client.destroy_publisher(by_hand)
-    for _ in range(20):  # longer than it takes to look at what is offered
-        time.sleep(0.1)
-        assert newest() == [5, 5]
+    # Longer than it takes to look at what is offered.
+    assert not until(lambda: newest() != [5, 5], 2, pause=0.1)
 
 
 def test_overrides_change_that_subscription_alone_and_wrong_ones_are_named(client):
@@ -166,8 +158,7 @@ def test_overrides_change_that_subscription_alone_and_wrong_ones_are_named(clien
 
 
 def test_an_object_beside_the_part_that_is_seen_is_named(client, weights):
-    beside = encode_objects(('cup',), [(20.0, 200.0)], [[0, 0, 0, 0, 0, 0, 1]], STAMP, 'world',
-                            ObjectStates.SOURCE_TRACKED)
+    beside = positions(('cup',), [(20.0, 200.0)])
     with running(client, 'beside', weights=weights) as service:
         picture = encode_image(START, STAMP, 'eye')
         message = service.refusal(
@@ -202,19 +193,19 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
         inputs = PlannerInputs(node, params, lambda: crop, lambda name: None)
         message = jpeg(START) if transport == 'compressed' else encode_image(START, STAMP, 'eye')
         name = inputs._types['image'][1]
-        objects = encode_objects(('cup', 'box'), PIXELS, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP,
-                                 'world', ObjectStates.SOURCE_TRACKED)
+        objects = positions(('cup', 'box'), PIXELS)
         joints = encode_joints(np.array([0.1, 0.2, 0.05, 0.5]), STAMP, 'world')
         publishers = [(client.create_publisher(type(one), topic, qos_profile_sensor_data), one)
                       for topic, one in ((name, message), ('objects', objects),
                                          ('joint_states', joints))]
-        deadline, seen = time.monotonic() + 30, None
-        while seen is None and time.monotonic() < deadline:
+
+        def look():
             for publisher, one in publishers:
                 publisher.publish(one)
-            time.sleep(0.2)
-            seen, lacking = inputs.look(inputs.topics())
-        assert seen is not None, lacking
+            return inputs.look(inputs.topics())[0]
+
+        seen = until(look, pause=0.2)
+        assert seen is not None
         shown = decode_image(message, 'start')
         assert np.array_equal(seen.image, crop.crop.image(shown))
         np.testing.assert_allclose(seen.pixels, (PIXELS - [80, 0] + 0.5) * 64 / 480 - 0.5)
@@ -225,21 +216,15 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on(client, transpo
         np.testing.assert_allclose(pixels, seen.pixels)
         # Pixels of a goal picture that is cut already are those of the part.
         small = encode_image(crop.crop.image(shown), STAMP, 'eye')
-        inside = encode_objects(names, pixels, [[0, 0, 0, 0, 0, 0, 1]] * 2, STAMP, 'world',
-                                ObjectStates.SOURCE_TRACKED)
-        np.testing.assert_allclose(
-            inputs.decode_positions(inside, 'goal_objects', small)[1], pixels)
+        np.testing.assert_allclose(inputs.decode_positions(
+            positions(names, pixels), 'goal_objects', small)[1], pixels)
         assert np.array_equal(inputs.cut(small, 'goal'), seen.image)
         # Another camera shows the table elsewhere.
         inputs.begin(time.monotonic())
         other = encode_image(np.ascontiguousarray(START[:240, :320]), to_stamp(9 * 10**9), 'eye')
-        inputs.sensors.put('image', other), inputs.sensors.put('objects', stamped(objects, 9))
+        inputs.sensors.put('image', other)
+        inputs.sensors.put('objects', positions(names, PIXELS, to_stamp(9 * 10**9)))
         inputs.sensors.attach('joints', 9 * 10**9, np.zeros(4, np.float32), time.monotonic())
         with pytest.raises(ImageError, match='320x240 pixels; the forward model was trained on '
                                              'those of 640x480'):
             inputs.look(inputs.topics())
-
-
-def stamped(message, seconds):
-    message.header.stamp = to_stamp(seconds * 10**9)
-    return message

@@ -2,12 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the explorer beside a real camera, where no simulator takes goal pictures."""
 
+from contextlib import ExitStack
+from itertools import count
 import json
 import time
 
 import numpy as np
-from processes import Client, NodeProcess, page_address
-import pytest
+from processes import Client, NodeProcess, page_address, until
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
@@ -33,80 +34,43 @@ def problem_of(browser):
     return problem['text']
 
 
-@pytest.fixture
-def camera(tmp_path):
-    """Return a node in the place of a camera, and an explorer that sees it."""
-    with Client('camera') as node:
-        explorer = NodeProcess('explorer_node', tmp_path / 'explorer.log', {
-            'port': 0, 'token': 'secret'}).wait_for('ready')
-        try:
-            yield node, explorer
-        finally:
-            explorer.kill()
-
-
-def test_a_photograph_of_a_real_camera_becomes_the_goal(camera):
-    node, explorer = camera
-    pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
-    objects = node.create_publisher(ObjectStates, 'objects', STREAM)
-    goal_image = Newest(node, Image, 'goal/image', LATCHED)
-    goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
+def test_a_photograph_of_a_real_camera_becomes_the_goal_with_its_own_objects_alone(tmp_path):
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    url = page_address(explorer).replace('http', 'ws').replace('/?', '/socket?')
-    assert url.endswith('?token=secret')
-    with connect(url, open_timeout=10) as browser:
-        stamp, deadline = 0, time.monotonic() + 30
-        while not goal_image.count:
-            assert time.monotonic() < deadline
-            stamp += 10**9
-            # Objects come after their picture, when there is a newer one already.
+    explorer = NodeProcess('explorer_node', tmp_path / 'explorer.log',
+                           {'port': 0, 'token': 'secret'})
+    with ExitStack() as stack:
+        stack.callback(explorer.kill)
+        node = stack.enter_context(Client('camera'))
+        pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
+        objects = node.create_publisher(ObjectStates, 'objects', STREAM)
+        goal_image = Newest(node, Image, 'goal/image', LATCHED)
+        goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
+        url = page_address(explorer).replace('http', 'ws').replace('/?', '/socket?')
+        assert url.endswith('?token=secret')
+        browser = stack.enter_context(connect(url, open_timeout=10))
+        stamps = count(10**9, 10**9)
+
+        def photograph(older):
+            """Publish a picture and objects that are so much older (ns), and ask for a goal."""
+            stamp = next(stamps)
             image[0, 0] = stamp // 10**9
             pictures.publish(encode_image(image, to_stamp(stamp), CAMERA_FRAME))
-            objects.publish(cup(stamp - 10**9))
-            time.sleep(0.2)
-            browser.send('{"do": "photograph"}')
-        found = []
-        while not any(isinstance(each, bytes) and each.startswith(b'camera\0')
-                      for each in found):
-            found.append(browser.recv(10))
-    goal, found = goal_image.wait(5), goal_objects.wait(5)
-    while found.header.stamp != goal.header.stamp:  # the last one may be on its way
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-        goal, found = goal_image.wait(5), goal_objects.wait(5)
-    assert bytes(goal.data)[3:] == image.tobytes()[3:]
-    assert [(place.name, place.u, place.v) for place in found.objects] == [('cup', 3.0, 4.0)]
-    assert explorer.end() == 0
-
-
-def test_objects_of_another_moment_are_no_goal(camera):
-    node, explorer = camera
-    pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
-    objects = node.create_publisher(ObjectStates, 'objects', STREAM)
-    goal_image = Newest(node, Image, 'goal/image', LATCHED)
-    url = page_address(explorer).replace('http', 'ws').replace('/?', '/socket?')
-    deadline = time.monotonic() + 30
-    while not all(each.get_subscription_count() for each in (pictures, objects)):
-        assert time.monotonic() < deadline  # a picture without any objects would be a goal
-        time.sleep(0.1)
-    with connect(url, open_timeout=10) as browser:
-        text, deadline, stamp = '', time.monotonic() + 30, 0
-        while 'no objects have the stamp' not in text:
-            assert time.monotonic() < deadline
-            stamp += 10**9
-            objects.publish(cup(stamp + 1))
-            time.sleep(0.1)
-            pictures.publish(encode_image(np.zeros((8, 8, 3), np.uint8), to_stamp(stamp),
-                                          CAMERA_FRAME))
+            # Objects come after their picture, when there is a newer one already.
+            objects.publish(cup(stamp - older))
             time.sleep(0.1)
             browser.send('{"do": "photograph"}')
-            text = problem_of(browser)
-    assert not goal_image.count
 
-
-def test_a_camera_that_is_silent_is_not_photographed(camera):
-    _, explorer = camera
-    url = page_address(explorer).replace('http', 'ws').replace('/?', '/socket?')
-    with connect(url, open_timeout=10) as browser:
         browser.send('{"do": "photograph"}')
         assert 'the camera is silent' in problem_of(browser)
+        # A picture without any objects would be a goal.
+        assert until(lambda: all(p.get_subscription_count() for p in (pictures, objects)))
+        assert until(lambda: photograph(1) or 'no objects have the stamp' in problem_of(browser))
+        assert not goal_image.count
+        assert until(lambda: photograph(10**9) or goal_image.count)
+        while not (isinstance(text := browser.recv(10), bytes) and text.startswith(b'camera\0')):
+            pass
+        assert until(lambda: goal_image.wait(5).header.stamp == goal_objects.wait(5).header.stamp)
+        assert bytes(goal_image.wait(5).data)[3:] == image.tobytes()[3:]
+        place, = goal_objects.wait(5).objects
+        assert (place.name, place.u, place.v) == ('cup', 3.0, 4.0)
+        assert explorer.end() == 0

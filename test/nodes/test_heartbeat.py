@@ -4,14 +4,16 @@
 
 from pathlib import Path
 import signal
+import threading
 import time
 
-from processes import Client, NodeProcess
+from processes import Client, NodeProcess, until
 import pytest
+from rclpy.node import Node
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call, CallError, Newest
+from tap_ros.nodes.clients import call, CallError, in_executor, Newest
 from tap_ros.nodes.heartbeat import Liveness, QOS
 from tap_ros.nodes.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
 
@@ -21,7 +23,7 @@ def test_every_death_is_noticed_and_every_return(tmp_path):
         client = node.create_client(SetBool, 'recorder/record')
         alive = Liveness(node, 'recorder_node')
         beats = Newest(node, Header, 'recorder_node/heartbeat', QOS)
-        for number in range(3):  # soon after each other: Fast DDS has not given up the one before
+        for number in range(2):  # soon after each other: Fast DDS has not given up the one before
             begun_ns = time.time_ns()
             process = NodeProcess('recorder_node', tmp_path / f'{number}.log', {
                 'folder': tmp_path / 'bag', 'record_on_start': 'false'})
@@ -33,10 +35,7 @@ def test_every_death_is_noticed_and_every_return(tmp_path):
                 maps = Path(f'/proc/{process.process.pid}/maps').read_text()
                 assert 'libfastrtps' in maps and '/dev/shm/fast' not in maps, 'no shared memory'
                 process.process.send_signal(signal.SIGSTOP)
-                deadline = time.monotonic() + 10.0
-                while not alive.dead:
-                    assert time.monotonic() < deadline, 'it is still thought alive'
-                    time.sleep(0.01)
+                assert until(lambda: alive.dead, 10)
                 with pytest.raises(CallError, match='recorder_node, has ended'):
                     call(client, SetBool.Request(data=False), 10.0, server=alive)
             finally:
@@ -61,3 +60,15 @@ def test_what_the_user_has_chosen_is_kept():
         configure_fast_dds(variables)
         assert variables.get(PROFILE) == (profile and str(profile)), given
         assert variables.get(discovery) == reach, given
+
+
+def test_a_function_is_called_in_the_thread_that_spins(client):
+    thread = in_executor(client, threading.current_thread, 10.0)
+    assert thread.name == 'spinner'
+    with pytest.raises(ZeroDivisionError):
+        in_executor(client, lambda: 1 / 0, 10.0)
+    assert in_executor(client, threading.current_thread, 10.0) is thread, 'it spins on'
+    idle = Node('idle', context=client.context)
+    with pytest.raises(CallError, match='idle is not spun'):
+        in_executor(idle, threading.current_thread, 10.0)
+    idle.destroy_node()

@@ -7,15 +7,13 @@ from importlib import import_module
 from importlib.util import find_spec
 import json
 from pathlib import Path
-import time
 
-from processes import LocalNode, NodeProcess
+from processes import until
 import pytest
 from rclpy.qos import DurabilityPolicy
-from tap_ros.nodes.planner.node import VisualMpcNode
-from tap_ros.nodes.predictor.node import PredictorNode
 import yaml
 
+pytestmark = pytest.mark.slow
 FOLDER = Path(__file__).parents[2] / 'config' / 'layouts'
 IMAGE, CAMERA_INFO = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
 MARKERS, TEXT = 'visualization_msgs/msg/MarkerArray', 'std_msgs/msg/String'
@@ -28,30 +26,9 @@ DISPLAYS = {'Grid': None, 'TF': None, 'RobotModel': TEXT, 'MarkerArray': MARKERS
             'CameraInfo': CAMERA_INFO, 'Image': IMAGE}
 
 
-@pytest.fixture(scope='module')
-def nodes(tmp_path_factory):
-    """Start the nodes whose topics are shown."""
-    sim = NodeProcess('sim_node', tmp_path_factory.mktemp('layouts') / 'log.txt',
-                      {'observer': 'true', 'lock_step': 'true'})
-    others = []
-    try:
-        others += [LocalNode(make) for make in (PredictorNode, VisualMpcNode)]
-        sim.wait_for('ready', 120)
-        yield
-    finally:
-        sim.kill()
-        for node in others:
-            node.end()
-
-
-def found(ask, missing, give_up_after=200):
+def found(ask, missing):
     """Return what is asked for as a dict, once it has all names."""
-    for _ in range(give_up_after):
-        answer = dict(ask())
-        if missing <= set(answer):
-            return answer
-        time.sleep(0.1)
-    raise AssertionError(f'nobody offers {sorted(missing - set(answer))}')
+    return until(lambda: missing <= set(answer := dict(ask())) and answer)
 
 
 def numbers(path, separator, topics):
@@ -92,7 +69,7 @@ def displayed() -> Iterator[dict]:
             yield display
 
 
-def test_foxglove_shows_topics_of_the_nodes(nodes, client):
+def test_foxglove_shows_topics_of_the_nodes(loop):
     panels = foxglove()['configById']
     images = [c['imageMode']['imageTopic'] for name, c in panels.items() if name[:6] == 'Image!']
     assert len(set(images)) == len(images) == 6
@@ -101,7 +78,7 @@ def test_foxglove_shows_topics_of_the_nodes(nodes, client):
               for c in panel.get('topics', {}).values() if 'cameraInfoTopic' in c]
     plotted = [p['value'] for c in panels.values() for p in c.get('paths', ())]
     health = panels['DiagnosticSummary!all']['topicToRender']
-    topics = found(client.get_topic_names_and_types, {*images, *drawn, health})
+    topics = found(loop.node.get_topic_names_and_types, {*images, *drawn, health})
     assert {topics[topic][0] for topic in images} == {IMAGE}
     assert {topics[topic][0] for topic in drawn} <= set(DRAWN)
     assert topics[health] == [DIAGNOSTICS] and topics['/plan/markers'] == [MARKERS]
@@ -109,20 +86,20 @@ def test_foxglove_shows_topics_of_the_nodes(nodes, client):
         if not path.isdigit():  # a line at a height
             numbers(path, '.', topics)
     call = panels['CallService!predict']
-    services = found(client.get_service_names_and_types, {call['serviceName']})
+    services = found(loop.node.get_service_names_and_types, {call['serviceName']})
     assert services[call['serviceName']] == ['tap_msgs/srv/PredictSubgoal']
     assert json.loads(call['requestPayload']) == {}
 
 
-def test_rviz_shows_topics_of_the_nodes_as_they_are_offered(nodes, client):
+def test_rviz_shows_topics_of_the_nodes_as_they_are_offered(loop):
     wanted = {}
     for display in displayed():
         topic = display.get('Topic') or display['Description Topic']
         wanted[topic['Value']] = DISPLAYS[display['Class'].split('/')[1]], topic
-    topics = found(client.get_topic_names_and_types, set(wanted))
+    topics = found(loop.node.get_topic_names_and_types, set(wanted))
     for name, (kind, topic) in wanted.items():
         assert topics[name] == [kind]
-        info, = client.get_publishers_info_by_topic(name)
+        info, = loop.node.get_publishers_info_by_topic(name)
         latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         assert topic['Durability Policy'] == ('Transient Local' if latched else 'Volatile'), name
         assert topic['Reliability Policy'] == 'Reliable'
@@ -130,12 +107,13 @@ def test_rviz_shows_topics_of_the_nodes_as_they_are_offered(nodes, client):
         assert topics['/tf'] == ['tf2_msgs/msg/TFMessage']
 
 
-def test_rqt_shows_topics_of_the_nodes(nodes, client):
+def test_rqt_shows_topics_of_the_nodes(loop):
     running, settings = rqt()
     images = [s['topic'] for s in settings.values() if 'topic' in s]
     assert len(set(images)) == len(images) == len(running['rqt_image_view/ImageView'])
-    topics = found(client.get_topic_names_and_types, {*images, '/plan/distance', '/diagnostics'})
+    topics = found(loop.node.get_topic_names_and_types,
+                   {*images, '/plan/distance', '/diagnostics'})
     assert {topics[topic][0] for topic in images} == {IMAGE}
     numbers(settings['plugin__rqt_plot__Plot__1']['topics'], '/', topics)
     service = settings['plugin__rqt_service_caller__ServiceCaller__1']['current_service_name']
-    assert found(client.get_service_names_and_types, {service})
+    assert found(loop.node.get_service_names_and_types, {service})

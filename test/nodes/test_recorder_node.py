@@ -9,7 +9,7 @@ import warnings
 
 from mcap.reader import make_reader
 import numpy as np
-from processes import LocalNode, NodeProcess
+from processes import LocalNode, NodeProcess, until
 import pytest
 from rclpy.context import Context
 from rclpy.duration import Duration
@@ -54,19 +54,10 @@ def record(tmp_path):
             node.end()
 
 
-def until(accept, seconds=20.0):
-    """Wait until something is so, and return what it is."""
-    deadline = time.monotonic() + seconds
-    while not (found := accept()):
-        assert time.monotonic() < deadline, 'not in time'
-        time.sleep(0.02)
-    return found
-
-
 def arrived(*publishers):
     """Wait until the recorder has all that was published reliably."""
     for publisher in publishers:
-        until(publisher.get_subscription_count)
+        assert until(publisher.get_subscription_count)
         assert publisher.wait_for_all_acked(Duration(seconds=20))
 
 
@@ -90,25 +81,26 @@ def test_messages_come_back_as_they_were_sent(client, record, tmp_path):
     images = client.create_publisher(Image, 'camera/image_raw', qos_profile_sensor_data)
     gripper = client.create_publisher(Float64, 'gripper/command', STREAM)
     node = record()
-    for publisher in (goal, images, gripper):
-        until(publisher.get_subscription_count)
+    arrived(goal, gripper)
     recorded = node.node._recorded['/camera/image_raw']
-    until(lambda: recorded.qos.reliability == ReliabilityPolicy.BEST_EFFORT)
-    time.sleep(1.0)  # a best-effort publisher cannot tell when its new subscriber is ready
-    sent = [random_image(stamp) for stamp in range(2, 12)]
+    assert until(lambda: recorded.qos.reliability == ReliabilityPolicy.BEST_EFFORT)
+    # A best-effort publisher cannot tell when its new subscriber is ready.
+    assert until(lambda: images.publish(random_image(2)) or node.node._bags.count > 1, pause=0.1)
+    sent = [random_image(stamp) for stamp in range(3, 12)]
     for index, image in enumerate(sent):
         images.publish(image)
         gripper.publish(Float64(data=index / 10))
         time.sleep(0.02)
     arrived(gripper)
-    assert ask(client, False).startswith('21 messages')
+    ask(client, False)
     assert node.end() == 0
     found = read(tmp_path / 'bag')
     assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
     pictures = [m.data.tobytes() for topic, _, m in found if topic == '/camera/image_raw']
-    assert pictures == [bytes(image.data) for image in sent]
+    assert [picture for picture in pictures if picture != bytes(random_image(2).data)] == [
+        bytes(image.data) for image in sent]
     assert [m.data for topic, _, m in found if topic == '/gripper/command'] \
-        == [index / 10 for index in range(10)]
+        == [index / 10 for index in range(9)]
     assert [m.data.tobytes() for topic, _, m in found if topic == '/goal/image'] \
         == [bytes(random_image(1).data)]
 
@@ -120,7 +112,7 @@ def test_what_has_arrived_when_it_ends_is_recorded(client, tmp_path):
     node = RecorderNode(context=context, parameter_overrides=[
         Parameter('folder', value=str(tmp_path / 'bag'))])
     try:
-        until(publisher.get_subscription_count)
+        assert until(publisher.get_subscription_count)
         for value in range(8):
             publisher.publish(Float64(data=float(value)))
         arrived(publisher)
@@ -141,10 +133,10 @@ def test_no_bag_is_overwritten_and_each_has_the_goal_and_the_cards(client, recor
     node = record()
     arrived(goal, cards)
     for stamp in (2, 2):
-        until(lambda: node.node._bags.count >= 2)
+        assert until(lambda: node.node._bags.count >= 2)
         goal.publish(random_image(stamp))
         arrived(goal)
-    until(lambda: node.node._bags.count == 4)
+    assert until(lambda: node.node._bags.count == 4)
     assert 'bag-2' in ask(client, False)
     assert 'bag-3' in ask(client, True)  # with what holds by now
     assert node.end() == 0
@@ -167,10 +159,10 @@ def test_topics_of_any_type_can_be_recorded_and_where_the_arm_stands(client, rec
     robot.publish(String(data='<robot/>'))  # before the recorder is there
     node = record(topics=['elsewhere/joints', 'robot_description'], compression='none',
                   mount_x=0.25, fixed_opening=0.5)
-    until(joints.get_subscription_count)
+    assert until(joints.get_subscription_count)
     joints.publish(JointState(name=['a'], position=[1.5]))
     arrived(joints, robot)
-    until(lambda: node.node._bags.count == 2)
+    assert until(lambda: node.node._bags.count == 2)
     assert node.end() == 0
     found = {topic: (kind, message) for topic, kind, message in read(tmp_path / 'bag')}
     assert sorted(found) == ['/elsewhere/joints', '/robot_description']
@@ -192,12 +184,9 @@ def test_a_full_disk_is_told_and_the_node_stays_up(client, tmp_path):
         resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (soft, hard))
 
     def size_when_written(path, at_least):
-        sizes = [0, 0]
-        while not sizes[-1] == sizes[-2] >= at_least:
-            assert len(sizes) < 60
-            time.sleep(0.7)  # it is flushed every half second
-            sizes.append(path.stat().st_size)
-        return sizes[-1]
+        assert until(lambda: path.stat().st_size >= at_least)
+        time.sleep(0.7)  # it is flushed every half second
+        return path.stat().st_size
 
     def send_eight():  # no more than the publisher keeps
         for stamp in range(1, 9):
@@ -206,7 +195,7 @@ def test_a_full_disk_is_told_and_the_node_stays_up(client, tmp_path):
 
     try:
         process.wait_for('ready')
-        until(images.get_subscription_count)
+        assert until(images.get_subscription_count)
         limit(100_000)
         for stamp in range(1, 200):
             images.publish(random_image(stamp))

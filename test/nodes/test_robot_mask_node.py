@@ -3,50 +3,82 @@
 """robot_mask_node beside the simulator: masks with the stamps of the pictures, or the reason."""
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
 import numpy as np
-from processes import Client, LocalNode, NodeProcess
+from processes import LocalNode, NodeProcess
 import pytest
-from sensor_msgs.msg import CameraInfo, Image
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import String
+from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import ImageError, TapError
 from tap_ros.messages.images import decode_camera_info, decode_mask
+from tap_ros.messages.joints import decode_gripper
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.robot_mask.node import RobotMaskNode
 from tap_ros.nodes.ros_messages import encode_camera_info
-from tap_ros.nodes.topics import STREAM, to_stamp
+from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
+from tap_ros.robots.ur10e import UR10E
 
 CAMERA = {  # of the simulator with its arm: 0.84 rad from straight down
     'camera_y': -1.36, 'camera_z': 1.33,
     'camera_qx': np.cos(0.42), 'camera_qy': 0.0, 'camera_qz': 0.0, 'camera_qw': -np.sin(0.42)}
 
 
-def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(tmp_path):
-    sim = NodeProcess('sim_node', tmp_path / 'sim.txt',
-                      {'lock_step': 'true', 'seed': 3, 'look': 'arm'})
-    nodes = []
-    try:
-        sim.wait_for('ready')
-        for shape in ({}, {'urdf': 'ur10e', 'hand_radius': 0.04}):  # by topic, our own
-            own_topic = f'own_mask{len(nodes)}'
-            nodes.append(LocalNode(
-                RobotMaskNode, remaps={'camera/robot_mask': own_topic}, **CAMERA, **shape,
-                shadow=True, light_x=0.45, light_y=0.28))
-            with Client() as client:
-                true, own = (Newest(client, Image, topic, STREAM)
-                             for topic in ('camera/robot_mask', own_topic))
-                message = own.wait(30)
-                simulated = true.wait(
-                    10, lambda m, stamp=message.header.stamp: m.header.stamp == stamp)
-            assert message.header == simulated.header
-            mask, wanted = (decode_mask(m, 'mask', (64, 64)) for m in (message, simulated))
-            arm = wanted == ROBOT_MASK_ARM
-            assert (mask[arm] != ROBOT_MASK_FREE).mean() > 0.97
-            assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.88
-            assert (mask == ROBOT_MASK_HAND).any() == bool(shape)
-    finally:
-        sim.kill()
-        for node in nodes:
+@pytest.fixture(scope='module')
+def sim(tmp_path_factory):
+    """Start a simulator that shows the arm, and a view from the side."""
+    process = NodeProcess(
+        'sim_node', tmp_path_factory.mktemp('sim') / 'log.txt',
+        {'lock_step': 'true', 'seed': 3, 'look': 'arm', 'observer': 'true'})
+    yield process.wait_for('ready')
+    process.kill()
+
+
+def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(sim, client):
+    for i, shape in enumerate(({}, {'urdf': 'ur10e', 'hand_radius': 0.04})):  # by topic, our own
+        node = LocalNode(RobotMaskNode, remaps={'camera/robot_mask': f'own_mask{i}'}, **CAMERA,
+                         **shape, shadow=True, light_x=0.45, light_y=0.28)
+        try:
+            true, own = (Newest(client, Image, topic, STREAM)
+                         for topic in ('camera/robot_mask', f'own_mask{i}'))
+            message = own.wait(30)
+            simulated = true.wait(
+                10, lambda m, stamp=message.header.stamp: m.header.stamp == stamp)
+        finally:
             node.end()
+        assert message.header == simulated.header
+        mask, wanted = (decode_mask(m, 'mask', (64, 64)) for m in (message, simulated))
+        arm = wanted == ROBOT_MASK_ARM
+        assert (mask[arm] != ROBOT_MASK_FREE).mean() > 0.97
+        assert (mask[wanted == ROBOT_MASK_FREE] == ROBOT_MASK_FREE).mean() > 0.88
+        assert (mask == ROBOT_MASK_HAND).any() == bool(shape)
+
+
+def test_the_simulator_tells_where_its_robot_is(sim, client):
+    image, mask, side = (Newest(client, Image, topic, STREAM) for topic in (
+        'camera/image_raw', 'camera/robot_mask', 'observer/image_raw'))
+    joints = Newest(client, JointState, 'joint_states', STREAM)
+    twist = client.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
+    assert Newest(client, String, 'robot_description', LATCHED).wait(10).data.startswith('<?xml')
+    goal_mask = Newest(client, Image, 'goal/robot_mask', LATCHED).wait(10)
+    assert decode_mask(goal_mask, 'mask', (64, 64)).any()
+
+    command = TwistStamped(header=image.wait(10).header)
+    command.twist.linear.x = 0.05
+    before = decode_gripper(joints.wait(10))
+    twist.publish(command)
+    then = to_nanoseconds(command.header.stamp) + round(CONTROL_PERIOD * 1e9)
+    _, shown, seen, told = (
+        topic.wait(10, lambda m: to_nanoseconds(m.header.stamp) == then)
+        for topic in (image, mask, side, joints))
+    assert set(np.unique(decode_mask(shown, 'mask', (64, 64)))) == {
+        ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM}
+    assert seen.height == 360
+    angles = dict(zip(told.name, told.position, strict=True))
+    gripper = UR10E.gripper_at([angles[name] for name in UR10E.joints])
+    assert np.allclose(gripper, decode_gripper(told)[:3], atol=1e-6)
+    assert gripper[0] - before[0] > 0.03
 
 
 def test_without_a_robot_or_its_joints_there_is_no_mask_and_the_reason(client):
@@ -92,14 +124,14 @@ def test_intrinsics_are_those_of_the_pictures_that_are_sent():
     assert size == (120, 120)
 
 
-@pytest.mark.parametrize('changes, words', [
-    ({'d': [0.1, 0.0]}, 'bends straight lines'), ({'k': [0.0] * 9}, 'k is not that of a camera'),
-    ({'k': [np.nan] * 9}, 'k is not that of a camera'), ({'height': 0}, '64x0 pixels'),
-    ({'height': 2**31, 'width': 2**31}, 'pixels')])
-def test_cameras_that_cannot_be_used_are_refused(changes, words):
-    message = encode_camera_info(np.eye(3), (64, 64), to_stamp(1), 'eye')
-    for name, value in changes.items():
-        setattr(message, name, value)
-    with pytest.raises(ImageError, match=words):
-        decode_camera_info(message, False)
-    assert isinstance(message, CameraInfo)
+def test_cameras_that_cannot_be_used_are_refused():
+    for changes, words in (
+            ({'d': [0.1, 0.0]}, 'bends straight lines'),
+            ({'k': [0.0] * 9}, 'k is not that of a camera'),
+            ({'k': [np.nan] * 9}, 'k is not that of a camera'), ({'height': 0}, '64x0 pixels'),
+            ({'height': 2**31, 'width': 2**31}, 'pixels')):
+        message = encode_camera_info(np.eye(3), (64, 64), to_stamp(1), 'eye')
+        for name, value in changes.items():
+            setattr(message, name, value)
+        with pytest.raises(ImageError, match=words):
+            decode_camera_info(message, False)
