@@ -34,7 +34,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                        'tap_ros.recording.formats.lerobot_export'),
     'train': ('train on recordings', {
         'predictor': ('train a subgoal predictor', 'tap_ros.prediction.train_command'),
-        'forward': ("train the planner's forward model", 'tap_ros.planning.train_command'),
+        'forward': ("train the planner's forward model",
+                    'tap_ros.planning.forward_training_config'),
     }),
     'evaluate': ('score trained weights', {
         'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.prediction'),

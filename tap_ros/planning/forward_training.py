@@ -16,8 +16,7 @@ import numpy as np
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_uint8
-from tap_ros.planning.forward_data import draw_windows, Windows
-from tap_ros.planning.forward_loss import draw_arm_like, forward_loss
+from tap_ros.planning.forward_loss import draw_arm_like, draw_windows, forward_loss, Windows
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig

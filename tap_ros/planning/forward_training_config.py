@@ -1,12 +1,15 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a training run of the forward model."""
+"""The settings of a training run of the forward model; `python -m tap_ros train forward`."""
 
 from dataclasses import dataclass, fields
 
 from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
+from tap_ros.options import Folder, Topic
 from tap_ros.recording.reading import Reading
+from tap_ros.recording.reading_options import Part
+from tap_ros.training.command import RecipeOption, Recordings, run_training, with_recipe
 from tap_ros.training.robot_mask import RobotMask
 from tap_ros.training.split import TEST_FRACTION
 
@@ -99,3 +102,30 @@ class ForwardTrainingConfig(Reading, ForwardRun):
 # What settings were before they existed.
 DEFAULTS = {field.name: field.default for field in fields(ForwardTrainingConfig)}
 DEFAULTS['object_weight'] = 0.0
+
+
+@dataclass(frozen=True)
+class Training(ForwardTrainingConfig):
+    """How the forward model is trained."""
+
+    recordings: Recordings
+    out: Folder = 'runs/forward'
+    image_topic: Topic = ''
+    crop: Part = ''
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(RecipeOption):
+    """Options of the command."""
+
+    training: Training
+
+
+def defaults(args: Options) -> Options:
+    """Return what stands for the options that were left out: those of the recipe."""
+    return with_recipe('forward', args)
+
+
+def run(args: Options) -> None:
+    """Train, and print where the weights are."""
+    run_training('forward', args)

@@ -25,9 +25,9 @@ from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.clients import call, Newest, send_goal
 from tap_ros.nodes.planner.node import VisualMpcNode
+from tap_ros.nodes.planner.plan_view import CHOSEN
 from tap_ros.nodes.predictor.node import OVERLAY_SCALE, PredictorNode
 from tap_ros.nodes.topics import STREAM
-from tap_ros.planning.plan_picture import CHOSEN
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 from visualization_msgs.msg import MarkerArray

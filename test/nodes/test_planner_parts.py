@@ -10,11 +10,10 @@ import pytest
 from tap_msgs.action import ReachGoal
 from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
-from tap_ros.nodes.planner.plan_view import encode_plan
+from tap_ros.nodes.planner.plan_view import encode_plan, way
 from tap_ros.nodes.planner.settings import check_request, unlike_training
 from tap_ros.nodes.topics import to_stamp
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
-from tap_ros.planning.plan_picture import way
 from visualization_msgs.msg import Marker
 
 

@@ -9,8 +9,7 @@ from made_episodes import cover, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.planning.forward_data import augment_windows, read_windows
-from tap_ros.planning.forward_loss import forward_loss
+from tap_ros.planning.forward_loss import augment_windows, forward_loss, read_windows
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training import train

@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 from safetensors.torch import load_file
 from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.planning.forward_data import (
+from tap_ros.planning.forward_loss import (
     augment_windows,
     COLOUR_ORDERS,
-    draw_windows,
-    read_windows,
-)
-from tap_ros.planning.forward_loss import (
     draw_arm_like,
+    draw_windows,
     forward_loss,
     motion_weight,
     picture_loss,
+    read_windows,
 )
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.forward_scores import map_errors

@@ -14,8 +14,7 @@ from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
-from tap_ros.planning.rollouts import Rollouts
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import Memory, Rollouts, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.weights import FORWARD_MODEL
 import torch

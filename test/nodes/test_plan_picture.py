@@ -8,8 +8,7 @@ import numpy as np
 from sim_bridge.world.looks import get_look
 from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.images.drawing import OBJECT_COLOURS
-from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
-from tap_ros.planning.plan_picture import (
+from tap_ros.nodes.planner.plan_view import (
     CHOSEN,
     draw_plan,
     ELITES,
@@ -20,6 +19,7 @@ from tap_ros.planning.plan_picture import (
     scale_of,
     way,
 )
+from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.weights import FORWARD_MODEL
 
 # Seen from above: 60 px a metre, and what is higher is seen farther up, by 40 px a metre.
