@@ -247,7 +247,10 @@ class TrainingConfig(
                 (self.skips and self.decoder != 'shared',
                  "skips: they go with decoder 'shared'"),
                 (self.fill_context and self.robot_mask == 'none',
-                 'fill_context: nothing is known of the robot; choose robot_mask arm or all')):
+                 'fill_context: nothing is known of the robot; choose robot_mask arm or all'),
+                *((self.latent == 'none' and getattr(self, name) != DEFAULTS[name],
+                   f'{name}: only z has it; choose latent vae, or leave {name} out')
+                  for name in ('free_nats', 'kl_warmup', 'posterior_std'))):
             if wrong:
                 raise ConfigError(advice)
 

@@ -120,13 +120,10 @@ def test_compiled_networks_are_trained(config, monkeypatch, values):
     assert load_network(path)[1]['steps'] == 1
 
 
-def test_several_processes_need_a_gpu_each(config, monkeypatch):
+def test_several_processes_need_a_gpu_each_and_an_equal_part_of_the_batch(config, monkeypatch):
     monkeypatch.setenv('WORLD_SIZE', '2')
     with pytest.raises(ConfigError, match='device: 2 processes train on a GPU each, not on cpu'):
         train(replace(config, device='cpu'), progress=False)
-
-
-def test_a_batch_that_cannot_be_divided_is_refused():
     with pytest.raises(ConfigError, match='batch_size: 5 episodes cannot be divided among 2'):
         Processes(0, 2).part(5)
     assert [Processes(rank, 2).part(6) for rank in (0, 1)] == [slice(0, 3), slice(3, 6)]
@@ -265,19 +262,18 @@ def test_the_price_of_z_rises():
     assert kl_share(0, 100, 0.0) == 1
 
 
-@pytest.mark.parametrize('values', [
-    {'recordings': ()}, {'loss': 'max'}, {'outer_power': 2.0}, {'mode': 'sideways'},
-    {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
-    {'fraction': 1.5}, {'beta': 0.0}, {'selection': 'progress', 'mode': 'forward'},
-    {'recursion': 2, 'loss': 'fix'}, {'posterior': 'frame', 'latent': 'vae', 'gan': True},
-    {'posterior': 'frame'}, {'gan_weight': -1.0}, {'free_nats': -1.0}, {'kl_warmup': 0.6},
-    {'posterior_std': 0.0}, {'posterior': 'frame', 'free_nats': 1.0, 'latent': 'vae'}])
-def test_settings_that_make_no_sense_are_refused_by_name(values):
-    with pytest.raises(ConfigError, match=next(iter(values))):
-        TrainingConfig(**{'recordings': ('bag',), 'out': 'out', **values})
-
-
-def test_a_device_that_is_not_there_is_refused(config):
+def test_settings_that_make_no_sense_or_do_nothing_are_refused_by_name(config):
+    for values in (
+            {'recordings': ()}, {'loss': 'max'}, {'outer_power': 2.0}, {'mode': 'sideways'},
+            {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
+            {'fraction': 1.5}, {'beta': 0.0}, {'selection': 'progress', 'mode': 'forward'},
+            {'recursion': 2, 'loss': 'fix'}, {'posterior': 'frame', 'latent': 'vae', 'gan': True},
+            {'posterior': 'frame'}, {'gan_weight': -1.0}, {'free_nats': -1.0}, {'kl_warmup': 0.6},
+            {'posterior_std': 0.0}, {'posterior': 'frame', 'free_nats': 1.0, 'latent': 'vae'},
+            # Without z
+            {'free_nats': 1.0}, {'kl_warmup': 0.5}, {'posterior_std': 0.1}):
+        with pytest.raises(ConfigError, match=next(iter(values))):
+            TrainingConfig(**{'recordings': ('bag',), 'out': 'out', **values})
     with pytest.raises(ConfigError, match="device: 'nonsense'"):
         train(replace(config, device='nonsense'), progress=False)
 

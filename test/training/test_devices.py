@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the choice of a precision."""
 
-import pytest
 from tap_ros.training import devices
 from tap_ros.training.devices import bfloat16_gain, make_autocast, pick_precision
 import torch
@@ -10,22 +9,14 @@ import torch
 CPU = torch.device('cpu')
 
 
-@pytest.fixture
-def gain(monkeypatch):
-    """Set what the trial finds."""
-    def found(value):
-        monkeypatch.setattr(devices, 'bfloat16_gain', lambda: value)
-    return found
-
-
-@pytest.mark.parametrize('value, expected', [
-    (0.0, 'float32'), (0.1, 'float32'), (1.0, 'float32'), (1.5, 'bfloat16'), (6.0, 'bfloat16')])
-def test_half_precision_is_chosen_where_it_is_clearly_faster(gain, value, expected):
-    gain(value)
-    assert pick_precision('auto', CPU) == expected
-    assert pick_precision('float32', CPU) == 'float32'
-    assert pick_precision('bfloat16', CPU) == 'bfloat16'
-    assert pick_precision('auto', torch.device('cuda')) == 'bfloat16'
+def test_half_precision_is_chosen_where_it_is_clearly_faster(monkeypatch):
+    for gain, expected in ((0.0, 'float32'), (0.1, 'float32'), (1.0, 'float32'),
+                           (1.5, 'bfloat16'), (6.0, 'bfloat16')):
+        monkeypatch.setattr(devices, 'bfloat16_gain', lambda gain=gain: gain)
+        assert pick_precision('auto', CPU) == expected
+        assert pick_precision('float32', CPU) == 'float32'
+        assert pick_precision('bfloat16', CPU) == 'bfloat16'
+        assert pick_precision('auto', torch.device('cuda')) == 'bfloat16'
 
 
 def test_the_trial_leaves_everything_as_it_was_and_is_made_once():
@@ -50,7 +41,7 @@ def test_what_torch_cannot_do_is_not_chosen(monkeypatch):
         bfloat16_gain.cache_clear()
 
 
-@pytest.mark.parametrize('precision', ['float32', 'bfloat16'])
-def test_networks_run_in_what_was_chosen(precision):
-    with make_autocast(precision, CPU)():
-        assert torch.nn.Linear(1, 1)(torch.ones(1, 1)).dtype == getattr(torch, precision)
+def test_networks_run_in_what_was_chosen():
+    for precision in ('float32', 'bfloat16'):
+        with make_autocast(precision, CPU)():
+            assert torch.nn.Linear(1, 1)(torch.ones(1, 1)).dtype == getattr(torch, precision)
