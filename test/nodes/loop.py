@@ -102,18 +102,17 @@ class Loop:
 
     def wait_until_seen(self):
         """
-        Wait until the predictor has found the simulator, and return its first whole answer.
+        Wait until the predictor has found the simulator.
 
         No new image is sent meanwhile; the newest one comes once it is discovered.
         """
-        for _ in range(300):
+        def seen():
             response = self.predict()
-            if response.success and response.subgoals[0].object_maps:
-                return response
             words = response.message
             assert response.success or '/camera/image_raw' in words or '/goal/image' in words
-            threading.Event().wait(0.1)
-        raise AssertionError(response.message)
+            return response.success and response.subgoals[0].object_maps
+
+        assert until(seen, pause=0.1)
 
     def predict(self, timeout_s=60.0, **fields):
         return call(self.predict_client, PredictSubgoal.Request(**fields), timeout_s,
@@ -123,6 +122,19 @@ class Loop:
         """Send a goal and wait for its end."""
         handle = send_goal(self.reach_client, ReachGoal.Goal(**fields), 30, on_feedback)
         return wait_for_result(handle, 300)
+
+    def reached(self, on_feedback=None, **fields):
+        """Send a goal that is to be pursued to its end; return the result."""
+        status, result = self.reach(on_feedback, **fields)
+        assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+        return result
+
+    def ended(self, handle, status, words=''):
+        """Check that a goal ends so and for this reason, and that the arm then stands."""
+        found, result = wait_for_result(handle, 60)
+        assert found == status and words in result.message, result.message
+        assert self.stopped()
+        return result
 
     def begin_moving(self, **fields):
         """Start a scene and a goal; return its handle once the arm was moved."""
@@ -231,8 +243,7 @@ def acts_like(loop, method, weights, **fields):
     """
     feedback = []
     loop.reset()
-    status, result = loop.reach(feedback.append, seed=SEED, **fields)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    loop.reached(feedback.append, seed=SEED, **fields)
     sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -4,79 +4,76 @@
 
 from contextlib import contextmanager
 import json
-import os
-from pathlib import Path
 import re
 import shutil
-import time
 
 from action_msgs.msg import GoalStatus, GoalStatusArray
+from loop import SEED
 import numpy as np
-from processes import Client, NodeProcess, page_address
+from processes import page_address, until
 import pytest
-from tap_msgs.msg import ObjectStates, Subgoal
 from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.images.drawing import overlay
 from tap_ros.messages.subgoals import decode_subgoal
-from tap_ros.nodes.clients import Newest
-from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.nodes.topics import STREAM
 from websockets.sync.client import connect
 
+pytestmark = pytest.mark.slow
 BROWSER = next(filter(None, map(shutil.which, (
     'chromium', 'chromium-browser', 'google-chrome'))), None)
-SEED = 1_000_003
-OPENINGS = 50
 needs_browser = pytest.mark.skipif(BROWSER is None, reason='no Chromium is installed')
 
 
 class Explored:
-    """All nodes as processes, and what they publish."""
+    """All nodes as processes, the explorer among them."""
 
-    def __init__(self, node, folder):
-        self.node, self.folder, self.processes = node, folder, {}
-        self.started = []
-        self.start('sim_node', lock_step='true', task='push2', seed=SEED)
-        self.start('predictor_node')
-        self.start('visual_mpc_node')
-        self.start('explorer_node', port=0)
-        self.objects = Newest(node, ObjectStates, 'objects', STREAM)
-        self.goals = Newest(node, ObjectStates, 'goal/objects', LATCHED)
-        self.subgoal = Newest(node, Subgoal, 'subgoal', LATCHED)
-        for process in self.processes.values():
-            process.wait_for('ready')
-        self.url = page_address(self.processes['explorer_node'])
+    def __init__(self, loop):
+        self.loop = loop
+        self.explorer, self.url = self.start()
 
-    def start(self, name, **parameters):
-        self.processes[name] = NodeProcess(name, self.folder / f'{name}.log', parameters)
-        self.started.append(self.processes[name])
+    def start(self):
+        """Start another explorer_node; return its process and the address of its page."""
+        self.loop.start('explorer_node', port=0)
+        process = self.loop.processes.pop('explorer_node')
+        return process, page_address(process)
 
     def statuses(self):
         """Return a list that gets the newest status of the newest goal, again and again."""
         found = []
-        self.node.create_subscription(
+        self.loop.node.create_subscription(
             GoalStatusArray, 'reach_goal/_action/status',
             lambda message: found.append(message.status_list[-1].status), STREAM)
         return found
 
     def away(self):
-        """Return the distances (m) of the objects from their goals, by name."""
+        """Return the greatest distance (m) of an object from its goal."""
         places, goals = (
             {each.name: each.pose.position for each in topic.wait(10).objects}
-            for topic in (self.objects, self.goals))
-        return {name: float(np.linalg.norm(
+            for topic in (self.loop.objects, self.loop.goal_objects))
+        return max(float(np.linalg.norm(
             [getattr(place, axis) - getattr(goals[name], axis) for axis in 'xyz']))
-            for name, place in places.items()}
+            for name, place in places.items())
 
 
 @pytest.fixture(scope='module')
-def explored(tmp_path_factory):
-    with Client('explorer_test') as node:
-        explored = Explored(node, tmp_path_factory.mktemp('explored'))
-        try:
-            yield explored
-        finally:
-            for process in explored.started:
-                process.kill()
+def explored(loop):
+    explored = Explored(loop)
+    yield explored
+    explored.explorer.kill()
+
+
+@contextmanager
+def commanded(explored, *commands):
+    """Start an explorer of its own and send it commands, as its page does."""
+    explored.loop.reset()
+    explorer, url = explored.start()
+    try:
+        with connect(url.replace('http', 'ws') + 'socket', open_timeout=10) as page:
+            for do, fields in commands:
+                page.send(json.dumps({'do': do, 'samples': 1, 'seed': 0, **fields}))
+            yield explorer, page
+    finally:
+        explorer.kill()
 
 
 @pytest.fixture(scope='module')
@@ -124,6 +121,7 @@ def drag(page, name, u, v):
 
 
 def reset(page, seed=SEED):
+    page.select_option('#task', 'push2')
     page.fill('#seed', str(seed))
     before = state(page)['log_count']
     page.click('#scene button')
@@ -134,13 +132,6 @@ def reset(page, seed=SEED):
 def wait_until_idle(page, seconds=240):
     page.wait_for_function('state.run.running')
     page.wait_for_function('!state.run.running', timeout=1000 * seconds)
-
-
-def wait_until(condition, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 @needs_browser
@@ -157,7 +148,7 @@ def test_an_object_that_is_dragged_is_brought_there_via_a_subgoal(explored, brow
         page.click('#subgoal-run')
         page.wait_for_function('pictures.subgoal && pictures.plan', timeout=120_000)
         wait_until_idle(page)
-        assert max(explored.away().values()) < SUCCESS_DISTANCE
+        assert explored.away() < SUCCESS_DISTANCE
         shown = page.inner_text('#legend')
         assert len(re.findall(r'\d cm', shown)) == 2
         assert any(line.startswith('via subgoal: ') and 'steps' in line
@@ -185,9 +176,9 @@ def test_a_second_browser_sees_the_same(explored, browser):
 def test_the_subgoal_shown_is_the_predicted_picture_with_its_maps(explored, browser):
     with opened(browser, explored.url) as page:
         reset(page)
-        stamp = explored.objects.wait(10).header.stamp
+        stamp = explored.loop.objects.wait(10).header.stamp
         page.click('#predict')
-        message = explored.subgoal.wait(60, lambda message: message.header.stamp == stamp)
+        message = explored.loop.subgoal.wait(60, lambda message: message.header.stamp == stamp)
         one = decode_subgoal(message, message.object_names, (64, 64))
         expected = overlay(one.image, one.object_maps)
         assert np.abs(expected.astype(int) - one.image).max() > 50, 'the maps are seen'
@@ -201,14 +192,8 @@ def test_the_subgoal_shown_is_the_predicted_picture_with_its_maps(explored, brow
                 return Array.from(context.getImageData(0, 0, 64, 64).data);
             }""")
             return np.reshape(values, (64, 64, 4))[..., :3]
-        wait_until(lambda: np.array_equal(shown(), expected))
-
-
-@needs_browser
-def test_samples_and_recursion_are_asked_for(explored, browser):
-    with opened(browser, explored.url) as page:
+        assert until(lambda: np.array_equal(shown(), expected))
         page.locator('#levels').fill('3')
-        assert page.inner_text('output[for=levels]') == '3'
         page.click('#predict')
         page.wait_for_function('state.subgoal_note === "3 subgoals"')
         wide, high = page.evaluate('[pictures.subgoal.width, pictures.subgoal.height]')
@@ -256,64 +241,24 @@ def test_the_page_works_under_its_own_policy(explored, browser):
     page.close()
 
 
-@needs_browser
-def test_many_openings_leave_nothing_behind(explored, browser):
-    pid = explored.processes['explorer_node'].process.pid
-
-    def held():
-        threads = int(re.search(r'Threads:\s+(\d+)', Path(
-            f'/proc/{pid}/status').read_text())[1])
-        memory = int(re.search(r'VmRSS:\s+(\d+)', Path(f'/proc/{pid}/status').read_text())[1])
-        return threads, len(os.listdir(f'/proc/{pid}/fd')), memory
-
-    def settle(count):
-        """Wait until browsers are gone and what was held for them is let go."""
-        deadline = time.monotonic() + 20
-        while held()[1] > count and time.monotonic() < deadline:
-            time.sleep(0.1)
-        return held()
-
-    for _ in range(3):  # what is loaded at the first openings stays
-        with opened(browser, explored.url):
-            pass
-    time.sleep(2)  # until the last one is let go
-    threads, files, memory = held()
-    for _ in range(OPENINGS):
-        with opened(browser, explored.url):
-            pass
-    after = settle(files)
-    assert after[0] <= threads + 1 and after[1] <= files + 1
-    assert after[2] <= memory + 20_000, 'kB'
-
-
 def test_a_goal_that_was_begun_ends_with_the_explorer(explored):
-    explored.start('explorer_node', port=0)  # another one; it ends here
-    explorer = explored.processes['explorer_node'].wait_for('ready')
     statuses = explored.statuses()
-    url = page_address(explorer).replace('http', 'ws') + 'socket'
-    with connect(url, open_timeout=10) as page:
-        page.send('{"do": "reach", "mode": "direct", "samples": 1, "levels": 1, "seed": 0}')
-        wait_until(lambda: GoalStatus.STATUS_EXECUTING in statuses)
+    with commanded(explored, ('reach', {'mode': 'direct', 'levels': 1})) as (explorer, _):
+        assert until(lambda: GoalStatus.STATUS_EXECUTING in statuses)
         assert explorer.end() == 0
-    wait_until(lambda: statuses[-1] == GoalStatus.STATUS_CANCELED)
+    assert until(lambda: statuses[-1] == GoalStatus.STATUS_CANCELED)
     assert 'internal error' not in explorer.text
 
 
 def test_a_goal_can_be_cancelled_at_once_and_while_others_wait(explored):
-    explored.start('explorer_node', port=0)
-    explorer = explored.processes['explorer_node'].wait_for('ready')
     statuses = explored.statuses()
-    url = page_address(explorer).replace('http', 'ws') + 'socket'
-    with connect(url, open_timeout=10) as page:
-        for _ in range(7):
-            page.send('{"do": "predict", "samples": 1, "levels": 4, "seed": 0}')
-        page.send('{"do": "reach", "mode": "direct", "samples": 1, "levels": 1, "seed": 0}')
-        page.send('{"do": "cancel"}')
+    with commanded(explored, *7 * [('predict', {'levels': 4})],
+                   ('reach', {'mode': 'direct', 'levels': 1}), ('cancel', {})) as (explorer, page):
         log = []
         while not any(line.startswith('direct: cancelled') for line in log):
             text = page.recv(30)
-            assert not (isinstance(text, str) and json.loads(text)['kind'] == 'error'), text
             if isinstance(text, str):
+                assert json.loads(text)['kind'] != 'error', text
                 log = json.loads(text).get('log', log)
+        assert explorer.end() == 0
     assert GoalStatus.STATUS_SUCCEEDED not in statuses
-    assert explorer.end() == 0

@@ -5,14 +5,12 @@
 from collections import Counter
 from pathlib import Path
 import re
-import threading
 
-from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from loop import SEED
 from mcap.reader import make_reader
 import numpy as np
-from processes import LocalNode
+from processes import LocalNode, until
 import pytest
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
@@ -42,8 +40,7 @@ def positions(message):
 def test_an_empty_request_predicts_from_what_was_seen_last(loop):
     loop.reset()
     response = loop.predict()
-    assert response.success, response.message
-    assert response.model_time_ms > 0
+    assert response.success and response.model_time_ms > 0, response.message
     subgoal, = response.subgoals
     assert subgoal.header.stamp == loop.image.wait(1).header.stamp
     assert decode_image(subgoal.image, 'subgoal', (64, 64)).std() > 5
@@ -66,8 +63,7 @@ def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
     arm, objects = loop.joints.wait(1), positions(loop.objects.wait(1))
     feedback = []
     budget = 10
-    status, result = loop.reach(feedback.append, step_budget=budget, seed=1)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    result = loop.reached(feedback.append, step_budget=budget, seed=1)
     assert result.steps == budget and len(loop.moves()) == budget
     assert [f.step for f in feedback] == list(range(1, budget + 1))
     stages = [f.stage for f in feedback]
@@ -84,10 +80,7 @@ def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
     assert result.expected_distance == pytest.approx(
         np.linalg.norm(pixels - goals, axis=1).mean(), abs=1e-3)
     assert loop.stopped()
-    for _ in range(100):  # the last may come after the result
-        if len(loop.distances) > budget:
-            break
-        threading.Event().wait(0.05)
+    assert until(lambda: len(loop.distances) > budget)  # the last may come after the result
     assert len(loop.distances) == budget + 1 and loop.distances[-1] == result.expected_distance
     assert loop.distances[0] > loop.distances[-1]
 
@@ -96,11 +89,8 @@ def test_plans_are_drawn_for_whoever_listens(loop):
     loop.reset()
     markers = Newest(loop.node, MarkerArray, 'plan/markers', STREAM)
     overlay = Newest(loop.node, Image, 'plan/overlay', STREAM)
-    for _ in range(10):  # until the planner knows of the listener
-        status, result = loop.reach(mode='direct', step_budget=2)
-        assert status == GoalStatus.STATUS_SUCCEEDED, result.message
-        if markers.count and overlay.count:
-            break
+    while not (markers.count and overlay.count):  # until the planner knows of the listener
+        loop.reached(mode='direct', step_budget=2)
     drawn = {marker.ns: marker for marker in markers.wait(10).markers}
     assert set(drawn) == {'chosen', 'elites', 'targets', 'gripper'}
     gripper, chosen = drawn['gripper'].pose.position, drawn['chosen'].points
@@ -127,10 +117,7 @@ def test_every_node_tells_how_it_is(loop):
                 if name not in ('robot_mask_node', 'explorer_node')),
               'visual_mpc_node: /joint_states', 'predictor_node: /goal/image',
               'sim_node: /arm/delta_twist_cmds', 'recorder_node: /objects']
-    for _ in range(200):
-        if all(name in told for name in wanted):
-            break
-        threading.Event().wait(0.1)
+    assert until(lambda: all(name in told for name in wanted))
     told = {name: {pair.key: pair.value for pair in told[name].values} for name in wanted}
     assert told['visual_mpc_node: /joint_states']['status'] == 'OK'
     assert float(told['recorder_node: /objects']['rate_hz']) > 1  # sent again in lock-step
@@ -146,8 +133,7 @@ def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
     loop.reset()
     assert loop.predict().success
     loop.reset(seed=7)
-    status, result = loop.reach(mode='direct', step_budget=2, seed=3)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    loop.reached(mode='direct', step_budget=2, seed=3)
     moves = loop.moves()
     loop.reset()
     begin = to_nanoseconds(loop.image.wait(30).header.stamp)

@@ -11,7 +11,7 @@ from tap_msgs.msg import ObjectState, ObjectStates
 from tap_msgs.srv import SetGoal
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call, wait_for_result
+from tap_ros.nodes.clients import call
 from tap_ros.recording.reader import iter_episodes
 
 pytestmark = pytest.mark.slow
@@ -40,8 +40,7 @@ def test_the_planner_goes_to_where_the_goal_was_moved(loop):
     drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
     pixels = set_goal(loop, MOVED)
     np.testing.assert_allclose(pixels, [drawn[0], MOVED['object_1']], atol=1e-4)
-    status, result = loop.reach(mode='direct', step_budget=3, seed=5)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    result = loop.reached(mode='direct', step_budget=3, seed=5)
     moves, distance = planned(5, 3, prepare=move)
     assert np.array_equal(loop.moves().astype(np.float32), moves)
     assert result.expected_distance == pytest.approx(distance, abs=1e-3)
@@ -62,19 +61,16 @@ def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_
     for mode in ('direct', 'subgoal'):
         handle = loop.begin_moving(mode=mode, step_budget=1000)
         set_goal(loop, MOVED)
-        status, result = wait_for_result(handle, 60)
-        assert status == GoalStatus.STATUS_ABORTED and result.steps >= 1
-        assert 'a new goal has come on' in result.message and '/goal/objects' in result.message
-        assert loop.stopped()
+        result = loop.ended(handle, GoalStatus.STATUS_ABORTED, 'a new goal has come on')
+        assert result.steps >= 1 and '/goal/objects' in result.message
     count = len(loop.moves())
     # The goal is where the objects are now: nothing is left to do.
     last = loop.image.wait(10)
     objects = loop.objects.wait(10, lambda m: m.header.stamp == last.header.stamp)
     names, pixels = decode_objects(objects, 'objects')
     np.testing.assert_allclose(set_goal(loop, dict(zip(names, pixels))), pixels, atol=1e-3)
-    status, result = loop.reach(mode='direct')
-    assert status == GoalStatus.STATUS_SUCCEEDED and result.success, result.message
-    assert 'reached' in result.message and result.expected_distance < 0.1
+    result = loop.reached(mode='direct')
+    assert result.success and 'reached' in result.message and result.expected_distance < 0.1
     assert len(loop.moves()) == count
 
 
@@ -85,8 +81,7 @@ def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
     folder = call(recorder, SetBool.Request(data=True), 30).message.removeprefix('recording to ')
     loop.reset(seed=7)
     set_goal(loop, {'object_1': (31.5, 44.25)})
-    status, result = loop.reach(mode='direct', step_budget=2)
-    assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+    loop.reached(mode='direct', step_budget=2)
     # Twice at the last moment of the episode: the later one counts.
     set_goal(loop, {'object_1': (30.0, 44.25)})
     pixels = set_goal(loop, MOVED)
