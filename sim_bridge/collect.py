@@ -20,7 +20,7 @@ from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode, TIMINGS
 from sim_bridge.world.looks import DEFAULT_LOOK
 from sim_bridge.world_protocol import Observation
-from tap_ros.engines.task import Engine, LOCAL, run_tasks, Task
+from tap_ros.engines.task import Engine, LOCAL, run_tasks, Work
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.episode import Episode
@@ -135,7 +135,7 @@ def _collect_missing(folder: Path, config: CollectConfig, engine: Engine, progre
     shards = -(-config.episodes // config.episodes_per_file)
     missing = [i for i in range(shards) if not _is_whole(folder, config, i)]
     start, stats = time.perf_counter(), []
-    tasks = [Task(_shard_path(folder, i).name, _collect_shard, (str(folder), config, i))
+    tasks = [Work(_shard_path(folder, i).name, _collect_shard, (str(folder), config, i))
              for i in missing]
     total = sum(len(_episodes(config, i)) for i in missing)
     with tqdm(total=total, unit='episode', disable=not progress) as bar:

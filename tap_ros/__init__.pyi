@@ -10,6 +10,7 @@ from tap_ros.planning.protocols import ForwardModel as ForwardModel
 from tap_ros.planning.protocols import Solver as Solver
 from tap_ros.planning.visual_mpc import VisualMPC as VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor as SubgoalPredictor
+from tap_ros.prediction.protocol import Predictor as Predictor
 from tap_ros.recording.cache import open_recordings as open_recordings
 from tap_ros.recording.reader import iter_episodes as iter_episodes
 from tap_ros.recording.writer import EpisodeWriter as EpisodeWriter

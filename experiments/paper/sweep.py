@@ -15,7 +15,7 @@ import time
 
 from experiments.paper.job import collect_task, DONE, FAILED, logged
 from experiments.paper.places import is_collected, read_json, recording_hash
-from tap_ros.engines.task import LOCAL, run_tasks, Task
+from tap_ros.engines.task import LOCAL, run_tasks, Work
 from tap_ros.errors import EngineError, TapError
 from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.training_config import DEFAULTS
@@ -138,7 +138,7 @@ def sweep(runs, places, engine=LOCAL, minutes=None, fresh=False, collect_only=Fa
     missing = {end.name for end in ends if end.kind != 'done'}
     chosen = {} if collect_only else {
         run.name: run for run in waiting if missing.isdisjoint((run.task, *run.shifted))}
-    tasks = [Task(run.name, logged, (run, places, deadline, fresh
+    tasks = [Work(run.name, logged, (run, places, deadline, fresh
                                      and states[run].kind != 'partial'))
              for run in chosen.values()]
     with tqdm(desc='paper', unit='step', total=sum(run.num_steps for run in chosen.values()),

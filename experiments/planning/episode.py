@@ -62,8 +62,8 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     start = seen = simulator.reset(seed)
     goal = simulator.goal()
-    view = View(getattr(mpc.model, 'robot_mask', 'none'))
-    asked = View(shown_mask(predictor) if method.predicted else 'none')
+    view = FilledView(getattr(mpc.model, 'robot_mask', 'none'))
+    asked = FilledView(shown_mask(predictor) if method.predicted else 'none')
     subgoals = []
     follower = mpc.model if method.tracking == 'carried' else None
     reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, follower,
@@ -96,7 +96,7 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
         np.array(tracked or [start.object_pixels]), subgoals)
 
 
-class View:
+class FilledView:
     """
     Observations of one episode without the robot, as the nodes show them to networks.
 

@@ -19,7 +19,7 @@ from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task
 from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
-from tap_ros.engines.task import LOCAL, run_tasks, Task
+from tap_ros.engines.task import LOCAL, run_tasks, Work
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.files import write_atomically
 from tap_ros.planning.forward_model import LearnedForwardModel
@@ -186,7 +186,7 @@ def run_jobs(jobs, seeds, folder, engine=LOCAL, progress=True):
     # scene by scene, so that what was run so far can be compared
     todo = [(i, seed) for seed in seeds for i, file in enumerate(files)
             if seed not in file.scenes]
-    tasks = {Task(f'{jobs[i].task}, {jobs[i].method.name}, scene {seed}', run_scene,
+    tasks = {Work(f'{jobs[i].task}, {jobs[i].method.name}, scene {seed}', run_scene,
                   (jobs[i], seed)): i for i, seed in todo}
     with tqdm(total=len(todo), desc='scenes x methods', disable=not progress) as bar:
         for task, get in run_tasks(tasks, engine):

@@ -9,7 +9,7 @@ true physics. A picture says which object goes where.
 
 from dataclasses import dataclass, field
 
-from experiments.planning.episode import shown_mask, View
+from experiments.planning.episode import FilledView, shown_mask
 from experiments.planning.reading import Move, PictureReader, read_moves
 import mujoco.rollout
 import numpy as np
@@ -138,7 +138,7 @@ def _expert_subgoals(simulator, seed):
 
 def _predict(predictor, method, start, goal, seed):
     """Return the pictures of the predicted subgoals, the earliest first."""
-    view = View(shown_mask(predictor))
+    view = FilledView(shown_mask(predictor))
     subgoals = predictor.predict(view.see(start).image, view.fill(goal).image,
                                  recursion_depth=method.recursion, seed=seed)
     return [subgoal.image for subgoal in subgoals]

@@ -22,7 +22,7 @@ from typing import ClassVar
 import mujoco
 import mujoco.rollout
 import numpy as np
-from sim_bridge.tasks.tasks import carry_out, Demonstration, Drawn, EpisodeRun, Scene, Task
+from sim_bridge.tasks.tasks import carry_out, Demonstration, Drawn, EpisodeRun, Task, TaskScene
 from sim_bridge.world.looks import GRIP_SPREAD
 from sim_bridge.world.scene import (
     box_shape,
@@ -98,7 +98,7 @@ class GraspTask(Task):
         """Return how high the object is lifted."""
         return LIFT_HEIGHT
 
-    def goal_gripper(self, table: Table, scene: Scene) -> np.ndarray:
+    def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
         """Return where the gripper holds the lifted object, and its opening."""
         place, _, half_gap = grasp_place(scene.shapes[0], scene.start_poses[0, 2])
         return np.array([
@@ -114,7 +114,7 @@ class GraspTask(Task):
         """Return how hard the expert searches."""
         return GraspConfig()
 
-    def demonstrate(self, table: Table, scene: Scene, first: Observation,
+    def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
                     rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
         """Act for exactly so many frames."""
         expert = GraspExpert(table, rng, how.config, how.rollout, lifts=self.lifts)
@@ -142,7 +142,7 @@ class PickPlaceTask(GraspTask):
         """Return 0: the object stands on the table."""
         return 0.0
 
-    def goal_gripper(self, table: Table, scene: Scene) -> np.ndarray:
+    def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
         """Return where the open gripper is above the object that it has just put down."""
         place, _, _ = grasp_place(scene.shapes[0], scene.start_poses[0, 2])
         return np.array([*scene.goal_poses[0, :2] + place, LEAVE_HEIGHT, 1])

@@ -30,7 +30,15 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from sim_bridge.tasks.pushes import Moment, Push, push_actions, PushRollouts
-from sim_bridge.tasks.tasks import apart, carry_out, Demonstration, Drawn, EpisodeRun, Scene, Task
+from sim_bridge.tasks.tasks import (
+    apart,
+    carry_out,
+    Demonstration,
+    Drawn,
+    EpisodeRun,
+    Task,
+    TaskScene,
+)
 from sim_bridge.world.scene import random_shape
 from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE, lifted, Table
 from sim_bridge.world_protocol import Observation
@@ -86,7 +94,7 @@ class PushTask(Task):
             if apart(starts, self.start_separation):
                 return starts
 
-    def goal_gripper(self, table: Table, scene: Scene) -> np.ndarray:
+    def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
         """Return where the gripper touches the object that it has pushed to its goal last."""
         starts, goals = scene.start_poses[:, :2], scene.goal_poses[:, :2]
         k = scene.order[-1]
@@ -108,7 +116,7 @@ class PushTask(Task):
         """Choose which of several objects is pushed next: the first one, then the nearest."""
         return expert.first if expert.first in todo else expert.nearest(todo, now)
 
-    def demonstrate(self, table: Table, scene: Scene, first: Observation,
+    def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
                     rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
         """Push, from the first motion of the arm to the last of an object."""
         natural = how.timing == 'natural'

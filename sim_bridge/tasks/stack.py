@@ -22,8 +22,8 @@ from sim_bridge.tasks.tasks import (
     Demonstration,
     Drawn,
     EpisodeRun,
-    Scene,
     Task,
+    TaskScene,
 )
 from sim_bridge.world.scene import HALF_HEIGHT, ObjectShape
 from sim_bridge.world.table import GRIPPER_HEIGHT, Table
@@ -65,7 +65,7 @@ class StackTask(Task):
         """Return how high above the table the blocks of a tower stand, (K,) m."""
         return levels(self.num_objects)
 
-    def goal_gripper(self, table: Table, scene: Scene) -> np.ndarray:
+    def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray:
         """Return where the open gripper has just let go of the top of the tower."""
         top = levels(self.num_objects)[-1]
         return np.array([*scene.goal_poses[-1, :2], top + GRASP_HEIGHT, 1])
@@ -78,7 +78,7 @@ class StackTask(Task):
         """Return how hard the expert searches."""
         return STACK_CONFIG
 
-    def demonstrate(self, table: Table, scene: Scene, first: Observation,
+    def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
                     rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
         """Act until the last block is let go; the outcome is that after SETTLE_STEPS more."""
         mover = PickAndPlace(table, rng, how.config, how.rollout)
@@ -207,7 +207,7 @@ def _moves(path: list[np.ndarray]) -> np.ndarray:
     return np.column_stack([np.diff(path, axis=0), np.zeros(len(path) - 1)])
 
 
-def _plans(table: Table, scene: Scene, mover: PickAndPlace) -> Iterator[np.ndarray]:
+def _plans(table: Table, scene: TaskScene, mover: PickAndPlace) -> Iterator[np.ndarray]:
     """Yield the actions of one episode; each waits until those before are carried out."""
     for k in scene.order:
         yield from mover.move(k, partial(_place_of, table, k - 1))

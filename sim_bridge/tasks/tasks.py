@@ -93,7 +93,7 @@ class Task:
         """Return how high above the table the goals are, m, or (K,) of each object."""
         return 0.0
 
-    def goal_gripper(self, table: Table, scene: 'Scene') -> np.ndarray | None:
+    def goal_gripper(self, table: Table, scene: 'TaskScene') -> np.ndarray | None:
         """
         Return where the arm is seen in the goal picture: (3,) m, or (4,) with its opening.
 
@@ -110,14 +110,14 @@ class Task:
         """Return what the expert does unless it is told otherwise, a dataclass."""
         return None
 
-    def demonstrate(self, table: Table, scene: 'Scene', first: Observation,
+    def demonstrate(self, table: Table, scene: 'TaskScene', first: Observation,
                     rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
         """Let the expert act from the start of a scene, of which `first` is seen."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class Scene:
+class TaskScene:
     """One draw of a task: planar poses are (x, y, yaw) in metres and radians."""
 
     task: Task
@@ -147,7 +147,7 @@ def get_task(name: str) -> Task:
 
 
 def sample_scene(task: Task, seed: int, spread: float = 1.0, low: Place = WORKSPACE_LOW,
-                 high: Place = WORKSPACE_HIGH) -> Scene:
+                 high: Place = WORKSPACE_HIGH) -> TaskScene:
     """
     Draw shapes, starts, goals and the gripper's start.
 
@@ -157,14 +157,14 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0, low: Place = WORKSP
         lie.
     :param low: x, y, z in m of what the arm reaches, least; high: greatest. Scenes are drawn until
         starts, places to push from, goals and the gripper are within.
-    :return: Scene.
+    :return: TaskScene.
     :raises SceneError: for a seed that is negative or not an integer.
     """
     if not isinstance(seed, (int, np.integer)) or seed < 0:
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.stream])
     while True:
-        scene = Scene(task, int(seed), *task.draw(rng, spread))
+        scene = TaskScene(task, int(seed), *task.draw(rng, spread))
         starts, goals = scene.start_poses[:, :2], scene.goal_poses[:, :2]
         needed = np.concatenate(
             [starts, starts - (goals - starts) / 2, goals, scene.gripper_start[None, :2]])

@@ -97,7 +97,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class View:
+class MaskedPicture:
     """One picture, and where the robot is in it."""
 
     picture: np.ndarray  # uint8 (H, W, 3) rgb

@@ -17,7 +17,7 @@ from functools import lru_cache
 import mujoco
 import numpy as np
 from sim_bridge.world.appearance import Appearance, USUAL
-from sim_bridge.world.camera import Camera, OpenGL, View
+from sim_bridge.world.camera import Camera, MaskedPicture, OpenGL
 from sim_bridge.world.scene import ARM_GEOM_GROUP
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import SceneError
@@ -85,13 +85,13 @@ class Studio:
         hand = model.geom_group == ARM_GEOM_GROUP
         self._labels = np.where(hand, ROBOT_MASK_HAND, ROBOT_MASK_FREE).astype(np.uint8)
 
-    def render(self, data: mujoco.MjData, hide_arm: bool = False) -> View:
+    def render(self, data: mujoco.MjData, hide_arm: bool = False) -> MaskedPicture:
         """
         Take one picture.
 
         :param data: mujoco.MjData of the physics model, after mj_forward.
         :param hide_arm: leave arm and hand out of the picture.
-        :return: View.
+        :return: MaskedPicture.
         """
         self._pose_arm(data.qpos[:3])
         scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL
@@ -110,7 +110,7 @@ class Studio:
         shaded = colours * shade[..., None]
         picture = sum(_samples(shaded)) / SAMPLES ** 2
         mask = np.maximum.reduce(_samples(label))  # the robot's if one of its samples is
-        return View(np.rint(picture).astype(np.uint8), mask, self._joints.copy())
+        return MaskedPicture(np.rint(picture).astype(np.uint8), mask, self._joints.copy())
 
     def close(self) -> None:
         """Free the OpenGL context."""

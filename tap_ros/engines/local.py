@@ -11,7 +11,7 @@ import signal
 import threading
 from typing import Any, Self
 
-from tap_ros.engines.task import call, Ended, Engine, lost, POLL_S, raising, Task, TRIES
+from tap_ros.engines.task import call, Ended, Engine, lost, POLL_S, raising, TRIES, Work
 
 
 class LocalWorkers:
@@ -19,8 +19,8 @@ class LocalWorkers:
 
     def __init__(self, engine: Engine, count: int) -> None:
         self.room = min(engine.workers or len(os.sched_getaffinity(0)), count)
-        self.running: dict[Any, Task] = {}  # by Future
-        self._lost: dict[int, int] = {}  # id of a Task to how often it was in a pool that broke
+        self.running: dict[Any, Work] = {}  # by Future
+        self._lost: dict[int, int] = {}  # id of a Work to how often it was in a pool that broke
 
     def __enter__(self) -> Self:
         self._pool = ProcessPoolExecutor(
@@ -33,7 +33,7 @@ class LocalWorkers:
             process.terminate()
         self._pool.shutdown(cancel_futures=True)
 
-    def begin(self, task: Task) -> None:
+    def begin(self, task: Work) -> None:
         try:
             future = self._pool.submit(call, task.function, task.args)
         except BrokenProcessPool:

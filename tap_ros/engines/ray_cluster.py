@@ -9,7 +9,7 @@ import socket
 import sys
 from typing import Any, Self
 
-from tap_ros.engines.task import call, Ended, Engine, lost, POLL_S, raising, Task, TRIES
+from tap_ros.engines.task import call, Ended, Engine, lost, POLL_S, raising, TRIES, Work
 from tap_ros.errors import ConfigError
 from tap_ros.text import escaped
 
@@ -26,7 +26,7 @@ class RayWorkers:
             raise ConfigError("engine: Ray is not installed; type `pip install '.[ray]'`, or "
                               'choose --engine local') from error
         self._ray, self._engine, self._count = ray, engine, count
-        self.running: dict[Any, Task] = {}  # by reference
+        self.running: dict[Any, Work] = {}  # by reference
 
     def __enter__(self) -> Self:
         ray, engine = self._ray, self._engine
@@ -50,7 +50,7 @@ class RayWorkers:
             self._ray.cancel(reference, force=True)
         self._ray.shutdown()
 
-    def begin(self, task: Task) -> None:
+    def begin(self, task: Work) -> None:
         self.running[self._call.remote(task.function, task.args)] = task
 
     def ended(self) -> Ended:
@@ -59,7 +59,7 @@ class RayWorkers:
             task = self.running.pop(reference)
             yield task, self._get(reference, task)
 
-    def _get(self, reference: Any, task: Task) -> Callable[[], Any]:
+    def _get(self, reference: Any, task: Work) -> Callable[[], Any]:
         """Fetch a result now, as there is none once Ray is shut down."""
         errors = self._ray.exceptions
         try:

@@ -51,7 +51,7 @@ LOCAL = Engine()
 
 
 @dataclass(frozen=True)
-class Task:
+class Work:
     """
     One of many tasks.
 
@@ -65,7 +65,7 @@ class Task:
     args: tuple[Any, ...] = ()
 
 
-Ended = Iterator[tuple[Task, Callable[[], Any]]]  # see run_tasks
+Ended = Iterator[tuple[Work, Callable[[], Any]]]  # see run_tasks
 
 
 class Workers(Protocol):
@@ -77,7 +77,7 @@ class Workers(Protocol):
     """
 
     room: int
-    running: dict[Any, Task]
+    running: dict[Any, Work]
 
     def __enter__(self) -> Self:
         """Start the workers."""
@@ -85,7 +85,7 @@ class Workers(Protocol):
     def __exit__(self, kind: object, error: object, traceback: object, /) -> None:
         """End them, and the tasks in progress."""
 
-    def begin(self, task: Task) -> None:
+    def begin(self, task: Work) -> None:
         """Begin a task."""
 
     def ended(self) -> Ended:
@@ -103,22 +103,22 @@ def raising(error: BaseException) -> Callable[[], NoReturn]:
     return get
 
 
-def lost(task: Task) -> EngineError:
+def lost(task: Work) -> EngineError:
     return EngineError(f'{task.name}: its worker process was killed {TRIES} times, perhaps for '
                        'want of memory; start again with fewer workers: what is done is kept')
 
 
 def run_tasks(
-        tasks: Iterable[Task], engine: Engine = LOCAL, stop: Callable[[], bool] = lambda: False,
+        tasks: Iterable[Work], engine: Engine = LOCAL, stop: Callable[[], bool] = lambda: False,
         tick: Callable[[], object] = lambda: None) -> Ended:
     """
     Run tasks, in their order as far as there are workers.
 
-    :param tasks: iterable of Task.
+    :param tasks: iterable of Work.
     :param engine: Engine.
     :param stop: asked before each task; once it says True, no other begins.
     :param tick: called about twice a second meanwhile.
-    :return: generator of (Task, get), in the order in which they end: get() returns what the
+    :return: generator of (Work, get), in the order in which they end: get() returns what the
         task returned, or raises what it raised. Tasks in progress are ended where the generator
         is closed or interrupted.
     :raises ConfigError: where Ray is asked for and not installed, or does not answer.

@@ -29,7 +29,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class View:
+class PinholeCamera:
     """
     A pinhole camera without distortion.
 
@@ -56,7 +56,7 @@ class Light:
     height: float = 0.0
 
 
-def draw_mask(bodies: Sequence[Body], view: View, dilation: float,
+def draw_mask(bodies: Sequence[Body], view: PinholeCamera, dilation: float,
               light: Light | None = None) -> np.ndarray:
     """
     Draw what bodies hide, the nearest last, over what their shadows darken.
@@ -99,7 +99,8 @@ def _cut(corners: np.ndarray, inside: np.ndarray) -> np.ndarray:
     return np.concatenate([corners[kept], cut.reshape(-1, 3)])
 
 
-def _fill(mask: np.ndarray, corners: np.ndarray, view: View, dilation: float, label: int) -> None:
+def _fill(mask: np.ndarray, corners: np.ndarray, view: PinholeCamera, dilation: float,
+          label: int) -> None:
     """Draw the hull of corners (N, 3) of the scene."""
     to_camera = np.linalg.inv(view.pose)
     seen = corners @ to_camera[:3, :3].T + to_camera[:3, 3]

@@ -10,7 +10,7 @@ import sys
 import time
 
 import pytest
-from tap_ros.engines.task import Engine, run_tasks, Task, TRIES
+from tap_ros.engines.task import Engine, run_tasks, TRIES, Work
 from tap_ros.errors import ConfigError, EngineError, RecordingError
 
 ROOT = Path(__file__).parents[2]
@@ -40,7 +40,7 @@ def write_slowly(path, seconds):
 
 
 def numbers(engine, count=5):
-    tasks = [Task(str(i), square, (i,)) for i in range(count)]
+    tasks = [Work(str(i), square, (i,)) for i in range(count)]
     return {task.name: get() for task, get in run_tasks(tasks, engine)}
 
 
@@ -54,7 +54,7 @@ def test_without_tasks_nothing_is_started():
 
 
 def test_an_error_is_that_of_its_task_and_the_others_go_on():
-    tasks = [Task('bad', refuse, (1,)), Task('good', square, (3,))]
+    tasks = [Work('bad', refuse, (1,)), Work('good', square, (3,))]
     ends = dict(run_tasks(tasks, Engine(workers=1)))
     assert ends[tasks[1]]() == 9
     with pytest.raises(RecordingError, match='1 is none'):
@@ -62,13 +62,13 @@ def test_an_error_is_that_of_its_task_and_the_others_go_on():
 
 
 def test_the_task_of_a_killed_worker_is_run_again(tmp_path):
-    tasks = [Task('dies', die, (tmp_path, 1)), Task('other', square, (3,))]
+    tasks = [Work('dies', die, (tmp_path, 1)), Work('other', square, (3,))]
     ends = {task.name: get() for task, get in run_tasks(tasks, Engine(workers=2))}
     assert ends['dies'] >= 2 and ends['other'] == 9
 
 
 def test_a_task_that_kills_every_worker_is_given_up(tmp_path):
-    (_, get), = run_tasks([Task('dies', die, (tmp_path, 100))], Engine(workers=1))
+    (_, get), = run_tasks([Work('dies', die, (tmp_path, 100))], Engine(workers=1))
     with pytest.raises(EngineError, match=f'dies: its worker process was killed {TRIES} times'):
         get()
     assert len(list(tmp_path.iterdir())) == TRIES
@@ -76,7 +76,7 @@ def test_a_task_that_kills_every_worker_is_given_up(tmp_path):
 
 def test_after_a_stop_no_task_begins():
     begun = []
-    tasks = [Task(str(i), square, (i,)) for i in range(9)]
+    tasks = [Work(str(i), square, (i,)) for i in range(9)]
     for task, _ in run_tasks(tasks, Engine(workers=1), stop=lambda: len(begun) == 2):
         begun.append(task.name)
     assert begun == ['0', '1']
@@ -89,9 +89,9 @@ def hear_interrupts():
 def test_an_interrupted_run_leaves_no_worker(tmp_path):
     script = ('import sys; sys.path[:0] = [sys.argv[2], sys.argv[2] + "/test/engines"]\n'
               'from test_engines import write_slowly\n'
-              'from tap_ros.engines.task import Engine, run_tasks, Task\n'
+              'from tap_ros.engines.task import Engine, run_tasks, Work\n'
               'if __name__ == "__main__":\n'
-              '    list(run_tasks([Task("slow", write_slowly, (sys.argv[1], 300.0))], Engine()))')
+              '    list(run_tasks([Work("slow", write_slowly, (sys.argv[1], 300.0))], Engine()))')
     (tmp_path / 'script.py').write_text(script)
     path = tmp_path / 'file'
     process = subprocess.Popen([sys.executable, tmp_path / 'script.py', path, ROOT],
@@ -137,7 +137,7 @@ def cluster():
 def test_ray_gives_what_the_pool_gives(cluster):
     engine = Engine('ray', address=cluster.address)
     assert numbers(engine) == numbers(Engine())
-    (_, get), = run_tasks([Task('bad', refuse, (1,))], engine)
+    (_, get), = run_tasks([Work('bad', refuse, (1,))], engine)
     with pytest.raises(RecordingError, match='1 is none'):
         get()
 
@@ -145,7 +145,7 @@ def test_ray_gives_what_the_pool_gives(cluster):
 @pytest.mark.slow
 def test_the_tasks_of_a_node_that_dies_run_on_another(cluster, tmp_path):
     engine = Engine('ray', address=cluster.address)
-    tasks = [Task(str(i), write_slowly, (tmp_path / f'file{i}', 3.0)) for i in range(4)]
+    tasks = [Work(str(i), write_slowly, (tmp_path / f'file{i}', 3.0)) for i in range(4)]
     for _, get in run_tasks(tasks, engine):
         get()
         if len(cluster.workers) == 2:
@@ -162,4 +162,4 @@ def test_the_tasks_of_a_node_that_dies_run_on_another(cluster, tmp_path):
 def test_a_cluster_that_is_not_there_is_named():
     pytest.importorskip('ray')
     with pytest.raises(ConfigError, match='does not answer at 127.0.0.1:1'):
-        list(run_tasks([Task('a', square, (1,))], Engine('ray', address='127.0.0.1:1')))
+        list(run_tasks([Work('a', square, (1,))], Engine('ray', address='127.0.0.1:1')))

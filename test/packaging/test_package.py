@@ -142,7 +142,8 @@ def test_what_rosdep_brings_from_apt_comes_from_wheels_without_it():
 
 
 def test_nothing_is_required_that_nobody_imports():
-    used = {'tensorboard'}  # by way of torch.utils.tensorboard
+    # By way of torch.utils.tensorboard, and of Meta-World.
+    used = {'tensorboard', 'gymnasium', 'imageio'}
     for name in imported_packages('tap_ros', 'sim_bridge', 'experiments', 'test'):
         used |= distributions_of(name)
     assert set(requirements('requirements.txt')) <= used

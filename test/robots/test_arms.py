@@ -15,7 +15,7 @@ from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE
 from tap_ros.errors import ConfigError, KinematicsError
 from tap_ros.robots.arm import find_joints, get_arm, known_arms, Mount, TIP_FRAME
 from tap_ros.robots.description import robot_description
-from tap_ros.robots.silhouette import Body, draw_mask, View
+from tap_ros.robots.silhouette import Body, draw_mask, PinholeCamera
 from tap_ros.robots.ur10e import inverse, UR10E
 from tap_ros.robots.urdf import read_urdf
 
@@ -78,7 +78,7 @@ def seen_and_drawn(name):
     simulator, arm = Simulator('push2', 64, 'arm', arm=name), get_arm(name)
     robot = read_urdf(robot_description(arm), 'own')
     seen = [simulator.reset(seed) for seed in range(3)]
-    view = View(simulator.camera_matrix, (64, 64), simulator.camera_pose)
+    view = PinholeCamera(simulator.camera_matrix, (64, 64), simulator.camera_pose)
     drawn = []
     for one in seen:
         poses = robot.poses(dict(zip(arm.joints, one.arm_joints)))

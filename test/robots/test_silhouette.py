@@ -8,7 +8,7 @@ from sim_bridge.simulator import Simulator
 from sim_bridge.world.studio import Studio
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.robots.description import robot_description
-from tap_ros.robots.silhouette import Body, draw_mask, Light, View
+from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
 from tap_ros.robots.ur10e import UR10E
 from tap_ros.robots.urdf import read_urdf
 
@@ -21,7 +21,7 @@ SIZE = (64, 64)
 def camera_at(height):
     pose = DOWN.copy()
     pose[2, 3] = height
-    return View(K, SIZE, pose)
+    return PinholeCamera(K, SIZE, pose)
 
 
 def cube(x, y, z, half):
@@ -51,7 +51,7 @@ def arms():
     pose = np.eye(4)
     pose[:3, :3] = camera.extrinsics[:, :3].T
     pose[:3, 3] = camera.position
-    return View(camera.K, SIZE, pose), seen
+    return PinholeCamera(camera.K, SIZE, pose), seen
 
 
 @pytest.mark.parametrize('dilation, overlap, free', [(0, 0.75, 0.96), (1, 0.55, 0.9)])

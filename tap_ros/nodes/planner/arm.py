@@ -27,7 +27,7 @@ STOOD_S = 2.0  # s; a longer gap between checks proves that the process or machi
 REPEAT_S = 0.2  # s after which a stop is repeated, while a goal is in progress
 
 
-class Arm:
+class ArmCommander:
     """
     Commands for one goal at a time; thread-safe.
 

@@ -25,7 +25,7 @@ from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.nodes.clients import CallError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
-from tap_ros.nodes.planner.arm import Arm
+from tap_ros.nodes.planner.arm import ArmCommander
 from tap_ros.nodes.planner.goal_source import GoalSource
 from tap_ros.nodes.planner.plan_view import PlanView
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
@@ -92,7 +92,7 @@ class VisualMpcNode(LifecycleBase):
         self._goal = GoalSource(self, robot_mask, received)
         self._inputs = PlannerInputs(self, self.params, lambda: self._model.camera_crop, received)
         self._sensors = self._inputs.sensors
-        self._arm = Arm(self, self.params, self._sensors)
+        self._arm = ArmCommander(self, self.params, self._sensors)
         subscribe(self, CommandRefused, 'arm/refused', self._on_refused, STREAM)
         self._view = PlanView(self)
         self._distance = self.create_publisher(Float64, 'plan/distance', STREAM)

@@ -24,7 +24,7 @@ from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.parameters import check_device
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue, THREAD_NAME
-from tap_ros.nodes.predictor.requests import encode_answer, RequestReader, Task
+from tap_ros.nodes.predictor.requests import encode_answer, PendingRequest, RequestReader
 from tap_ros.nodes.predictor.settings import (
     declare_parameters,
     MAX_ROWS,
@@ -68,7 +68,7 @@ class PredictorNode(LifecycleBase):
         super().__init__('predictor_node', **options)
         self.params = declare_parameters(self)
         self._predictor: Predictor | None = None
-        self._queue: RequestQueue[Task, Found] | None = None
+        self._queue: RequestQueue[PendingRequest, Found] | None = None
         self.autostart('configure')
         goal = goal_topics(self.params['robot_mask'])
         self._diagnostics = Diagnostics(
@@ -80,7 +80,7 @@ class PredictorNode(LifecycleBase):
         self._picture = self.create_publisher(Image, 'subgoal/image', LATCHED)
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
         # The newest subgoal until it is published, by a timer: the answer does not wait for it.
-        self._unshown: deque[tuple[Task, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
+        self._unshown: deque[tuple[PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
         self.create_timer(
             SHOW_PERIOD, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._service = create_deferred_service(
@@ -98,7 +98,7 @@ class PredictorNode(LifecycleBase):
 
     def load(self) -> None:
         """Load the weights, in the thread that will use them."""
-        def prepare() -> Callable[[list[Task]], list[Found]]:
+        def prepare() -> Callable[[list[PendingRequest]], list[Found]]:
             # OpenMP is slow where two threads have begun parallel work on few cores.
             check_device(self.params['device'])
             self._predictor = load_predictor(self.params['weights'], self.params['device'])
@@ -164,7 +164,8 @@ class PredictorNode(LifecycleBase):
 
     # In the thread of the queue
 
-    def _answer(self, task: Task, found: Found | Exception, send: Send, begin: float) -> None:
+    def _answer(self, task: PendingRequest, found: Found | Exception, send: Send,
+                begin: float) -> None:
         """Send the response to a task that was received at time `begin`."""
         try:
             if isinstance(found, Exception):
@@ -201,8 +202,8 @@ class PredictorNode(LifecycleBase):
             log_error(self, 'predict_subgoal: a response cannot be sent', error)
 
 
-def predict(predictor: Predictor, tasks: list[Task]) -> list[Found]:
-    """Predict a batch; return subgoals and ms for each Task."""
+def predict(predictor: Predictor, tasks: list[PendingRequest]) -> list[Found]:
+    """Predict a batch; return subgoals and ms for each PendingRequest."""
     begin = time.perf_counter()
     found = predictor.predict_together([task.question for task in tasks])
     elapsed_ms = (time.perf_counter() - begin) * 1e3

@@ -36,7 +36,7 @@ OBJECTS_TIMEOUT = 0.1  # s that objects and mask of the newest picture may come 
 
 
 @dataclass(frozen=True)
-class View:
+class AskedPicture:
     """A picture of a request or a topic, ready for the predictor."""
 
     image: np.ndarray  # (H, W, 3) uint8
@@ -48,7 +48,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Task:
+class PendingRequest:
     """A request, checked and decoded."""
 
     mode: str
@@ -93,7 +93,7 @@ class RequestReader:
                 with suppress(TapError):  # a request for this picture is refused with it
                     self._robot.see(found['image'], found['mask'], start.jumps)
 
-    def read(self, request: PredictSubgoal.Request, predictor: Predictor) -> Task:
+    def read(self, request: PredictSubgoal.Request, predictor: Predictor) -> PendingRequest:
         """
         Check and decode a request.
 
@@ -115,9 +115,11 @@ class RequestReader:
         question = Question(start.image, goal.image if goal else None,
                             start.pixels if names else None, goal_pixels,
                             num_samples, depth, request.seed)
-        return Task(predictor.mode, question, names, lacking, start.stamp, start.frame_id)
+        return PendingRequest(
+            predictor.mode, question, names, lacking, start.stamp, start.frame_id)
 
-    def _view(self, name: str, image: Image, objects: ObjectStates, crop: TrainedCrop) -> View:
+    def _view(self, name: str, image: Image, objects: ObjectStates,
+              crop: TrainedCrop) -> AskedPicture:
         """Decode a picture and its objects; take the newest ones if it was left empty."""
         lacking = '' if objects.objects else f'{name}_objects are empty'
         if is_empty(image):
@@ -130,8 +132,9 @@ class RequestReader:
         given_size = picture.shape[:2]
         cut = crop.of(given_size, name)
         names, pixels = decode_cut_objects(objects, f'{name}_objects', given_size, cut)
-        return View(check_image(cut.image(picture), name, crop.size), names, pixels, lacking,
-                    image.header.stamp, image.header.frame_id or CAMERA_FRAME)
+        return AskedPicture(
+            check_image(cut.image(picture), name, crop.size), names, pixels, lacking,
+            image.header.stamp, image.header.frame_id or CAMERA_FRAME)
 
     def _find(self, name: str) -> dict[str, Any]:
         """
@@ -182,9 +185,9 @@ class RequestReader:
                 f'{observations.names(["image"])} {stamps[1]}; publish both with the same')
 
 
-def encode_answer(task: Task, subgoals: Sequence[Subgoal],
+def encode_answer(task: PendingRequest, subgoals: Sequence[Subgoal],
                   elapsed_ms: float) -> PredictSubgoal.Response:
-    """Return the response to a Task."""
+    """Return the response to a PendingRequest."""
     wanted = task.question.num_samples
     message = (f'{task.mode}, {len(subgoals)} subgoal{"s" * (len(subgoals) > 1)}, '
                + (f'no object maps: {task.lacking}' if task.lacking

@@ -32,7 +32,7 @@ from tap_ros.nodes.ros_messages import encode_mask
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
 from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.robots.silhouette import Body, draw_mask, View
+from tap_ros.robots.silhouette import Body, draw_mask, PinholeCamera
 from tap_ros.robots.urdf import read_urdf, Robot
 from tap_ros.text import escaped
 
@@ -169,7 +169,7 @@ class RobotMaskNode(Node):
         for shape, label in zip(robot.shapes, self._labels):
             pose = to_base @ poses[shape.link]
             bodies.append(Body(shape.corners @ pose[:3, :3].T + pose[:3, 3], label))
-        view = View(K, size, self._camera)
+        view = PinholeCamera(K, size, self._camera)
         mask = draw_mask(bodies, view, self.params['dilation'], self._light)
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'mask')
         return mask
