@@ -155,7 +155,7 @@ def run_scene(client: Client, watch: Watch, task: str, seed: int, step_budget: i
         expert=() if runs else film_expert(task, seed, world))
 
 
-def film_expert(task: str, seed: int, world: dict[str, str]) -> list[np.ndarray]:
+def film_expert(task: str, seed: int, world: dict[str, Any]) -> list[np.ndarray]:
     """Return pictures from the side of the expert doing a task, without ROS."""
     simulator = Simulator(task, **world)
     try:
