@@ -106,7 +106,7 @@ class GraspTask(Task):
             (half_gap - FINGER_GAP) / FINGER_TRAVEL])
 
     def succeeds(self, table: Table) -> bool:
-        """Tell whether the fingers hold the object SUCCESS_DISTANCE above the table."""
+        """Return whether the fingers hold the object SUCCESS_DISTANCE above the table."""
         high = table.object_poses()[:, 2] - HALF_HEIGHT > SUCCESS_DISTANCE
         return bool(high.all() and table.touching())
 
@@ -148,7 +148,7 @@ class PickPlaceTask(GraspTask):
         return np.array([*scene.goal_poses[0, :2] + place, LEAVE_HEIGHT, 1])
 
     def succeeds(self, table: Table) -> bool:
-        """Tell whether the object is within SUCCESS_DISTANCE of its goal."""
+        """Return whether the object is within SUCCESS_DISTANCE of its goal."""
         return Task.succeeds(self, table)
 
 

@@ -105,7 +105,7 @@ def _at_the_edge(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.n
 
 
 def _free(starts: np.ndarray, goals: np.ndarray) -> bool:
-    """Tell whether, from the last object to the first, nothing stands in the way of the arm."""
+    """Return whether, from the last object to the first, nothing stands in the way of the arm."""
     positions = starts.copy()
     for k in range(len(starts) - 1, -1, -1):
         along = (goals[k] - starts[k]) / GOAL_DISTANCE

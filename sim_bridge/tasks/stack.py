@@ -71,7 +71,7 @@ class StackTask(Task):
         return np.array([*scene.goal_poses[-1, :2], top + GRASP_HEIGHT, 1])
 
     def succeeds(self, table: Table) -> bool:
-        """Tell whether every block stands on the one below, let go."""
+        """Return whether every block stands on the one below, let go."""
         return is_tower(table.object_poses()) and not table.touching()
 
     def default_config(self, timing: str = 'natural') -> GraspConfig:
@@ -131,7 +131,7 @@ def levels(count: int) -> np.ndarray:
 
 
 def is_tower(poses: np.ndarray) -> bool:
-    """Tell whether blocks stand on each other; poses (K, 3 or more) m, from the lowest on."""
+    """Return whether blocks stand on each other; poses (K, 3 or more) m, from the lowest on."""
     up = np.diff(poses[:, :3], axis=0)
     return bool((np.linalg.norm(up[:, :2], axis=1) < STACK_OFFSET).all()
                 and (np.abs(up[:, 2] - 2 * HALF_HEIGHT) < LEVEL_TOLERANCE).all()

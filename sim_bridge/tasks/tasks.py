@@ -103,7 +103,7 @@ class Task:
         return None
 
     def succeeds(self, table: Table) -> bool:
-        """Tell whether every object is within SUCCESS_DISTANCE of its goal."""
+        """Return whether every object is within SUCCESS_DISTANCE of its goal."""
         return bool((table.distances() < SUCCESS_DISTANCE).all())
 
     def default_config(self, timing: str = 'natural') -> Any:
@@ -221,6 +221,6 @@ def carry_out(table: Table, succeeds: Callable[[Table], bool], first: Observatio
 
 
 def apart(positions: np.ndarray, separation: float) -> bool:
-    """Tell whether all pairs of positions (K, 2) are at least so far apart."""
+    """Return whether all pairs of positions (K, 2) are at least so far apart."""
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     return (gaps[np.triu_indices(len(positions), 1)] >= separation).all()

@@ -103,13 +103,13 @@ def box_around(box: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def overlaps_box(box: np.ndarray, other: ArrayLike) -> bool:
-    """Tell whether two boxes (2, 3) along the same axes, highest corner first, overlap."""
+    """Return whether two boxes (2, 3) along the same axes, highest corner first, overlap."""
     other = np.asarray(other)
     return bool((box[1] <= other[0]).all() and (other[1] <= box[0]).all())
 
 
 def overlaps_sphere(box: np.ndarray, centre: np.ndarray, radius: float) -> bool:
-    """Tell whether a box (2, 3), highest corner first, and a sphere overlap."""
+    """Return whether a box (2, 3), highest corner first, and a sphere overlap."""
     return math.dist(np.clip(centre, box[1], box[0]), centre) <= radius
 
 

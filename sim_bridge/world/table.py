@@ -299,7 +299,7 @@ class Table:
         self._renderer = self._observer = None
 
     def touching(self) -> bool:
-        """Tell whether a finger touches anything."""
+        """Return whether a finger touches anything."""
         fingers = [self.model.geom(f'{side}_finger').id for side in ('left', 'right')]
         return bool(np.isin(self.data.contact.geom, fingers).any())
 

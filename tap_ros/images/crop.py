@@ -48,7 +48,7 @@ class Crop:
             raise ConfigError(f'size: expected 0 to {MAX_SIZE} pixels a side, got {self.size}')
 
     def __bool__(self) -> bool:
-        """Tell whether pictures are changed."""
+        """Return whether pictures are changed."""
         return bool(self.part or self.size)
 
     def window(self, size: Sequence[int]) -> tuple[int, int, int, int]:

@@ -77,7 +77,7 @@ class Liveness:
 
     @property
     def dead(self) -> bool:
-        """Tell whether the beats of a node have stopped; to be polled."""
+        """Return whether the beats of a node have stopped; to be polled."""
         now = time.monotonic()
         if not self._silent(now):
             self._doubted_at = None

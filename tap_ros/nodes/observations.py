@@ -167,7 +167,7 @@ class Observations:
                           if other in parts and topic not in parts)
 
     def _believe(self, topic: str, stamp: int) -> bool:
-        """Tell whether a stamp is used; forget all others when the clock has jumped to it."""
+        """Return whether a stamp is used; forget all others when the clock has jumped to it."""
         self._drop_stray(topic, stamp)
         clock = max(self._newest.values(), default=stamp)
         if self._newest.get(topic, 0) <= stamp <= clock + JUMP_NS:

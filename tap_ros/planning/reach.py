@@ -153,7 +153,7 @@ class Reach:
 
     @property
     def aimed(self) -> bool:
-        """Tell whether head_for has been called."""
+        """Return whether head_for has been called."""
         return self._next is not None
 
     @property

@@ -77,7 +77,7 @@ class EpisodeTable:
         return _take([part.frames for part in self.parts], self.file[rows], self.row[rows])
 
     def has_masks(self, i: int) -> bool:
-        """Tell whether every frame of episode i has a robot mask."""
+        """Return whether every frame of episode i has a robot mask."""
         return bool((self.mask_row[self.starts[i]:self.starts[i + 1]] >= 0).all())
 
     def masks(self, i: int) -> np.ndarray | None:

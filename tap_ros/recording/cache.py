@@ -79,7 +79,7 @@ class EpisodeStore:
         return table.frames(local)
 
     def has_masks(self, i: int) -> bool:
-        """Tell whether every frame of episode i has a robot mask."""
+        """Return whether every frame of episode i has a robot mask."""
         table, local = self._index[i]
         return table.has_masks(local)
 

@@ -113,7 +113,7 @@ class ExplorerCalls:
         return self._running
 
     def offered(self, service: str) -> bool:
-        """Tell whether the simulator offers a service, 'reset' or 'set_goal'."""
+        """Return whether the simulator offers a service, 'reset' or 'set_goal'."""
         return self._client.is_ready(service)
 
     def do(self, text: str | bytes) -> None:

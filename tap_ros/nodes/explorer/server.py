@@ -138,7 +138,7 @@ class ExplorerServer:
         return _page(HTTPStatus.OK, body, kind)
 
     def _is_own(self, request: 'Request') -> bool:
-        """Tell whether our own page asks, under a name of this server."""
+        """Return whether our own page asks, under a name of this server."""
         host = ','.join(request.headers.get_all('Host'))
         origins = request.headers.get_all('Origin')
         if any(urlsplit(origin).netloc != host for origin in origins):
@@ -187,7 +187,7 @@ class ExplorerServer:
 
 
 def is_loopback(host: str) -> bool:
-    """Tell whether a name or address leads to this machine alone."""
+    """Return whether a name or address leads to this machine alone."""
     if host == 'localhost':
         return True
     try:

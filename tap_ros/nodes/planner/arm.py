@@ -153,7 +153,7 @@ class ArmCommander:
             self._stop()
 
     def _silent(self, topics: Collection[str], now: float, renewed: bool = False) -> bool:
-        """Tell whether one of the topics is silent."""
+        """Return whether one of the topics is silent."""
         ages = self._sensors.ages(topics, now, renewed)
         return any(age > self._params['max_silence'] for age in ages.values())
 

@@ -110,7 +110,7 @@ class RecorderNode(Node):
                 self.get_logger().error(f'{escaped(topic)} is not recorded: {escaped(error)}')
 
     def _is_latched(self, topic: str) -> bool:
-        """Tell whether all publishers of a topic keep messages for late joiners."""
+        """Return whether all publishers of a topic keep messages for late joiners."""
         publishers = self.get_publishers_info_by_topic(topic)
         return {publisher.qos_profile.durability for publisher in publishers} == {
             DurabilityPolicy.TRANSIENT_LOCAL}

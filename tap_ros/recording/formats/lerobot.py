@@ -163,7 +163,7 @@ class DataSet:
         return names if isinstance(names, list) else []
 
     def _is_ours(self, key: str) -> bool:
-        """Tell whether the numbers of a feature mean what they do in our recordings."""
+        """Return whether the numbers of a feature mean what they do in our recordings."""
         return self._flat_names(key) == NAMES[key]
 
     def _object_names(self) -> tuple[str, ...]:
