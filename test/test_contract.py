@@ -3,7 +3,6 @@
 """Simulator, experts, planner, shipped weights and nodes keep to the contract."""
 
 import ast
-from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,10 +19,8 @@ from tap_ros.planning.mpc_config import PLANNING_TASKS
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 import torch
-import yaml
 
 ROOT = Path(__file__).parents[1]
-CONFIG = yaml.safe_load((ROOT / 'config' / 'tap_ros.yaml').read_text())
 
 
 @pytest.fixture
@@ -36,29 +33,6 @@ def simulator(request):
 def test_the_contract_imports_nothing():
     tree = ast.parse(Path(contract.__file__).read_text())
     assert not [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
-
-
-@pytest.mark.ros
-@pytest.mark.parametrize('name', contract.NODE_MODULES)
-def test_parameter_file_shows_the_defaults_of_every_node(name):
-    from rclpy.context import Context
-    from rclpy.node import Node
-    assert set(CONFIG) == {f'/**/{name}' for name in contract.NODE_MODULES}
-    context = Context()
-    context.init()
-    node = Node(f'a_{name}', context=context)
-    try:
-        declared = import_module(contract.NODE_MODULES[name]).declare_parameters(node)
-        listed = CONFIG[f'/**/{name}']['ros__parameters']
-        assert {key: declared[key] for key in listed} == listed
-        for key, limit in (('max_step_xy', contract.MOVE_LIMIT),
-                           ('max_step_z', contract.CLIMB_LIMIT)):
-            if name == 'visual_mpc_node':  # neither more than the arm does, nor less
-                allowed, = node.describe_parameter(key).floating_point_range
-                assert allowed.to_value == declared[key] == limit
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
 
 
 def test_the_forward_model_moves_the_gripper_as_the_simulator_does():

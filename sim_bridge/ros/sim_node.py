@@ -49,7 +49,6 @@ from tap_ros.nodes.ros_messages import (
 )
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import answering
-from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
@@ -105,7 +104,7 @@ class SimNode(Node):
                 (Float64, 'gripper/command', self._on_gripper, STREAM),
                 (TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM),
                 (Float64, 'arm/command_timeout', self._on_timeout, LATCHED)):
-            subscribe(self, kind, topic, callback, qos)
+            self.create_subscription(kind, topic, callback, qos)
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
                                    (SetGoal, 'sim/set_goal', self._on_set_goal),

@@ -133,12 +133,13 @@ class JointHistory:
         self._late = dict.fromkeys(self.names, 0)  # stamps in a row that go back
         self.received = -math.inf
 
-    def add(self, message: Any, received: float) -> bool:
+    def add(self, message: Any, received: float, again: bool = False) -> bool:
         """
         Take a message; tell whether it says something new of a joint.
 
         :param message: sensor_msgs/JointState; joints that are not asked for are passed over.
         :param received: monotonic time in seconds of its reception.
+        :param again: whether a state with a stamp that is known counts as received anew.
         :raises KinematicsError: for a position that no joint can have; such a message is not used.
         """
         found = {name: position for name, position in decode_positions(message).items()
@@ -150,7 +151,7 @@ class JointHistory:
         stamp, new = to_nanoseconds(message.header.stamp), False
         with self._lock:
             for name, position in found.items():
-                new |= self._add(name, (stamp, position, received))
+                new |= self._add(name, (stamp, position, received), again)
             self.received = min((states[-1][2] if states else -math.inf
                                  for states in self._states.values()), default=received)
         return new
@@ -179,13 +180,13 @@ class JointHistory:
         with self._lock:
             return [name for name, states in self._states.items() if not states]
 
-    def _add(self, name: str, state: tuple[int, float, float]) -> bool:
+    def _add(self, name: str, state: tuple[int, float, float], again: bool) -> bool:
         """Add a state of a joint; tell whether its stamp is a new one."""
         states = self._states[name]
         if states and state[0] <= states[-1][0]:
             at = bisect_left(states, state[0], key=lambda known: known[0])
             if states[at][0] == state[0]:  # sent again
-                states[at] = state
+                states[at] = (*state[:2], state[2] if again else states[at][2])
                 return False
             self._late[name] += 1
             if self._late[name] < PROOF:
@@ -247,12 +248,13 @@ class GripperHistory:
         """Return the joints that were heard last; either tells where the gripper is."""
         return max((self._told, self._arm), key=lambda history: history.received)
 
-    def take(self, message: Any, received: float) -> bool:
+    def take(self, message: Any, received: float, again: bool = False) -> bool:
         """
         Take joint states.
 
         :param message: sensor_msgs/JointState.
         :param received: monotonic time in seconds of its reception.
+        :param again: as JointHistory.add has it.
         :return: whether they tell something new of where the gripper is.
         :raises TapError: when there is nothing in them, or nothing that can be used.
         """
@@ -263,10 +265,10 @@ class GripperHistory:
                 f'has neither {", ".join(PLACE)} nor {", ".join(self._arm.names)}; it has '
                 f'{listing(known) or "no joints"}')
         if math.isfinite(known.get(OPENING, 0.0)):
-            self._openings.add(message, received)
+            self._openings.add(message, received, again)
             if source is self._told:
-                self._beside.add(message, received)
-        return source.add(message, received)
+                self._beside.add(message, received, again)
+        return source.add(message, received, again)
 
     def at(self, stamp_ns: int, max_gap_s: float) -> tuple[np.ndarray, float]:
         """

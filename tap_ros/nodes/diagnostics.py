@@ -2,86 +2,62 @@
 # SPDX-License-Identifier: Apache-2.0
 """The state of a node, once a second on /diagnostics, where rqt and Foxglove read it."""
 
+from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 import math
 import threading
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
 from tap_ros.text import escaped
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
-
 PERIOD = 1.0  # s
-RATE_SECONDS = 10.0  # over which rates are taken, of RATE_LIMIT messages at most
-RATE_LIMIT = 100
-WORK_SECONDS = 60.0  # over which percentiles are taken, of WORK_LIMIT durations at most
-WORK_LIMIT = 10_000
+RATE_SECONDS = 10.0  # over which rates are taken
+WORK_SECONDS = 60.0  # over which percentiles are taken
 ERROR_SECONDS = 10.0  # that the level is ERROR after an error
+LIMIT = 1000  # events of a kind that are remembered, the newest ones
 
 
-class RollingWindow:
+class Record:
     """
-    Numbers with the times at which they were added; old ones are forgotten.
+    What is known of an input or of a kind of work; times of the monotonic clock, in s.
 
-    :param seconds: how long a number counts.
-    :param limit: most numbers kept, the newest ones; bounds the memory whatever their rate.
+    :param seconds: how long an event counts as recent.
+    :param max_age_s: of an input, see Diagnostics.
+    :ivar count: of all events; newest: time of the last one.
     """
 
-    def __init__(self, seconds: float, limit: int) -> None:
+    def __init__(self, seconds: float, max_age_s: float = math.inf) -> None:
+        self.max_age_s, self.count, self.newest = max_age_s, 0, -math.inf
         self._seconds = seconds
-        self._times, self._values = np.empty(limit), np.empty(limit)  # rings: fast to summarise
-        self._count = 0
+        self._events: deque[tuple[float, float]] = deque(maxlen=LIMIT)
 
     def add(self, now: float, value: float = 0.0) -> None:
-        """Add a number at time `now`, in seconds of a monotonic clock."""
-        place = self._count % len(self._times)
-        self._times[place], self._values[place] = now, value
-        self._count += 1
-
-    def newest(self, now: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return times and values, each float64 (N,), oldest first."""
-        limit = len(self._times)
-        places = np.arange(max(self._count - limit, 0), self._count) % limit
-        places = places[np.searchsorted(self._times[places], now - self._seconds):]
-        return self._times[places], self._values[places]
-
-
-def rate(times: np.ndarray) -> float:
-    """
-    Return the mean number of events per second; 0 for fewer than two.
-
-    :param times: (N,) seconds, oldest first.
-    """
-    span = times[-1] - times[0] if len(times) else 0.0
-    return (len(times) - 1) / span if span > 0 else 0.0
-
-
-def percentiles(values: np.ndarray) -> np.ndarray:
-    """Return the 50th and the 99th percentile; NaN without values."""
-    return np.percentile(values, (50, 99)) if len(values) else np.full(2, np.nan)
-
-
-@dataclass
-class _Record:
-    """What is known of an input or of a kind of work; times of the monotonic clock, in s."""
-
-    recent: RollingWindow
-    max_age_s: float = math.inf
-    count: int = 0
-    newest: float = -math.inf
-
-    def add(self, value: float = 0.0) -> None:
-        """Count an event of now."""
-        self.newest = time.monotonic()
+        """Count an event."""
+        self.newest = now
         self.count += 1
-        self.recent.add(self.newest, value)
+        self._events.append((now, value))
+
+    def recent(self, now: float) -> np.ndarray:
+        """Return time and value of recent events, float64 (N, 2), oldest first."""
+        found = [event for event in self._events if now - event[0] <= self._seconds]
+        return np.array(found).reshape(-1, 2)
+
+    def rate(self, now: float) -> float:
+        """Return the mean number of recent events per second; 0 for fewer than two."""
+        times = self.recent(now)[:, 0]
+        span = times[-1] - times[0] if len(times) else 0.0
+        return (len(times) - 1) / span if span > 0 else 0.0
+
+    def percentiles(self, now: float) -> np.ndarray:
+        """Return the 50th and the 99th percentile of recent values; NaN without any."""
+        values = self.recent(now)[:, 1]
+        return np.percentile(values, (50, 99)) if len(values) else np.full(2, np.nan)
 
 
 class Diagnostics:
@@ -99,19 +75,15 @@ class Diagnostics:
     :param idle: called without arguments, returns why the node does not work, '' if it does.
     """
 
-    def __init__(self, node: 'Node', inputs: Mapping[str, float],
+    def __init__(self, node: Node, inputs: Mapping[str, float],
                  queue: Callable[[], int] | None = None,
                  idle: Callable[[], str] = lambda: '') -> None:
         self._node = node
         self._queue, self._idle = queue, idle
         self._lock = threading.Lock()
-        self._inputs = {
-            node.resolve_topic_name(topic): _Record(
-                RollingWindow(RATE_SECONDS, RATE_LIMIT), max_age_s)
-            for topic, max_age_s in inputs.items()}
-        self._by_name = self._inputs | {
-            topic: self._inputs[node.resolve_topic_name(topic)] for topic in inputs}
-        self._work: dict[str, _Record] = {}  # what -> Work
+        self._inputs = {node.resolve_topic_name(topic): Record(RATE_SECONDS, max_age_s)
+                        for topic, max_age_s in inputs.items()}
+        self._work: dict[str, Record] = {}
         self._errors, self._last_error, self._error_time = 0, '', -math.inf
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         # Its own group: it goes on while the node works, where there are threads enough.
@@ -119,32 +91,17 @@ class Diagnostics:
                           clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def received(self, topic: str) -> None:
-        """
-        Count a message.
-
-        :param topic: one of the inputs, by the name given or by the resolved one.
-        """
+        """Count a message of one of the inputs."""
         with self._lock:
-            self._by_name[topic].add()
+            self._inputs[self._node.resolve_topic_name(topic)].add(time.monotonic())
 
     def took(self, ms: float, what: str) -> None:
-        """
-        Add the duration of a piece of work.
-
-        :param ms: milliseconds.
-        :param what: name of this kind of work, for example 'predict_subgoal'.
-        """
+        """Add the milliseconds of a piece of work of this kind, such as 'predict_subgoal'."""
         with self._lock:
-            if what not in self._work:
-                self._work[what] = _Record(RollingWindow(WORK_SECONDS, WORK_LIMIT))
-            self._work[what].add(ms)
+            self._work.setdefault(what, Record(WORK_SECONDS)).add(time.monotonic(), ms)
 
     def error(self, text: object) -> None:
-        """
-        Report an error.
-
-        :param text: the error or its text; shown in one line.
-        """
+        """Report an error, or its text; shown in one line."""
         with self._lock:
             self._errors += 1
             self._last_error, self._error_time = escaped(text), time.monotonic()
@@ -163,7 +120,7 @@ class Diagnostics:
     def _describe_work(self, queue: int | None, now: float) -> DiagnosticStatus:
         values: dict[str, int | str] = {} if queue is None else {'queue': queue}
         for what, work in self._work.items():
-            p50, p99 = percentiles(work.recent.newest(now)[1])
+            p50, p99 = work.percentiles(now)
             values |= {f'{what} calls': work.count,
                        f'{what} p50_ms': f'{p50:.2f}', f'{what} p99_ms': f'{p99:.2f}'}
         values['errors'] = self._errors
@@ -178,7 +135,7 @@ class Diagnostics:
             return self._status('service', DiagnosticStatus.WARN, idle, values)
         return self._status('service', DiagnosticStatus.OK, 'OK', values)
 
-    def _describe_input(self, topic: str, source: _Record, now: float) -> DiagnosticStatus:
+    def _describe_input(self, topic: str, source: Record, now: float) -> DiagnosticStatus:
         age = now - source.newest
         if not source.count:
             level, status, age = DiagnosticStatus.WARN, 'NotReceived', math.nan
@@ -188,7 +145,7 @@ class Diagnostics:
             level, status = DiagnosticStatus.OK, 'OK'
         return self._status(topic, level, status, {
             'status': status, 'age_s': f'{age:.3f}', 'max_age_s': f'{source.max_age_s:g}',
-            'rate_hz': f'{rate(source.recent.newest(now)[0]):.2f}', 'count': source.count})
+            'rate_hz': f'{source.rate(now):.2f}', 'count': source.count})
 
     def _status(self, name: str, level: bytes, text: str,
                 values: Mapping[str, Any]) -> DiagnosticStatus:

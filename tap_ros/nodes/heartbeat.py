@@ -4,17 +4,15 @@
 
 import threading
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
+from rclpy.callback_groups import CallbackGroup
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.qos import LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 from tap_ros.nodes.observations import reception_time
 from tap_ros.text import escaped
-
-if TYPE_CHECKING:
-    from rclpy.callback_groups import CallbackGroup
-    from rclpy.node import Node
 
 BEAT_S = 0.1
 LEASE_S = 0.4  # of the topic's liveliness, for other programs that watch it
@@ -32,7 +30,7 @@ class Heartbeat:
     A thread does it: a long callback is no death; a killed or stopped process is.
     """
 
-    def __init__(self, node: 'Node') -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
         self._publisher = node.create_publisher(Header, '~/heartbeat', QOS)
         self._ended = threading.Event()
@@ -65,8 +63,8 @@ class Liveness:
     :param callback_group: callback group, None for the node's own.
     """
 
-    def __init__(self, node: 'Node', name: str,
-                 callback_group: 'CallbackGroup | None' = None) -> None:
+    def __init__(self, node: Node, name: str,
+                 callback_group: CallbackGroup | None = None) -> None:
         self.name = name
         self._beat_at: float | None = None  # monotonic time of the newest beat
         self._doubted_at: float | None = None  # when its silence was seen first

@@ -6,26 +6,24 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, TYPE_CHECKING
+from typing import Any, ClassVar
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from tap_ros.errors import WeightsError
+from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.services import log_error
 from tap_ros.nodes.topics import LATCHED
 from tap_ros.text import escaped, listing
 from tap_ros.training.weights import stored_digest
 
-if TYPE_CHECKING:
-    from rclpy.parameter import Parameter
-    from tap_ros.nodes.parameters import Parameters
-
 MAX_CARD_BYTES = 2**18
 
 
-def declare_autostart(parameters: 'Parameters') -> None:
+def declare_autostart(parameters: Parameters) -> None:
     """Declare the parameter autostart of a lifecycle node."""
     parameters.declare(
         'autostart', True,
@@ -192,7 +190,7 @@ class LifecycleBase(LifecycleNode):
         label: str = self._state_machine.current_state[1]
         return label
 
-    def _check_loaded(self, parameters: Iterable['Parameter']) -> SetParametersResult:
+    def _check_loaded(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse to change what is loaded unless the node is unconfigured."""
         changed = [parameter.name for parameter in parameters if parameter.name in self.loaded_by
                    and self.has_parameter(parameter.name)

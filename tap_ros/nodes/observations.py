@@ -5,12 +5,16 @@
 from collections import deque, OrderedDict
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 import math
 import threading
 import time
 from types import MappingProxyType
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.subscriptions import (
     ADAPT_PERIOD,
@@ -19,17 +23,13 @@ from tap_ros.nodes.subscriptions import (
     PollOnlyGroup,
 )
 
-if TYPE_CHECKING:
-    from rclpy.callback_groups import CallbackGroup
-    from rclpy.node import Node
-    from rclpy.qos import QoSProfile
-
 DEPTH = 10  # stamps remembered
 JUMP_NS = 10 * 10**9  # a stamp that far ahead of all others is not believed at once
 REMEMBERED = 100  # messages of a latched topic by which repetitions are recognised
 PROOF = 3  # messages in a row that prove that the clock of a topic has jumped
 POLL_LIMIT = 100  # messages of a topic taken by one poll; the rest comes with the next
 POLL_PERIOD = 0.005  # s between two polls while waiting
+CLOCK_S = 1.0  # s after which nothing is known of a clock that is silent
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Moment:
 
     stamp_ns: int
     messages: dict[str, Any]  # topic -> message
-    received: float  # s, monotonic: when the one that was received first came, or came again
+    received: float  # s, monotonic: when the one that was received first came
 
 
 class Observations:
@@ -50,6 +50,10 @@ class Observations:
     simulator or a bag that loops. Then everything earlier is forgotten, and `jumps` counts it.
     A stray that is less far ahead is dropped when the next message continues from the one before.
 
+    A message that repeats the stamp of the one before is as old as that: a driver that hangs sends
+    such ones. It counts as received now only where a clock says that time stands still, as a
+    simulator does that waits for a command.
+
     :param topics: short names, for example 'image', 'objects'; the first is the one whose stamp
         counts, the others describe it.
     :param latched: messages are rare and may have any stamp: the newest is the last one received.
@@ -58,44 +62,69 @@ class Observations:
     """
 
     def __init__(self, *topics: str, latched: bool = False) -> None:
-        self._topics = topics
-        self._latched = latched
+        self._topics, self._latched = topics, latched
         self._changed = threading.Condition()
         # stamp in ns -> {topic: (message, received)}
         self._by_stamp: OrderedDict[int, dict[str, tuple[Any, float]]] = OrderedDict()
         self._newest: dict[str, int] = {}  # topic -> stamp in ns
         self._previous: dict[str, int] = {}  # topic -> the stamp before that
         self._received: dict[str, float] = {}  # topic -> monotonic time of its last message
-        self._renewed: dict[str, float] = {}  # likewise, with a new stamp
         # topic -> stamps in a row that are not believed
         self._suspects: dict[str, list[int]] = {topic: [] for topic in topics}
         self._sent: dict[str, deque[int]] = {topic: deque(maxlen=REMEMBERED) for topic in topics}
+        self._clock = -1, -math.inf, False  # ns, when it came, whether it said the same before
         self.count, self.jumps = 0, 0
         self._subscriptions: dict[str, AdaptiveSubscription] = {}
+        self._poll: Callable[[], None] | None = None
 
-    def subscribe(self, node: 'Node', types: Mapping[str, tuple[type, str]], qos: 'QoSProfile',
-                  callback_group: 'CallbackGroup | None' = None,
-                  on_message: Callable[[str], object] | None = None,
-                  others: Mapping[str, Callable[..., Any]] = MappingProxyType({})) -> None:
+    def subscribe(self, node: Node, types: Mapping[str, tuple[type, str]], qos: QoSProfile,
+                  callback_group: CallbackGroup | None = None,
+                  on_message: Callable[[str], object] = lambda name: None,
+                  others: Mapping[str, Callable[..., Any]] = MappingProxyType({}),
+                  on_demand: bool = False) -> None:
         """
         Subscribe to the topics.
 
         :param types: {short name: (message type, topic name)}.
         :param qos: QoSProfile of all of them.
         :param callback_group: callback group, None for the node's own.
-        :param on_message: called with the topic name after each message, or None.
+        :param on_message: called with the topic name after each message.
         :param others: {short name: callback that takes message and info instead of `put`}.
+        :param on_demand: messages are taken only when something is asked of this object, as many
+            as `qos` keeps: a callback for each would interrupt a running network.
         """
-        for topic, (message_type, name) in types.items():
-            def receive(message: Any, info: dict[str, Any], topic: str = topic,
-                        name: str = name) -> None:
-                self.put(topic, message, reception_time(info), info.get('source_timestamp', 0))
-                if on_message is not None:
-                    on_message(name)
+        def put(topic: str, message: Any, info: dict[str, Any]) -> None:
+            self.put(topic, message, reception_time(info), info.get('source_timestamp', 0))
+            on_message(types[topic][1])
 
+        group = PollOnlyGroup() if on_demand else callback_group
+        for topic, (message_type, name) in types.items():
             self._subscriptions[topic] = AdaptiveSubscription(
-                node, message_type, name, others.get(topic, receive), qos, callback_group)
-        adapt_regularly(node, self._subscriptions.values(), callback_group)
+                node, message_type, name, others.get(topic, partial(put, topic)), qos, group)
+        if not on_demand:
+            adapt_regularly(node, self._subscriptions.values(), callback_group)
+            return
+        adapted = [-math.inf]  # monotonic time
+
+        def poll() -> None:
+            with self._changed:  # all topics together, in the order of reception
+                taken = sorted(((reception_time(info), topic, message, info)
+                                for topic, subscription in self._subscriptions.items()
+                                for message, info in subscription.take(POLL_LIMIT)),
+                               key=lambda one: one[0])
+                if time.monotonic() - adapted[0] > ADAPT_PERIOD:
+                    adapted[0] = time.monotonic()
+                    for subscription in self._subscriptions.values():  # nothing waits in it now
+                        subscription.adapt()
+                for _, topic, message, info in taken:
+                    put(topic, message, info)
+
+        self._poll = poll
+
+    def poll(self) -> None:
+        """Take what has arrived, if that is done on demand alone."""
+        if self._poll is not None:
+            self._poll()
 
     def names(self, topics: Iterable[str], explained: bool = False) -> str:
         """Return the full names of topics; explained: with why nothing arrives, where known."""
@@ -125,10 +154,10 @@ class Observations:
                     return
                 self._sent[topic].append(sent_ns)
             if stamp != self._newest.get(topic):
-                self._renewed[topic] = received
                 self._previous[topic] = self._newest.get(topic, stamp)
-            self._newest[topic] = stamp
-            self._received[topic] = received
+            elif not self._latched and not self.time_stands:
+                received = self._received[topic]
+            self._newest[topic], self._received[topic] = stamp, received
             self._by_stamp.setdefault(stamp, {})[topic] = message, received
             self._by_stamp.move_to_end(stamp)
             while len(self._by_stamp) > DEPTH * len(self._topics):
@@ -149,16 +178,20 @@ class Observations:
                 self.count += 1
                 self._changed.notify_all()
 
-    def note(self, topic: str, received: float, renewed: bool) -> None:
-        """
-        Note the reception of something from which messages of a topic are derived.
-
-        :param renewed: it did not repeat the one before.
-        """
+    def note(self, topic: str, received: float) -> None:
+        """Note the reception of something from which messages of a topic are derived."""
         with self._changed:
             self._received[topic] = received
-            if renewed:
-                self._renewed[topic] = received
+
+    def tell_time(self, now_ns: int) -> None:
+        """Take what a clock says."""
+        self._clock = now_ns, time.monotonic(), now_ns == self._clock[0]
+
+    @property
+    def time_stands(self) -> bool:
+        """Return whether a clock says, and has said before, that it is the same time."""
+        _, received, same = self._clock
+        return same and time.monotonic() - received < CLOCK_S
 
     def without(self, topic: str, other: str) -> list[int]:
         """Return the stamps at which `other` has come and `topic` has not, newest last."""
@@ -208,6 +241,7 @@ class Observations:
     def moment(self, topics: Collection[str], after_ns: int = -1,
                since: float = -math.inf) -> Moment | None:
         """Return the same as a Moment, with its stamp and time of reception."""
+        self.poll()
         with self._changed:
             found = [stamp for stamp, parts in self._by_stamp.items() if stamp > after_ns and all(
                 topic in parts and parts[topic][1] >= since for topic in topics)]
@@ -236,7 +270,7 @@ class Observations:
                 left = deadline - time.monotonic()
                 if found is not None or left <= 0:
                     return found
-                self._changed.wait(min(left, 0.1))
+                self._changed.wait(min(left, 0.1 if self._poll is None else POLL_PERIOD))
         return None
 
     def wait_for_change(self, timeout_s: float, count: int) -> None:
@@ -252,79 +286,18 @@ class Observations:
 
     def missing(self, topics: Collection[str]) -> list[str]:
         """Return those of `topics` on which nothing has been received yet."""
+        self.poll()
         with self._changed:
             return [topic for topic in topics if topic not in self._received]
 
-    def ages(self, topics: Collection[str], now: float, renewed: bool = False) -> dict[str, float]:
+    def ages(self, topics: Collection[str], now: float) -> dict[str, float]:
         """
         Return the age of the last message of each topic, {topic: seconds}, infinity for none.
 
         :param now: monotonic time.
-        :param renewed: messages that repeat the stamp of the one before do not count.
         """
         with self._changed:
-            times = self._renewed if renewed else self._received
-            return {topic: now - times.get(topic, -math.inf) for topic in topics}
-
-
-class OnDemandObservations(Observations):
-    """
-    Observations of topics that are received often and needed seldom: messages are polled.
-
-    With a callback for each message, every one would interrupt a running network.
-
-    :param types: {short name: (message type, topic name)}, the one whose stamp counts first.
-    :param qos: QoSProfile of all of them; its depth is how many messages wait to be taken.
-    :param latched: as in Observations.
-    :param on_message: called with the topic name for each message that is taken, or None.
-    """
-
-    def __init__(self, node: 'Node', types: Mapping[str, tuple[type, str]], qos: 'QoSProfile',
-                 latched: bool = False, on_message: Callable[[str], object] | None = None) -> None:
-        super().__init__(*types, latched=latched)
-        self._polling = threading.Lock()
-        self._on_message, self._types = on_message, types
-        group = PollOnlyGroup()
-        self._subscriptions = {
-            topic: AdaptiveSubscription(node, message_type, name, lambda message: None, qos, group)
-            for topic, (message_type, name) in types.items()}
-        self._adapted = -math.inf  # monotonic time
-
-    def moment(self, topics: Collection[str], after_ns: int = -1,
-               since: float = -math.inf) -> Moment | None:
-        """Return the newest Moment, after taking what has arrived."""
-        self.poll()
-        return super().moment(topics, after_ns, since)
-
-    def wait(self, topics: Collection[str], timeout_s: float, after_ns: int = -1,
-             give_up: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
-        """Wait for an observation, polling."""
-        deadline = time.monotonic() + timeout_s
-        while True:
-            found = self.newest(*topics, after_ns=after_ns)
-            if found is not None or time.monotonic() >= deadline or give_up():
-                return found
-            time.sleep(POLL_PERIOD)
-
-    def missing(self, topics: Collection[str]) -> list[str]:
-        """Return those of `topics` on which nothing has been received yet."""
-        self.poll()
-        return super().missing(topics)
-
-    def poll(self) -> None:
-        """Take what has arrived, all topics together in the order of reception."""
-        with self._polling:
-            taken = [(reception_time(info), topic, message, info.get('source_timestamp', 0))
-                     for topic, subscription in self._subscriptions.items()
-                     for message, info in subscription.take(POLL_LIMIT)]
-            if time.monotonic() - self._adapted > ADAPT_PERIOD:
-                self._adapted = time.monotonic()
-                for subscription in self._subscriptions.values():  # nothing waits in it now
-                    subscription.adapt()
-            for received, topic, message, sent_ns in sorted(taken, key=lambda one: one[0]):
-                self.put(topic, message, received, sent_ns)
-                if self._on_message is not None:
-                    self._on_message(self._types[topic][1])
+            return {topic: now - self._received.get(topic, -math.inf) for topic in topics}
 
 
 def reception_time(info: Mapping[str, Any]) -> float:

@@ -5,7 +5,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -14,13 +14,11 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 from tap_ros.errors import ConfigError
 from tap_ros.plugins import names
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
-
-if TYPE_CHECKING:
-    from rclpy.node import Node
-    from rclpy.parameter import Parameter
 
 
 class Parameters:
@@ -30,7 +28,7 @@ class Parameters:
     :param node: rclpy Node.
     """
 
-    def __init__(self, node: 'Node') -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
         self._choices: dict[str, tuple[str, ...]] = {}
         node.add_on_set_parameters_callback(self._check_choices)
@@ -71,7 +69,7 @@ class Parameters:
             raise ConfigError(
                 f'parameter {name}: {reason}. {description} Default: {default!r}') from error
 
-    def _check_choices(self, parameters: Iterable['Parameter']) -> SetParametersResult:
+    def _check_choices(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse strings that are none of the choices."""
         for parameter in parameters:
             choices = self._choices.get(parameter.name)

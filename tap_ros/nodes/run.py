@@ -8,23 +8,21 @@ from pathlib import Path
 import signal
 import sys
 import threading
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import rclpy
 from rclpy.executors import (
+    Executor,
     ExternalShutdownException,
     MultiThreadedExecutor,
     SingleThreadedExecutor,
 )
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from tap_ros.errors import TapError
 from tap_ros.nodes.heartbeat import Heartbeat
 from tap_ros.nodes.services import log_error
 from tap_ros.text import escaped
-
-if TYPE_CHECKING:
-    from rclpy.executors import Executor
-    from rclpy.node import Node
 
 SUBNET = Path(__file__).with_name('fastdds_subnet.xml')
 LOCALHOST = Path(__file__).with_name('fastdds_localhost.xml')
@@ -141,7 +139,7 @@ def _handle_signals(handler: Callable[[int, Any], Any]) -> None:
         signal.signal(signal.SIGHUP, handler)
 
 
-def _spin_once(executor: 'Executor', node: 'Node') -> None:
+def _spin_once(executor: Executor, node: Node) -> None:
     """Run what is ready; a signal is noticed after 0.1 s at most."""
     try:
         executor.spin_once(timeout_sec=0.1)

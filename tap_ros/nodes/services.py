@@ -4,18 +4,16 @@
 
 from collections.abc import Callable
 import traceback
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
+from rclpy.node import Node
+from rclpy.service import Service
 from tap_ros.errors import TapError
 from tap_ros.nodes.topics import SERVICE_QOS
 from tap_ros.text import escaped
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
-    from rclpy.service import Service
 
-
-def log_error(node: 'Node', what: str, error: BaseException) -> None:
+def log_error(node: Node, what: str, error: BaseException) -> None:
     """Log an error in one line; an unexpected one, that is no TapError, with its traceback."""
     if isinstance(error, TapError):
         node.get_logger().error(f'{what}: {escaped(error, 1000)}')
@@ -34,7 +32,7 @@ def refusal(kind: type, message: str) -> Any:
     return kind(success=False, message=message)
 
 
-def answering(node: 'Node', callback: Callable[[Any, Any], Any],
+def answering(node: Node, callback: Callable[[Any, Any], Any],
               refuse: Callable[[type, str], Any] = refusal) -> Callable[[Any, Any], Any]:
     """
     Wrap the callback of a service so that any exception becomes a response.
@@ -52,8 +50,8 @@ def answering(node: 'Node', callback: Callable[[Any, Any], Any],
     return answer
 
 
-def create_deferred_service(node: 'Node', service_type: type, name: str,
-                            take: Callable[[Any, Callable[[Any], object]], object]) -> 'Service':
+def create_deferred_service(node: Node, service_type: type, name: str,
+                            take: Callable[[Any, Callable[[Any], object]], object]) -> Service:
     """
     Offer a service whose responses may be sent later, by any thread.
 
@@ -73,7 +71,7 @@ def create_deferred_service(node: 'Node', service_type: type, name: str,
     return service
 
 
-def take_pending_requests(service: 'Service') -> None:
+def take_pending_requests(service: Service) -> None:
     """Take the requests of a deferred service that wait after its executor has ended."""
     with service.handle:
         while True:

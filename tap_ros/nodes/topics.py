@@ -2,16 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What several nodes share of topics: quality of service, message classes, stamps."""
 
-from typing import TYPE_CHECKING
-
 from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tap_ros.messages import topics
 from tap_ros.messages.topics import Topic
+from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.ros_messages import message_class
-
-if TYPE_CHECKING:
-    from tap_ros.nodes.parameters import Parameters
 
 # Reliable and kept for late joiners: goals, the last subgoal.
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE,
@@ -30,14 +26,14 @@ def of_topic(topic: Topic) -> tuple[type, str]:
     return message_class(topic.type), topic.name
 
 
-def camera_image(parameters: 'Parameters') -> tuple[type, str]:
+def camera_image(parameters: Parameters) -> tuple[type, str]:
     """Return message class and name of the topic of the camera's pictures."""
     if parameters['image_transport'] == 'compressed':
         return message_class(topics.COMPRESSED_TYPE), f'{topics.IMAGE.name}/compressed'
     return of_topic(topics.IMAGE)
 
 
-def camera_topics(parameters: 'Parameters') -> dict[str, tuple[type, str]]:
+def camera_topics(parameters: Parameters) -> dict[str, tuple[type, str]]:
     """
     Return what belongs to a picture of the camera.
 

@@ -4,7 +4,6 @@
 
 import math
 from threading import Thread
-import tracemalloc
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
@@ -12,7 +11,7 @@ from processes import LocalNode
 import pytest
 from sensor_msgs.msg import JointState
 from tap_ros.nodes.clients import Newest
-from tap_ros.nodes.diagnostics import Diagnostics, percentiles, rate, RollingWindow
+from tap_ros.nodes.diagnostics import Diagnostics, Record
 from tap_ros.nodes.recorder.node import RecorderNode
 from tap_ros.nodes.topics import STREAM
 
@@ -61,7 +60,7 @@ def test_work_and_inputs_of_many_threads_are_counted(client):
         client, {'camera/image_raw': 1.0, '/goal/image': math.inf}, queue=lambda: len(waiting))
 
     def work():
-        for index in range(500):
+        for index in range(100):
             diagnostics.received('camera/image_raw')
             diagnostics.received('/camera/image_raw')
             diagnostics.took(index % 100, 'predict_subgoal')
@@ -77,68 +76,33 @@ def test_work_and_inputs_of_many_threads_are_counted(client):
     assert set(found) == {
         'test_client: service', 'test_client: /camera/image_raw', 'test_client: /goal/image'}
     assert {status.hardware_id for status in message.status} == {'/test_client'}
-    assert found['test_client: /camera/image_raw'][2]['count'] == '8000'
+    assert found['test_client: /camera/image_raw'][2]['count'] == '1600'
     level, text, values = found['test_client: service']
     assert (level, text) == (DiagnosticStatus.ERROR, r'bad\nname \x1b[31m')
     assert values.pop('last_error_age_s')
     assert values == {
-        'queue': '3', 'errors': '1', 'last_error': text, 'predict_subgoal calls': '4000',
+        'queue': '3', 'errors': '1', 'last_error': text, 'predict_subgoal calls': '800',
         'predict_subgoal p50_ms': '49.50', 'predict_subgoal p99_ms': '98.01'}
     stamp = message.header.stamp
     now = client.get_clock().now().nanoseconds * 1e-9
     assert 0 <= now - (stamp.sec + stamp.nanosec * 1e-9) < 60
 
 
-def test_the_rate_of_a_regular_stream_is_its_frequency_and_of_less_than_two_zero():
+def test_a_rate_is_the_frequency_and_percentiles_are_of_recent_values_alone():
     for frequency in (0.5, 4.0, 30.0, 5000.0):
-        window = RollingWindow(10.0, 100)
+        record = Record(10.0)
         for index in range(500):
-            window.add(index / frequency)
-        assert rate(window.newest(500 / frequency)[0]) == pytest.approx(frequency, rel=1e-6)
-    window = RollingWindow(10.0, 100)
-    assert rate(window.newest(0.0)[0]) == 0.0
-    window.add(0.0)
-    assert rate(window.newest(0.0)[0]) == 0.0
-    window.add(0.0)
-    assert rate(window.newest(0.0)[0]) == 0.0  # two at once tell no rate
-    window.add(1.0)
-    assert rate(window.newest(1.0)[0]) > 0
-    assert rate(window.newest(11.1)[0]) == 0.0
-
-
-def test_percentiles_are_those_of_the_last_minute_only():
-    rng = np.random.default_rng(0)
+            record.add(index / frequency)
+        assert record.rate(500 / frequency) == pytest.approx(frequency, rel=1e-6)
+    record, rng = Record(60.0), np.random.default_rng(0)
+    assert record.rate(0.0) == 0.0 and np.isnan(record.percentiles(0.0)).all()
     times = np.cumsum(rng.exponential(0.1, 2000))
     values = rng.exponential(5.0, 2000)
-    window = RollingWindow(60.0, 10_000)
     for now, value in zip(times, values):
-        window.add(now, value)
-        if rng.random() < 0.01:  # asking in between changes nothing
-            window.newest(now)
+        record.add(now, value)
     now = times[-1] + 3.0
     late = values[now - times <= 60.0]
-    assert 300 < len(late) < 900
-    assert percentiles(window.newest(now)[1]).tolist() == np.percentile(late, (50, 99)).tolist()
-    assert np.isnan(percentiles(window.newest(now + 60.0)[1])).all()
-
-
-def test_a_number_counts_for_exactly_so_many_seconds():
-    window = RollingWindow(2.0, 10)
-    for now, value in enumerate((5.0, 6.0, 7.0)):
-        window.add(now, value)
-    assert [part.tolist() for part in window.newest(2.0)] == [[0, 1, 2], [5, 6, 7]]
-    assert [part.tolist() for part in window.newest(2.5)] == [[1, 2], [6, 7]]
-    window.add(3.0)
-    assert window.newest(5.0)[1].tolist() == [0.0]
-
-
-def test_memory_is_bounded_whatever_the_rate():
-    window = RollingWindow(60.0, 1000)
-    window.add(0.0, 0)
-    tracemalloc.start()
-    for index in range(1, 50_000):
-        window.add(index * 1e-6, index)
-    grown = tracemalloc.get_traced_memory()[0]
-    tracemalloc.stop()
-    assert grown < 100_000
-    assert window.newest(0.05)[1].tolist() == list(range(49_000, 50_000))
+    assert 300 < len(late) < 900 and record.count == 2000
+    assert record.percentiles(now).tolist() == np.percentile(late, (50, 99)).tolist()
+    assert len(record.recent(times[-1] + 59.9)) >= 1
+    assert len(record.recent(times[-1] + 60.1)) == 0 and record.rate(times[-1] + 60.1) == 0.0

@@ -16,14 +16,13 @@ import yaml
 pytestmark = pytest.mark.slow
 FOLDER = Path(__file__).parents[2] / 'config' / 'layouts'
 IMAGE, CAMERA_INFO = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
-MARKERS, TEXT = 'visualization_msgs/msg/MarkerArray', 'std_msgs/msg/String'
+TEXT = 'std_msgs/msg/String'
 DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 
 # What the 3D panel of Lichtblick 1.28.1 draws, by packages/suite-base/src/panels/ThreeDeeRender.
-DRAWN = (IMAGE, CAMERA_INFO, MARKERS, TEXT)
+DRAWN = (IMAGE, CAMERA_INFO, TEXT)
 # Of rviz 14.1 (Jazzy), by rviz_default_plugins/plugins_description.xml.
-DISPLAYS = {'Grid': None, 'TF': None, 'RobotModel': TEXT, 'MarkerArray': MARKERS,
-            'CameraInfo': CAMERA_INFO, 'Image': IMAGE}
+DISPLAYS = {'RobotModel': TEXT, 'CameraInfo': CAMERA_INFO, 'Image': IMAGE}
 
 
 def found(ask, missing):
@@ -81,7 +80,7 @@ def test_foxglove_shows_topics_of_the_nodes(loop):
     topics = found(loop.node.get_topic_names_and_types, {*images, *drawn, health})
     assert {topics[topic][0] for topic in images} == {IMAGE}
     assert {topics[topic][0] for topic in drawn} <= set(DRAWN)
-    assert topics[health] == [DIAGNOSTICS] and topics['/plan/markers'] == [MARKERS]
+    assert topics[health] == [DIAGNOSTICS]
     for path in plotted:
         if not path.isdigit():  # a line at a height
             numbers(path, '.', topics)

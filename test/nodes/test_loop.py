@@ -28,7 +28,6 @@ from tap_ros.nodes.predictor.node import OVERLAY_SCALE, PredictorNode
 from tap_ros.nodes.topics import STREAM
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
-from visualization_msgs.msg import MarkerArray
 
 pytestmark = pytest.mark.slow
 
@@ -87,17 +86,10 @@ def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
 
 def test_plans_are_drawn_for_whoever_listens(loop):
     loop.reset()
-    markers = Newest(loop.node, MarkerArray, 'plan/markers', STREAM)
     overlay = Newest(loop.node, Image, 'plan/overlay', STREAM)
-    while not (markers.count and overlay.count):  # until the planner knows of the listener
+    while not overlay.count:  # until the planner knows of the listener
         loop.reached(mode='direct', step_budget=2)
-    drawn = {marker.ns: marker for marker in markers.wait(10).markers}
-    assert set(drawn) == {'chosen', 'elites', 'targets', 'gripper'}
-    gripper, chosen = drawn['gripper'].pose.position, drawn['chosen'].points
-    assert len(chosen) == 16 and len(drawn['targets'].points) == 2
-    assert (chosen[0].x, chosen[0].y, chosen[0].z) == (gripper.x, gripper.y, gripper.z)
-    assert len(drawn['elites'].points) >= 2 * 15
-    picture = overlay.wait(10, lambda m: m.header.stamp == drawn['chosen'].header.stamp)
+    picture = overlay.wait(10)
     assert picture.header.frame_id == loop.image.wait(1).header.frame_id
     shown = decode_image(picture, 'plan/overlay', (384, 384))
     assert (shown == CHOSEN).all(-1).sum() > 30

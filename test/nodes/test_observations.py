@@ -7,6 +7,7 @@ from math import inf
 import threading
 import time
 
+import pytest
 from sensor_msgs.msg import Image, JointState
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.observations import DEPTH, JUMP_NS, Observations, PROOF, reception_time
@@ -66,9 +67,15 @@ def test_a_stray_stamp_now_and_then_is_not_believed():
             put(seen, stray + 1, topic)
             assert stamp_of(seen.newest('image', 'joints')) == stamp
         assert seen.jumps == 0
+    for strays in ((10**17, 5 * 10**17) * PROOF, (3, 2) * PROOF, (10**17, 3) * PROOF):
+        seen = Observations('image')
+        put(seen, 10**9, 'image')
+        for stray in strays:  # they do not follow each other
+            put(seen, stray, 'image')
+        assert stamp_of(seen.newest('image')) == 10**9 and seen.jumps == 0
 
 
-def test_a_stray_that_is_seconds_ahead_is_dropped():
+def test_a_stray_that_is_seconds_ahead_or_comes_first_is_dropped():
     for ahead in (1, 5, 9):
         seen = Observations('image', 'joints')
         for stamp in range(10**9, 20 * 10**9, 10**9 // 4):
@@ -80,9 +87,6 @@ def test_a_stray_that_is_seconds_ahead_is_dropped():
                 assert stamp_of(seen.newest('image')) == stamp
                 put(seen, stamp + ahead * 10**9, 'joints')
         assert seen.jumps == 0
-
-
-def test_a_stray_that_comes_first_is_found_out():
     seen = Observations('image', 'joints')
     put(seen, 10**17, 'image')
     for stamp in range(10**9, (PROOF + 2) * 10**9, 10**9):
@@ -96,27 +100,7 @@ def test_a_stamp_is_believed_at_once_up_to_ten_seconds_ahead():
         put(seen, 100, 'joints')
         put(seen, 100 + ahead, 'image')
         assert (seen.newest('image') is not None) == believed
-        assert seen.ages(('image',), 0.0)['image'] < inf if believed else (
-            seen.missing(('image',)) == ['image'])
-
-
-def test_strays_that_do_not_follow_each_other_prove_nothing():
-    for strays in ((10**17, 5 * 10**17) * PROOF, (3, 2) * PROOF, (10**17, 3) * PROOF):
-        seen = Observations('image')
-        put(seen, 10**9, 'image')
-        for stray in strays:
-            put(seen, stray, 'image')
-        assert stamp_of(seen.newest('image')) == 10**9 and seen.jumps == 0
-
-
-def test_a_message_that_is_believed_clears_the_suspicion():
-    seen = Observations('image')
-    put(seen, 10**9, 'image')
-    for _ in range(3):
-        put(seen, 10**17, 'image')
-        put(seen, 10**17 + 1, 'image')
-        put(seen, 10**9, 'image')
-    assert seen.jumps == 0 and stamp_of(seen.newest('image')) == 10**9
+        assert (seen.missing(('image',)) == []) == believed
 
 
 def test_after_a_jump_the_new_clock_counts_and_can_jump_again():
@@ -131,17 +115,6 @@ def test_after_a_jump_the_new_clock_counts_and_can_jump_again():
         assert stamp_of(seen.newest('image', 'joints')) == clock + PROOF
 
 
-def test_so_many_stamps_are_remembered_for_each_topic():
-    for stamps, found in ((2 * DEPTH, True), (2 * DEPTH + 1, False)):
-        seen = Observations('image', 'joints', latched=True)
-        put(seen, 0, 'joints')
-        for stamp in range(1, stamps):
-            put(seen, stamp, 'image')
-        put(seen, 0, 'image')
-        assert (seen.newest('image', 'joints') is not None) == found
-        assert seen.count == stamps + 1 and len(seen._by_stamp) <= 2 * DEPTH + 1
-
-
 def test_what_comes_now_and_then_may_have_any_stamp():
     seen = Observations('image', 'objects', latched=True)
     for stamp in (5, 10**18, 0):
@@ -149,16 +122,33 @@ def test_what_comes_now_and_then_may_have_any_stamp():
         assert stamp_of(seen.newest('image', 'objects')) == stamp
 
 
-def test_only_what_was_received_since_a_time_counts():
+def test_what_repeats_a_stamp_is_as_old_as_the_first_unless_a_clock_says_that_time_stands():
     seen = Observations('image', 'joints')
-    for topic, received in (('image', 1.0), ('joints', 2.0)):
-        seen.put(topic, stamped(Image, 10), received)
+
+    def receive(stamp, image, joints=None):
+        seen.put('image', stamped(Image, stamp), image)
+        if joints is not None:
+            seen.put('joints', stamped(Image, stamp), joints)
+
+    receive(10, 1.0, 2.0)
     assert seen.moment(('image', 'joints'), since=1.0).received == 1.0
     assert seen.moment(('image', 'joints'), since=1.5) is None
-    seen.put('image', stamped(Image, 10), 3.0)  # sent again, as in lock-step
-    assert seen.moment(('image', 'joints'), since=1.5).received == 2.0
-    assert seen.ages(('image', 'joints'), 4.0) == {'image': 1.0, 'joints': 2.0}
-    assert seen.ages(('image', 'other'), 4.0, renewed=True) == {'image': 3.0, 'other': inf}
+    receive(10, 3.0)
+    seen.tell_time(10)  # once: it may run on
+    receive(10, 3.5)
+    for stray in range(100, 100 + 3 * DEPTH):
+        seen.put('joints', stamped(Image, stray), 3.6)
+    receive(10, 3.7)  # long forgotten by its stamp
+    assert seen.ages(('image', 'other'), 4.0) == {'image': 3.0, 'other': inf}
+    seen.tell_time(10)
+    receive(10, 3.9)
+    assert seen.moment(('image',), since=3.8).received == 3.9
+    assert seen.ages(('image',), 4.0)['image'] == pytest.approx(0.1)
+    seen.tell_time(11)
+    receive(10, 5.0)
+    assert seen.ages(('image',), 5.0)['image'] == pytest.approx(1.1)
+    receive(12, 6.0)
+    assert seen.ages(('image',), 6.0)['image'] == 0
 
 
 def test_time_in_a_queue_makes_a_message_older():
@@ -182,25 +172,25 @@ def test_who_waits_for_a_change_is_woken_by_messages_and_by_wake():
     seen.wait_for_change(0.01, seen.count)
 
 
-def test_topics_that_are_subscribed_to_are_put_together(client):
-    seen, told = Observations('image', 'joints'), []
+def test_topics_are_put_together_as_they_come_or_on_demand(client):
     types = {'image': (Image, 'eye/image'), 'joints': (JointState, 'arm/joints')}
+    seen, told = Observations('image', 'joints'), []
     seen.subscribe(client, types, STREAM, on_message=told.append)
-    quiet = Observations('image')
-    quiet.subscribe(client, {'image': types['image']}, STREAM)
+    asked, taken = Observations('image', 'joints'), []
+    asked.subscribe(client, types, STREAM, on_message=taken.append, on_demand=True)
     publishers = [client.create_publisher(kind, name, STREAM) for kind, name in types.values()]
     begun = time.monotonic()
     for stamp in range(1, 600):
         for publisher, (kind, _) in zip(publishers, types.values()):
             publisher.publish(stamped(kind, stamp))
-        if seen.wait(('image', 'joints'), 0.1) and quiet.wait(('image',), 0.1):
+        if seen.wait(('image', 'joints'), 0.1):
             break
     moment = seen.moment(('image', 'joints'))
     assert begun <= moment.received <= time.monotonic()
     assert {topic: type(message) for topic, message in moment.messages.items()} == {
         'image': Image, 'joints': JointState}
-    assert set(told) == {'eye/image', 'arm/joints'}
-    assert isinstance(quiet.newest('image')['image'], Image)
+    assert set(told) == {'eye/image', 'arm/joints'} and not taken
+    assert asked.wait(('image', 'joints'), 5) and set(taken) == set(told)
 
 
 def test_waiting_ends_with_the_message_with_giving_up_and_with_the_time():

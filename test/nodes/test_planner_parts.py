@@ -1,75 +1,114 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of visual_mpc_node without the node: checks of a goal, and plans as markers."""
+"""Parts of visual_mpc_node without the node: checks of a goal, and plans drawn over pictures."""
 
-from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from sim_bridge.world.looks import get_look
 from tap_msgs.action import ReachGoal
-from tap_ros.contract import ROBOT_MASKS
+from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import ConfigError
-from tap_ros.nodes.planner.plan_view import encode_plan, way
-from tap_ros.nodes.planner.settings import check_request, unlike_training
-from tap_ros.nodes.topics import to_stamp
+from tap_ros.images.drawing import OBJECT_COLOURS
+from tap_ros.nodes.planner.plan_view import (
+    CHOSEN,
+    draw_plan,
+    ELITES,
+    fingertip_pixels,
+    GRIPPER,
+    LARGEST,
+    SCALE,
+    way,
+)
+from tap_ros.nodes.planner.settings import check_request
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
-from visualization_msgs.msg import Marker
+from tap_ros.weights import FORWARD_MODEL
+
+# Seen from above: 60 px a metre, and what is higher is seen farther up, by 40 px a metre.
+ABOVE = ForwardModelConfig(
+    table=(60, 0, 32, 0, -60, 32, 0, 0, 1), arm=(60, 0, 0, 35, 0, -60, -40, 30, 0, 0, 0, 1))
+HAND = np.array([0.1, -0.2, 0.05, 0.5], np.float32)
+GREY = np.full((64, 64, 3), 90, np.uint8)
+TARGETS = np.array([[20, 10], [50, 20]], np.float32)
 
 
-def test_an_empty_mode_is_subgoal_and_the_limit_of_a_budget_is_named():
+def test_modes_budgets_and_samples_are_bounded():
     assert check_request(ReachGoal.Goal(step_budget=1000)) == 'subgoal'
-    with pytest.raises(ConfigError, match='1001; expected 1 to 1000, or 0 for 40, .* three.* 75'):
-        check_request(ReachGoal.Goal(step_budget=1001))
-
-
-def test_samples_that_are_weighed_are_bounded_and_those_of_direct_goals_are_not_looked_at():
     check_request(ReachGoal.Goal(num_samples=32))
     check_request(ReachGoal.Goal(num_samples=1, recursion_depth=100))
     check_request(ReachGoal.Goal(mode='direct', num_samples=100))
-    with pytest.raises(ConfigError, match='33 x 2 = 66; at most 64 plans'):
-        check_request(ReachGoal.Goal(num_samples=33))
+    for fields, words in (
+            ({'step_budget': 1001}, '1001; expected 1 to 1000, or 0 for 40, .* three.* 75'),
+            ({'num_samples': 33}, '33 x 2 = 66; at most 64 plans')):
+        with pytest.raises(ConfigError, match=words):
+            check_request(ReachGoal.Goal(**fields))
 
 
-def test_pictures_unlike_those_of_the_training_are_named():
-    for trained, robot_mask in product(ROBOT_MASKS, ROBOT_MASKS):
-        model = LearnedForwardModel(
-            ForwardModelConfig((1.0,) * 9, (1.0,) * 12, robot_mask=trained))
-        told = unlike_training(model, robot_mask)
-        assert bool(told) is (robot_mask != trained)
-        assert not told or (f'robot_mask is {robot_mask}' in told and f'with {trained}' in told)
+def plan_of(*elites):
+    """Return a plan that takes the first of these sequences of moves."""
+    return SimpleNamespace(actions=np.array(elites[0], float), elites=np.array(elites, float))
 
 
-GRIPPER = np.array([0.1, -0.2, 0.05, 0.5], np.float32)
+def straight(x, y, steps=15):
+    return np.tile([x / steps, y / steps, 0, 0], (steps, 1))
 
 
-def points(marker):
-    return np.array([(p.x, p.y, p.z) for p in marker.points])
+def shown(canvas, pixel):
+    """Return the colour at a pixel (u, v) of the picture before it was enlarged."""
+    u, v = ((np.asarray(pixel) + 0.5) * len(canvas) / 64).astype(int)
+    return tuple(canvas[v, u].tolist())
 
 
-def test_a_plan_is_drawn_with_what_it_was_chosen_from():
-    rng = np.random.default_rng(0)
-    elites = rng.uniform(-0.02, 0.02, (3, 15, 4))
-    plan = SimpleNamespace(actions=elites[1], elites=elites, places=np.array([[0.2, 0.1], [0, 0]]))
-    found = {m.ns: m for m in encode_plan(plan, GRIPPER, to_stamp(5 * 10**9), 'world').markers}
-    assert set(found) == {'chosen', 'elites', 'targets', 'gripper'}
-    assert len({m.id for m in found.values()}) == 4
-    for marker in found.values():
-        assert (marker.header.frame_id, marker.header.stamp.sec) == ('world', 5)
-        assert marker.action == Marker.ADD and marker.color.a > 0 and marker.scale.x > 0
-        assert marker.pose.orientation.w == 1
-    np.testing.assert_allclose(points(found['chosen']), way(elites[1], GRIPPER))
-    lines = points(found['elites']).reshape(3, 15, 2, 3)  # beginning and end of each move
-    for line, actions in zip(lines, elites):
-        np.testing.assert_allclose(line[:, 0], way(actions, GRIPPER)[:-1])
-        np.testing.assert_allclose(line[:, 1], way(actions, GRIPPER)[1:])
-    np.testing.assert_allclose(points(found['targets']), [[0.2, 0.1, 0], [0, 0, 0]])
-    assert found['gripper'].pose.position.x == np.float32(0.1)
+def test_a_way_is_the_sum_of_its_moves_within_the_workspace():
+    moves = np.array([[0.05, 0.02, 0.01, 1], [0.03, -0.02, 0, 1], [9, 0, 9, 0]])
+    np.testing.assert_allclose(way(moves, HAND), [
+        [0.1, -0.2, 0.05], [0.15, -0.18, 0.06], [0.18, -0.2, 0.06],
+        [WORKSPACE_HIGH[0], -0.2, WORKSPACE_HIGH[2]]], atol=1e-6)
 
 
-def test_without_elites_the_chosen_way_is_drawn():
-    actions = np.zeros((15, 4))
-    plan = SimpleNamespace(actions=actions, elites=actions[:0].reshape(0, 15, 4),
-                           places=np.zeros((1, 2)))
-    found = encode_plan(plan, GRIPPER, to_stamp(0), 'world').markers
-    assert [len(m.points) for m in found] == [16, 0, 1, 0]
+def test_fingertips_are_drawn_where_the_camera_sees_them():
+    camera = get_look('hand').camera(False, 64, 64)
+    config = LearnedForwardModel.load(FORWARD_MODEL).config
+    points = np.random.default_rng(0).uniform(WORKSPACE_LOW, WORKSPACE_HIGH, (200, 3))
+    gaps = np.linalg.norm(fingertip_pixels(config, points) - camera.project(points), axis=1)
+    assert gaps.max() < 3 and gaps.mean() < 1.5
+    # At the table, where objects are pushed, the arm's offset counts for nothing.
+    low = np.array([[0.2, -0.1, 0.0]])
+    np.testing.assert_allclose(fingertip_pixels(ABOVE, low), [[44, 38]])
+    np.testing.assert_allclose(fingertip_pixels(ABOVE, low + [0, 0, 0.1]), [[44, 34]])
+
+
+def test_all_ways_the_targets_and_the_gripper_are_where_they_belong():
+    ways = [straight(-0.3, 0), straight(0.2, 0.4), straight(-0.1, 0.5)]
+    canvas = draw_plan(GREY, ABOVE, plan_of(*ways), HAND, TARGETS)
+    assert canvas.shape == (64 * SCALE, 64 * SCALE, 3) and canvas.dtype == np.uint8
+    middle = [fingertip_pixels(ABOVE, way(one, HAND)[8:9])[0] for one in ways]
+    assert shown(canvas, middle[0]) == CHOSEN
+    for place in middle[1:]:  # a thin line has no pixel of its own colour alone
+        assert np.abs(np.subtract(shown(canvas, place), ELITES)).max() < 60
+    assert shown(canvas, fingertip_pixels(ABOVE, HAND[None, :3].astype(float))[0]) == GRIPPER
+    for k, target in enumerate(TARGETS):
+        assert shown(canvas, target) == OBJECT_COLOURS[k]
+    touched = (canvas != 90).any(-1).mean()
+    assert 0.01 < touched < 0.1, 'most of the picture stays as it is'
+    alone = draw_plan(GREY, ABOVE, SimpleNamespace(
+        actions=ways[0], elites=np.empty((0, 15, 4))), HAND, TARGETS)
+    assert (alone == CHOSEN).all(-1).sum() > 200 and not (alone == ELITES).all(-1).any()
+
+
+def test_pictures_are_enlarged_as_far_as_a_page_has_room():
+    for width, times in ((16, 6), (106, 6), (107, 5), (320, 2), (321, 1), (640, 1), (1000, 1)):
+        picture = np.zeros((width // 2, width, 3), np.uint8)
+        canvas = draw_plan(picture, ABOVE, plan_of(straight(0, 0.3)), HAND, TARGETS)
+        assert canvas.shape == (width // 2 * times, width * times, 3)
+        assert canvas.shape[1] <= max(LARGEST, width)
+
+
+def test_what_cannot_be_seen_is_not_drawn_and_does_no_harm():
+    absurd = ForwardModelConfig(table=(0.0,) * 9, arm=(1e30,) * 12)
+    far = ForwardModelConfig(table=(60, 0, 1e9, 0, -60, 32, 0, 0, 1), arm=ABOVE.arm)
+    nowhere = np.array([[np.nan, 3], [1e30, -1e30]], np.float32)
+    for config in (absurd, far):
+        canvas = draw_plan(GREY, config, plan_of(straight(0.1, 0.1)), HAND, nowhere)
+        np.testing.assert_array_equal(canvas, 90)

@@ -63,7 +63,7 @@ def made():
     yield make
     for rig in rigs:
         rig.go.set()
-        rig.queue.close(TIMEOUT)
+        rig.queue.close()
 
 
 def test_every_request_of_many_threads_is_answered_once_and_its_own_way(made):
@@ -133,7 +133,7 @@ def test_at_the_end_all_that_wait_are_told_and_the_batch_is_finished(made):
     rig.hold()
     for one in range(1, 4):
         rig.put(one)
-    ending = threading.Thread(target=rig.queue.close, args=(TIMEOUT,))
+    ending = threading.Thread(target=rig.queue.close)
     ending.start()
     found = rig.wait(3)  # at once, while the batch is in progress
     assert all(isinstance(found[one], Busy) for one in (1, 2, 3)) and 0 not in found
@@ -156,7 +156,7 @@ def test_what_is_prepared_is_prepared_in_the_thread_that_works():
     assert len(threads) == 1
     queue.put('one', lambda found: answered.set())
     assert answered.wait(TIMEOUT)
-    queue.close(TIMEOUT)
+    queue.close()
     assert threads[0] is threads[1] is not threading.current_thread()
 
     def fail():
@@ -180,7 +180,7 @@ def test_an_answer_that_cannot_be_given_leaves_the_others_theirs(capsys):
     queue.put(1, fail)
     queue.put(2, keep)
     assert done.wait(TIMEOUT) and answers == [2]
-    queue.close(TIMEOUT)
+    queue.close()
     assert 'the client has gone' in capsys.readouterr().err
 
 
@@ -189,6 +189,7 @@ def test_an_interrupted_start_leaves_no_thread_at_work():
 
     def prepare():
         threads.append(threading.current_thread())
+        time.sleep(0.1)  # until it is waited for
         _thread.interrupt_main()
         time.sleep(0.3)
         prepared.set()

@@ -6,21 +6,18 @@ from collections.abc import Collection
 import math
 import threading
 import time
-from typing import TYPE_CHECKING
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from rclpy.duration import Duration
+from rclpy.node import Node
 from std_msgs.msg import Float64
 from tap_ros.errors import PlanningError
+from tap_ros.nodes.observations import Observations
+from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.text import escaped
-
-if TYPE_CHECKING:
-    from builtin_interfaces.msg import Time
-    from rclpy.node import Node
-    from tap_ros.nodes.observations import Observations
-    from tap_ros.nodes.parameters import Parameters
 
 WATCH_S = 0.02  # s between two checks whether the arm has to be stopped
 STOOD_S = 2.0  # s; a longer gap between checks proves that the process or machine stood still
@@ -38,7 +35,7 @@ class ArmCommander:
     :param sensors: Observations of the watched sensors.
     """
 
-    def __init__(self, node: 'Node', params: 'Parameters', sensors: 'Observations') -> None:
+    def __init__(self, node: Node, params: Parameters, sensors: Observations) -> None:
         self._node, self._params, self._sensors = node, params, sensors
         self._lock = threading.Condition()  # no command may follow the end of a goal
         self._goal: object = None
@@ -75,7 +72,7 @@ class ArmCommander:
                 self._goal = None
             self._stop()
 
-    def send(self, goal: object, action: np.ndarray, stamp: 'Time',
+    def send(self, goal: object, action: np.ndarray, stamp: Time,
              topics: Collection[str]) -> bool:
         """
         Send one command, clipped to the limits.
@@ -149,12 +146,12 @@ class ArmCommander:
         """Stop the arm if the last command or a sensor is too old, and again after REPEAT_S."""
         if now - self._stopped_at >= REPEAT_S and (
                 now - self._moved_at > self._params['max_silence']
-                or self._silent(self._topics, now, renewed=True)):
+                or self._silent(self._topics, now)):
             self._stop()
 
-    def _silent(self, topics: Collection[str], now: float, renewed: bool = False) -> bool:
+    def _silent(self, topics: Collection[str], now: float) -> bool:
         """Return whether one of the topics is silent."""
-        ages = self._sensors.ages(topics, now, renewed)
+        ages = self._sensors.ages(topics, now)
         return any(age > self._params['max_silence'] for age in ages.values())
 
     def _stop(self) -> None:

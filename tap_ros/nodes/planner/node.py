@@ -10,15 +10,16 @@ from pathlib import Path
 import sys
 import threading
 import time
-from typing import Any, cast, TYPE_CHECKING
+from typing import Any, cast
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
+from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused
 from tap_ros.errors import PlanningError, TapError
-from tap_ros.messages.images import is_empty
 from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
@@ -26,33 +27,27 @@ from tap_ros.nodes.clients import CallError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.planner.arm import ArmCommander
-from tap_ros.nodes.planner.goal_source import GoalSource
-from tap_ros.nodes.planner.plan_view import PlanView
+from tap_ros.nodes.planner.goals import GoalSource, SubgoalClient
+from tap_ros.nodes.planner.plan_view import draw_plan
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import (
     check_request,
     declare_parameters,
     load_planner,
     reach_config,
-    unlike_training,
 )
-from tap_ros.nodes.planner.subgoals import SubgoalClient
+from tap_ros.nodes.robot_view import warn_if_unlike
+from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import internal_error, log_error
-from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.topics import camera_topics, goal_topics, STREAM, to_stamp
+from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.planning.hierarchy import choose_sample, targets_by
+from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.reach import Aim, Command, End, Reach
+from tap_ros.planning.reach import Aim, Command, End, Reach, Seen
+from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.text import escaped
-
-if TYPE_CHECKING:
-    from rclpy.action.server import ServerGoalHandle
-    from tap_ros.planning.action_sequences import Limits
-    from tap_ros.planning.hierarchy import Target
-    from tap_ros.planning.reach import Seen
-    from tap_ros.planning.visual_mpc import VisualMPC
 
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'
@@ -72,7 +67,7 @@ class VisualMpcNode(LifecycleBase):
     """
 
     loaded_by = 'weights',
-    _mpc: 'VisualMPC'  # while configured
+    _mpc: VisualMPC  # while configured
 
     def __init__(self, **options: Any) -> None:
         super().__init__('visual_mpc_node', **options)
@@ -89,12 +84,12 @@ class VisualMpcNode(LifecycleBase):
             **{name: math.inf for _, name in goal_topics(robot_mask).values()}},
             idle=self.why_not)
         received = self._diagnostics.received
-        self._goal = GoalSource(self, robot_mask, received)
         self._inputs = PlannerInputs(self, self.params, lambda: self._model.camera_crop, received)
+        self._goal = GoalSource(self, self._inputs.robot, received)
         self._sensors = self._inputs.sensors
         self._arm = ArmCommander(self, self.params, self._sensors)
-        subscribe(self, CommandRefused, 'arm/refused', self._on_refused, STREAM)
-        self._view = PlanView(self)
+        self.create_subscription(CommandRefused, 'arm/refused', self._on_refused, STREAM)
+        self._overlay = self.create_publisher(Image, 'plan/overlay', STREAM)
         self._distance = self.create_publisher(Float64, 'plan/distance', STREAM)
         group = ReentrantCallbackGroup()  # answers and cancels arrive while a goal is executed
         self._subgoals = SubgoalClient(self, self._inputs, group)
@@ -115,9 +110,8 @@ class VisualMpcNode(LifecycleBase):
         """Load the weights."""
         self._check_idle()
         self._mpc = load_planner(self.params)
-        unlike = unlike_training(self._model, self.params['robot_mask'])
-        if unlike:
-            self.get_logger().warning(unlike)
+        warn_if_unlike(self, self.params['robot_mask'], [self._model.config.robot_mask],
+                       'forward model')
 
     def unload(self) -> None:
         """Release the weights."""
@@ -170,7 +164,7 @@ class VisualMpcNode(LifecycleBase):
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
-    def _on_cancel(self, handle: 'ServerGoalHandle') -> CancelResponse:
+    def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         self._cancelled = handle  # its state is still executing
         self._arm.end(handle)  # at once: a plan may be in progress
         self._sensors.wake()
@@ -180,7 +174,7 @@ class VisualMpcNode(LifecycleBase):
         self._refusals.append((to_nanoseconds(message.header.stamp), escaped(message.message)))
         self._sensors.wake()
 
-    def _execute(self, handle: 'ServerGoalHandle') -> ReachGoal.Result:
+    def _execute(self, handle: ServerGoalHandle) -> ReachGoal.Result:
         """Run a goal to its end; runs in a thread of the executor."""
         result = ReachGoal.Result()
         # Two goals may have been accepted at the same time.
@@ -218,7 +212,7 @@ class VisualMpcNode(LifecycleBase):
 
     # One goal
 
-    def _reach(self, handle: 'ServerGoalHandle', accepted: float,
+    def _reach(self, handle: ServerGoalHandle, accepted: float,
                result: ReachGoal.Result) -> None:
         """Show the loop what is seen since `accepted`, do what it answers, fill the result."""
         request = handle.request
@@ -260,8 +254,8 @@ class VisualMpcNode(LifecycleBase):
             else:
                 self._sensors.wait_for_change(0.1, count)
 
-    def _aim(self, handle: 'ServerGoalHandle', mode: str, seen: 'Seen',
-             limits: 'Limits') -> list['Target']:
+    def _aim(self, handle: ServerGoalHandle, mode: str, seen: Seen,
+             limits: Limits) -> list[Target]:
         """Return the Targets of a goal, asking for subgoals in that mode."""
         if not seen.names or seen.pixels is None:
             raise PlanningError('objects: none are seen, so there is nothing to push; publish '
@@ -271,16 +265,16 @@ class VisualMpcNode(LifecycleBase):
             return self._is_cancelled(handle) or bool(self._halt)
 
         request = handle.request
-        goal = self._goal.take(self.params['image_timeout'], give_up)
+        picture, objects = self._goal.take(self.params['image_timeout'], give_up)
         self._go_on(handle)
         names, pixels = self._inputs.decode_positions(
-            goal['objects'], 'goal_objects', None if is_empty(goal['image']) else goal['image'])
+            objects, 'goal_objects', None if picture is None else picture.shape[:2])
         goal_pixels = match_objects(seen.names, names, pixels, 'objects', 'goal_objects')
-        if mode != 'subgoal':
+        if mode != 'subgoal' or picture is None:
             return targets_by([], goal_pixels)
         begin = time.perf_counter()
         try:
-            found = self._subgoals.ask(request, seen, goal, goal_pixels,
+            found = self._subgoals.ask(request, seen, picture, goal_pixels,
                                        self.params['predictor_timeout'], give_up)
         except CallError:
             self._go_on(handle)
@@ -290,7 +284,7 @@ class VisualMpcNode(LifecycleBase):
             self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found,
             request.seed, limits, lambda: self._go_on(handle)), goal_pixels)
 
-    def _send(self, handle: 'ServerGoalHandle', accepted: float, reach: Reach, command: Command,
+    def _send(self, handle: ServerGoalHandle, accepted: float, reach: Reach, command: Command,
               topics: Collection[str]) -> bool:
         """
         Send a command; tell whether it was: not when a sensor is silent or it comes too late.
@@ -311,28 +305,31 @@ class VisualMpcNode(LifecycleBase):
         return self._arm.send(
             handle, command.plan.action, to_stamp(command.seen.stamp_ns), topics)
 
-    def _tell(self, handle: 'ServerGoalHandle', reach: Reach, command: Command) -> None:
+    def _tell(self, handle: ServerGoalHandle, reach: Reach, command: Command) -> None:
         """Publish feedback, the plan and the distance after a command."""
-        plan = command.plan
+        plan, seen = command.plan, command.seen
         self._diagnostics.took(plan.planning_ms, 'plan')
         self._distance.publish(Float64(data=reach.distance))
-        self._view.show(command, reach.targets[command.stage], self._model.config,
-                        self._inputs.messages['image'].header.frame_id)
+        if self._overlay.get_subscription_count():
+            picture = draw_plan(seen.image, self._model.config, plan, seen.gripper,
+                                reach.targets[command.stage].pixels)
+            self._overlay.publish(encode_image(
+                picture, to_stamp(seen.stamp_ns), self._inputs.frame_id))
         handle.publish_feedback(ReachGoal.Feedback(
             step=reach.steps, stage=stage_name(command.stage, len(reach.targets) - 1),
             expected_distance=float(plan.expected_distance),
             planning_ms=float(plan.planning_ms)))
 
-    def _is_cancelled(self, handle: 'ServerGoalHandle') -> bool:
+    def _is_cancelled(self, handle: ServerGoalHandle) -> bool:
         return self._cancelled is handle or handle.is_cancel_requested
 
-    def _go_on(self, handle: 'ServerGoalHandle') -> None:
+    def _go_on(self, handle: ServerGoalHandle) -> None:
         """Raise Cancelled if the goal has to end."""
         if self._is_cancelled(handle) or self._halt:
             raise Cancelled('cancelled' if self._is_cancelled(handle) else self._halt)
 
 
-def cancel_is_known(handle: 'ServerGoalHandle', seconds: float = 1.0) -> bool:
+def cancel_is_known(handle: ServerGoalHandle, seconds: float = 1.0) -> bool:
     """Wait until rclpy knows that a goal is cancelled, which is after _on_cancel has returned."""
     deadline = time.monotonic() + seconds
     while not handle.is_cancel_requested and time.monotonic() < deadline:

@@ -7,10 +7,13 @@ from contextlib import suppress
 from dataclasses import replace
 import math
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import CompressedImage, Image, JointState
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from tap_msgs.msg import Episode, ObjectStates
 from tap_ros.errors import ImageError, KinematicsError, PlanningError, TapError
 from tap_ros.images.crop import TrainedCrop
@@ -20,17 +23,11 @@ from tap_ros.messages.joints import GripperHistory
 from tap_ros.messages.objects import decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
-from tap_ros.nodes.observations import JUMP_NS, Moment, Observations, reception_time
-from tap_ros.nodes.parameters import declared_arm
+from tap_ros.nodes.observations import JUMP_NS, Observations, reception_time
+from tap_ros.nodes.parameters import declared_arm, Parameters
 from tap_ros.nodes.robot_view import RobotView
-from tap_ros.nodes.ros_messages import encode_image
-from tap_ros.nodes.subscriptions import subscribe
 from tap_ros.nodes.topics import camera_topics, of_topic, STREAM
 from tap_ros.planning.reach import Seen
-
-if TYPE_CHECKING:
-    from rclpy.node import Node
-    from tap_ros.nodes.parameters import Parameters
 
 
 class PlannerInputs:
@@ -48,12 +45,12 @@ class PlannerInputs:
     :param on_message: called with the topic name after each message.
     :ivar sensors: Observations.
     :ivar robot: RobotView.
-    :ivar messages: {topic: message} that the newest Seen was decoded from.
+    :ivar frame_id: of the picture that was seen last.
     """
 
-    def __init__(self, node: 'Node', params: 'Parameters', crop: Callable[[], TrainedCrop],
+    def __init__(self, node: Node, params: Parameters, crop: Callable[[], TrainedCrop],
                  on_message: Callable[[str], object]) -> None:
-        self._node, self._params, self._crop_now = node, params, crop
+        self._node, self._params, self._crop = node, params, crop
         self._camera_size: tuple[int, int] | None = None
         self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
         self.robot = RobotView(params['robot_mask'])
@@ -64,14 +61,10 @@ class PlannerInputs:
             declared_arm(params), params['joint_prefix'], params['fixed_opening'])
         self._useless = ''  # why the joint states cannot be used
         self.begin(0.0)
+        node.create_subscription(Clock, 'clock', self._on_clock, qos_profile_sensor_data)
         self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
                                others={'joints': self._on_joints})
-        subscribe(node, Episode, 'episode', self._on_episode, STREAM)
-
-    @property
-    def _crop(self) -> TrainedCrop:
-        """Return what the planner makes of pictures now."""
-        return self._crop_now()
+        node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
 
     def topics(self, objects: bool = True) -> tuple[str, ...]:
         """Return the names of what is looked at, with or without the objects."""
@@ -81,7 +74,7 @@ class PlannerInputs:
         """Begin a goal: only what is received from this monotonic time on is seen."""
         self._since = since
         self._seen: Seen | None = None
-        self.messages: dict[str, Any] = {}
+        self.frame_id = ''
         self._publishers = self._count_publishers()
 
     def look(self, topics: Collection[str]) -> tuple[Seen | None, str]:
@@ -107,9 +100,8 @@ class PlannerInputs:
                 moment.stamp_ns, times['jumps']):
             self._seen = replace(self._seen, **times)
         else:
-            moment = self._without_robot(moment)
-            self._seen = self._decode(moment, topics, times)
-            self.messages = moment.messages
+            self._seen = self._decode(moment.messages, topics, moment.stamp_ns, times)
+            self.frame_id = moment.messages['image'].header.frame_id
         return self._seen, lacking
 
     def newest_stamp(self) -> int:
@@ -123,59 +115,49 @@ class PlannerInputs:
         known = jumps == self.sensors.jumps and begun_ns <= stamp_ns + JUMP_NS
         return begun_ns if known else 0
 
-    def _without_robot(self, moment: Moment) -> Moment:
-        """Return the Moment with a raw picture, without the robot if a mask is used."""
-        messages = moment.messages
+    def _picture(self, messages: dict[str, Any]) -> np.ndarray:
+        """Return the picture of the camera, without the robot if a mask is used."""
         if self.robot.used:
-            image = self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
-        elif isinstance(messages['image'], CompressedImage):
-            header = messages['image'].header
-            image = encode_image(decode_image(messages['image'], self._types['image'][1]),
-                                 header.stamp, header.frame_id)
-        else:
-            return moment
-        return replace(moment, messages=messages | {'image': image})
+            return self.robot.see(messages['image'], messages['mask'], self.sensors.jumps)
+        return decode_image(messages['image'], self._types['image'][1])
 
-    def cut(self, message: Image, name: str) -> np.ndarray:
+    def cut(self, picture: np.ndarray, name: str) -> np.ndarray:
         """
-        Return a picture as the planner sees it, uint8 (H, W, 3).
+        Return a picture, uint8 (H, W, 3), as the planner sees it.
 
-        :param message: sensor_msgs/Image.
         :param name: how errors call it.
-        :raises ImageError: for one that cannot be used, or cut as in the training.
+        :raises ImageError: for one that cannot be cut as in the training.
         """
-        picture = decode_image(message, name)
-        return check_image(self._crop.of(picture.shape[:2], name).image(picture), name,
-                           self._crop.size)
+        crop = self._crop()
+        return check_image(crop.of(picture.shape[:2], name).image(picture), name, crop.size)
 
-    def decode_positions(self, message: ObjectStates, name: str,
-                         picture: Image | None = None) -> tuple[tuple[str, ...], np.ndarray]:
+    def decode_positions(
+            self, message: ObjectStates, name: str,
+            size: tuple[int, int] | None = None) -> tuple[tuple[str, ...], np.ndarray]:
         """
         Decode where objects are, in the pixels that the planner works with.
 
         :param message: tap_msgs/ObjectStates, in pixels of a picture.
         :param name: how errors call it.
-        :param picture: the picture; None: the one that was seen last.
+        :param size: of the picture (H, W); None: of the one that was seen last.
         :return: names, and pixels (K, 2) float32.
         :raises TapError: see objects.decode_objects; also for a pixel outside of the used part.
         """
-        size = (self._camera_size or self._crop.size if picture is None
-                else (picture.height, picture.width))
-        return decode_cut_objects(message, name, size, self._crop.of(size, name))
+        size = size or self._camera_size or self._crop().size
+        return decode_cut_objects(message, name, size, self._crop().of(size, name))
 
     def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
         """Take joint states of the gripper, of the arm, or of another driver."""
         received, name = reception_time(info), self._types['joints'][1]
         self._tell(name)
         try:
-            new = self._gripper.take(message, received)
+            if self._gripper.take(message, received, self.sensors.time_stands):
+                self._useless = ''
         except TapError as error:
             self._useless = f'{self.sensors.names(["joints"])}: {error}'
             return
-        if new:
-            self._useless = ''
         if self._gripper.received > -math.inf:
-            self.sensors.note('joints', self._gripper.received, new)
+            self.sensors.note('joints', self._gripper.received)
             newest = self.sensors.moment(('image',))  # again, as joints that come again are newer
             for stamp_ns in {*self.sensors.without('joints', 'image'),
                              *([newest.stamp_ns] if newest else [])}:
@@ -210,14 +192,14 @@ class PlannerInputs:
         moment = self.sensors.moment(('image', 'mask'))
         if moment is not None:
             with suppress(TapError):  # look() reports it
-                self._without_robot(moment)
+                self._picture(moment.messages)
 
-    def _decode(self, moment: Moment, topics: Collection[str], times: dict[str, Any]) -> Seen:
+    def _decode(self, messages: dict[str, Any], topics: Collection[str], stamp_ns: int,
+                times: dict[str, Any]) -> Seen:
         """Return a Seen; the objects keep the order in which they were seen first."""
-        first, pixels = self._seen, None
-        names = first.names if first else ()
-        name, crop = self._types['image'][1], self._crop
-        picture = decode_image(moment.messages['image'], name)
+        names, pixels = self._seen.names if self._seen else (), None
+        name, crop = self._types['image'][1], self._crop()
+        picture = self._picture(messages)
         self._camera_size = picture.shape[:2]
         if crop.crop and crop.camera_size and crop.camera_size != self._camera_size:
             # The model knows where the table is in the pictures of one camera.
@@ -225,15 +207,12 @@ class PlannerInputs:
                              'those of {4}x{3}, send such ones'.format(
                                  name, *self._camera_size, *crop.camera_size))
         if 'objects' in topics:
-            found, pixels = self.decode_positions(moment.messages['objects'], 'objects')
+            found, pixels = self.decode_positions(messages['objects'], 'objects')
             if set(found) == set(names):
                 pixels = match_objects(names, found, pixels, 'the first objects', 'objects')
             else:
                 names = found
-        image = check_image(
-            crop.of(self._camera_size, name).image(picture), name, crop.size)
-        gripper = moment.messages['joints']
-        return Seen(image, gripper, names, pixels, moment.stamp_ns, **times)
+        return Seen(self.cut(picture, name), messages['joints'], names, pixels, stamp_ns, **times)
 
     def _lacking(self, topics: Collection[str]) -> str:
         """Return which sensors are silent and why, '' if none is."""
@@ -258,6 +237,9 @@ class PlannerInputs:
                     'the scene has changed: '
                     f'{count} nodes publish on {self.sensors.names([topic])} now; '
                     'leave one, and send the goal again')
+
+    def _on_clock(self, message: Clock) -> None:
+        self.sensors.tell_time(to_nanoseconds(message.clock))
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:

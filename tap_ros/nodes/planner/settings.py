@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from rclpy.node import Node
+from tap_msgs.action import ReachGoal
 from tap_ros.contract import (
     CLIMB_LIMIT,
     CONTROL_PERIOD,
@@ -34,17 +34,13 @@ from tap_ros.plugins import names
 from tap_ros.text import escaped
 from tap_ros.weights import FORWARD_MODEL
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
-    from tap_msgs.action import ReachGoal
-
 MODES = ('subgoal', 'direct')
 TRACKING = ('ground_truth', 'carried')
 MAX_BUDGET = 1000
 MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
 
 
-def declare_parameters(node: 'Node') -> Parameters:
+def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     declare_autostart(parameters)
@@ -134,20 +130,7 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     return mpc
 
 
-def unlike_training(model: LearnedForwardModel, robot_mask: str) -> str:
-    """
-    Return how the pictures differ from those of the training, '' if they do not.
-
-    :param robot_mask: parameter of the node.
-    """
-    trained = model.config.robot_mask
-    if robot_mask == trained:
-        return ''
-    return (f'parameter robot_mask is {robot_mask}, but the forward model was trained on pictures '
-            f'as with {trained}; plans may be worse')
-
-
-def reach_config(parameters: Parameters, request: 'ReachGoal.Goal',
+def reach_config(parameters: Parameters, request: ReachGoal.Goal,
                  model: LearnedForwardModel) -> ReachConfig:
     """Return the settings of the control loop for one goal."""
     return ReachConfig(
@@ -157,7 +140,7 @@ def reach_config(parameters: Parameters, request: 'ReachGoal.Goal',
         parameters['max_age'], parameters['image_timeout'], rounds=parameters['subgoal_rounds'])
 
 
-def check_request(request: 'ReachGoal.Goal') -> str:
+def check_request(request: ReachGoal.Goal) -> str:
     """
     Check what can be checked of a goal alone, and return its mode, the default filled in.
 

@@ -6,10 +6,8 @@ from collections import deque
 from collections.abc import Callable
 from functools import partial
 import math
-import os
 from pathlib import Path
 import sys
-import threading
 import time
 from typing import Any
 
@@ -23,26 +21,26 @@ from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.parameters import check_device
-from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue, THREAD_NAME
+from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
 from tap_ros.nodes.predictor.requests import encode_answer, PendingRequest, RequestReader
 from tap_ros.nodes.predictor.settings import (
     declare_parameters,
     MAX_ROWS,
     MAX_TOGETHER,
     MAX_WAITING,
-    unlike_training,
 )
+from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import (
     create_deferred_service,
     internal_error,
     log_error,
-    refusal,
     take_pending_requests,
 )
 from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
+from tap_ros.training.robot_mask import trained_robot_mask
 
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 Send = Callable[[PredictSubgoal.Response], object]
@@ -50,7 +48,6 @@ Send = Callable[[PredictSubgoal.Response], object]
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 SHOW_PERIOD = 0.1  # s between two checks for a subgoal to publish
 STALE_S = 2.0  # s without a message after which diagnostics call an input stale
-CLOSE_TIMEOUT = 5.0  # s that the running batch has to end
 
 
 class PredictorNode(LifecycleBase):
@@ -88,9 +85,9 @@ class PredictorNode(LifecycleBase):
         self.autostart('activate')
 
     def close(self) -> None:
-        """Answer all waiting requests, and let the running batch end."""
+        """Refuse all waiting requests, and let the running batch end."""
         if self._queue is not None:
-            self._queue.close(CLOSE_TIMEOUT)
+            self._queue.close()
         take_pending_requests(self._service)  # they are told that the node is ending
         self._show()
 
@@ -107,14 +104,14 @@ class PredictorNode(LifecycleBase):
         self._queue = RequestQueue(
             prepare, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
         assert self._predictor is not None
-        unlike = unlike_training(self._predictor, self.params['robot_mask'])
-        if unlike:
-            self.get_logger().warning(unlike)
+        trained, share = trained_robot_mask(self._predictor.training)
+        warn_if_unlike(self, self.params['robot_mask'], ['none'] * (share < 1)
+                       + [trained] * (share > 0), f'{self._predictor.mode} predictor')
 
     def unload(self) -> None:
         """Release the weights, once the running batch has ended."""
         if self._queue is not None:
-            self._queue.close(CLOSE_TIMEOUT, 'the weights are no longer in use; ask again')
+            self._queue.close('the weights are no longer in use; ask again')
         self._queue = self._predictor = None
 
     def described(self) -> str:
@@ -191,8 +188,8 @@ class PredictorNode(LifecycleBase):
         else:
             self._diagnostics.error(error)
             log_error(self, 'predict_subgoal', error)
-            return refusal(PredictSubgoal.Response, internal_error(error))
-        return refusal(PredictSubgoal.Response, str(error))
+            error = TapError(internal_error(error))
+        return PredictSubgoal.Response(success=False, message=str(error))
 
     def _send(self, send: Send, response: PredictSubgoal.Response) -> None:
         """Send a response; its client may have gone."""
@@ -212,12 +209,7 @@ def predict(predictor: Predictor, tasks: list[PendingRequest]) -> list[Found]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
-    code = run_node(PredictorNode, 'predictor_node', args)
-    if any(thread.name == THREAD_NAME for thread in threading.enumerate()):
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)  # Python would abort if it ended while that thread is in C++
-    return code
+    return run_node(PredictorNode, 'predictor_node', args)
 
 
 if __name__ == '__main__':

@@ -4,7 +4,7 @@
 
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
 import threading
 import traceback
 from typing import Generic, TypeVar
@@ -13,9 +13,6 @@ from tap_ros.errors import TapError
 
 Request = TypeVar('Request')
 Answer = TypeVar('Answer')
-
-THREAD_NAME = 'request queue'
-PREPARE_TIMEOUT = 8.0  # s that an interrupted start waits for what it was preparing
 
 
 class Busy(TapError):
@@ -40,25 +37,17 @@ class RequestQueue(Generic[Request, Answer]):
     def __init__(self, prepare: Callable[[], Callable[[list[Request]], Iterable[Answer]]],
                  cost: Callable[[Request], float], max_waiting: int, max_together: int,
                  max_cost: float) -> None:
-        self._cost = cost
-        self._max_waiting = max_waiting
+        self._cost, self._max_waiting = cost, max_waiting
         self._max_together, self._max_cost = max_together, max_cost
         self._waiting: deque[tuple[Request, Callable[[Answer | Exception], object]]] = deque()
-        self._changed = threading.Condition()
-        self._ending = False
-        self._reason = ''  # why
-        prepared: Future[None] = Future()
-        self._thread = threading.Thread(
-            target=self._run, args=(prepare, prepared), name=THREAD_NAME, daemon=True)
+        self._lock = threading.Lock()
+        self._closed = ''  # why
+        self._thread = ThreadPoolExecutor(1, 'request queue')
         try:
-            self._thread.start()
-            prepared.result()
+            self._work = self._thread.submit(prepare).result()
         except BaseException:
-            # Interrupted: Python would abort if it ended while this thread is in C++.
-            with self._changed:
-                self._ending = True
-            if self._thread.is_alive():
-                self._thread.join(PREPARE_TIMEOUT)
+            # Interrupted: Python would abort if it ended while the thread is in C++.
+            self._thread.shutdown()
             raise
 
     def __len__(self) -> int:
@@ -69,74 +58,51 @@ class RequestQueue(Generic[Request, Answer]):
         """
         Let a request wait for its answer.
 
-        :param request: what `work` takes.
-        :param answer: called once, in another thread, with what `work` returned for the request,
+        :param request: what the work takes.
+        :param answer: called once, in another thread, with what the work returned for the request,
             or with the exception that it raised. What it raises itself is printed.
         :raises Busy: when it cannot wait; `answer` is not called then.
         """
-        with self._changed:
-            if self._ending:
-                raise Busy(f'busy: {self._reason}')
+        with self._lock:
+            if self._closed:
+                raise Busy(f'busy: {self._closed}')
             if len(self._waiting) >= self._max_waiting:
                 raise Busy(f'busy: {len(self._waiting)} requests are waiting, which is the most '
                            'that may; ask again')
             self._waiting.append((request, answer))
-            self._changed.notify()
+            self._thread.submit(self._answer_batch)
 
-    def close(self, timeout_s: float,
-              reason: str = 'the node is ending; ask again when it is back') -> None:
-        """
-        Answer what still waits with Busy, and end the thread after its batch.
-
-        :param timeout_s: most seconds to wait for that batch.
-        :param reason: what those are told who wait or come later.
-        """
-        with self._changed:
-            self._ending, self._reason = True, reason
+    def close(self, reason: str = 'the node is ending; ask again when it is back') -> None:
+        """Answer what still waits with Busy, for this reason; return after the running batch."""
+        with self._lock:
+            self._closed = reason
             left = list(self._waiting)
             self._waiting.clear()
-            self._changed.notify()
         for _, answer in left:
             answer(Busy(f'busy: {reason}'))
-        self._thread.join(timeout_s)
+        self._thread.shutdown()
 
-    def _run(self, prepare: Callable[[], Callable[[list[Request]], Iterable[Answer]]],
-             prepared: Future[None]) -> None:
-        try:
-            self._work = prepare()
-        except BaseException as error:
-            prepared.set_exception(error)
-            return
-        prepared.set_result(None)
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._ending)
-                if self._ending:
-                    return
-                batch = self._take()
-            for (_, answer), found in zip(batch, self._answers([one for one, _ in batch])):
-                try:
-                    answer(found)
-                except Exception:  # else all that wait would wait for ever
-                    traceback.print_exc()
-
-    def _take(self) -> list[tuple[Request, Callable[[Answer | Exception], object]]]:
-        """Take the oldest requests, as many as go together."""
+    def _answer_batch(self) -> None:
+        """Answer the oldest requests, as many as go together."""
         batch: list[tuple[Request, Callable[[Answer | Exception], object]]] = []
         cost = 0.0
-        while self._waiting and len(batch) < self._max_together:
-            cost += self._cost(self._waiting[0][0])
-            if batch and cost > self._max_cost:
-                break
-            batch.append(self._waiting.popleft())
-        return batch
+        with self._lock:
+            while self._waiting and len(batch) < self._max_together:
+                cost += self._cost(self._waiting[0][0])
+                if batch and cost > self._max_cost:
+                    break
+                batch.append(self._waiting.popleft())
+        for (_, answer), found in zip(batch, self._answers([one for one, _ in batch])):
+            try:
+                answer(found)
+            except Exception:
+                traceback.print_exc()
 
     def _answers(self, requests: list[Request]) -> Iterable[Answer | Exception]:
         """Yield the answers of a batch, in its order; an exception stands for one that failed."""
         try:
-            found = self._work(requests)
+            return self._work(requests) if requests else []
         except Exception as error:
             if len(requests) == 1:
                 return [error]
             return (answer for one in requests for answer in self._answers([one]))
-        return found

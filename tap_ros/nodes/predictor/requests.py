@@ -5,10 +5,11 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from builtin_interfaces.msg import Time
 import numpy as np
+from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
@@ -20,7 +21,7 @@ from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.objects import decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.nodes.observations import OnDemandObservations
+from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.predictor.settings import check_mode, check_work
 from tap_ros.nodes.robot_view import RobotView
@@ -28,9 +29,6 @@ from tap_ros.nodes.ros_messages import encode_subgoal
 from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, STREAM
 from tap_ros.prediction.protocol import Predictor, Question
 from tap_ros.text import listing
-
-if TYPE_CHECKING:
-    from rclpy.node import Node
 
 OBJECTS_TIMEOUT = 0.1  # s that objects and mask of the newest picture may come after it
 
@@ -73,14 +71,15 @@ class RequestReader:
     :param on_message: called with the topic name for each message that is taken.
     """
 
-    def __init__(self, node: 'Node', params: Parameters,
+    def __init__(self, node: Node, params: Parameters,
                  on_message: Callable[[str], object]) -> None:
         self._robot = RobotView(params['robot_mask'])
-        self._newest = {
-            'start': OnDemandObservations(
-                node, camera_topics(params), STREAM, on_message=on_message),
-            'goal': OnDemandObservations(
-                node, goal_topics(params['robot_mask']), LATCHED, True, on_message)}
+        self._newest = {}
+        for name, types, qos in (('start', camera_topics(params), STREAM),
+                                 ('goal', goal_topics(params['robot_mask']), LATCHED)):
+            self._newest[name] = Observations(*types, latched=name == 'goal')
+            self._newest[name].subscribe(
+                node, types, qos, on_message=on_message, on_demand=True)
 
     def poll(self) -> None:
         """Take what has arrived, and remember what the camera sees behind the robot."""
@@ -122,25 +121,23 @@ class RequestReader:
               crop: TrainedCrop) -> AskedPicture:
         """Decode a picture and its objects; take the newest ones if it was left empty."""
         lacking = '' if objects.objects else f'{name}_objects are empty'
-        if is_empty(image):
-            found = self._find(name)
-            image = found['image']
-            if not objects.objects:
-                objects = found.get('objects', objects)
-                lacking = '' if objects.objects else self._why_no_objects(name, found)
-        picture = decode_image(image, name)
+        found = self._find(name) if is_empty(image) else {'image': image}
+        if is_empty(image) and not objects.objects:
+            objects = found.get('objects', objects)
+            lacking = '' if objects.objects else self._why_no_objects(name, found)
+        picture, header = self._picture(name, found), found['image'].header
         given_size = picture.shape[:2]
         cut = crop.of(given_size, name)
         names, pixels = decode_cut_objects(objects, f'{name}_objects', given_size, cut)
         return AskedPicture(
             check_image(cut.image(picture), name, crop.size), names, pixels, lacking,
-            image.header.stamp, image.header.frame_id or CAMERA_FRAME)
+            header.stamp, header.frame_id or CAMERA_FRAME)
 
     def _find(self, name: str) -> dict[str, Any]:
         """
-        Return the newest picture, and its objects if there are any with its stamp.
+        Return the newest picture, and its objects and robot mask if there are any with its stamp.
 
-        The picture is without the robot where a mask is used; a start picture needs its own mask.
+        :raises ImageError: for a start picture without the mask that it needs.
         """
         newest = self._newest[name]
         found = newest.newest('image')
@@ -149,27 +146,28 @@ class RequestReader:
                 f'{name}: the request has none and nothing has come on '
                 f'{newest.names(["image"], explained=True)}; publish one there '
                 '(the simulator does at sim/reset), or send it along')
-        stamp, needed = to_nanoseconds(found['image'].header.stamp), ['image']
-        for topic in ('mask', 'objects'):
-            if topic == 'mask' and not self._robot.used:
-                continue
-            if topic not in found and (topic == 'mask' and name == 'start'
-                                       or not newest.missing([topic])):
-                found = newest.wait((*needed, topic), OBJECTS_TIMEOUT, stamp - 1) or found
+        needed, must = ['image'], name == 'start'
+        for topic in ['mask'] * self._robot.used + ['objects']:
+            if topic not in found and (topic == 'mask' and must or not newest.missing([topic])):
                 stamp = to_nanoseconds(found['image'].header.stamp)
+                found = newest.wait((*needed, topic), OBJECTS_TIMEOUT, stamp - 1) or found
             if topic in found:
                 needed.append(topic)
-        if 'mask' in needed:
-            image = (self._robot.see(found['image'], found['mask'], newest.jumps)
-                     if name == 'start' else
-                     self._robot.fill_goal(found['image'], found['mask']))
-            return found | {'image': image}
-        if self._robot.used and name == 'start':
+        if self._robot.used and must and 'mask' not in found:
             raise ImageError(
-                f'start: no robot mask with the stamp of the picture, {stamp / 1e9:.9f} s, '
-                f'has come on {newest.names(["mask"])}; publish it, or start the node '
-                'with robot_mask none')
+                'start: no robot mask with the stamp of the picture, '
+                f'{to_nanoseconds(found["image"].header.stamp) / 1e9:.9f} s, has come on '
+                f'{newest.names(["mask"])}; publish it, or start the node with robot_mask none')
         return found
+
+    def _picture(self, name: str, found: Mapping[str, Any]) -> np.ndarray:
+        """Return the picture of what was found, without the robot if there is a mask."""
+        if name == 'start' and 'mask' in found:
+            return self._robot.see(found['image'], found['mask'], self._newest['start'].jumps)
+        picture = decode_image(found['image'], name)
+        if 'mask' in found:
+            return self._robot.fill_goal(picture, found['mask'])
+        return picture
 
     def _why_no_objects(self, name: str, found: Mapping[str, Any]) -> str:
         """Return why a picture that was found has no objects."""

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters and weights of predictor_node, and the limits of a request."""
 
-from typing import TYPE_CHECKING
-
+from rclpy.node import Node
+from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import ConfigError
 from tap_ros.messages.images import is_empty
 from tap_ros.nodes.lifecycle import declare_autostart
@@ -11,13 +11,7 @@ from tap_ros.nodes.parameters import declare_device, declare_transport, Paramete
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.prediction.methods import MODES
 from tap_ros.text import escaped
-from tap_ros.training.robot_mask import trained_robot_mask
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
-
-if TYPE_CHECKING:
-    from rclpy.node import Node
-    from tap_msgs.srv import PredictSubgoal
-    from tap_ros.prediction.protocol import Predictor
 
 MAX_SAMPLES = 100
 MAX_DEPTH = 8
@@ -29,7 +23,7 @@ MAX_TOGETHER = 8  # requests in one batch
 MAX_ROWS = 64  # samples x objects in one batch, unless one request alone has more
 
 
-def declare_parameters(node: 'Node') -> Parameters:
+def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     declare_autostart(parameters)
@@ -46,21 +40,7 @@ def declare_parameters(node: 'Node') -> Parameters:
     return parameters
 
 
-def unlike_training(predictor: 'Predictor', robot_mask: str) -> str:
-    """
-    Return how the pictures differ from those of the training, '' if they do not.
-
-    :param robot_mask: parameter of the node.
-    """
-    trained, share = trained_robot_mask(predictor.training)
-    fitting = [*(['none'] if share < 1 else []), *([trained] if share > 0 else [])]
-    if robot_mask in fitting:
-        return ''
-    return (f'parameter robot_mask is {robot_mask}, but the {predictor.mode} weights were trained '
-            f'on start and goal pictures as with {" or ".join(fitting)}; predictions may be worse')
-
-
-def check_mode(request: 'PredictSubgoal.Request', mode: str) -> None:
+def check_mode(request: PredictSubgoal.Request, mode: str) -> None:
     """
     Raise ConfigError if a request wants another mode than that of the weights.
 

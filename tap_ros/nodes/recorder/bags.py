@@ -5,17 +5,13 @@
 from collections.abc import Callable
 from pathlib import Path
 import time
-from typing import TYPE_CHECKING
 
 from tap_ros.errors import RecordingError, StorageError
-from tap_ros.nodes.parameters import declared_mount
+from tap_ros.messages.topics import Qos
+from tap_ros.nodes.parameters import declared_mount, Parameters
 from tap_ros.recording.metadata import ArmMount, write_mount
 from tap_ros.recording.writer import BagWriter
 from tap_ros.text import escaped
-
-if TYPE_CHECKING:
-    from tap_ros.messages.topics import Qos
-    from tap_ros.nodes.parameters import Parameters
 
 
 class Bags:
@@ -28,7 +24,7 @@ class Bags:
     :ivar count: messages in the last bag.
     """
 
-    def __init__(self, params: 'Parameters', report: Callable[[str], object]) -> None:
+    def __init__(self, params: Parameters, report: Callable[[str], object]) -> None:
         self._params, self._report = params, report
         self._writer: BagWriter | None = None
         self._last: dict[str, tuple[str, bytes, Qos]] = {}  # of latched topics
@@ -72,7 +68,7 @@ class Bags:
             raise RecordingError(self.failure)
         return folder
 
-    def take(self, topic: str, type_name: str, data: bytes, qos: 'Qos', received_ns: int,
+    def take(self, topic: str, type_name: str, data: bytes, qos: Qos, received_ns: int,
              sent_ns: int) -> None:
         """
         Write a message, if a bag is open, and remember it if its topic is latched.
@@ -110,7 +106,7 @@ class Bags:
             return self.failure
         return f'{self.count} messages in {escaped(writer.folder)}'
 
-    def _write(self, topic: str, type_name: str, data: bytes, qos: 'Qos', received_ns: int,
+    def _write(self, topic: str, type_name: str, data: bytes, qos: Qos, received_ns: int,
                sent_ns: int) -> None:
         if self._writer is None:
             return

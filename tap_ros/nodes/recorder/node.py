@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records topics into an MCAP bag, as serialized messages."""
 
+from functools import partial
 import math
 import sys
 import time
@@ -25,6 +26,7 @@ from tap_ros.text import escaped
 DEPTH = 100  # messages that may wait while the disk is slow
 MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls it stale
 LONG = 1000  # characters of an answer
+TRANSIENT_LOCAL = DurabilityPolicy.TRANSIENT_LOCAL
 
 
 class RecorderNode(Node):
@@ -100,43 +102,32 @@ class RecorderNode(Node):
             if type_name is None:
                 continue
             self._wanted.remove(name)
+            latched = {publisher.qos_profile.durability for publisher in
+                       self.get_publishers_info_by_topic(topic)} == {TRANSIENT_LOCAL}
             try:
-                self._subscribe(topic, type_name, QoSProfile(
-                    depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE,
-                    durability=DurabilityPolicy.TRANSIENT_LOCAL
-                    if (known and known.latched) or self._is_latched(topic)
-                    else DurabilityPolicy.VOLATILE))
+                self._recorded[topic] = AdaptiveSubscription(
+                    self, message_class(type_name), topic,
+                    partial(self._on_message, topic, type_name), QoSProfile(
+                        depth=DEPTH, durability=TRANSIENT_LOCAL if latched or (
+                            known and known.latched) else DurabilityPolicy.VOLATILE), raw=True)
             except ConfigError as error:
                 self.get_logger().error(f'{escaped(topic)} is not recorded: {escaped(error)}')
-
-    def _is_latched(self, topic: str) -> bool:
-        """Return whether all publishers of a topic keep messages for late joiners."""
-        publishers = self.get_publishers_info_by_topic(topic)
-        return {publisher.qos_profile.durability for publisher in publishers} == {
-            DurabilityPolicy.TRANSIENT_LOCAL}
-
-    def _subscribe(self, topic: str, type_name: str, qos: QoSProfile) -> None:
-        def on_message(data: bytes, info: dict[str, Any]) -> None:
-            try:
-                self._on_message(topic, type_name, data, info)
-            except Exception as error:  # no message ends the node
-                self._tell(f'{escaped(topic)}: a message was not recorded', error)
-
-        self._recorded[topic] = AdaptiveSubscription(
-            self, message_class(type_name), topic, on_message, qos, raw=True)
 
     def _on_message(self, topic: str, type_name: str, data: bytes, info: dict[str, Any]) -> None:
         self._diagnostics.received(topic)
         asked = self._recorded[topic].qos
-        latched = asked.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        latched = asked.durability == TRANSIENT_LOCAL
         qos = Qos(
             depth=1 if latched else 10,
             durability='transient_local' if latched else 'volatile',
             reliability='reliable' if asked.reliability == ReliabilityPolicy.RELIABLE
             else 'best_effort')
         received = info['received_timestamp'] or time.time_ns()
-        self._bags.take(topic, type_name, data, qos, received,
-                        info['source_timestamp'] or received)
+        try:
+            self._bags.take(topic, type_name, data, qos, received,
+                            info['source_timestamp'] or received)
+        except Exception as error:  # no message ends the node
+            self._tell(f'{escaped(topic)}: a message was not recorded', error)
 
     def _on_timer(self) -> None:
         """Write buffered messages to the disk; subscribe to topics that appear or change."""

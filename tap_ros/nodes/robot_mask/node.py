@@ -3,7 +3,6 @@
 """Publishes masks of a real robot: its URDF, projected into each picture of the camera."""
 
 from collections import deque
-from dataclasses import dataclass
 import math
 import sys
 import time
@@ -25,27 +24,20 @@ from tap_ros.nodes.robot_mask.settings import (
     camera_pose,
     declare_parameters,
     declared_light,
-    hand_link,
     named_robot,
 )
 from tap_ros.nodes.ros_messages import encode_mask
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
 from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.plugins import names
+from tap_ros.robots.arm import TIP_FRAME
 from tap_ros.robots.silhouette import Body, draw_mask, PinholeCamera
 from tap_ros.robots.urdf import read_urdf, Robot
 from tap_ros.text import escaped
 
 STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
 WAITING = 10  # pictures that may wait for their joint states
-
-
-@dataclass(eq=False)
-class Picture:
-    """A picture that has no mask yet."""
-
-    info: CameraInfo
-    received: float  # s, monotonic
 
 
 class RobotMaskNode(Node):
@@ -62,8 +54,8 @@ class RobotMaskNode(Node):
         self.params = declare_parameters(self)
         self._light = declared_light(self.params)
         self._camera = camera_pose(self.params)
-        self._hand, self._base = hand_link(self.params), self.params['base_frame']
-        self._waiting: deque[Picture] = deque(maxlen=WAITING)
+        # CameraInfo of pictures that have no mask yet, and when they were received.
+        self._waiting: deque[tuple[CameraInfo, float]] = deque(maxlen=WAITING)
         self._robot: Robot | None = None
         self._diagnostics = Diagnostics(self, {
             'camera/camera_info': STALE_S, 'joint_states': STALE_S,
@@ -93,8 +85,11 @@ class RobotMaskNode(Node):
 
         :raises ConfigError: when it lacks the links that the parameters name.
         """
-        hand = robot.held_by(self._hand) if self._hand else set()
-        robot.held_by(self._base or robot.root)
+        named = self.params['urdf'] in names('tap_ros.arms')
+        hand_link = self.params['hand_link'] or (TIP_FRAME if named else '')
+        hand = robot.held_by(hand_link) if hand_link else set()
+        self._base = self.params['base_frame'] or robot.root
+        robot.held_by(self._base)
         self._labels = [ROBOT_MASK_HAND if shape.link in hand else ROBOT_MASK_ARM
                         for shape in robot.shapes]
         prefix = self.params['joint_prefix']
@@ -120,7 +115,7 @@ class RobotMaskNode(Node):
 
     def _on_camera_info(self, message: CameraInfo, info: dict[str, Any]) -> None:
         self._diagnostics.received('camera/camera_info')
-        self._waiting.append(Picture(message, reception_time(info)))
+        self._waiting.append((message, reception_time(info)))
         self._answer_waiting()
 
     def _answer_waiting(self) -> None:
@@ -128,28 +123,26 @@ class RobotMaskNode(Node):
         if self._robot is None:
             return
         for picture in list(self._waiting):
+            info, _ = picture
             try:
-                mask = self._mask(self._robot, picture.info)
+                mask = self._mask(self._robot, info)
+                self._masks.publish(encode_mask(mask, info.header.stamp, info.header.frame_id))
             except KinematicsError:  # of joints: they may come, see _give_up_waiting
                 continue
             except TapError as error:
                 self._tell(error)
-            else:
-                header = picture.info.header
-                self._masks.publish(encode_mask(mask, header.stamp, header.frame_id))
             self._waiting.remove(picture)
 
     def _give_up_waiting(self) -> None:
         """Report why pictures that have waited for too long get no mask."""
         while self._waiting and (
-                time.monotonic() - self._waiting[0].received > self.params['max_silence']):
-            picture = self._waiting.popleft()
-            if self._robot is None:
-                self._tell('nothing that can be used has come on robot_description; name a file '
-                           'by the parameter urdf')
-                continue
+                time.monotonic() - self._waiting[0][1] > self.params['max_silence']):
+            info, _ = self._waiting.popleft()
             try:
-                self._mask(self._robot, picture.info)
+                if self._robot is None:
+                    raise KinematicsError('nothing that can be used has come on '
+                                          'robot_description; name a file by the parameter urdf')
+                self._mask(self._robot, info)
             except TapError as error:
                 self._tell(error)
 
@@ -163,8 +156,7 @@ class RobotMaskNode(Node):
         K, size = decode_camera_info(info, self.params['rectified'])
         found = self._history.at(to_nanoseconds(info.header.stamp), self.params['max_silence'])
         poses = robot.poses(dict(zip(robot.positions, found.positions)))
-        base = self._base or robot.root
-        to_base = np.linalg.inv(poses[base])
+        to_base = np.linalg.inv(poses[self._base])
         bodies = []
         for shape, label in zip(robot.shapes, self._labels):
             pose = to_base @ poses[shape.link]

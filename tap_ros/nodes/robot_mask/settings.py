@@ -3,24 +3,21 @@
 """Parameters of robot_mask_node: the robot, its camera, and the light."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from rclpy.node import Node
+from scipy.spatial.transform import Rotation
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.parameters import declare_mount, declared_mount, Parameters
 from tap_ros.plugins import names
-from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.silhouette import Light
 from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
 from tap_ros.text import escaped
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
 
-
-
-def declare_parameters(node: 'Node') -> Parameters:
+def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare('urdf', '',
@@ -90,14 +87,6 @@ def named_robot(parameters: Parameters) -> Robot | None:
         raise ConfigError(f'parameter urdf: {escaped(urdf)}: {escaped(error)}') from error
 
 
-def hand_link(parameters: Parameters) -> str:
-    """Return the link that is the hand, or an empty string."""
-    from_parameter = parameters['hand_link']
-    if not from_parameter and parameters['urdf'] in names('tap_ros.arms'):
-        return TIP_FRAME
-    return from_parameter
-
-
 def declared_light(parameters: Parameters) -> Light | None:
     """
     Return the light whose shadows are marked, if they are.
@@ -119,15 +108,10 @@ def camera_pose(parameters: Parameters) -> np.ndarray:
 
     :raises ConfigError: for a quaternion of length 0.
     """
-    quaternion = np.array([parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')])
-    length = float(np.linalg.norm(quaternion))
-    if length < 0.1:
+    quaternion = [parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')]
+    if np.linalg.norm(quaternion) < 0.1:
         raise ConfigError('parameters camera_qx to camera_qw: a quaternion of no direction')
-    x, y, z, w = quaternion / length
     pose = np.eye(4)
-    pose[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     pose[:3, 3] = [parameters[f'camera_{axis}'] for axis in 'xyz']
     return pose
