@@ -20,7 +20,7 @@ from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode, TIMINGS
 from sim_bridge.world.looks import DEFAULT_LOOK
 from sim_bridge.world_protocol import Observation
-from tap_ros.engines.task import Engine, LOCAL, run_tasks, Work
+from tap_ros.engines import Engine, LOCAL, run_tasks, Work
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.episode import Episode

@@ -9,7 +9,7 @@ from sim_bridge.collect import collect, CollectConfig, CollectSettings
 from sim_bridge.tasks.tasks import task_names, TIMINGS
 from sim_bridge.world.appearance import CHOICES
 from sim_bridge.world.looks import LOOKS
-from tap_ros.engines.options import EngineOptions
+from tap_ros.engines import Engine
 from tap_ros.options import Folder, one_of
 from tap_ros.plugins import names
 
@@ -35,7 +35,7 @@ class Options:
 
     out: Folder
     recording: Recording = Recording()
-    engine: EngineOptions = EngineOptions()
+    engine: Engine = Engine()
 
 
 def run(args: Options) -> None:

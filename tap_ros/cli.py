@@ -22,7 +22,8 @@ from tap_ros.options import parse
 from tap_ros.text import escaped
 from tyro import conf
 
-# Of a command: the name of its module, or {word: (one line of help, the same)}.
+# Of a command: the name of its module, MODULE:FUNCTION where that is of several commands, or
+# {word: (one line of help, the same)}.
 Module: TypeAlias = 'str | dict[str, tuple[str, Module]]'
 Run: TypeAlias = Callable[[Any], int | None]
 
@@ -58,8 +59,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
     }),
     'hub': ('share trained weights on the Hugging Face Hub', {
-        'push': ('upload weights with their model card', 'tap_ros.hub.push_command'),
-        'pull': ('download weights and check them', 'tap_ros.hub.pull_command'),
+        'push': ('upload weights with their model card', 'tap_ros.hub:push'),
+        'pull': ('download weights and check them', 'tap_ros.hub:pull'),
     }),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
@@ -163,17 +164,19 @@ def _command(name: str, summary: str, module: Module, words: list[str] | None,
 
 
 def _load(name: str, runs: dict[Any, Run], needed: bool = True) -> Any:
-    """Import a module of COMMANDS; return the type of its options."""
+    """Import a module of COMMANDS; return the type of its options: Options, or as FUNCTION."""
     try:
         if name.startswith('experiments.'):
             _find_experiments()
-        module = importlib.import_module(name)
+        place, _, word = name.partition(':')
+        module = importlib.import_module(place)
     except (ConfigError, ImportError):
         if needed:
             raise
         return Unread  # without ROS or a checkout it completes what there is
-    runs[module.Options] = module.run
-    return module.Options
+    kind = getattr(module, word.title() or 'Options')
+    runs[kind] = getattr(module, word or 'run')
+    return kind
 
 
 def _find_experiments() -> None:

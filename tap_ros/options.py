@@ -3,9 +3,8 @@
 """
 Options of a command from a dataclass: a field is an option, its `:param` line is its help.
 
-tyro reads them. Settings that the package uses without a command line stay free of it: a command
-takes them as a field, or adds to a subclass what only the command line knows, as EngineOptions
-does. Options of a field that is a dataclass itself stand in a box of their own in --help.
+tyro reads them. Settings that the package uses without a command line stay free of it; a command
+takes them as a field. A field that is a dataclass has a box of its own in --help.
 """
 
 from collections.abc import Iterable, Sequence

@@ -5,7 +5,6 @@
 from contextlib import suppress
 from dataclasses import fields, is_dataclass, MISSING
 from functools import cache
-import importlib
 from pathlib import Path
 import re
 import shlex
@@ -13,7 +12,7 @@ import subprocess
 import sys
 
 import pytest
-from tap_ros.cli import _find_experiments, COMMANDS, main, read
+from tap_ros.cli import _find_experiments, _load, COMMANDS, main, read
 from tap_ros.errors import ConfigError
 
 ROOT = Path(__file__).parents[1]
@@ -28,14 +27,14 @@ IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --scale full --list', 'be
 
 
 @cache
-def modules():
-    """Return the module of each command by its words, such as 'hub push'."""
+def kinds():
+    """Return the options of each command by its words, such as 'hub push'."""
     _find_experiments()
     flat = {}
     for name, (_, module) in COMMANDS.items():
         flat |= {f'{name} {word}': inner for word, (_, inner) in module.items()} if isinstance(
             module, dict) else {name: module}
-    return {words: importlib.import_module(module) for words, module in flat.items()}
+    return {words: _load(module, {}) for words, module in flat.items()}
 
 
 def options(kind):
@@ -78,13 +77,13 @@ def needed(kind, text):
     return line
 
 
-@pytest.mark.parametrize('command', modules())
+@pytest.mark.parametrize('command', kinds())
 def test_help_says_of_every_option_what_it_is_and_takes(command, capsys, monkeypatch):
     text = help_of(command, capsys, monkeypatch)
     assert text.startswith(f'usage: python -m tap_ros {command}')
-    line = command + needed(modules()[command].Options, text)
+    line = command + needed(kinds()[command], text)
     before = read(shlex.split(line))[1]
-    for name, default in options(modules()[command].Options):
+    for name, default in options(kinds()[command]):
         option = f'--{name.replace("_", "-")}'
         shown = re.findall(rf'{option}[ ,](.*?)\((?:default|required)', text)
         if not shown:  # a word without an option
@@ -109,7 +108,7 @@ def test_commands_that_are_shown_are_valid():
             assert read(shlex.split(command)), command
         else:  # a command is mentioned, what it needs is left out
             known = command.split(' bags')[0].strip()
-            assert any(each.startswith(known) for each in modules()), command
+            assert any(each.startswith(known) for each in kinds()), command
 
 
 @pytest.mark.parametrize('line, named', [

@@ -12,7 +12,7 @@ from typing import Annotated
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import task_names
-from tap_ros.engines.task import Engine
+from tap_ros.engines import Engine
 from tap_ros.options import one_of
 
 

@@ -11,7 +11,7 @@ from experiments.paper.places import Places
 from experiments.paper.runs import paper_runs, SCALES
 from experiments.paper.sweep import data_hashes, find_state, sweep
 import numpy as np
-from tap_ros.engines.options import EngineOptions
+from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError
 from tap_ros.options import default_text, Flag, Folder, one_of
 from tyro import conf
@@ -55,7 +55,7 @@ class Options:
     episodes: int = 0
     steps: int = 0
     fresh: Flag = False
-    engine: EngineOptions = EngineOptions()
+    engine: Engine = Engine()
     places: PlaceOptions = PlaceOptions()
 
 

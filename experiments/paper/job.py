@@ -23,7 +23,7 @@ from experiments.paper.places import (
 )
 from experiments.paper.recordings import RECORDINGS
 import numpy as np
-from tap_ros.engines.task import LOCAL
+from tap_ros.engines import LOCAL
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.files import locked, write_atomically
 

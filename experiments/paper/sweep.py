@@ -15,7 +15,7 @@ import time
 
 from experiments.paper.job import collect_task, DONE, FAILED, logged
 from experiments.paper.places import is_collected, read_json, recording_hash
-from tap_ros.engines.task import LOCAL, run_tasks, Work
+from tap_ros.engines import LOCAL, run_tasks, Work
 from tap_ros.errors import EngineError, TapError
 from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.training_config import DEFAULTS

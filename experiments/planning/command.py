@@ -7,7 +7,7 @@ from typing import Annotated
 
 from experiments.planning.methods import TASKS
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
-from tap_ros.engines.options import EngineOptions
+from tap_ros.engines import Engine
 from tap_ros.options import Flag, Folder, one_of, ShippedFile
 from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS
 from tap_ros.plugins import names
@@ -49,7 +49,7 @@ class Options:
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     scenes: int = 100
     seed: int = 0
-    engine: EngineOptions = EngineOptions()
+    engine: Engine = Engine()
     preset: Annotated[str, one_of(PRESETS)] = 'default'
     solver: Annotated[str, one_of(names('tap_ros.solvers'))] = 'cem'
     plan_samples: int = 0

@@ -19,7 +19,7 @@ from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task
 from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
-from tap_ros.engines.task import LOCAL, run_tasks, Work
+from tap_ros.engines import LOCAL, run_tasks, Work
 from tap_ros.errors import ConfigError, PlanningError
 from tap_ros.files import write_atomically
 from tap_ros.planning.forward_model import LearnedForwardModel

@@ -3,19 +3,8 @@
 """Laws of how pages, tables and numbers are written."""
 
 from experiments import pages
-from jinja2 import DictLoader, UndefinedError
 import numpy as np
 import pandas as pd
-import pytest
-
-
-def test_a_template_fails_where_it_names_what_is_not_there(monkeypatch):
-    monkeypatch.setattr(pages._ENVIRONMENT, 'loader', DictLoader(
-        {'page': '# {{ title }}\n\n\n\n{% if text %}\n{{ text }}\n{% endif %}\n'}))
-    assert pages.render('page', title='A', text='b') == '# A\n\nb\n'
-    assert pages.render('page', title='A', text='') == '# A\n'
-    with pytest.raises(UndefinedError, match='text'):
-        pages.render('page', title='A')
 
 
 def test_numbers_keep_their_place_and_what_is_missing_stays_missing():

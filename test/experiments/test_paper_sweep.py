@@ -7,16 +7,13 @@ from functools import partial
 import json
 import os
 from pathlib import Path
-import signal
 import subprocess
 import sys
-import time
 
 from experiments.paper import command
 from experiments.paper import sweep as sweep_module
 from experiments.paper.job import BUSY, DONE, perform, UNFINISHED
 from experiments.paper.places import (
-    is_collected,
     Places,
     recording_hash,
 )
@@ -27,7 +24,7 @@ from experiments.paper.sweep import find_state, sweep
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
-from tap_ros.engines.task import Engine
+from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError
 from tap_ros.files import locked
 from tap_ros.options import parse
@@ -193,38 +190,6 @@ def test_the_way_behind_is_a_share_of_what_moves():
     assert np.isnan(way_behind(pixels[:2], 1)) and np.isnan(way_behind(pixels * np.nan, 1))
 
 
-@pytest.mark.slow
-def test_missing_recordings_are_collected(places):
-    run = replace(RUN, task='grasp', episodes=2)
-    ends = sweep([run], places, engine=Engine(workers=2), collect_only=True, progress=False)
-    assert [(end.name, end.kind) for end in ends] == [('grasp', 'done')]
-    assert is_collected(places.recording('grasp'), 2)
-    assert sweep([run], places, collect_only=True, progress=False) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_sweep_leaves_no_process_and_goes_on(places, number):
-    script = (
-        'import sys; from experiments.paper.places import Places\n'
-        'from experiments.paper.runs import PaperRun\n'
-        'from experiments.paper.sweep import sweep\n'
-        'import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n'
-        f'sweep([PaperRun(**{vars(replace(RUN, steps=10 ** 6))!r})], Places(*sys.argv[1:]),'
-        ' progress=False)\n')
-    process = subprocess.Popen([sys.executable, '-c', script, *vars(places).values()],
-                               stderr=subprocess.PIPE)
-    lock, patience = RUN.folder(places.runs) / 'lock', time.monotonic() + 60
-    while not lock.exists() and time.monotonic() < patience:
-        time.sleep(0.05)
-    process.send_signal(number)
-    assert (b'KeyboardInterrupt' in process.communicate(timeout=60)[1]) == (
-        number == signal.SIGINT)
-    with locked(lock, wait=True) as mine:  # the worker ends soon
-        assert mine
-    assert find_state(RUN, places).kind in ('missing', 'other')
-
-
 def arguments(places, *options):
     return parse(command.Options, [
         '--recordings', places.recordings, '--runs', places.runs, '--results', places.results,
@@ -248,11 +213,3 @@ def test_the_command_lists_and_does_what_fits_the_pattern(places, capsys, monkey
     assert f'{error:.4f}' in lines[1]
     assert command.run(arguments(places, '--list')) == 0
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(paper_runs('small'))
-
-
-@pytest.mark.parametrize('options, named', [
-    (['--only', 'nothing-*'], 'nothing-'), (['--jobs', '-1'], 'workers'),
-    (['--limit', '-1'], 'lim')])
-def test_bad_options_are_refused(places, options, named):
-    with pytest.raises(ConfigError, match=named):
-        command.run(arguments(places, *options))

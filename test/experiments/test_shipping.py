@@ -10,7 +10,6 @@ from experiments.weights.card import found
 import numpy as np
 import pytest
 from tap_ros.cli import main
-from tap_ros.errors import ConfigError
 from tap_ros.evaluation.prediction import EpisodeScores
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.training.recipes import Recipe, RECIPES
@@ -81,13 +80,6 @@ def test_the_list_is_of_commands_that_exist(places, capsys):
         with pytest.raises(SystemExit) as ended:
             main([*words, '--help'])
         assert ended.value.code == 0
-
-
-def test_a_step_that_fails_ends_it(places, monkeypatch, capfd):
-    monkeypatch.setitem(RECIPES['predictor'], 'tiny', replace(TINY, settings={'steps': -1}))
-    with pytest.raises(ConfigError, match='steps'):
-        command.run(command.Options(only=('tiny',), **places))
-    assert not Path(places['out']).exists()
 
 
 def test_success_is_a_bottleneck_or_hand_and_objects():

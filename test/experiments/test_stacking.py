@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of stacking via pictures, in the real simulator with the shipped weights."""
 
-from dataclasses import replace
 
 from experiments.planning.methods import FIRST_SCENES, parse_method, STACKING_TASKS
 from experiments.planning.reading import Move, PictureReader, read_moves
@@ -10,10 +9,8 @@ from experiments.planning.stacking import stack, what_is_below
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.stack import is_tower
 from sim_bridge.world.scene import HALF_HEIGHT
 from tap_ros.contract import SUCCESS_DISTANCE
-from tap_ros.errors import ConfigError
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.training.robot_mask import FreeView
 
@@ -91,15 +88,6 @@ def test_a_true_subgoal_says_that_one_block_goes_on_the_first_and_the_others_sta
         assert right >= len(SEEDS) - 1
 
 
-def test_a_block_that_hangs_above_another_one_is_to_be_put_on_it(tower):
-    start, reader = reset(tower, CLEAR_SCENE)
-    poses = start.object_poses.copy()
-    poses[1, :3] = poses[0, :3] + [0, 0, 0.14]
-    move, = moves_to(tower, reader, tower.photograph(poses, hide_arm=True).image)
-    assert move.object == 1
-    np.testing.assert_allclose(move.place, poses[0, :2])
-
-
 def test_what_is_shown_twice_is_elsewhere_and_what_is_not_shown_stays(tower):
     start, reader = reset(tower, CLEAR_SCENE)
     poses = start.object_poses.copy()
@@ -135,13 +123,6 @@ def test_the_oracle_succeeds_in_most_scenes_and_doing_nothing_in_none(simulator)
         assert not run.success and not run.moves and len(run.frames) == 1
 
 
-def test_true_subgoals_are_brought_about_one_after_the_other(tower):
-    runs = episodes(tower, 'true_subgoals')
-    assert all(len(run.stages) == 3 for run in runs)  # two blocks moved, and the goal
-    assert sum([move.object for move in run.moves][:2] == [1, 2] for run in runs) >= 5
-    assert np.mean([run.success for run in runs]) >= 0.6
-
-
 def test_direct_fails_where_it_begins_with_the_upper_block(tower):
     runs = episodes(tower, 'direct', range(FIRST_SCENE, FIRST_SCENE + 10))
     assert {run.first_right for run in runs} == {True, False}
@@ -155,15 +136,6 @@ def test_an_object_comes_to_stand_on_the_highest_one_at_its_place():
     np.testing.assert_array_equal(what_is_below(poses, Move(1, (0.01, 0))), poses[0])
     assert what_is_below(poses, Move(2, (0.1, 0))).tolist() == [0.1, 0, -HALF_HEIGHT]
     assert what_is_below(poses, Move(2, (0.2, 0))).tolist() == [0.2, 0, -HALF_HEIGHT]
-
-
-def test_the_simulator_is_left_with_a_tower_that_stands(tower):
-    run, = episodes(tower, 'true_places', SEEDS[:1])
-    assert run.success and is_tower(tower.object_poses())
-    before = tower.object_poses()
-    for _ in range(10):
-        tower.step([0, 0, 0, 1])
-    np.testing.assert_allclose(tower.object_poses()[:, :3], before[:, :3], atol=1e-3)
 
 
 def test_the_chain_of_predicted_subgoals_ends_with_the_goal_and_repeats(tower):
@@ -198,31 +170,3 @@ def test_a_predictor_is_shown_pictures_as_it_was_trained_on(tower):
                 view.fill(run.goal.image, run.goal.robot_mask)]
     np.testing.assert_array_equal(witness.shown, expected)
     assert (witness.shown[1] != run.goal.image).any()
-
-
-def test_the_subgoals_of_the_shipped_weights_mostly_begin_with_the_right_block(tower):
-    predictor = SubgoalPredictor.load('stack3')
-    seeds = range(FIRST_SCENE, FIRST_SCENE + 10)
-    runs = [stack(tower, parse_method('shipped'), seed, predictor) for seed in seeds]
-    assert np.mean([run.first_right for run in runs]) >= 0.6
-
-
-def test_a_missing_predictor_is_named(tower):
-    with pytest.raises(ConfigError, match='predictor'):
-        stack(tower, parse_method('shipped'), SEEDS[0])
-
-
-def test_a_hidden_block_counts_from_its_lower_edge(tower):
-    start, reader = reset(tower, SEEDS[1])
-    goal = tower.goal()
-    now = tower.camera.project(start.object_poses[:, :3])
-    pixels = reader.read(goal.image, now)
-    np.testing.assert_allclose(pixels[0], goal.object_pixels[0], atol=2)  # half of it is covered
-
-
-def test_an_object_as_the_table_is_never_seen(tower):
-    start = tower.reset(SEEDS[0])
-    away = replace(start, object_pixels=start.object_pixels + [[0, 0], [0, 0], [500, 0]])
-    reader = PictureReader(tower, away)  # no pixel is nearest to the last object
-    pixels = reader.read(start.image, away.object_pixels)
-    assert np.isnan(pixels[2]).all() and np.isfinite(pixels[0]).all()

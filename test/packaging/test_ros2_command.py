@@ -73,11 +73,6 @@ def call(line, folder, domain):
     return done.stdout
 
 
-def test_the_page_has_lines_of_every_kind():
-    assert len(RUNS) >= 5 and len(CALLS) >= 6
-    assert any('reach_goal' in line for line in CALLS)
-
-
 def test_nodes_run_and_answer_as_the_page_says(tmp_path, domain):
     started = []
     try:

@@ -16,7 +16,7 @@ import pytest
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode
-from tap_ros.engines.task import Engine
+from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError, StorageError
 from tap_ros.files import only_writer
 from tap_ros.recording.reader import iter_episodes
