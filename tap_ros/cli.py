@@ -34,7 +34,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'export-lerobot': ('export recordings as a LeRobot data set',
                        'tap_ros.recording.formats.lerobot_export'),
     'train': ('train on recordings', {
-        'predictor': ('train a subgoal predictor', 'tap_ros.prediction.train_command'),
+        'predictor': ('train a subgoal predictor', 'tap_ros.prediction.training_config'),
         'forward': ("train the planner's forward model",
                     'tap_ros.planning.forward_training_config'),
     }),

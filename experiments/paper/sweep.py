@@ -86,7 +86,7 @@ def find_state(run, places, hashes=None):
 
 def _same(settings, config):
     """Compare settings of a run, all that training depends on; new ones count as the default."""
-    from tap_ros.training.checkpoints import FREE  # torch takes seconds, --help does without
+    from tap_ros.training.settings import FREE  # torch takes seconds, --help does without
     wanted = json.loads(json.dumps(asdict(config)))
     settings = {**DEFAULTS, **todays_settings(settings)}
     return all(settings.get(name) == wanted.get(name)

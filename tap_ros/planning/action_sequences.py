@@ -187,11 +187,9 @@ def push_proposals(shape: SequenceShape, gripper: np.ndarray, objects: np.ndarra
     """
     Propose pushes.
 
-    :param shape: SequenceShape.
     :param gripper: (4,) metres.
     :param objects: (K, 2) metres on the table; goals (K, 2).
     :param count: P, how many.
-    :param rng: numpy Generator.
     :return: (P, D) parameters, none when every object is at its goal.
     """
     gaps = goals - objects

@@ -85,7 +85,6 @@ def draw_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int], batch_
 
     :param episodes: episode indices to draw from, each with more than `steps` frames.
     :param homography: (3, 3) tensor, or (E, 3, 3), one for each episode of the store.
-    :param rng: numpy Generator.
     :param robot_mask: see read_windows.
     :return: Windows.
     """
@@ -190,10 +189,7 @@ def forward_loss(model: LearnedForwardModel, batch: Windows, picture_steps: Coll
     What the robot hides in a picture is compared with nothing. Where the model moves something
     counts as much as where something moved, else it would rather see pushes where there are none.
 
-    :param model: LearnedForwardModel.
-    :param batch: Windows.
     :param picture_steps: indices in 1..T of the pictures compared.
-    :param config: ForwardTrainingConfig.
     :return: loss, dict of its parts.
     """
     arms = draw_arm_like(model, batch.grippers[:, 0], batch.mirrored, batch.colours)

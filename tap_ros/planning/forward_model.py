@@ -110,11 +110,7 @@ class Look:
 
 
 class LearnedForwardModel(nn.Module):
-    """
-    A protocols.ForwardModel; see the file's head.
-
-    :param config: ForwardModelConfig.
-    """
+    """A protocols.ForwardModel; see the file's head."""
 
     homography: torch.Tensor
     arm_camera: torch.Tensor

@@ -43,7 +43,6 @@ def measure_maps(model: LearnedForwardModel, store: 'Episodes', episodes: Iterab
     Maps start at the recorded object pixels; these ground truths are used here only, never in
     training.
 
-    :param model: LearnedForwardModel.
     :param store: EpisodeStore; episodes: indices to score.
     :param stride: frames from one window's start to the next.
     :return: dict from steps t to dicts of arrays (N,) in pixels, for the N objects that moved by

@@ -75,7 +75,6 @@ class Problem:
     """
     What a solver minimises.
 
-    :param cost: Judge.
     :param mean: (D,) of the first Gaussian; std: (D,).
     :param clip: limits samples (N, D) to what is allowed.
     :param proposals: (P, D), samples that are worth a look.

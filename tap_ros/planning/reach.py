@@ -123,8 +123,6 @@ class Reach:
     once `sent` has been called, so it may be called any number of times in between. A picture is
     planned from once.
 
-    :param mpc: VisualMPC.
-    :param config: ReachConfig.
     :param seed: of the planner.
     :param now: s, on any clock that does not go back; 0.0 throughout if time does not matter.
     :ivar steps: commands carried out.

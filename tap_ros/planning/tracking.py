@@ -26,7 +26,6 @@ class ObjectTracker:
     """
     Keep track of K objects.
 
-    :param model: LearnedForwardModel.
     :param image: (H, W, 3) uint8, the first picture; gripper (4,) in it.
     :param pixels: (K, 2) where the objects are in it.
     """

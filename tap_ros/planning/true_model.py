@@ -26,7 +26,6 @@ class TrueModel:
     The planner sees no difference: a map is put on the table grid where the object truly gets to.
 
     :param table: Table, such as that of a learned model.
-    :param simulator: Simulator.
     """
 
     def __init__(self, table: Table, simulator: Simulator) -> None:

@@ -83,8 +83,6 @@ class VisualMPC:
     """
     The planner. It keeps nothing: the same scene, goal and memory give the same plan.
 
-    :param model: ForwardModel.
-    :param config: VisualMPCConfig.
     :param cost: PlanCost; None: that of the config.
     :raises ConfigError: for an unknown name of a solver.
     """

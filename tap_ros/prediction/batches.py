@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Training batches from recorded episodes.
+Training batches from recorded episodes, and changes of their appearance.
 
 A batch depends on nothing but the episodes, the seed and the step: training that is interrupted
 and resumed sees the same ones.
@@ -9,7 +9,7 @@ and resumed sees the same ones.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Self, TYPE_CHECKING
 
 import numpy as np
 from tap_ros.training.frames import Frames, GOAL, MappedFrames
@@ -145,7 +145,6 @@ def uses_recorded_goal(episode: 'Episode', goal_picture: str,
     In the last frame the arm stands beside the object that was pushed last, in the goal's own
     picture it does not.
 
-    :param episode: the Episode.
     :param goal_picture: 'last'; 'recorded': the goal's own picture where it was reached;
         'mixed': that in half of the cases. Reached means that every object ends within
         REACHED pixels of its goal; where positions are unknown, that the outcome says success.
@@ -176,7 +175,6 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     """
     Gather context pictures and targets.
 
-    :param store: the EpisodeStore.
     :param episodes: indices of B episodes.
     :param sampling: Sampling; by default all frames between the first and the last.
     :param frames: where the pictures come from, see training/frames.py; None: the store.
@@ -259,3 +257,73 @@ def _choose(store: 'EpisodeStore', i: int, sampling: Sampling, rng: np.random.Ge
     video[video == start + end] = goal
     filled = sampling.fill_context > 0 and rng.random() < sampling.fill_context
     return _Row(start, context, video, times, (first, last, end), filled)
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """
+    A change of appearance, the same for all pictures of an episode, that can be undone.
+
+    :param flip: bool (B,), mirror left and right.
+    :param order: int64 (B, 3), which channel each colour channel is taken from.
+    :param gain: (B, 3), factor on each channel's brightness.
+    """
+
+    flip: torch.Tensor
+    order: torch.Tensor
+    gain: torch.Tensor
+
+    @classmethod
+    def draw(cls, batch_size: int, flip: bool, colour: bool, brightness: float,
+             rng: np.random.Generator) -> Self:
+        """
+        Draw one for each episode of a batch.
+
+        :param batch_size: B.
+        :param flip: whether to mirror half of them.
+        :param colour: whether to permute their colour channels.
+        :param brightness: gains lie within 1 +- this.
+        :return: Augmentation.
+        """
+        order = np.argsort(rng.random((batch_size, 3)), 1)
+        if not colour:
+            order = np.tile(np.arange(3), (batch_size, 1))
+        flips = rng.random(batch_size) < (0.5 if flip else 0.0)
+        gain = 1 + brightness * rng.uniform(-1, 1, (batch_size, 3))
+        return cls(torch.from_numpy(flips), torch.from_numpy(order),
+                   torch.from_numpy(gain.astype(np.float32)))
+
+    def part(self, part: slice) -> 'Augmentation':
+        """Return that of a slice of the episodes."""
+        return Augmentation(self.flip[part], self.order[part], self.gain[part])
+
+    def to(self, device: torch.device | str) -> 'Augmentation':
+        """Copy everything to a device."""
+        return Augmentation(self.flip.to(device), self.order.to(device), self.gain.to(device))
+
+    def apply(self, images: torch.Tensor) -> torch.Tensor:
+        """
+        Change pictures.
+
+        :param images: (B, N, 3, H, W) in [-1, 1].
+        :return: the same shape; beyond 1 where a gain brightens what was bright.
+        """
+        images = _take_channels(images, self.order)
+        images = (images + 1) * self.gain[:, None, :, None, None] - 1
+        return torch.where(self.flip[:, None, None, None, None], images.flip(-1), images)
+
+    def undo(self, images: torch.Tensor) -> torch.Tensor:
+        """
+        Change pictures back.
+
+        :param images: (B, N, 3, H, W), as apply returned them.
+        :return: the same shape.
+        """
+        images = torch.where(self.flip[:, None, None, None, None], images.flip(-1), images)
+        images = (images + 1) / self.gain[:, None, :, None, None] - 1
+        return _take_channels(images, self.order.argsort(1))
+
+
+def _take_channels(images: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
+    order = order[:, None, :, None, None].expand_as(images)
+    return images.gather(2, order)

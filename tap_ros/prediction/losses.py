@@ -1,13 +1,14 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The losses of section 3: fixed time, minimum over time, generalized minimum over time, recursive.
+The parts of section 3's losses: errors, which of them is matched, preferences, recursion.
 
-Errors are per-pixel means of the absolute difference on [0, 1], half of that on [-1, 1], so that
-losses and reported numbers have the same unit.
+What is trained with a match is in selection.py. Errors are per-pixel means of the absolute
+difference on [0, 1], half of that on [-1, 1], so that losses and reported numbers have the same
+unit.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 import math
 from typing import cast
 
@@ -79,52 +80,6 @@ def match_step(selection_error: torch.Tensor,
     return selection_error.argmin(1)
 
 
-def fixed_time_loss(error: torch.Tensor | Callable[[torch.Tensor], torch.Tensor],
-                    step: torch.Tensor) -> torch.Tensor:
-    """
-    Fixed-time loss: the error at a step chosen in advance.
-
-    L_0 = E(x_tau, G(c)) (Eq. 1).
-
-    :param error: (B, T) errors E_t, or a function from steps (B,) to their errors (B,).
-    :param step: int64 (B,), tau as an index into T.
-    :return: its mean over the batch.
-    """
-    error = error(step) if callable(error) else error.gather(1, step[:, None])
-    return error.mean()
-
-
-def minimum_loss(error: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
-    """
-    Minimum-over-time loss: the least error over the targets.
-
-    L = min_{t in T} E(x_t, G(c)) (Eq. 2).
-
-    :param error: (B, T) errors E_t.
-    :param valid: bool (B, T), False where an episode is padded.
-    :return: its mean over the batch.
-    """
-    return generalized_minimum_loss(error, error, valid)
-
-
-def generalized_minimum_loss(error: torch.Tensor | Callable[[torch.Tensor], torch.Tensor],
-                             selection_error: torch.Tensor,
-                             valid: torch.Tensor | None = None) -> torch.Tensor:
-    """
-    Generalized minimum over time: E at the argmin of E'.
-
-    L = E(x_{t*}, G(c)) with t* = argmin_{t in T} E'(x_t, G(c)) (Eq. 5).
-    The choice has no gradient; the outer error is not weighted by the preference.
-
-    :param error: (B, T) errors E_t, or a function from steps (B,) to their errors (B,), which
-        saves the gradients of the frames that were not chosen.
-    :param selection_error: (B, T) errors E'_t.
-    :param valid: bool (B, T), False where an episode is padded.
-    :return: its mean over the batch.
-    """
-    return fixed_time_loss(error, match_step(selection_error.detach(), valid))
-
-
 def recursive_loss(losses: Sequence[torch.Tensor], counts: Sequence[int]) -> torch.Tensor:
     """
     Recursive loss: the sum over levels r of the loss of the prediction from c(r).
@@ -167,22 +122,15 @@ def bell_preference(times: torch.Tensor, first: torch.Tensor | float,
     w(t) = exp(-(t - m)^2 / (2 sigma^2)), m the middle, sigma 1.110 of half the range (section 4).
 
     :param times: (B, T) times of the targets.
-    :param first: (B, 1) or number, the earliest target time.
-    :param last: (B, 1) or number, the latest.
+    :param first: (B, 1) or number, the earliest target time; last: likewise, the latest.
     :return: w(t), (B, T).
     """
-    half_range = ((last - first) / 2)
-    half_range = torch.as_tensor(half_range, dtype=torch.float32).clamp(min=0.5)
+    half_range = torch.as_tensor((last - first) / 2, dtype=torch.float32).clamp(min=0.5)
     return bell((times - (last + first) / 2) / half_range)
 
 
 def bell(position: torch.Tensor) -> torch.Tensor:
-    """
-    Compute the Gaussian that is 1 at 0 and 2/3 at -1 and 1.
-
-    :param position: any shape.
-    :return: the same shape.
-    """
+    """Return the Gaussian that is 1 at 0 and 2/3 at -1 and 1, of positions of any shape."""
     return torch.exp(math.log(2 / 3) * position ** 2)
 
 
@@ -240,17 +188,6 @@ def linear_preference(times: torch.Tensor, last: torch.Tensor | float,
     if math.isinf(beta):
         return torch.ones_like(times, dtype=torch.float32)
     return beta + times / last
-
-
-def preferred_error(error: torch.Tensor, preference: torch.Tensor) -> torch.Tensor:
-    """
-    Divide by the time preference, the selection error E'_t = E_t / w(t) of section 3.2.
-
-    :param error: (B, T).
-    :param preference: (B, T), w(t).
-    :return: (B, T).
-    """
-    return error / preference
 
 
 def relative_to_copying(error: torch.Tensor, copy_error: torch.Tensor,

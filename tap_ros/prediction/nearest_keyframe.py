@@ -100,7 +100,6 @@ def recorded_places(episode: Episode, t: int, start_pixels: np.ndarray) -> np.nd
     Each is taken for the recorded object that began nearest to it; one without such an object, or
     with one whose place is unknown, stays where it is.
 
-    :param episode: Episode.
     :param t: index of the frame.
     :param start_pixels: (K, 2), (u, v) in the start picture of the question.
     :return: float32 (K, 2).

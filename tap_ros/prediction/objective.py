@@ -9,22 +9,24 @@ from typing import Any, Self
 
 import numpy as np
 from tap_ros.images.pixels import to_float
-from tap_ros.prediction.augmentation import Augmentation
-from tap_ros.prediction.batches import Batch
-from tap_ros.prediction.discriminator import discriminator_loss, generator_loss
+from tap_ros.prediction.batches import Augmentation, Batch
 from tap_ros.prediction.losses import (
-    fixed_time_loss,
     match_step,
     recursive_loss,
     remaining_targets,
     total,
 )
 from tap_ros.prediction.networks import Prediction, PredictorNetwork
-from tap_ros.prediction.recognition import kl_divergence, Recognition, sample_latent
 from tap_ros.prediction.selection import outer_error, selection_errors, Targets
 from tap_ros.prediction.training_config import ObjectiveSettings
-from tap_ros.training.devices import Autocast
-from tap_ros.training.parallel import ALONE, Processes
+from tap_ros.prediction.training_networks import (
+    discriminator_loss,
+    generator_loss,
+    kl_divergence,
+    Recognition,
+    sample_latent,
+)
+from tap_ros.training.devices import ALONE, Autocast, Processes
 import torch
 
 
@@ -90,7 +92,6 @@ class Outcome:
 
     :param loss: scalar with gradient.
     :param match: int64 (B,), the matched targets as indices into T.
-    :param prediction: Prediction.
     :param parts: dict of the terms of the loss, scalars without gradient.
     :param judged: what the discriminators learn from, or None (see discriminators_loss).
     :param nats: KL divergence of z, mean over the batch, without gradient; None without z.
@@ -123,10 +124,6 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
     the paper. The mean of E_t is as low for a blend of two possible bottlenecks as for either of
     them; a concave function of it is lowest at one of them, so that the network commits itself.
 
-    :param networks: Networks.
-    :param batch: batches.Batch.
-    :param augmentation: Augmentation, or None.
-    :param config: ObjectiveSettings.
     :param draws: Draws; needed with GAN or VAE.
     :param autocast: makes the context manager to run the networks in.
     :param kl_share: of the weight of the KL divergence at this step, see training.kl_share.
@@ -155,7 +152,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
         prediction = networks.predictor(context, z)
     measured = targets.measured(context)
     match = targets.match(prediction.image, measured)
-    parts['error'] = targets.loss(prediction.image, match)
+    parts['error'] = outer_error(targets.outer_l1(prediction.image, match), config).mean()
     judged = None
     if networks.discriminator is not None:
         assert draws is not None, "t' is drawn"
@@ -282,9 +279,9 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
     whole = (kl_weight * divergences + errors).detach()
     match = match_step(selection_errors(
         whole, lambda: targets.errors(measured), batch, config), batch.valid)
-    nats = fixed_time_loss(divergences, match)
-    parts = {'kl': kl_weight * nats,
-             'error': fixed_time_loss(outer_error(errors, config), match)}
+    nats, error = (values.gather(1, match[:, None]).mean()
+                   for values in (divergences, outer_error(errors, config)))
+    parts = {'kl': kl_weight * nats, 'error': error}
     return Outcome(total(parts.values()), match, _choose(predictions, match),
                    {name: value.detach() for name, value in parts.items()}, nats=nats.detach())
 

@@ -91,7 +91,6 @@ class SubgoalPredictor(Predictor):
         through the network in one batch, where the last digits of an answer may differ from those
         of the question alone. Mind the memory: all their samples are held at once.
 
-        :param questions: list of Question.
         :return: see Predictor.
         :raises ImageError: likewise; ConfigError: likewise.
         """

@@ -67,7 +67,6 @@ class Predictor(Protocol):
         """
         Answer questions.
 
-        :param questions: list of Question.
         :return: for each a list of Subgoal: sample after sample, of each its subgoals in a row,
             earliest first.
         :raises ImageError: if a picture has the wrong type or size, or a position is unusable.
@@ -115,7 +114,6 @@ def check_question(question: Question, mode: str,
     """
     Check a question.
 
-    :param question: Question.
     :param mode: of the predictor; image_size: likewise.
     :return: pictures (C, H, W, 3) and positions (C, K, 2): of the start, and of the goal if the
         mode is bidirectional.

@@ -6,19 +6,16 @@ from collections.abc import Callable
 import math
 
 from tap_ros.images.pixels import to_float
-from tap_ros.prediction.augmentation import Augmentation
-from tap_ros.prediction.batches import Batch
+from tap_ros.prediction.batches import Augmentation, Batch
 from tap_ros.prediction.losses import (
     bell,
     bell_preference,
     beside_context,
-    fixed_time_loss,
     l1_error,
     l1_errors,
     linear_preference,
     match_step,
     picture_progress,
-    preferred_error,
     relative_to_copying,
 )
 from tap_ros.prediction.training_config import ObjectiveSettings
@@ -27,34 +24,23 @@ import torch
 _POWER_OFFSET = 1e-4  # keeps the slope of a power finite at an error of 0
 
 
-def time_preference(batch: Batch, config: ObjectiveSettings) -> torch.Tensor:
-    """
-    Compute w(t) for the configured method: linear in forward prediction, else a bell.
-
-    :param batch: batches.Batch.
-    :param config: ObjectiveSettings.
-    :return: (B, T).
-    """
-    if config.forward:
-        return linear_preference(batch.times, batch.end, config.beta)
-    return bell_preference(batch.times, batch.first, batch.last)
-
-
 def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor], batch: Batch,
                      config: ObjectiveSettings) -> torch.Tensor:
     """
-    Compute E'_t of Eq. 5 for the configured method.
+    Compute E'_t of Eq. 5 for the configured method: E_t / w(t) in the paper (section 3.2).
+
+    The preference w(t) is linear in forward prediction, else a bell. With w = 1 this is the
+    minimum over time (Eq. 2).
 
     :param error: (B, T), of the prediction against each target.
     :param copy_error: function without arguments that returns (B, C, T), the errors of the context
         pictures against each target.
-    :param batch: batches.Batch.
-    :param config: ObjectiveSettings.
     :return: (B, T).
     """
     if config.loss == 'min':
         return error
-    preference = time_preference(batch, config)
+    preference = (linear_preference(batch.times, batch.end, config.beta) if config.forward
+                  else bell_preference(batch.times, batch.first, batch.last))
     if config.selection == 'relative':
         return relative_to_copying(error, copy_error(), preference)
     if config.selection == 'progress':
@@ -62,17 +48,15 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
         if config.progress_margin:
             hidden = beside_context(progress, config.progress_margin, batch.valid)
             error = error.masked_fill(hidden, math.inf)
-        return preferred_error(error, bell(progress))
-    return preferred_error(error, preference)
+        return error / bell(progress)
+    return error / preference
 
 
 class Targets:
     """
     The frames of a batch that predictions are compared with.
 
-    :param batch: batches.Batch.
     :param augmentation: Augmentation of all pictures that networks see, or None.
-    :param config: ObjectiveSettings.
     """
 
     def __init__(self, batch: Batch, augmentation: Augmentation | None,
@@ -132,19 +116,8 @@ class Targets:
         """Return the l1 errors (B,) of predictions (B, 3, H, W) at targets (B,) of T."""
         return l1_error(self.visible(image), self.frame(step))
 
-    def loss(self, image: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Return E_t: the l1 error at step, to the configured power, as a mean."""
-        return fixed_time_loss(
-            lambda step: outer_error(self.outer_l1(image, step), self.config), step)
-
 
 def outer_error(error: torch.Tensor, config: ObjectiveSettings) -> torch.Tensor:
-    """
-    Raise errors to the configured power; not in the paper, see objective.predictor_loss.
-
-    :param error: l1 errors on [0, 1].
-    :param config: ObjectiveSettings.
-    :return: the same shape.
-    """
+    """Raise l1 errors to the configured power; not in the paper, see objective.predictor_loss."""
     power = config.outer_power
     return error if power == 1 else (error + _POWER_OFFSET) ** power

@@ -1,56 +1,33 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-The settings of a training run of the predictor, in parts.
+The settings of a training run of the predictor, in parts; `python -m tap_ros train predictor`.
 
 A TrainingConfig has the fields of all parts: options on the command line and settings in files are
 one flat list.
 """
 
 from dataclasses import dataclass, fields
+from functools import partial
 import math
-from typing import get_args, get_origin, Literal
+from typing import Literal
 
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.methods import Latent, Loss, method_name, Mode, Selection
 from tap_ros.recording.reading import Reading
 from tap_ros.training.robot_mask import RobotMask
-from tap_ros.training.split import TEST_FRACTION
+from tap_ros.training.settings import (
+    check_settings,
+    OptimizerSettings,
+    RunSettings,
+    TrainOptions,
+)
+from tap_ros.training.train import run_training, with_recipe
 
 Decoder = Literal['separate', 'shared']
 GoalPicture = Literal['last', 'recorded', 'mixed']
 Posterior = Literal['video', 'frame']
 Precision = Literal['auto', 'float32', 'bfloat16']
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """
-    Where a run happens and what it leaves.
-
-    :param recordings: .mcap files, bag folders, or folders of these.
-    :param out: the run's folder; if it holds a checkpoint, training goes on from there.
-    :param test_fraction: share of episodes held out, by seed.
-    :param seed: of the weights, batches and augmentation.
-    :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
-    :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 where a short trial
-        finds it faster. The choice stays for the whole run.
-    :param threads: of the CPU; 0: as many as there are.
-    :param compile: use torch.compile; slow to start, results differ in the last digits.
-    :param log_every: steps between curve points.
-    :param save_every: steps between checkpoints, scores and sample pictures.
-    """
-
-    recordings: tuple[str, ...]
-    out: str
-    test_fraction: float = TEST_FRACTION
-    seed: int = 0
-    device: str = 'auto'
-    precision: Precision = 'auto'
-    threads: int = 0
-    compile: bool = False
-    log_every: int = 20
-    save_every: int = 500
 
 
 @dataclass(frozen=True)
@@ -108,6 +85,11 @@ class ObjectiveSettings:
         """The name of the method in the paper's tables."""
         return method_name(self.loss, self.selection, self.gan, self.latent, self.fraction,
                            self.beta if self.forward else None)
+
+    @property
+    def only_fraction(self) -> float | None:
+        """The share of an episode at which its only target is, None for all targets."""
+        return self.fraction if self.loss == 'fix' else None
 
     @property
     def forward(self) -> bool:
@@ -175,47 +157,34 @@ class NetworkSettings:
 
 
 @dataclass(frozen=True)
-class OptimizerSettings:
+class PredictorOptimizer(OptimizerSettings):
     """
-    How the weights are moved.
+    How the weights are moved, and in which precision; beta1 of Adam is 0.5 with a GAN, else 0.9.
 
-    :param steps: length of the training, and of the cosine schedule of the learning rate.
-    :param batch_size: 64 in the paper.
-    :param learning_rate: at the start; Adam (beta1 is 0.5 with a GAN, else 0.9). 1e-4 in the
-        paper, for 200 epochs.
-    :param discriminator_rate: the discriminators' learning rate at the start.
-    :param warmup: steps over which the learning rate rises.
-    :param gradient_clip: largest norm of the gradient; 0: any.
-    :param average_decay: of the exponential moving average that is shipped; 0: none.
+    :param discriminator_rate: the discriminators' learning rate at its highest.
+    :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 on a GPU, and on a CPU
+        that has instructions for it. The choice stays for the whole run.
+    :param compile: use torch.compile; slow to start, results differ in the last digits.
     """
 
-    steps: int = 10000
-    batch_size: int = 24
-    learning_rate: float = 1e-3
     discriminator_rate: float = 2e-4
-    warmup: int = 100
-    gradient_clip: float = 1.0
-    average_decay: float = 0.999
+    precision: Precision = 'auto'
+    compile: bool = False
 
 
-# Least and largest value of numbers.
 _RANGES = {
-    'test_fraction': (0, 0.9), 'threads': (0, math.inf), 'log_every': (1, math.inf),
-    'save_every': (1, math.inf), 'fraction': (1e-6, 1), 'beta': (1e-6, math.inf),
-    'progress_margin': (0, 0.95), 'outer_power': (0.1, 1), 'recursion': (1, math.inf),
-    'gan_weight': (0, math.inf), 'kl_weight': (0, math.inf), 'free_nats': (0, math.inf),
-    'kl_warmup': (0, 0.5), 'posterior_std': (0.01, 1), 'margin': (0, math.inf),
-    'num_targets': (0, math.inf), 'min_crop': (1e-6, 1), 'start_crop': (0, 0.9),
-    'brightness': (0, 0.9), 'fill_context': (0, 1), 'base_width': (1, math.inf),
-    'latent_size': (1, math.inf), 'video_frames': (1, math.inf), 'steps': (1, math.inf),
-    'batch_size': (1, math.inf), 'warmup': (0, math.inf), 'average_decay': (0, 0.99999)}
+    'fraction': (1e-6, 1), 'beta': (1e-6, math.inf), 'progress_margin': (0, 0.95),
+    'outer_power': (0.1, 1), 'recursion': (1, math.inf), 'gan_weight': (0, math.inf),
+    'kl_weight': (0, math.inf), 'free_nats': (0, math.inf), 'kl_warmup': (0, 0.5),
+    'posterior_std': (0.01, 1), 'margin': (0, math.inf), 'num_targets': (0, math.inf),
+    'min_crop': (1e-6, 1), 'start_crop': (0, 0.9), 'brightness': (0, 0.9), 'fill_context': (0, 1),
+    'base_width': (1, math.inf), 'latent_size': (1, math.inf), 'video_frames': (1, math.inf)}
 
 
 # Of the bases the last has its fields first.
 @dataclass(frozen=True)
-class TrainingConfig(
-        OptimizerSettings, NetworkSettings, DataSettings, ObjectiveSettings, Reading,
-        RunSettings):
+class TrainingConfig(PredictorOptimizer, NetworkSettings, DataSettings, ObjectiveSettings, Reading,
+                     RunSettings):
     """
     All that a training run is made from: the fields of its parts.
 
@@ -225,17 +194,7 @@ class TrainingConfig(
     def __post_init__(self) -> None:
         """Raise ConfigError for settings that cannot be trained with."""
         super().__post_init__()
-        if not self.recordings:
-            raise ConfigError('recordings: expected at least one .mcap file or bag folder')
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if get_origin(field.type) is Literal and value not in get_args(field.type):
-                raise ConfigError(f'{field.name}: expected one of '
-                                  f'{", ".join(get_args(field.type))}, got {value!r}')
-            low, high = _RANGES.get(field.name, (-math.inf, math.inf))
-            if field.name in _RANGES and not low <= value <= high:
-                wanted = f'{low}..{high}' if high < math.inf else f'{low} or more'
-                raise ConfigError(f'{field.name}: expected {wanted}, got {value}')
+        check_settings(self, _RANGES)
         for wrong, advice in (
                 (self.forward and self.loss == 'genmin' and self.selection == 'progress',
                  'selection: progress needs a goal picture; with mode forward choose absolute'),
@@ -256,3 +215,16 @@ class TrainingConfig(
 
 
 DEFAULTS = {field.name: field.default for field in fields(TrainingConfig)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(TrainOptions):
+    """Options of the command `train predictor`."""
+
+    objective: ObjectiveSettings = ObjectiveSettings()
+    data: DataSettings = DataSettings()
+    network: NetworkSettings = NetworkSettings()
+    optimizer: PredictorOptimizer = PredictorOptimizer()
+
+
+defaults, run = partial(with_recipe, 'predictor'), partial(run_training, 'predictor')

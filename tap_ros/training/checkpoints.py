@@ -1,36 +1,28 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A training run: its state, its way to a file and back, and its folder.
+The state of a training run, and its way to a file and back.
 
 Batches and augmentation are drawn from (seed, step), so that there are no random numbers in it.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sized
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 import copy
 from dataclasses import dataclass
 import json
 import math
 from pathlib import Path
-import platform
-import threading
-from typing import Any, Generic, TYPE_CHECKING, TypeVar
+from typing import Any, Generic, TypeVar
 
 from tap_ros.errors import ConfigError, WeightsError
-from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.text import escaped
-from tap_ros.training.devices import device_name, placed
+from tap_ros.training.devices import placed
+from tap_ros.training.settings import FREE
 from tap_ros.training.weights import load_tensors, save_tensors
 import torch
 
-if TYPE_CHECKING:
-    from tap_ros.recording.cache import EpisodeStore
-
 Trained = TypeVar('Trained', bound=torch.nn.Module)
 
-# Settings that change where a run happens and what it shows, not what it learns.
-FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
 _REMEDY = 'remove it to begin anew, or choose another --out folder'
 
 
@@ -72,6 +64,11 @@ class TrainingState(Generic[Trained]):
             for group in optimizer.param_groups:
                 group['lr'] = rate * rise * (0.02 + 0.98 * fall)
 
+    def clip_gradients(self, most: float) -> torch.Tensor:
+        """Scale the network's gradients down to the norm `most`, 0: any; return what it was."""
+        return torch.nn.utils.clip_grad_norm_(
+            self.optimizers[0].param_groups[0]['params'], most or math.inf)
+
     @torch.no_grad()
     def update_average(self, decay: float) -> None:
         """
@@ -94,7 +91,6 @@ def start(network: Trained, learning_rate: float, device: torch.device,
 
     :param network: with fresh weights.
     :param learning_rate: of Adam.
-    :param device: torch device.
     :param helpers: dict of the networks that only training needs. Those whose name ends in
         'discriminator' are trained against the others.
     :return: TrainingState.
@@ -118,7 +114,6 @@ def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     Write the whole state of a run, in one step.
 
     :param path: the file.
-    :param state: TrainingState.
     :param settings: dict of the run's settings.
     :param data_hash: of the recordings.
     :raises StorageError: if the disk is full; the checkpoint before stays.
@@ -155,7 +150,7 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
             or not isinstance(about.get('seconds'), (int, float))
             or about.get('precision', '') not in ('', 'float32', 'bfloat16')):
         raise WeightsError(f'{escaped(path)}: is no checkpoint; {_REMEDY}')
-    begun = todays(about['settings'])
+    begun, settings = json.loads(json.dumps([todays(about['settings']), settings]))  # no tuples
     for name in {**begun, **settings}:
         before, value = begun.get(name), settings.get(name)
         if name not in FREE and before != value:
@@ -187,56 +182,3 @@ def _put_back(state: TrainingState[Any], tensors: Mapping[str, torch.Tensor]) ->
                 if value.shape == weight.shape:  # the fused Adam wants the weight's own strides
                     value = torch.empty_like(weight).copy_(value)
                 optimizer.state[weight][name.rsplit('.', 1)[1]] = value
-
-
-@contextmanager
-def run_folder(folder: str | Path) -> Iterator[None]:
-    """
-    Write to the folder of a training run, as the only process.
-
-    :param folder: made if it is not there.
-    :raises StorageError: when another process trains there, or it cannot be written.
-    """
-    def tell(failed: threading.ExceptHookArgs) -> None:
-        # The thread that writes the curves; its error is raised where the next point is added.
-        if not isinstance(failed.exc_value, OSError):
-            before(failed)
-
-    with only_writer(folder), storage_errors(folder):
-        before, threading.excepthook = threading.excepthook, tell
-        try:
-            yield
-        finally:
-            threading.excepthook = before
-
-
-def run_facts(state: TrainingState[Any], seed: int, store: 'EpisodeStore', training: Sized,
-              held_out: Sized) -> dict[str, Any]:
-    """
-    Return what is known of a run, for run.json and the weights file.
-
-    :param state: TrainingState.
-    :param seed: of the run.
-    :param store: EpisodeStore; training, held_out: indices of its episodes.
-    :return: dict that JSON can hold.
-    """
-    device = device_name(next(state.network.parameters()).device)
-    chosen = {'precision': state.precision} if state.precision else {}
-    return chosen | {
-        'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': seed,
-        'data_hash': store.data_hash,
-        'camera_size': list(store.camera_size) if store.camera_size else None,
-        'episodes': len(training), 'held_out': len(held_out),
-        'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, {device}',
-        'torch': torch.__version__, 'python': platform.python_version()}
-
-
-def describe_run(folder: str | Path, **files: Mapping[str, Any]) -> None:
-    """
-    Write what a run was.
-
-    :param folder: of the run.
-    :param files: name without .json to what stands in the file.
-    """
-    for name, values in files.items():
-        write_atomically(Path(folder, f'{name}.json'), json.dumps(values, indent=2) + '\n')

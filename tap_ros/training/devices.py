@@ -1,21 +1,26 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Where networks run, and in which precision."""
+"""
+Where networks run: devices, precision, and the processes that torchrun starts.
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from functools import cache, partial
-import time
+Of several processes each takes its part of every batch. All have the same weights and draw the
+same random numbers, so that the loss is that of one process with the whole batch. Gradients are
+averaged after the backward pass rather than by DistributedDataParallel, which cannot be told that
+discriminators stand still while the predictor learns from them.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from functools import partial
+import os
 from typing import TypeVar
 
 from tap_ros.errors import ConfigError
-from tap_ros.training.parallel import local_rank
 import torch
+from torch import distributed, nn
 
-_WORTHWHILE = 1.15  # of bfloat16_gain; less is within what a trial errs
-_TRIALS = 6
-
-Placed = TypeVar('Placed', bound=torch.nn.Module)
+Placed = TypeVar('Placed', bound=nn.Module)
 Autocast = Callable[[], AbstractContextManager[object]]  # makes what networks run in
 
 
@@ -30,8 +35,9 @@ def pick_device(name: str) -> torch.device:
     """
     if name == 'auto':
         name = 'cuda' if torch.cuda.is_available() else 'cpu'
-    if name == 'cuda' and local_rank():
-        name = f'cuda:{local_rank()}'
+    rank = int(os.environ.get('LOCAL_RANK', 0))
+    if name == 'cuda' and rank:
+        name = f'cuda:{rank}'
     try:
         torch.empty(1, device=name)
     except (RuntimeError, AssertionError) as error:
@@ -45,70 +51,9 @@ def placed(module: Placed, device: torch.device | str) -> Placed:
     return module.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
-def pick_precision(precision: str, device: torch.device) -> str:
-    """
-    Choose the precision to train in.
-
-    :param precision: 'float32', 'bfloat16', or 'auto': bfloat16 on a GPU, and on a CPU that
-        convolves in it clearly faster; one that emulates it is ten times slower.
-    :param device: torch device.
-    :return: 'float32' or 'bfloat16'; for 'auto' the same whenever asked in one process.
-    """
-    if precision != 'auto':
-        return precision
-    half = device.type == 'cuda' or (device.type == 'cpu' and bfloat16_gain() > _WORTHWHILE)
-    return 'bfloat16' if half else 'float32'
-
-
-@cache
-def bfloat16_gain() -> float:
-    """
-    Measure how many times faster this CPU convolves in bfloat16 than in float32, in some 30 ms.
-
-    A decoder's convolution, forward and backward, on one thread, by the time of that thread: what
-    else the machine does hardly matters.
-
-    :return: the ratio, below 1 where bfloat16 is slower; 0 where torch cannot do it.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return _pass_time(torch.float32) / _pass_time(torch.bfloat16)
-    except RuntimeError:
-        return 0.0
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _pass_time(dtype: torch.dtype) -> float:
-    """Return the least CPU time of some convolutions, forward and backward."""
-    pictures, weight = (  # of ones: the random numbers of a training stay what they are
-        torch.ones(shape, dtype=dtype).contiguous(memory_format=torch.channels_last)
-        .requires_grad_() for shape in ((8, 64, 16, 16), (32, 64, 3, 3)))
-    times = []
-    for _ in range(_TRIALS):
-        began = time.thread_time()
-        torch.nn.functional.conv2d(pictures, weight, padding=1).sum().backward()
-        times.append(time.thread_time() - began)
-    return min(times)
-
-
-def make_autocast(precision: str, device: torch.device) -> Autocast:
-    """
-    Make what networks run in.
-
-    :param precision: 'float32' or 'bfloat16'.
-    :param device: torch device.
-    :return: function that makes a context manager.
-    """
-    return partial(torch.autocast, device.type, torch.bfloat16, enabled=precision == 'bfloat16')
-
-
 def has_bfloat16(device: torch.device | str) -> bool:
     """
     Say whether a device has instructions for bfloat16; others emulate it many times slower.
-
-    For what must be the same in all processes of a machine, which pick_precision does not promise.
 
     :param device: torch device or its name.
     :return: bool; of CPUs, those with AVX512_BF16.
@@ -118,6 +63,122 @@ def has_bfloat16(device: torch.device | str) -> bool:
     return getattr(torch.cpu, '_is_avx512_bf16_supported', lambda: False)()
 
 
+def pick_precision(precision: str, device: torch.device) -> str:
+    """Return 'float32' or 'bfloat16' for these and for 'auto': bfloat16 where it is fast."""
+    if precision != 'auto':
+        return precision
+    return 'bfloat16' if has_bfloat16(device) else 'float32'
+
+
+def make_autocast(precision: str, device: torch.device) -> Autocast:
+    """
+    Make what networks run in.
+
+    :param precision: 'float32' or 'bfloat16'.
+    :return: function that makes a context manager.
+    """
+    return partial(torch.autocast, device.type, torch.bfloat16, enabled=precision == 'bfloat16')
+
+
 def device_name(device: torch.device) -> str:
     """Say what computes: 'cpu', or the name of the GPU."""
     return torch.cuda.get_device_name(device) if device.type == 'cuda' else device.type
+
+
+@dataclass(frozen=True)
+class Processes:
+    """
+    The processes that train together.
+
+    :param rank: of this one, from 0; the first one writes files and shows progress.
+    :param count: how many there are.
+    """
+
+    rank: int = 0
+    count: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the one that writes files and shows progress."""
+        return self.rank == 0
+
+    def part(self, batch_size: int) -> slice:
+        """
+        Return the slice of a batch that is this process's.
+
+        :raises ConfigError: when the batch cannot be divided.
+        """
+        if batch_size % self.count:
+            raise ConfigError(f'batch_size: {batch_size} episodes cannot be divided among '
+                              f'{self.count} processes; choose a multiple of {self.count}')
+        size = batch_size // self.count
+        return slice(self.rank * size, (self.rank + 1) * size)
+
+    def average_gradients(self, parameters: Iterable[torch.Tensor]) -> None:
+        """Replace the gradients of parameters by their mean over the processes."""
+        if self.count == 1:
+            return
+        gradients = [p.grad for p in parameters if p.grad is not None]
+        flat = torch.cat([gradient.flatten() for gradient in gradients])
+        distributed.all_reduce(flat)
+        parts = (flat / self.count).split([gradient.numel() for gradient in gradients])
+        for gradient, part in zip(gradients, parts):
+            gradient.copy_(part.view_as(gradient))
+
+    def mean(self, value: torch.Tensor) -> torch.Tensor:
+        """Return the mean of a tensor over the processes."""
+        if self.count == 1:
+            return value
+        value = value.detach().clone()
+        distributed.all_reduce(value)
+        return value / self.count
+
+    def agree(self, flag: bool, device: torch.device) -> bool:
+        """Return what the first process says, so that all do the same."""
+        if self.count == 1:
+            return flag
+        said = torch.tensor(float(flag), device=device)
+        distributed.broadcast(said, 0)
+        return bool(said)
+
+    def wait(self) -> None:
+        """Wait until all processes are here."""
+        if self.count > 1:
+            distributed.barrier()
+
+
+ALONE = Processes()
+
+
+@contextmanager
+def joined(device: torch.device) -> Iterator[Processes]:
+    """
+    Join the processes that torchrun started with this one.
+
+    :param device: torch device of this process.
+    :return: context manager of Processes; one alone where torchrun started none.
+    :raises ConfigError: for several processes without GPUs; batches are normalised over all
+        processes on GPUs only (torch.nn.SyncBatchNorm).
+    """
+    count = int(os.environ.get('WORLD_SIZE', 1))
+    if count == 1:
+        yield ALONE
+        return
+    if device.type != 'cuda':
+        raise ConfigError(f'device: {count} processes train on a GPU each, not on {device.type}; '
+                          'start one process, with threads')
+    distributed.init_process_group('nccl')
+    try:
+        yield Processes(distributed.get_rank(), count)
+    finally:
+        distributed.destroy_process_group()
+
+
+def share_batch_norm(module: nn.Module, processes: Processes) -> None:
+    """
+    Let batch normalisation use the statistics of the whole batch.
+
+    :param module: changed in place; its weights and their names stay.
+    """
+    if processes.count > 1:
+        nn.SyncBatchNorm.convert_sync_batchnorm(module)

@@ -19,11 +19,7 @@ GOAL = -1  # the "time" of the goal's own picture
 
 
 class MappedFrames:
-    """
-    Take pictures from the files of the cache.
-
-    :param store: the EpisodeStore.
-    """
+    """Take pictures from the files of the cache."""
 
     def __init__(self, store: 'EpisodeStore') -> None:
         self._store = store
@@ -49,8 +45,6 @@ class ResidentFrames:
     """
     Keep the pictures of all episodes in the memory of a device, where a batch is one gather.
 
-    :param store: the EpisodeStore.
-    :param device: torch device.
     :param progress: whether to show a progress bar.
     """
 

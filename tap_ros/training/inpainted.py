@@ -34,7 +34,6 @@ class FilledStore:
     the process. Filling takes some 8 ms for 40 frames of 64x64. Episodes without masks are as
     recorded.
 
-    :param store: the EpisodeStore.
     :param robot_mask: see robot_mask.hidden_pixels.
     :param progress: whether to show a progress bar.
     :param filling: robot_mask.fill_in_time or fill_from_past.
@@ -124,7 +123,6 @@ def fill(store: 'EpisodeStore', robot_mask: RobotMask,
     """
     Fill the episodes of recordings.
 
-    :param store: the EpisodeStore.
     :param robot_mask: see robot_mask.hidden_pixels.
     :param make_frames: takes a store and makes the Frames of it.
     :param progress: whether to show a progress bar.
@@ -141,7 +139,6 @@ def with_masks(store: 'EpisodeStore', parts: tuple[np.ndarray, np.ndarray],
     """
     Leave out the episodes that a robot mask cannot be used with.
 
-    :param store: the EpisodeStore.
     :param parts: int64, indices of the episodes to train on and of those held out.
     :param robot_mask: see robot_mask.hidden_pixels; with 'none' all of them stay.
     :return: the same, with those whose frames all have a mask; a warning says how many have not.

@@ -25,7 +25,6 @@ def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
     Recordings without seeds are split by position. Of two scenes or more one is always held out,
     unless the share is 0.
 
-    :param store: the EpisodeStore.
     :param test_fraction: the held-out share, 0..1.
     :param min_frames: episodes with fewer frames are left out.
     :return: (training, held-out), int64 arrays of episode indices.

@@ -1,20 +1,24 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Train by a recipe: the function `tap_ros.train`, and what the commands share."""
+"""Train by a recipe: the function `tap_ros.train`, and what the commands `train ...` do."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
 from difflib import get_close_matches
 from importlib import import_module
+import os
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.recording.reading import Reading
 from tap_ros.training.recipes import DEFAULT, find_recipe, Model, RECIPES
+from tap_ros.training.settings import TrainOptions
 
-# Of each model: its settings, a dataclass, and what trains it.
+Options = TypeVar('Options', bound=TrainOptions)
+
+# Of each model: its settings, a dataclass, and what trains it; torch takes seconds to import.
 _TRAINERS = {
     'predictor': ('tap_ros.prediction.training_config:TrainingConfig',
                   'tap_ros.prediction.training:train'),
@@ -46,31 +50,26 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
         raise ConfigError(f'model {model!r} is unknown; valid: {", ".join(_TRAINERS)}')
     paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)
     bags = tuple(str(path) for path in paths)
-    config_class, function = map(_imported, _TRAINERS[model])
+    config_class, function = (getattr(import_module(module), name) for module, name in (
+        place.split(':') for place in _TRAINERS[model]))
     known = [field.name for field in fields(config_class)]
     for name in settings:
         if name not in known:
             near = get_close_matches(name, known, 1)
             raise ConfigError(f'setting {name!r} of a {model} is unknown'
                               + (f'; did you mean {near[0]!r}?' if near else ''))
-    if recipe:
-        chosen = recipe
-    else:
-        chosen = recipe_of(model, bags, Reading(**{
-            field.name: settings[field.name] for field in fields(Reading)
-            if field.name in settings}))
-    values = {**find_recipe(model, chosen).settings, **settings}
+    chosen = find_recipe(model, recipe or recipe_of(model, bags, settings))
     return Path(function(config_class(
-        recordings=bags, out=str(out or f'runs/{model}'), **values)))
+        recordings=bags, out=str(out or f'runs/{model}'), **{**chosen.settings, **settings})))
 
 
-def recipe_of(model: str, recordings: Sequence[str], reading: Reading) -> str:
+def recipe_of(model: str, recordings: Sequence[str], settings: Mapping[str, Any]) -> str:
     """
     Name the recipe for recordings: that of the task of their first episode, if there is one.
 
     :param model: 'predictor' or 'forward'.
     :param recordings: paths.
-    :param reading: how they are read.
+    :param settings: of the training; those of Reading say how they are read.
     :return: name of a recipe; the default one where no recipe has the task's name, or the
         recordings cannot be read, which the training will say.
     """
@@ -78,12 +77,41 @@ def recipe_of(model: str, recordings: Sequence[str], reading: Reading) -> str:
     with suppress(TapError):
         from tap_ros.recording.bags import check_first_picture
         from tap_ros.recording.cache import open_recordings  # --help does without numpy
-        check_first_picture(tuple(recordings), reading, f'the {model}')
+        reading = Reading(**{field.name: settings[field.name] for field in fields(Reading)
+                             if field.name in settings})
+        check_first_picture(recordings, reading, f'the {model}')
         task = open_recordings(list(recordings), reading=reading)[0].task
     return task if task in RECIPES[model] else DEFAULT[model]
 
 
-def _imported(place: str) -> Any:
-    """Import 'module:attribute'; a training needs torch, which takes seconds."""
-    module, _, name = place.partition(':')
-    return getattr(import_module(module), name)
+def with_recipe(model: Model, args: Options) -> Options:
+    """
+    Put the settings of the recipe into the options of a command.
+
+    :param model: 'predictor' or 'forward'.
+    :param args: options; their fields beside `recipe` are dataclasses of settings.
+    """
+    given = settings_of(args)
+    if not given['recordings']:
+        raise ConfigError('missing: BAG; name the recordings, or see --help')
+    chosen = find_recipe(model, args.recipe or recipe_of(model, given['recordings'], given))
+    changed: dict[str, Any] = {
+        name: replace(part, **{key: chosen.settings[key]
+                               for key in asdict(part).keys() & chosen.settings})
+        for name, part in vars(args).items() if name != 'recipe'}
+    return replace(args, **changed)
+
+
+def settings_of(args: TrainOptions) -> dict[str, Any]:
+    """Return the settings of all parts of a command's options, by name."""
+    return {name: value for key, part in vars(args).items() if key != 'recipe'
+            for name, value in asdict(part).items()}
+
+
+def run_training(model: Model, args: TrainOptions) -> None:
+    """Train with the options' settings, and print where the weights are."""
+    settings = settings_of(args)
+    weights = train(settings.pop('recordings'), settings.pop('out'), model,
+                    args.recipe or DEFAULT[model], **settings)
+    if not int(os.environ.get('LOCAL_RANK', 0)):
+        print(weights)

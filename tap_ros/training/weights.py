@@ -14,7 +14,6 @@ import json
 import math
 import os
 from pathlib import Path
-import stat
 from typing import Any, get_origin, Literal, TypeVar
 
 from safetensors import SafetensorError
@@ -30,7 +29,6 @@ Network = TypeVar('Network', bound=torch.nn.Module)
 LATER = {'later': True}  # metadata of a field that files of earlier versions lack
 
 _FORMAT = 'tap_ros 2'  # 1 had no SHA-256
-_MAX_HEADER = 2 ** 22  # bytes; names, shapes and description of the largest networks need 1%
 _AGAIN = 'copy it again, or train again'
 
 
@@ -93,12 +91,11 @@ def make_network(network_class: Callable[[Config], Network], config_class: type[
     config = make_config(config_class, values, path)
     try:
         network = network_class(config)
+        network.load_state_dict(state)
     except (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError,
             ValueError) as error:
-        raise WeightsError(f'{escaped(path)}: no network has its configuration '
-                           f'({escaped(error)}); {_AGAIN}') from error
-    check_fit(network.state_dict(), state, path)
-    network.load_state_dict(state)
+        raise WeightsError(f'{escaped(path)}: does not fit its own configuration '
+                           f'({escaped(" ".join(str(error).split()), 300)}); {_AGAIN}') from error
     return network
 
 
@@ -153,32 +150,6 @@ def _is_a(value: object, kind: Any) -> bool:
     return kind is float and isinstance(value, float) and math.isfinite(value)
 
 
-def check_fit(wanted: Mapping[str, torch.Tensor], state: Mapping[str, torch.Tensor],
-              path: str | Path) -> None:
-    """
-    Compare weights with what a network has.
-
-    :param wanted: state dict of the network; state: of load_weights.
-    :param path: the file, for the message.
-    :raises WeightsError: if names, sizes or types do not fit.
-    """
-    missing = sorted(set(wanted) - set(state))
-    unknown = sorted(set(state) - set(wanted))
-    if missing or unknown:
-        raise WeightsError(
-            f'{escaped(path)}: does not fit its own configuration; missing '
-            f'{listing(missing, 3) or "nothing"}, unknown {listing(unknown, 3) or "nothing"}. '
-            'Train again')
-    for name, tensor in wanted.items():
-        if tensor.shape != state[name].shape:
-            raise WeightsError(
-                f'{escaped(path)}: {name} has size {tuple(state[name].shape)}, the configuration '
-                f'wants {tuple(tensor.shape)}. Use weights made for this image size and width')
-        if tensor.is_floating_point() != state[name].is_floating_point():
-            raise WeightsError(f'{escaped(path)}: {name} is {state[name].dtype}, the network '
-                               f'wants {tensor.dtype}. Train again')
-
-
 def save_tensors(path: str | Path, tensors: Mapping[str, torch.Tensor],
                  about: Mapping[str, Any]) -> None:
     """
@@ -221,15 +192,22 @@ def stored_digest(path: str | Path) -> str:
 def _load(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, Any], str]:
     """Return tensors, description and SHA-256 of a file."""
     name = escaped(path)
-    data = _read(path, name)
     try:
-        header = json.loads(data[8:8 + _header_length(data)])
+        if not os.path.isfile(path):  # a pipe would wait for somebody to write to it
+            raise WeightsError(f'{name}: no such weights file; train one with `python -m tap_ros '
+                               'train`, or give another .safetensors file')
+        data = Path(path).read_bytes()
+    except (OSError, ValueError, MemoryError) as error:
+        raise WeightsError(f'{name}: cannot be read: '
+                           f'{escaped(getattr(error, "strerror", None) or error)}') from error
+    try:
+        tensors = load(data)
+        header = json.loads(data[8:8 + int.from_bytes(data[:8], 'little')])
         metadata = header.get('__metadata__') or {}
         if metadata.get('format') != _FORMAT or not {'about', 'sha256'} <= set(metadata):
             raise WeightsError(
                 f'{name}: written by format {escaped(metadata.get("format"), 40)}, not by '
                 f'{_FORMAT}, which holds a SHA-256; train again with this version')
-        tensors = load(data)
         digest = content_digest(tensors, metadata['about'])
         about = json.loads(metadata['about'])
     except (SafetensorError, ArithmeticError, AssertionError, AttributeError, LookupError,
@@ -242,33 +220,6 @@ def _load(path: str | Path) -> tuple[dict[str, torch.Tensor], dict[str, Any], st
     if not isinstance(about, dict):
         raise WeightsError(f'{name}: does not describe what it holds; train again')
     return tensors, about, digest
-
-
-def _read(path: str | Path, name: str) -> bytes:
-    """Return the bytes of a file whose header is not longer than can be."""
-    try:
-        # without O_NONBLOCK a pipe would wait for somebody to write to it
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb') as stream:
-            status = os.fstat(stream.fileno())
-            if not stat.S_ISREG(status.st_mode):
-                raise WeightsError(f'{name}: is no file; give a .safetensors file')
-            length = _header_length(stream.read(8))
-            if length > min(_MAX_HEADER, status.st_size):
-                raise WeightsError(f'{name}: damaged, truncated, or no safetensors file (a header '
-                                   f'of {length} bytes); {_AGAIN}')
-            stream.seek(0)
-            return stream.read()
-    except FileNotFoundError:
-        raise WeightsError(f'{name}: no such weights file; train one with '
-                           '`python -m tap_ros train`, or correct the path') from None
-    except (OSError, ValueError, MemoryError) as error:
-        raise WeightsError(f'{name}: cannot be read: '
-                           f'{escaped(getattr(error, "strerror", None) or error)}') from error
-
-
-def _header_length(data: bytes) -> int:
-    """Return the length that a file's first bytes give its header."""
-    return int.from_bytes(data[:8], 'little')
 
 
 def content_digest(tensors: Mapping[str, torch.Tensor], about: str) -> str:

@@ -15,7 +15,7 @@ from experiments.paper.runs import (
 )
 from tap_ros.prediction.methods import method_fields, todays_settings
 from tap_ros.prediction.training_config import DEFAULTS
-from tap_ros.training.checkpoints import FREE
+from tap_ros.training.settings import FREE
 
 ROOT = Path(__file__).parents[2]
 

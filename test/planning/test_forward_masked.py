@@ -120,7 +120,7 @@ def test_a_run_of_before_goes_on_as_without_a_mask(bags, tmp_path, monkeypatch):
 
     config = config_for(bags[0], tmp_path, robot_mask='none')
     with monkeypatch.context() as patch:
-        patch.setattr('tap_ros.planning.forward_training.save_checkpoint', save)
+        patch.setattr('tap_ros.training.run.save_checkpoint', save)
         train(config, stop_at=2, progress=False)
     train(config, progress=False)
     with pytest.raises(ConfigError, match='robot_mask'):

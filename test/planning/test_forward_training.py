@@ -267,7 +267,7 @@ def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(
     config = config_for(bag, tmp_path / 'a')
     train(config, stop_at=2, progress=False)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(f'tap_ros.planning.forward_training.{where}', killed)
+        patch.setattr(f'tap_ros.training.run.{where}', killed)
         train(config, progress=False)
     resumed = load_file(train(config, progress=False))
     whole = load_file(train(config_for(bag, tmp_path / 'b'), progress=False))

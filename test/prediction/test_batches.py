@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tap_ros.prediction.augmentation import Augmentation
 from tap_ros.prediction.batches import (
+    Augmentation,
     episode_order,
     make_batch,
     Sampling,

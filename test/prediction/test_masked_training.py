@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.pixels import to_float
-from tap_ros.prediction.augmentation import Augmentation
-from tap_ros.prediction.batches import make_batch, Sampling
-from tap_ros.prediction.discriminator import Discriminator
-from tap_ros.prediction.held_out import held_out_scores
+from tap_ros.prediction.batches import Augmentation, make_batch, Sampling
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import discriminators_loss, Draws, Networks, predictor_loss
-from tap_ros.prediction.recognition import Recognition
 from tap_ros.prediction.selection import Targets
-from tap_ros.prediction.training import train
+from tap_ros.prediction.training import held_out_scores, train
 from tap_ros.prediction.training_config import ObjectiveSettings, TrainingConfig
+from tap_ros.prediction.training_networks import Discriminator, Recognition
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.inpainted import fill
 from tap_ros.training.weights import load_weights

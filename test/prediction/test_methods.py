@@ -14,8 +14,8 @@ from tap_ros.errors import ConfigError
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.prediction.methods import method_fields, todays_settings
 from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
-from tap_ros.training.checkpoints import FREE
 from tap_ros.training.recipes import DEFAULT, find_recipe, RECIPES
+from tap_ros.training.settings import FREE
 from tap_ros.training.weights import load_tensors
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 

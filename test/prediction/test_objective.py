@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction import objective, selection
-from tap_ros.prediction.augmentation import Augmentation
-from tap_ros.prediction.batches import Batch
-from tap_ros.prediction.held_out import held_out_scores
-from tap_ros.prediction.losses import (
-    bell_preference,
-    l1_error,
-    minimum_loss,
-)
+from tap_ros.prediction.batches import Augmentation, Batch
+from tap_ros.prediction.losses import bell_preference, l1_error
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.objective import (
@@ -24,7 +18,8 @@ from tap_ros.prediction.objective import (
     Networks,
     predictor_loss,
 )
-from tap_ros.prediction.selection import selection_errors, time_preference
+from tap_ros.prediction.selection import selection_errors
+from tap_ros.prediction.training import held_out_scores
 from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
@@ -57,34 +52,19 @@ def make_batch(B=4, T=6, padded=0, seed=0):
                  column * (T + 1), times <= T - padded)
 
 
-def test_a_perfect_prediction_is_matched_at_no_loss():
-    batch = make_batch()
-    for method in ('min-wo-gan', 'genmin-wo-gan', 'genmin-wo-gan+relative'):
-        config = replace(CONFIG, **method_fields(method))
-        outcome = predictor_loss(showing(to_float(batch.targets[:, 2])), batch, None, config)
-        assert outcome.match.tolist() == [2] * 4, method
-        assert outcome.loss.item() == pytest.approx(0, abs=1e-6)
-
-
-def test_min_is_eq_2():
-    batch = make_batch()
+def test_each_loss_is_the_error_at_the_frame_that_it_chooses():
+    batch = make_batch(B=8, padded=2)
     image = to_float(batch.context).mean(1)
-    outcome = predictor_loss(showing(image), batch, None, replace(CONFIG, loss='min'))
-    errors = l1_error(image[:, None], to_float(batch.targets))
-    assert outcome.loss.item() == pytest.approx(minimum_loss(errors).item(), abs=1e-6)
-
-
-def test_fix_stays_at_its_frame_where_another_is_nearer():
-    batch = make_batch(T=2)  # with a GAN the second frame is there to be judged
-    outcome = predictor_loss(showing(to_float(batch.targets[:, 1])), batch, None,
-                             replace(CONFIG, **method_fields('fix-wo-gan')))
-    assert outcome.match.tolist() == [0] * 4 and outcome.loss > 0.1
-
-
-def test_padding_is_never_matched():
-    batch = make_batch(padded=3)
-    outcome = predictor_loss(showing(to_float(batch.targets[:, 4])), batch, None, CONFIG)
-    assert outcome.match.max() <= 2 and outcome.loss > 0.1
+    errors = l1_error(image[:, None], to_float(batch.targets))[:, :4]  # the rest is padding
+    preferred = (errors / bell_preference(batch.times, batch.first, batch.last)[:, :4]).argmin(1)
+    for settings, match in (({'loss': 'min'}, errors.argmin(1)),  # Eq. 2
+                            ({'loss': 'fix'}, torch.zeros(8, dtype=torch.int64)),  # Eq. 1
+                            ({'selection': 'absolute'}, preferred)):  # Eq. 5
+        outcome = predictor_loss(showing(image), batch, None, replace(CONFIG, **settings))
+        assert outcome.match.equal(match), settings
+        expected = errors.gather(1, match[:, None]).mean()  # not weighted by the preference
+        assert outcome.loss.item() == pytest.approx(expected.item(), abs=1e-6)
+    assert not preferred.equal(errors.argmin(1))
 
 
 def test_augmentation_does_not_change_the_choice():
@@ -154,7 +134,7 @@ class Judge(torch.nn.Module):
 
 
 def test_gan_terms_stand_at_the_matched_time():
-    batch = make_batch()
+    batch = make_batch(padded=2)
     config = replace(CONFIG, **method_fields('genmin'), gan_weight=1.0)
     image = to_float(batch.targets[:, 2]).requires_grad_()
     networks = Networks(Showing(image), discriminator=Judge(7))
@@ -164,6 +144,7 @@ def test_gan_terms_stand_at_the_matched_time():
     assert outcome.parts['gan'].item() == pytest.approx(expected.item(), rel=1e-5)
     assert outcome.judged['step'].tolist() == [2] * 4  # index of time 3
     assert (outcome.judged['other_step'] != outcome.judged['step']).all()
+    assert (outcome.judged['other_step'] < 4).all()  # the rest is padding
     frames = to_float(batch.targets)
     assert outcome.judged['real'].equal(frames[:, 2])
     for b, step in enumerate(outcome.judged['other_step'].tolist()):
@@ -174,14 +155,6 @@ def test_gan_terms_stand_at_the_matched_time():
     discriminators_loss(outcome.judged).backward()
     assert image.grad.equal(before)  # the discriminators' loss does not reach the predictor
     assert networks.discriminator.weight.grad.nonzero().flatten().tolist() == [2]
-
-
-def test_padding_is_never_judged():
-    batch = make_batch(B=32, padded=4)
-    networks = Networks(Showing(to_float(batch.targets[:, 0])), discriminator=Judge(7))
-    outcome = predictor_loss(networks, batch, None, replace(CONFIG, **method_fields('min')),
-                             Draws.make(batch, 3, 0, 0))
-    assert outcome.judged['other_step'].tolist() == [1] * 32  # the only other one
 
 
 class Shade(torch.nn.Module):
@@ -381,23 +354,6 @@ def test_the_preference_of_a_level_lies_between_its_own_inputs(monkeypatch):
     assert seen[1].argmax(1).tolist() == [2] * 4  # 3.5 of 1 to 6; the first of two
 
 
-def test_recursion_ends_where_no_target_is_left():
-    batch = make_batch()
-    config = replace(CONFIG, **method_fields('min-wo-gan'), recursion=3)
-    frames = to_float(batch.targets)
-    network = Moving(frames[:, 0], frames[:, 3], frames[:, 3])
-    assert predictor_loss(Networks(network), batch, None, config).loss < 1e-6
-
-
-def test_draws_are_those_of_the_step():
-    batch = make_batch()
-    first, again = Draws.make(batch, 8, 3, 5), Draws.make(batch, 8, 3, 5)
-    other = Draws.make(batch, 8, 3, 6)
-    assert first.prior.equal(again.prior) and first.other.equal(again.other)
-    assert not first.prior.equal(other.prior)
-    assert not first.prior.equal(first.posterior[:, 0])
-
-
 def brightening(*shares):
     """Return a batch of one episode whose frames show these shares of the way to the goal."""
     start, goal, T = torch.zeros(8, 8, 3), torch.full((8, 8, 3), 200), len(shares)
@@ -435,11 +391,3 @@ def test_padding_changes_no_selection_error():
         found = selection_errors(torch.ones(4, 6), lambda: copy_error, padded, config)[:, :4]
         expected = selection_errors(torch.ones(4, 4), lambda: copy_error[..., :4], short, config)
         assert found.allclose(expected), kind
-
-
-def test_preferences_are_those_of_the_settings():
-    batch = make_batch()
-    bell = time_preference(batch, CONFIG)
-    assert bell[:, [0, -1]].allclose(torch.tensor(2 / 3))
-    forward = time_preference(batch, replace(CONFIG, beta=2.0, mode='forward'))
-    assert forward[:, [0, -1]].allclose(2 + torch.tensor([1 / 7, 6 / 7]))

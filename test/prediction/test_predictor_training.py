@@ -21,7 +21,7 @@ from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training import devices
 from tap_ros.training.checkpoints import start
-from tap_ros.training.parallel import Processes
+from tap_ros.training.devices import Processes
 from tap_ros.training.weights import load_tensors, load_weights, save_tensors
 import torch
 
@@ -179,7 +179,7 @@ def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(config, monke
         raise KeyboardInterrupt
     train(config, stop_at=2, progress=False)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(f'tap_ros.prediction.training.{where}', killed)
+        patch.setattr(f'tap_ros.training.run.{where}', killed)
         train(config, progress=False)
     train(config, progress=False)
     out = Path(config.out)

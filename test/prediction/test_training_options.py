@@ -14,8 +14,8 @@ from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.checkpoints import start
+from tap_ros.training.devices import Processes
 from tap_ros.training.frames import MappedFrames
-from tap_ros.training.parallel import Processes
 from tap_ros.training.weights import load_tensors
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
