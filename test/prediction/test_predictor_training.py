@@ -1,53 +1,58 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of training the predictor."""
+"""Laws of training the predictor; each option does what it says."""
 
 from dataclasses import replace
-from functools import partial
 import json
 from pathlib import Path
-import resource
 
+import numpy as np
 import pytest
 from tap_ros.cli import main
-from tap_ros.errors import ConfigError, StorageError, WeightsError
-from tap_ros.files import only_writer
-from tap_ros.images.pixels import to_float
-from tap_ros.prediction.batches import make_batch
+from tap_ros.errors import ConfigError
+from tap_ros.prediction import training
+from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
-from tap_ros.prediction.training import kl_share, train
+from tap_ros.prediction.training import kl_share, network_config, train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training import devices
-from tap_ros.training.checkpoints import start
-from tap_ros.training.devices import Processes
-from tap_ros.training.weights import load_tensors, load_weights, save_tensors
+from tap_ros.training.devices import pick_precision, Processes
+from tap_ros.training.frames import MappedFrames
+from tap_ros.training.weights import load_tensors, load_weights
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 import torch
 
-ROOT = Path(__file__).parents[2]
+HEAD = 'network.head.0.weight'
 
 
 @pytest.fixture
 def config(bag, tmp_path):
     return TrainingConfig(
         recordings=(str(bag),), out=str(tmp_path / 'run'), base_width=4, batch_size=4, steps=4,
-        warmup=1, margin=1, test_fraction=0.3, threads=1, save_every=2, log_every=1,
-        selection='relative')
+        warmup=1, margin=1, test_fraction=0.3, threads=1, save_every=2, log_every=2,
+        precision='float32', selection='relative')
+
+
+@pytest.fixture
+def store(bag):
+    return open_recordings([str(bag)], progress=False)
 
 
 def weights(config):
     return load_tensors(f'{config.out}/checkpoint.safetensors')[0]
 
 
+def curve(folder, name):
+    return {point.step: point.value for point in
+            EventAccumulator(folder).Reload().Scalars(f'train/{name}')}
+
+
 @pytest.mark.parametrize('values', [
-    {'precision': 'float32', 'num_targets': 3, 'min_crop': 0.6},
     {'precision': 'bfloat16', 'num_targets': 3, 'min_crop': 0.6},
-    {**method_fields('genmin-vae-gan')},
-    {**method_fields('fix0.25'), 'mode': 'forward'},
-    {**method_fields('genmin4'), 'mode': 'forward', 'recursion': 2},
-    {'decoder': 'separate', 'skips': False, 'recursion': 2},
-    {**method_fields('genmin-vae'), 'kl_warmup': 0.5, 'posterior_std': 0.1},
+    {**method_fields('genmin-vae-gan'), 'kl_warmup': 0.5, 'posterior_std': 0.1},
+    {**method_fields('genmin4'), 'mode': 'forward', 'recursion': 2, 'decoder': 'separate',
+     'skips': False},
     {**method_fields('genmin-vae'), 'posterior': 'frame', 'num_targets': 2}])
 def test_two_steps_and_two_more_equal_four(config, tmp_path, values):
     config = replace(config, **values)
@@ -58,66 +63,76 @@ def test_two_steps_and_two_more_equal_four(config, tmp_path, values):
     train(interrupted, progress=False)
     expected, resumed = weights(config), weights(interrupted)
     assert set(expected) == set(resumed)
-    for name, tensor in expected.items():
-        assert resumed[name].equal(tensor), name
-    assert not halfway['network.head.0.weight'].equal(resumed['network.head.0.weight'])
-
-
-def test_a_training_can_begin_with_the_weights_of_another(config, tmp_path):
-    first = train(config, progress=False)
-    tuned = replace(config, out=str(tmp_path / 'tuned'), initial_weights=first, seed=1,
-                    learning_rate=1e-12, steps=2)
-    expected, begun = load_network(first)[0], load_network(train(tuned, progress=False))[0]
-    weights = dict(begun.named_parameters())
-    for name, tensor in expected.named_parameters():
-        assert torch.allclose(weights[name], tensor, atol=1e-6), name
-    again = replace(tuned, out=str(tmp_path / 'again'))
-    train(again, stop_at=1, progress=False)
-    Path(first).unlink()  # once begun, it goes on without them
-    train(again, progress=False)
-
-
-def test_weights_of_another_network_are_no_beginning(config, tmp_path):
-    first = train(config, stop_at=1, progress=False)
-    other = replace(config, out=str(tmp_path / 'other'), initial_weights=first, base_width=8)
-    with pytest.raises(ConfigError, match='base_width 4 instead of 8'):
-        train(other, progress=False)
-    with pytest.raises(ConfigError, match='skips True instead of False'):
-        train(replace(other, base_width=4, skips=False), progress=False)
-    assert not (Path(other.out) / 'checkpoint.safetensors').exists()
-
-
-def test_seed_decides(config, tmp_path):
-    train(config, stop_at=1, progress=False)
-    other = replace(config, seed=1, out=str(tmp_path / 'other'))
-    train(other, stop_at=1, progress=False)
-    name = 'network.head.0.weight'
-    assert not weights(config)[name].equal(weights(other)[name])
-
-
-@pytest.mark.parametrize('mode, method', [
-    ('bidirectional', 'fix'), ('bidirectional', 'min'), ('bidirectional', 'genmin'),
-    ('bidirectional', 'genmin-wo-gan+relative'),
-    ('bidirectional', 'genmin-wo-gan+progress'),
-    ('bidirectional', 'genmin-vae'), ('bidirectional', 'genmin-vae-gan'), ('forward', 'fix1.00'),
-    ('forward', 'genmin2')])
-def test_every_method_learns(config, mode, method):
-    config = replace(config, mode=mode, **method_fields(method), steps=30, learning_rate=2e-3,
-                     new_pixels=True, save_every=1, average_decay=0.0)
-    losses = []
-    for stop in (1, 30):
-        train(replace(config, save_every=stop), stop_at=stop, progress=False)
-        with open(f'{config.out}/scores.json') as file:
-            losses.append(json.load(file)['loss'])
-    assert losses[1] < losses[0]
+    assert all(resumed[name].equal(tensor) for name, tensor in expected.items())
+    assert not halfway[HEAD].equal(resumed[HEAD])
 
 
 @pytest.mark.parametrize('values', [
-    {**method_fields('genmin'), 'new_pixels': True}, method_fields('genmin-vae-gan')])
-def test_compiled_networks_are_trained(config, monkeypatch, values):
-    monkeypatch.setattr(torch, 'compile', partial(torch.compile, backend='eager'))
-    path = train(replace(config, compile=True, steps=1, **values), progress=False)
-    assert load_network(path)[1]['steps'] == 1
+    {'selection': 'progress'}, method_fields('genmin-vae-gan'),
+    {**method_fields('fix1.00'), 'mode': 'forward'}])
+def test_every_kind_of_method_learns(config, values):
+    config = replace(config, **values, steps=30, learning_rate=2e-3, new_pixels=True,
+                     average_decay=0.0, save_every=30)
+    losses = []
+    for stop in (1, 30):
+        train(config, stop_at=stop, progress=False)
+        losses.append(json.loads(Path(config.out, 'scores.json').read_text())['loss'])
+    assert losses[1] < losses[0]
+
+
+def test_a_training_can_begin_with_the_weights_of_another(config, tmp_path):
+    first = train(config, stop_at=1, progress=False)
+    tuned = replace(config, out=str(tmp_path / 'tuned'), initial_weights=first, seed=1,
+                    learning_rate=1e-12, steps=2)
+    begun = dict(load_network(train(tuned, stop_at=1, progress=False))[0].named_parameters())
+    for name, tensor in load_network(first)[0].named_parameters():
+        assert torch.allclose(begun[name], tensor, atol=1e-6), name
+    other = replace(config, out=str(tmp_path / 'other'), initial_weights=first, base_width=8)
+    with pytest.raises(ConfigError, match='base_width 4 instead of 8'):
+        train(other, progress=False)
+    assert not (Path(other.out) / 'checkpoint.safetensors').exists()
+    Path(first).unlink()  # once begun, it goes on without them
+    train(tuned, progress=False)
+
+
+def test_a_run_leaves_what_is_needed_to_repeat_it(config):
+    path = train(replace(config, average_decay=0.9), progress=False)
+    about = {name: json.loads(Path(config.out, f'{name}.json').read_text())
+             for name in ('config', 'run', 'scores')}
+    assert about['config']['learning_rate'] == config.learning_rate
+    assert about['run']['steps'] == 4 and len(about['run']['data_hash']) == 64
+    assert about['run']['precision'] == 'float32'
+    assert about['run']['episodes'] + about['run']['held_out'] == 24
+    assert about['scores']['loss'] > 0
+    values, shipped, told = load_weights(path, 'predictor')
+    assert values['image_size'] == 32 and values['base_width'] == 4
+    assert (told['scores'], told['settings']) == (about['scores'], about['config'])
+    assert SubgoalPredictor.load(path).image_size == (32, 32)
+    tensors = weights(config)  # the average is shipped
+    assert all(tensors[f'average.{name}'].equal(tensor) for name, tensor in shipped.items())
+    assert not tensors[HEAD].equal(shipped['head.0.weight'])
+    assert set(curve(config.out, 'loss')) == set(curve(config.out, 'learning_rate')) == {2, 4}
+    assert {event.step for event in EventAccumulator(config.out).Reload().Images('held_out')} == {
+        2, 4}
+
+
+def test_compiled_networks_are_trained(config, monkeypatch):
+    class Compiled(torch.nn.Module):
+        def __init__(self, module):
+            super().__init__()
+            self.module = module
+
+        def __len__(self):
+            raise TypeError('a compiled network has no truth value')
+
+        def forward(self, *inputs):
+            return self.module(*inputs)
+
+    made = []
+    monkeypatch.setattr(torch, 'compile', lambda module: made.append(module) or Compiled(module))
+    path = train(replace(config, compile=True, steps=1, **method_fields('genmin-vae-gan')),
+                 progress=False)
+    assert load_network(path)[1]['steps'] == 1 and len(made) == 4
 
 
 def test_several_processes_need_a_gpu_each_and_an_equal_part_of_the_batch(config, monkeypatch):
@@ -127,133 +142,7 @@ def test_several_processes_need_a_gpu_each_and_an_equal_part_of_the_batch(config
     with pytest.raises(ConfigError, match='batch_size: 5 episodes cannot be divided among 2'):
         Processes(0, 2).part(5)
     assert [Processes(rank, 2).part(6) for rank in (0, 1)] == [slice(0, 3), slice(3, 6)]
-
-
-def test_a_run_leaves_what_is_needed_to_repeat_it(config):
-    path = train(config, progress=False)
-    about = {}
-    for name in ('config', 'run', 'scores'):
-        with open(f'{config.out}/{name}.json') as file:
-            about[name] = json.load(file)
-    assert about['config']['learning_rate'] == config.learning_rate
-    assert about['run']['steps'] == 4 and len(about['run']['data_hash']) == 64
-    assert about['run']['episodes'] + about['run']['held_out'] == 24
-    assert about['scores']['loss'] > 0
-    values, _, training = load_weights(path, 'predictor')
-    assert values['image_size'] == 32 and values['base_width'] == 4
-    assert training['scores'] == about['scores']
-    assert SubgoalPredictor.load(path).image_size == (32, 32)
-    assert list(Path(config.out).glob('events.out.tfevents.*'))
-
-
-@pytest.mark.parametrize('first, second', [(0.1, 9.0), (9.0, 0.1)])
-def test_a_run_goes_on_in_the_precision_that_it_began_with(config, monkeypatch, first, second):
-    monkeypatch.setattr(devices, 'bfloat16_gain', lambda: first)
-    train(config, stop_at=2, progress=False)
-    monkeypatch.setattr(devices, 'bfloat16_gain', lambda: second)
-    path = train(config, progress=False)
-    expected = replace(config, out=f'{config.out}-expected',
-                       precision='float32' if first < 1 else 'bfloat16')
-    train(expected, progress=False)
-    assert all(weights(config)[name].equal(value) for name, value in weights(expected).items())
-    for facts in (load_network(path)[1], json.loads(Path(config.out, 'run.json').read_text())):
-        assert facts['precision'] == expected.precision
-
-
-def test_a_run_of_other_settings_is_not_continued(config):
-    train(config, stop_at=2, progress=False)
-    with pytest.raises(ConfigError, match='learning_rate=0.001, not 0.1'):
-        train(replace(config, learning_rate=0.1), progress=False)
-
-
-def test_a_finished_run_stays_as_it_is(config):
-    train(config, progress=False)
-    before = weights(config)
-    train(config, progress=False)
-    assert all(before[name].equal(tensor) for name, tensor in weights(config).items())
-
-
-@pytest.mark.parametrize('where', ['save_weights', 'save_checkpoint'])
-def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(config, monkeypatch, where):
-    def killed(*_):
-        raise KeyboardInterrupt
-    train(config, stop_at=2, progress=False)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(f'tap_ros.training.run.{where}', killed)
-        train(config, progress=False)
-    train(config, progress=False)
-    out = Path(config.out)
-    assert json.loads((out / 'run.json').read_text())['steps'] == config.steps
-    served = load_weights(out / 'predictor.safetensors', 'predictor')[1]
-    for name, tensor in served.items():
-        assert weights(config)[f'average.{name}'].equal(tensor), name
-    assert not list(out.glob('*.part'))
-
-
-@pytest.mark.parametrize('change', [
-    lambda path: path.write_bytes(path.read_bytes()[:-9]),
-    lambda path: path.write_bytes(path.with_name('predictor.safetensors').read_bytes()),
-    lambda path: save_tensors(path, {}, load_tensors(path)[1]),
-    lambda path: save_tensors(path, load_tensors(path)[0], {'kind': 'checkpoint'})],
-    ids=['cut', 'other', 'empty', 'undescribed'])
-def test_a_damaged_or_foreign_checkpoint_is_one_line(config, change):
-    train(config, stop_at=2, progress=False)
-    path = Path(config.out, 'checkpoint.safetensors')
-    change(path)
-    with pytest.raises(WeightsError, match=str(path)) as error:
-        train(config, progress=False)
-    assert str(error.value).isprintable()
-
-
-def test_a_full_disk_is_one_line_and_the_run_goes_on_later(config):
-    train(config, stop_at=2, progress=False)
-    before = Path(config.out, 'checkpoint.safetensors').read_bytes()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    try:
-        with pytest.raises(StorageError, match=config.out) as error:
-            train(config, progress=False)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert str(error.value).isprintable()
-    assert Path(config.out, 'checkpoint.safetensors').read_bytes() == before
-    assert not list(Path(config.out).glob('*.part'))
-    train(config, progress=False)
-    resumed = weights(config)
-    whole = replace(config, out=f'{config.out}-whole')
-    train(whole, progress=False)
-    assert all(resumed[name].equal(value) for name, value in weights(whole).items())
-
-
-def test_a_second_training_in_the_same_folder_is_refused(config):
-    with only_writer(config.out), pytest.raises(StorageError, match='another process'):
-        train(config, progress=False)
-
-
-def test_a_network_in_use_predicts_as_in_training(config):
-    config = replace(config, steps=60, average_decay=0.0, save_every=60, new_pixels=True,
-                     decoder='separate', skips=False, **method_fields('genmin-wo-gan'))
-    network, _ = load_network(train(config, progress=False))
-    store = open_recordings(list(config.recordings), progress=False)
-    context = to_float(make_batch(store, range(len(store))).context)
-    with torch.no_grad():
-        used, trained = network(context).image, network.train()(context).image
-        for module in network.modules():
-            if isinstance(module, torch.nn.BatchNorm2d):
-                module.reset_running_stats()
-        without = network.eval()(context).image
-    # Batch norm's averages lag behind, but serve far better than none.
-    assert (used - trained).abs().mean() < 0.5 * (without - trained).abs().mean()
-
-
-def test_learning_rate_rises_and_falls():
-    state, rates = start(torch.nn.Linear(1, 1), 1e-3, 'cpu'), []
-    for state.step in range(1000):
-        state.set_rates(1000, 10, 1.0)
-        rates.append(state.optimizers[0].param_groups[0]['lr'])
-    assert rates[0] < 0.1 and max(rates) == pytest.approx(1, abs=0.01)
-    assert rates[-1] == pytest.approx(0.02, abs=0.001)
-    assert all(a >= b for a, b in zip(rates[10:], rates[11:]))
+    assert pick_precision('auto', torch.device('cuda')) == 'bfloat16'
 
 
 def test_the_price_of_z_rises():
@@ -271,35 +160,96 @@ def test_settings_that_make_no_sense_or_do_nothing_are_refused_by_name(config):
             {'posterior': 'frame'}, {'gan_weight': -1.0}, {'free_nats': -1.0}, {'kl_warmup': 0.6},
             {'posterior_std': 0.0}, {'posterior': 'frame', 'free_nats': 1.0, 'latent': 'vae'},
             # Without z
-            {'free_nats': 1.0}, {'kl_warmup': 0.5}, {'posterior_std': 0.1}):
+            {'free_nats': 1.0}, {'kl_warmup': 0.5}, {'posterior_std': 0.1},
+            {'robot_mask': 'hand'}, {'fill_context': 0.5}):
         with pytest.raises(ConfigError, match=next(iter(values))):
             TrainingConfig(**{'recordings': ('bag',), 'out': 'out', **values})
     with pytest.raises(ConfigError, match="device: 'nonsense'"):
         train(replace(config, device='nonsense'), progress=False)
 
 
-def test_the_command_line_sets_every_field(config, capsys):
+def test_the_command_line_sets_every_field_and_one_needs_no_held_out_episodes(config, capsys):
     assert main([
         'train', 'predictor', *config.recordings, '--out', config.out, '--steps', '1',
-        '--no-flip', '--base-width', '4', '--batch-size', '2', '--loss', 'min',
-        '--new-pixels']) == 0
+        '--no-flip', '--base-width', '4', '--batch-size', '2', '--loss', 'min', '--new-pixels',
+        '--test-fraction', '0']) == 0
     assert capsys.readouterr().out.strip() == f'{config.out}/predictor.safetensors'
-    with open(f'{config.out}/config.json') as file:
-        settings = json.load(file)
+    settings = json.loads(Path(config.out, 'config.json').read_text())
     assert settings['loss'] == 'min' and settings['new_pixels'] and not settings['flip']
+    assert json.loads(Path(config.out, 'scores.json').read_text()) == {}
+    assert torch.isfinite(weights(config)[HEAD]).all()
 
 
-def test_training_on_one_episode_works_without_held_out_ones(config):
-    train(replace(config, test_fraction=0.0, steps=1), progress=False)
-    with open(f'{config.out}/scores.json') as file:
-        assert json.load(file) == {}
-    assert torch.isfinite(weights(config)['network.head.0.weight']).all()
+def test_the_networks_are_those_asked_for(config, store):
+    shape = network_config(replace(config, base_width=8, new_pixels=False), (32, 32))
+    assert (shape.base_width, shape.new_pixels, shape.num_context) == (8, False, 2)
+    assert (shape.latent_size, shape.decoder, shape.skips) == (0, 'shared', True)
+    assert network_config(replace(config, mode='forward'), (32, 32)).num_context == 1
+    for posterior, images in (('video', 5), ('frame', 3)):
+        vae = replace(config, latent='vae', latent_size=6, posterior=posterior, video_frames=5)
+        shape = network_config(vae, (32, 32))
+        helpers = training._helpers(vae, shape, store)
+        assert shape.latent_size == 6 and list(helpers) == ['recognition']
+        assert helpers['recognition'].encoder[0].in_channels == 3 * images
+    helpers = training._helpers(replace(config, gan=True, latent='vae'), shape, store)
+    assert set(helpers) == {'recognition', 'discriminator', 'posterior_discriminator'}
+    assert helpers['discriminator'].head[-1].out_channels == store.lengths.max() - 1
 
 
-def test_training_stops_after_the_minutes_given_and_goes_on(config):
-    train(config, minutes=1e-9, progress=False)
-    with open(f'{config.out}/run.json') as file:
-        assert json.load(file)['steps'] == 1
-    train(config, progress=False)
-    with open(f'{config.out}/run.json') as file:
-        assert json.load(file)['steps'] == 4
+def test_each_setting_reaches_the_loss_or_the_step(config):
+    def first(**options):
+        run = replace(config, steps=1, warmup=0, log_every=1, **options)
+        train(run, progress=False)
+        Path(run.out, 'checkpoint.safetensors').unlink()
+        found = {name: curve(run.out, name)[1] for name in ('loss', 'gradient_norm')}
+        for file in Path(run.out).glob('events*'):
+            file.unlink()
+        return found, load_tensors(Path(run.out, 'predictor.safetensors'))[0]['head.0.weight']
+
+    plain, weight = first()
+    again, same = first()
+    assert again == plain and same.equal(weight)
+    for options in ({'outer_power': 0.5}, {'recursion': 2}, {'loss': 'min'}, {'loss': 'fix'},
+                    {'loss': 'fix', 'fraction': 0.2}, {'selection': 'absolute'}, {'seed': 1}):
+        assert first(**options)[0]['loss'] != pytest.approx(plain['loss'], rel=1e-6), options
+    for options in ({'gradient_clip': 1e-12}, {'learning_rate': 1e-4}, {'average_decay': 0.0},
+                    {'precision': 'bfloat16'}):
+        assert not first(**options)[1].equal(weight), options
+
+
+def test_what_is_taken_from_episodes_is_what_the_settings_say(config, store, monkeypatch):
+    used = []
+
+    def make(store, chosen, sampling, *others):
+        used.append(sampling)
+        return make_batch(store, chosen, sampling, *others)
+
+    def drawn(count=2, **options):
+        settings = replace(config, **{'goal_picture': 'last', 'margin': 0, 'start_crop': 0.0,
+                                      **options})
+        return [item[1:] for item in training._batches(
+            store, MappedFrames(store), None, np.arange(len(store)), settings, Processes(), 0,
+            count)]
+
+    monkeypatch.setattr(training, 'make_batch', make)
+    same = {'margin': 2, 'num_targets': 3, 'min_crop': 0.7, 'start_crop': 0.2,
+            'goal_picture': 'mixed', 'fill_context': 0.4}
+    options = {**same, 'robot_mask': 'all', 'batch_size': 5}
+    assert len(drawn(**options)[0][0].context) == 5 and used[-1] == Sampling(**same)
+    drawn(**options, mode='forward', video_frames=7, latent='vae', loss='fix', fraction=0.3,
+          gan=True)
+    assert used[-1] == Sampling(**same, forward=True, video_frames=7, fraction=0.3, num_others=1)
+    drawn(latent='vae', posterior='frame')
+    assert used[-1].video_frames == 0
+
+    def looks(**options):
+        changes = [augmentation for _, augmentation in drawn(20, **options)]
+        return (torch.cat([a.flip for a in changes]).float().mean().item(),
+                len(torch.cat([a.order for a in changes]).unique(dim=0)),
+                (torch.cat([a.gain for a in changes]) - 1).abs().max().item())
+
+    off = {'flip': False, 'colour': False, 'brightness': 0.0}
+    assert looks(**off) == (0.0, 1, 0.0)
+    assert 0.3 < looks(**off | {'flip': True})[0] < 0.7
+    assert looks(**off | {'colour': True})[1] == 6
+    assert 0.25 < looks(**off | {'brightness': 0.3})[2] <= 0.3

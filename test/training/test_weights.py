@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of weights files, and what is said about files that are none."""
 
-from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -82,17 +81,6 @@ def test_files_that_are_no_weights_are_refused_with_the_reason(path, tmp_path):
     assert 'no such' in refusal(load_network, tmp_path / 'none.safetensors')
 
 
-@pytest.mark.parametrize('config', [
-    CONFIG, replace(CONFIG, decoder='shared'), replace(CONFIG, decoder='shared', skips=True)])
-def test_a_network_comes_back_with_its_decoder(tmp_path, config):
-    network = PredictorNetwork(config).eval()
-    save_weights(tmp_path / 'weights', network, 'predictor', config, {})
-    other, _ = load_network(tmp_path / 'weights')
-    context = torch.rand(1, 2, 3, 16, 16)
-    assert other.config == config
-    assert other(context).image.allclose(network(context).image, atol=1e-5)
-
-
 def test_files_of_earlier_versions_lack_the_decoder_and_are_the_same_network(path):
     values, state, _ = load_weights(path, 'predictor')
     old = {name: value for name, value in values.items() if name not in ('decoder', 'skips')}
@@ -109,17 +97,10 @@ def test_files_of_earlier_versions_lack_the_decoder_and_are_the_same_network(pat
 
 def test_wrong_size(path):
     values, state, _ = load_weights(path, 'predictor')
-    with pytest.raises(WeightsError, match='encoder.0.weight has size'):
+    with pytest.raises(WeightsError, match='size mismatch for encoder.0.weight'):
         make_network(PredictorNetwork, PredictorConfig, values | {'base_width': 8}, state, path)
-    with pytest.raises(WeightsError, match='missing.*pixel_decoder'):
+    with pytest.raises(WeightsError, match='Missing key.*pixel_decoder'):
         make_network(PredictorNetwork, PredictorConfig, values | {'new_pixels': True}, state, path)
-
-
-def test_configuration_is_readable_json(path):
-    header = path.read_bytes()
-    length = int.from_bytes(header[:8], 'little')
-    about = json.loads(json.loads(header[8:8 + length])['__metadata__']['about'])
-    assert about['kind'] == 'predictor' and about['config']['base_width'] == 4
 
 
 def refusal(load, *arguments):
@@ -156,17 +137,6 @@ def test_swapped_tensors_and_another_description_are_refused(path):
     assert b'16.0' in whole
     path.write_bytes(whole.replace(b'16.0', b'61.0'))
     assert 'SHA-256' in refusal(load_network, path)
-
-
-def test_the_digest_is_of_the_content_alone(path, tmp_path):
-    save_tensors(tmp_path / 'again', *load_tensors(path))
-    assert stored_digest(tmp_path / 'again') == stored_digest(path)
-    tensors, about = load_tensors(path)
-    save_tensors(tmp_path / 'other', tensors, about | {'training': {'seed': 4}})
-    assert stored_digest(tmp_path / 'other') != stored_digest(path)
-    tensors['encoder.0.weight'][0, 0, 0, 0] += 1
-    save_tensors(tmp_path / 'other', tensors, about)
-    assert stored_digest(tmp_path / 'other') != stored_digest(path)
 
 
 def test_planning_results_are_of_one_forward_model_and_the_page_says_where_it_is_another():

@@ -1,0 +1,168 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of every training run: whatever ends it, it goes on to the same result."""
+
+from dataclasses import replace
+import json
+from pathlib import Path
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from tap_ros.errors import ConfigError, StorageError, WeightsError
+from tap_ros.files import only_writer
+from tap_ros.planning.forward_training_config import ForwardTrainingConfig
+from tap_ros.prediction.training import train
+from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.training.checkpoints import start
+from tap_ros.training.settings import check_settings
+from tap_ros.training.weights import load_tensors, save_tensors
+import torch
+
+SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
+CONFIG = TrainingConfig(
+    recordings=(str(SAMPLE),), out='', base_width=4, batch_size=2, steps=4, threads=1,
+    test_fraction=0.3, save_every=2, precision='float32', log_every=1, margin=1)
+
+
+@pytest.fixture(scope='module')
+def runs(tmp_path_factory):
+    """Train twice, the second time half of the way; return the folders."""
+    folder = tmp_path_factory.mktemp('runs')
+    for name, stop in (('whole', 4), ('half', 2)):
+        train(replace(CONFIG, out=str(folder / name)), stop_at=stop, progress=False)
+    return folder
+
+
+@pytest.fixture
+def half(runs, tmp_path):
+    """Return the settings of a copy of the run that is half done."""
+    shutil.copytree(runs / 'half', tmp_path / 'run')
+    return replace(CONFIG, out=str(tmp_path / 'run'))
+
+
+def same(config, runs):
+    """Tell whether a run has ended as the whole one did."""
+    found, expected = (load_tensors(Path(folder, 'checkpoint.safetensors'))[0]
+                       for folder in (config.out, runs / 'whole'))
+    shipped = load_tensors(Path(config.out, 'predictor.safetensors'))[0]
+    return all(found[name].equal(value) for name, value in expected.items()) and all(
+        expected[f'average.{name}'].equal(value) for name, value in shipped.items())
+
+
+@pytest.mark.parametrize('where', ['save_weights', 'save_checkpoint'])
+def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(
+        half, runs, monkeypatch, where):
+    def killed(*_):
+        raise KeyboardInterrupt
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(f'tap_ros.training.run.{where}', killed)
+        train(half, progress=False)
+    train(half, progress=False)
+    assert same(half, runs) and not list(Path(half.out).glob('*.part'))
+    train(half, progress=False)  # a finished run stays as it is
+    assert same(half, runs)
+
+
+def test_ctrl_c_saves_what_a_training_has(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'tap_ros', 'train', 'predictor', str(SAMPLE), '--out', tmp_path,
+         '--steps', '100000', '--base-width', '4', '--batch-size', '2', '--threads', '1',
+         '--save-every', '100000', '--log-every', '1', '--precision', 'float32'],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline and process.poll() is None and not any(
+                file.stat().st_size > 500 for file in tmp_path.glob('events*')):
+            time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        out, told = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    about = load_tensors(tmp_path / 'checkpoint.safetensors')[1]
+    run = json.loads((tmp_path / 'run.json').read_text())
+    assert process.returncode == 130 and out == '' and 'Traceback' not in told
+    assert 0 < about['step'] == run['steps'] < 100000
+    assert f'{about["step"]} of 100000 steps are saved' in told
+    assert (tmp_path / 'predictor.safetensors').exists()
+
+
+@pytest.mark.parametrize('change', [
+    lambda path: path.write_bytes(path.read_bytes()[:-9]),
+    lambda path: path.write_bytes(path.with_name('predictor.safetensors').read_bytes()),
+    lambda path: save_tensors(path, {}, load_tensors(path)[1]),
+    lambda path: save_tensors(path, load_tensors(path)[0], {'kind': 'checkpoint'})],
+    ids=['cut', 'other', 'empty', 'undescribed'])
+def test_a_damaged_or_foreign_checkpoint_is_one_line(half, change):
+    path = Path(half.out, 'checkpoint.safetensors')
+    change(path)
+    with pytest.raises(WeightsError, match=str(path)) as error:
+        train(half, progress=False)
+    assert str(error.value).isprintable()
+
+
+def test_a_full_disk_is_one_line_and_the_run_goes_on_later(half, runs):
+    before = Path(half.out, 'checkpoint.safetensors').read_bytes()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(StorageError, match=half.out) as error:
+            train(half, progress=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(error.value).isprintable()
+    assert Path(half.out, 'checkpoint.safetensors').read_bytes() == before
+    assert not list(Path(half.out).glob('*.part'))
+    train(half, progress=False)
+    assert same(half, runs)
+
+
+def test_a_run_of_other_settings_or_of_another_process_is_not_continued(half):
+    with pytest.raises(ConfigError, match='learning_rate=0.001, not 0.1'):
+        train(replace(half, learning_rate=0.1), progress=False)
+    with only_writer(half.out), pytest.raises(StorageError, match='another process'):
+        train(half, progress=False)
+
+
+def test_learning_rate_rises_and_falls_and_the_average_moves_fast_at_first():
+    state, rates = start(torch.nn.Linear(3, 2), 1e-3, 'cpu'), []
+    for state.step in range(1000):
+        state.set_rates(1000, 10, 1.0)
+        rates.append(state.optimizers[0].param_groups[0]['lr'])
+    assert rates[0] < 0.1 and max(rates) == pytest.approx(1, abs=0.01)
+    assert rates[-1] == pytest.approx(0.02, abs=0.001)
+    assert all(a >= b for a, b in zip(rates[10:], rates[11:]))
+    for state.step, decay, stays in ((0, 0.999, 0.1), (8, 0.999, 0.5), (10**6, 0.9, 0.9),
+                                     (0, 0.0, 0.0)):
+        before = state.average.weight.clone()
+        with torch.no_grad():
+            state.network.weight.copy_(before + 1)
+        state.update_average(decay)
+        assert torch.allclose(state.average.weight, before + (1 - stays), atol=1e-6)
+
+
+def test_discriminators_have_an_adam_of_their_own():
+    def betas(**helpers):
+        state = start(torch.nn.Linear(1, 1), 1e-3, torch.device('cpu'), helpers)
+        return [optimizer.param_groups[0]['betas'] for optimizer in state.optimizers]
+    assert betas() == betas(recognition=torch.nn.Linear(1, 1)) == [(0.9, 0.999)]
+    assert betas(discriminator=torch.nn.Linear(1, 1)) == [(0.5, 0.999)] * 2
+
+
+def test_the_bounds_of_settings_are_inside():
+    for name, good, bad in (
+            *((name, [1, 2], [0, -1]) for name in (
+                'steps', 'batch_size', 'horizon', 'pictures', 'width', 'features', 'log_every',
+                'save_every')),
+            ('grow', [0, 1], [-0.01, 1.01]), ('test_fraction', [0, 0.9], [-0.01, 0.91]),
+            ('average_decay', [0, 0.99999], [-0.01, 1]),
+            ('learning_rate', [0, 1], [-0.01, 1.01])):
+        for value in good:
+            check_settings(ForwardTrainingConfig(('x',), 'x', **{name: value}), {})
+        for value in bad:
+            with pytest.raises(ConfigError, match=f'^{name}: expected'):
+                ForwardTrainingConfig(('x',), 'x', **{name: value})
