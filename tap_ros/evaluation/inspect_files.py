@@ -16,12 +16,13 @@ from tap_ros.files import write_atomically
 from tap_ros.images.crop import CENTRE, check_trainable
 from tap_ros.images.drawing import film_strip, grid, png_bytes
 from tap_ros.options import File
-from tap_ros.recording.bags import check_first_picture, find_bags, find_topics, list_topics
+from tap_ros.recording.bags import check_first_picture, find_bags, list_topics
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.columns import first_size
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.reading import Reading, reading_of
 from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.recording.topic_choice import find_topics
 from tap_ros.text import escaped, listing
 from tap_ros.training.split import split_episodes, warn_if_none
 from tyro import conf
@@ -69,12 +70,12 @@ def run(args: Options) -> None:
     except ConfigError as error:
         refusal = error
         bags = find_bags(args.path)
-        size = first_size(bags[0], find_topics(bags[0], reading.image_topic))
+        size = first_size(bags[0], next(iter(find_topics(bags[0], reading.image_topic))))
         with suppress(ImageError):  # whoever opens it is told
             if size is not None and max(reading.cut.cut_size(size)) > LARGE:  # gigabytes
                 shown = replace(reading, crop=reading.crop or CENTRE, size=64)
     store = open_recordings([args.path], reading=shown)
-    cameras = {find_topics(bag, reading.image_topic)['frame'] for bag in find_bags(args.path)}
+    cameras = {next(iter(find_topics(bag, reading.image_topic))) for bag in find_bags(args.path)}
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})

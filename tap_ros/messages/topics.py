@@ -7,12 +7,8 @@ A new topic is a row of TOPICS; the recorder records it then. If recordings are 
 its `becomes` is a group of columns, see recording/columns.py.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-
-from tap_ros.errors import RecordingError
-from tap_ros.text import listing
 
 IMAGE_TYPE, COMPRESSED_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 
@@ -102,57 +98,3 @@ def default_qos(topic: str) -> Qos:
     if any(one.latched and one.becomes and one.is_called(topic) for one in TOPICS):
         return Qos(depth=1, durability='transient_local')
     return Qos()
-
-
-def resolve(available: Mapping[str, str], source: str,
-            image_topic: str = '') -> dict[str, str]:
-    """
-    Find the topics of a recording, in whatever namespace they are.
-
-    :param available: dict topic -> type of what the recording holds.
-    :param source: what messages call the recording.
-    :param image_topic: the camera's topic; by default the one that ends in /camera/image_raw, else
-        the only one of images, compressed or not; X/compressed beside X does not count.
-    :return: dict from Topic.becomes to topics of the recording; what it lacks is left out.
-    :raises RecordingError: without a topic that is needed, or when several would do.
-    """
-    known = listing((f'{t} ({k})' for t, k in sorted(available.items())), 20) or 'none'
-    if image_topic and available.get(image_topic) not in IMAGE.types:
-        raise RecordingError(
-            f'{source}: no topic {image_topic} of type {" or ".join(IMAGE.types)}; topics found: '
-            f'{known}')
-    found: dict[str, str] = {}
-    for columns, topic in BY_COLUMNS.items():
-        candidates = [name for name, kind in available.items()
-                      if kind == topic.type and _named_best(name) is topic]
-        if topic is IMAGE and image_topic:
-            candidates = [image_topic]
-        elif IMAGE.is_called(found.get('frame', '')):
-            beside = found['frame'].removesuffix(IMAGE.recorded) + topic.recorded
-            candidates = [beside] if beside in candidates else candidates
-        if len(candidates) > 1:
-            raise RecordingError(
-                f'{source}: several topics could be {topic.recorded}: '
-                f'{listing(sorted(candidates))}; name the camera topic (image_topic, '
-                '--image-topic) whose namespace is wanted')
-        if candidates:
-            found[columns] = candidates[0]
-    if 'frame' not in found:
-        images = [name for name, kind in available.items()
-                  if kind == IMAGE.type and name not in found.values()]
-        # Of a camera that is there raw, too, nothing more is learned from the compressed pictures.
-        images += [name for name, kind in available.items() if kind == COMPRESSED_TYPE
-                   and name.removesuffix('/compressed') not in images]
-        if len(images) != 1:
-            raise RecordingError(
-                f'{source}: no topic ends in {IMAGE.recorded} with type {IMAGE.type}; name the '
-                'camera topic (image_topic, --image-topic) if it is called otherwise; topics '
-                f'found: {known}')
-        found['frame'] = images[0]
-    return found
-
-
-def _named_best(name: str) -> Topic | None:
-    """Return the Topic whose name is the longest that a full name ends in."""
-    return max((topic for topic in TOPICS if topic.is_called(name)),
-               key=lambda topic: len(topic.name), default=None)

@@ -11,14 +11,12 @@ import warnings
 
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.images.crop import CENTRE, check_trainable
-from tap_ros.messages import topics
 from tap_ros.recording.columns import Columns, first_size
-from tap_ros.recording.damage import describe
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.mcap_file import Channel, McapFile
-from tap_ros.recording.messages import check_schema
+from tap_ros.recording.foreign import open_file, recognise
 from tap_ros.recording.metadata import bag_files, FILE_NAME
 from tap_ros.recording.reading import Reading, trained_reading
+from tap_ros.recording.topic_choice import find_topics, list_paths
 from tap_ros.text import escaped
 
 
@@ -31,6 +29,9 @@ def find_bags(path: str | Path) -> list[list[Path]]:
     """
     path = Path(path)
     try:
+        foreign = recognise(path) if path.exists() else None
+        if foreign is not None:
+            return foreign
         if path.is_file():
             return [[path]]
         if not path.is_dir():
@@ -48,38 +49,6 @@ def find_bags(path: str | Path) -> list[list[Path]]:
     return bags
 
 
-def find_topics(files: Sequence[Path], image_topic: str = '') -> dict[str, str]:
-    """
-    Find the topics of a bag.
-
-    :param files: its .mcap files.
-    :param image_topic: as in open_recordings.
-    :return: as topics.resolve.
-    """
-    channels: dict[str, Channel] = {}
-    damage = []
-    for path in files:
-        file = McapFile(path)
-        channels |= file.topics()
-        if not file.channels and file.losses:
-            damage.append(f'{path}: {describe(file.losses)[0]}')
-    if not channels and damage:
-        raise RecordingError(damage[0])
-    available = {topic: channel.type_name for topic, channel in channels.items()}
-    found = topics.resolve(available, list_paths(files), image_topic)
-    for topic in found.values():
-        channel, source = channels[topic], f'{list_paths(files)}: topic {escaped(topic)}'
-        if channel.encoding != 'cdr':
-            raise RecordingError(
-                f'{source}: encoded as {channel.encoding[:40]!r}; only cdr can be read')
-        if channel.schema_encoding == 'ros2msg':
-            try:
-                check_schema(available[topic], channel.schema)
-            except RecordingError as error:
-                raise RecordingError(f'{source}: {error}') from error
-    return found
-
-
 def list_topics(path: str | Path) -> list[tuple[str, str, int | None]]:
     """
     List what recordings hold, whether it can be used or not.
@@ -89,7 +58,7 @@ def list_topics(path: str | Path) -> list[tuple[str, str, int | None]]:
     :raises RecordingError: when there is no recording, or nothing of a file can be read.
     """
     found: dict[str, tuple[str, int | None]] = {}
-    for file in (McapFile(file) for bag in find_bags(path) for file in bag):
+    for file in (open_file(file) for bag in find_bags(path) for file in bag):
         channels, counts = file.topics(), file.counts()
         for topic, channel in channels.items():
             before = found.get(topic, ('', 0))[1]
@@ -131,7 +100,7 @@ def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: 
     """
     sizes = set()
     for bag in (bag for path in paths for bag in find_bags(path)):
-        size = first_size(bag, find_topics(bag, reading.image_topic))
+        size = first_size(bag, next(iter(find_topics(bag, reading.image_topic))))
         if size is not None:
             sizes.add(size)
             with suppress(ImageError):  # whoever opens it is told
@@ -168,9 +137,3 @@ def warn_of_damage(part: Columns) -> None:
 
 def _is_bag(path: Path) -> bool:
     return path.is_dir() and ((path / FILE_NAME).exists() or any(path.glob('*.mcap')))
-
-
-def list_paths(paths: Iterable[str | Path]) -> str:
-    """Name the first of several files and how many more there are."""
-    names = [str(path) for path in paths]
-    return names[0] + (f' and {len(names) - 1} more' if len(names) > 1 else '')

@@ -4,14 +4,14 @@
 Recordings as memory maps: decoded once, kept in a cache, then read at the speed of memory.
 
 Each file of a recording has a folder in the cache, named after the SHA-256 of its content, with
-the frames as one uint8 array, the robot masks as another, and all else as columns. Any number of
-processes may build and read it at once.
+its pictures as uint8 arrays, and all else as columns. Any number of processes may build and read
+it at once.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 import hashlib
 import json
@@ -26,18 +26,18 @@ import numpy as np
 from safetensors import safe_open, SafetensorError
 from safetensors.numpy import save_file
 from tap_ros.errors import RecordingError
-from tap_ros.recording.align import assemble, EpisodeTable, follows
-from tap_ros.recording.bags import check_sizes, find_bags, find_topics, list_paths, warn_of_damage
-from tap_ros.recording.columns import Columns, decode_file
+from tap_ros.recording.align import assemble, EpisodeTable, runs_of
+from tap_ros.recording.bags import check_sizes, find_bags, warn_of_damage
+from tap_ros.recording.columns import Columns, decode_file, PICTURES
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
+from tap_ros.recording.topic_choice import find_topics, list_paths
 from tqdm import tqdm
 
-FORMAT = 6  # of a cache folder; another number makes all files be decoded again
+FORMAT = 7  # of a cache folder; another number makes all files be decoded again
 ENVIRONMENT = 'TAP_ROS_CACHE'
 _ALONE_BYTES = 2**24  # of files that are decoded before other processes would have started
-_GOALS = ('goal_frames', 'goal_masks')  # of Columns, kept among the arrays
 
 
 class EpisodeStore:
@@ -121,7 +121,7 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     arms = [read_mount(bag[0].parent) for bag in bags]
     cutting = for_bags(reading, len(bags))
     tables = [
-        assemble(run, arm, cutting) for bag, arm in zip(columns, arms) for run in _runs(bag)]
+        assemble(run, arm, cutting) for bag, arm in zip(columns, arms) for run in runs_of(bag)]
     # What is read depends on these, too.
     apart = [repr(arm) for arm in arms if arm != ArmMount()]
     if replace(reading, image_topic='') != AS_RECORDED:
@@ -144,7 +144,7 @@ class _Job:
     path: Path
     size: int
     digest: str
-    found: tuple[tuple[str, str], ...]  # pairs of a name in topics and the file's topic
+    found: tuple[tuple[str, str], ...]  # topics and names of their columns
     reading: Reading
     folder: Path  # of the cache
 
@@ -198,17 +198,6 @@ def _built(jobs: Iterable[_Job]) -> Iterator[_Job]:
         yield job
 
 
-def _runs(parts: Iterable[Columns]) -> list[list[Columns]]:
-    """Split the files of a bag where one does not go on where the one before ended."""
-    runs: list[list[Columns]] = []
-    for part in parts:
-        if runs and follows(runs[-1][-1], part):
-            runs[-1].append(part)
-        else:
-            runs.append([part])
-    return runs
-
-
 def _build(job: _Job) -> None:
     """Decode a file into its cache folder, which appears complete or not at all."""
     folder = job.folder
@@ -220,23 +209,18 @@ def _build(job: _Job) -> None:
             f'{folder.parent}: the cache cannot be written ({error.strerror}); set {ENVIRONMENT} '
             'to a folder that can') from error
     try:
-        with open(part / 'frames', 'wb') as frames, open(part / 'masks', 'wb') as masks:
+        with ExitStack() as stack:
+            streams = {name: stack.enter_context(open(part / name, 'wb')) for name in PICTURES}
+
             def restart() -> None:
-                for stream in (frames, masks):
+                for stream in streams.values():
                     stream.seek(0)
                     stream.truncate()
 
-            columns = decode_file(job.path, dict(job.found),
-                                  lambda pixels: frames.write(pixels.data),
-                                  lambda mask: masks.write(mask.data), restart, job.reading)
-        order = columns.arrays.pop('frame_order', None)
-        if order is not None and (np.diff(order) != 1).any():  # they were not logged in order
-            frames_in_order = _map(part / 'frames', len(order), *columns.image_size or (), 3)
-            frames_in_order[order].tofile(part / 'sorted')
-            os.replace(part / 'sorted', part / 'frames')
-        arrays = {k: np.ascontiguousarray(a) for k, a in columns.arrays.items()}
-        arrays |= {key: pictures for key in _GOALS
-                   if (pictures := getattr(columns, key)) is not None}
+            columns = decode_file(
+                job.path, dict(job.found),
+                lambda name, pixels: streams[name].write(pixels.data), restart, job.reading)
+        arrays = {key: np.ascontiguousarray(a) for key, a in columns.arrays.items()}
         save_file(arrays, part / 'columns.safetensors', {'columns': columns.describe()})
         _put(part, job)
     except OSError as error:
@@ -259,30 +243,20 @@ def _put(part: Path, job: _Job) -> None:
             raise
 
 
-def _map(path: Path, *shape: int) -> np.ndarray:
-    """Map pictures into memory, uint8 of a shape; raise ValueError for a file of another size."""
-    if path.stat().st_size != math.prod(shape):
-        raise ValueError(f'{path}: of another size')
-    return np.memmap(path, np.uint8, 'r', shape=shape)
-
-
 def _load(job: _Job) -> Columns | None:
     """Return the Columns of a cache folder, or None when it is not there or not complete."""
-    path = job.folder / 'columns.safetensors'
     try:
-        with safe_open(path, 'numpy') as file:
+        with safe_open(job.folder / 'columns.safetensors', 'numpy') as file:
             about = json.loads(file.metadata()['columns'])
             arrays = {key: file.get_tensor(key) for key in file.keys()}
-        frames, masks = (
-            _map(job.folder / name, len(arrays[log]), *about['image_size'], *channels)
-            if log in arrays else None
-            for name, log, channels in (('frames', 'frame_log', [3]), ('masks', 'mask_log', [])))
+        pictures = {}
+        for name, shape in about['shapes'].items():
+            if (job.folder / name).stat().st_size != math.prod(shape):
+                return None
+            pictures[name] = np.memmap(job.folder / name, np.uint8, 'r', shape=tuple(shape))
+        sizes = {key: about[key] and tuple(about[key]) for key in ('image_size', 'camera_size')}
+        return Columns(str(job.path), **about | sizes | {
+            key: [tuple(one) for one in about[key]] for key in ('names', 'marks')},
+            pictures=pictures, arrays=arrays)
     except (OSError, SafetensorError, ValueError, LookupError, TypeError):
         return None
-    image_size, camera_size = (about[key] and tuple(about[key]) for key in (
-        'image_size', 'camera_size'))
-    return Columns(
-        str(job.path), image_size, camera_size, frames,
-        **{key: arrays.pop(key, None) for key in _GOALS}, masks=masks, arrays=arrays,
-        names=[tuple(n) for n in about['names']], marks=[tuple(m) for m in about['marks']],
-        damage=about['damage'])

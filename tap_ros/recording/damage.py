@@ -12,16 +12,14 @@ FAR = 2**62  # ns; log times are held within +-FAR
 EXAMPLES = 3  # places named of one cause
 CAUSES = 8  # causes named of one file
 
-EVERYTHING, FRAMES, NOTHING = 2, 1, 0  # what may be missing from an episode; see Loss.cuts
-
 
 @dataclass(frozen=True)
 class Loss:
     """
     A part of a file that could not be used.
 
-    cuts: EVERYTHING when messages of any topic may be missing, FRAMES when frames or actions are,
-        NOTHING when all that is missing is unknown in the episode too (NaN, no goal).
+    cuts: whether an episode ends there, as messages of any topic may be missing; else what is
+        missing is unknown in the episode too (a picture fewer, NaN, no goal).
     """
 
     why: str
@@ -29,7 +27,7 @@ class Loss:
     byte: int | None = None
     start: int | None = None  # log times of what is missing (ns), from one end to the other
     end: int | None = None
-    cuts: int = EVERYTHING
+    cuts: bool = True
 
     def place(self) -> str:
         """Return where it is, in words."""
@@ -68,12 +66,12 @@ def gaps(losses: Iterable[Loss]) -> np.ndarray:
     Return where episodes are cut.
 
     :param losses: list of Loss.
-    :return: (G, 3) int64: first and last log time (ns), and EVERYTHING or FRAMES; the times are
-        -FAR where nothing of the file could be read.
+    :return: (G, 2) int64: first and last log time (ns), -FAR where nothing of the file could be
+        read.
     """
-    rows = [(-FAR if loss.start is None else loss.start, -FAR if loss.end is None else loss.end,
-             loss.cuts) for loss in losses if loss.cuts != NOTHING]
-    return np.array(rows, np.int64).reshape(-1, 3)
+    rows = [[-FAR if time is None else time for time in (loss.start, loss.end)]
+            for loss in losses if loss.cuts]
+    return np.array(rows, np.int64).reshape(-1, 2)
 
 
 def _line(what: str, why: str, group: Sequence[Loss]) -> str:

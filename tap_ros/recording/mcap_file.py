@@ -32,7 +32,7 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.errors import RecordingError
-from tap_ros.recording.damage import FAR, Loss, NOTHING
+from tap_ros.recording.damage import FAR, Loss
 from tap_ros.text import escaped
 import zstandard
 
@@ -309,7 +309,7 @@ class McapFile:
             f'{escaped(self.channels[number].topic)}' for number, count in missing.items()
             if number in self.channels and self.channels[number].topic in wanted]
         if lines:
-            self.losses.append(Loss(f'messages are missing: {", ".join(lines)}', cuts=NOTHING))
+            self.losses.append(Loss(f'messages are missing: {", ".join(lines)}', cuts=False))
         if self._stopped is not None and not is_whole:
             self.losses.append(Loss(
                 f'the file is cut off at byte {self._stopped} of {self.size}; '
@@ -317,7 +317,7 @@ class McapFile:
                 start=None if end is None else end + 1, end=end))
         elif not is_whole and not self._is_without_summary:
             self.losses.append(Loss('its summary is damaged, so that nothing tells whether all '
-                                    'messages are there', cuts=NOTHING))
+                                    'messages are there', cuts=False))
 
 
 def read_record(kind: type[Record], content: bytes | memoryview, whole: bool = True) -> Record:

@@ -7,18 +7,23 @@ By header stamps and by log time: a message belongs to an episode whose marks en
 and that is nearest in the log. So neither marks and images that overtake each other on their way
 to the recorder, nor a simulated clock that starts anew, mix up episodes.
 
-Where something was lost an episode is cut in two: the frames before end as 'interrupted', those
+Where messages were lost an episode is cut in two: the frames before end as 'interrupted', those
 after are an episode of their own with the outcome of the whole. Frames on both sides never stand
-next to each other. Where marks may be lost too, frames after the gap belong to the episode whose
-end follows; without such an end they are left out.
+next to each other. Frames after the gap belong to the episode whose end follows; without such an
+end they are left out.
 """
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from tap_ros.recording.damage import EVERYTHING, FAR
+from tap_ros.recording.damage import FAR
+from tap_ros.recording.reading import Reading
+
+if TYPE_CHECKING:
+    from tap_ros.recording.columns import Track
 
 Mark = tuple[str, int, str]  # task, seed, outcome
 
@@ -36,25 +41,24 @@ class Span:
     task: str = ''
     seed: int = 0
     outcome: str | None = ''  # None: of frames that may belong to no episode
-    first_cut: int | None = None  # log time of the gap where the first part of this one ends
 
 
-def read_spans(data: dict[str, np.ndarray], marks: Sequence[Mark], pause: float = 0,
-               longest: float = 0) -> list[Span]:
+def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.ndarray,
+               reading: Reading) -> list[Span]:
     """
     Read the marks: a list of spans in the order of the log.
 
-    :param data: dict with mark_log, mark_stamp, mark_event (N,), frame_log, frame_stamp (F,), and
-        gap (G, 3) as losses.gaps.
-    :param marks: N triples (task, seed, outcome).
-    :param pause: s; without marks, a longer one between two frames begins an episode; 0: none.
-    :param longest: s; without marks and pauses, longer episodes are cut into equal parts; 0: none.
+    :param frame, mark: sorted by log time.
+    :param marks: (task, seed, outcome) of each mark, by its row of values.
+    :param gaps: (G, 2) as damage.gaps.
+    :param reading: Reading; without marks, a longer pause than its gap between two frames begins
+        an episode; without pauses, longer episodes than it says are cut into equal parts.
     """
-    gaps = data['gap'][np.argsort(data['gap'][:, 0], kind='stable')].tolist()
-    spans = _marked(data, marks, gaps) if marks else _unmarked(
-        data['frame_log'], data['frame_stamp'], int(pause * 1e9), int(longest * 1e9))
-    if gaps:
-        spans = [part for span in spans for part in _cut(span, gaps)]
+    places = gaps[np.argsort(gaps[:, 0], kind='stable')].tolist()
+    spans = _marked(mark, marks, places) if marks else _unmarked(
+        frame.log, frame.stamp, int(reading.gap * 1e9), int(reading.episode_seconds * 1e9))
+    if places:
+        spans = [part for span in spans for part in _cut(span, places)]
         spans = sorted((s for s in spans if s.start_log <= s.end_log), key=lambda s: s.start_log)
     return spans or [Span(outcome=None)]
 
@@ -63,26 +67,23 @@ def in_gaps(gaps: np.ndarray, log: np.ndarray) -> np.ndarray:
     """
     Tell which times lie where messages of any topic may be missing, ends included.
 
-    :param gaps: (G, 3) int64, as losses.gaps gives it.
+    :param gaps: (G, 2) int64, as damage.gaps gives it.
     :param log: (N,) int64, ns.
     :return: (N,) bool.
     """
-    gaps = gaps[gaps[:, 2] == EVERYTHING]
     gaps = gaps[np.argsort(gaps[:, 0], kind='stable')]
     before = np.searchsorted(gaps[:, 0], log, 'right')
     ends = np.append(-FAR - 1, np.maximum.accumulate(gaps[:, 1]))
     return log <= ends[before]
 
 
-def _marked(data: dict[str, np.ndarray], marks: Sequence[Mark],
-            gaps: list[list[int]]) -> list[Span]:
+def _marked(mark: 'Track', marks: Sequence[Mark], gaps: list[list[int]]) -> list[Span]:
     """Return the spans between marks; where marks may be lost nothing is known until the next."""
     # At the same time starts come before gaps and ends behind: what cannot be told is left out.
     events: list[tuple[int, int, int, int, Mark]] = [
-        (log, 2 * (event != 0), stamp, event, about) for log, stamp, event, about in zip(
-            data['mark_log'].tolist(), data['mark_stamp'].tolist(), data['mark_event'].tolist(),
-            marks, strict=True)]
-    events += [(start, 1, end, 0, ('', 0, '')) for start, end, cuts in gaps if cuts == EVERYTHING]
+        (log, 2 * (event != 0), stamp, event, marks[row]) for log, stamp, event, row in zip(
+            *(a.tolist() for a in (mark.log, mark.stamp, mark.index, mark.first)), strict=True)]
+    events += [(start, 1, end, 0, ('', 0, '')) for start, end in gaps]
     spans, current, last_end = [], None, -FAR
     for log, order, stamp, event, about in sorted(events, key=lambda e: e[:2]):
         unsure = current is not None and current.outcome is None
@@ -113,8 +114,6 @@ def _marked(data: dict[str, np.ndarray], marks: Sequence[Mark],
 
 def _unmarked(log: np.ndarray, stamps: np.ndarray, pause: int, longest: int) -> list[Span]:
     """Return spans that end where the camera pauses, or its clock was set; times in ns."""
-    order = np.argsort(log, kind='stable')
-    log, stamps = log[order], stamps[order]
     steps = np.diff(stamps)  # a clock that is set back begins another episode, too
     begins = np.flatnonzero((steps > pause) | (steps < -MAX_JITTER_NS)) + 1 if pause else (
         np.empty(0, int))
@@ -133,16 +132,15 @@ def _cut(span: Span, gaps: list[list[int]]) -> Iterator[Span]:
     """Yield the parts of a span between gaps."""
     interrupted = 'interrupted' if span.task or span.outcome else span.outcome
     first = bisect_right(gaps, span.start_log, key=lambda gap: gap[0])
-    for start, end, cuts in gaps[first:bisect_right(gaps, span.end_log, key=lambda gap: gap[0])]:
+    for start, end in gaps[first:bisect_right(gaps, span.end_log, key=lambda gap: gap[0])]:
         yield replace(span, end_log=start - 1, outcome=interrupted)
-        first_cut = start if span.first_cut is None else span.first_cut
-        span = replace(span, start_log=max(end + 1, start),
-                       first_cut=None if cuts == EVERYTHING else first_cut)
+        span = replace(span, start_log=max(end + 1, start))
     yield span
 
 
-def assign(spans: Sequence[Span], log: np.ndarray, stamps: np.ndarray) -> np.ndarray:
+def assign(spans: Sequence[Span], track: 'Track') -> np.ndarray:
     """Return (N,) int64: the episode of each message, -1 for none."""
+    log, stamps = track.log, track.stamp
     start_log, end_log, start_stamp, end_stamp = np.array(
         [(s.start_log, s.end_log, s.start_stamp, s.end_stamp) for s in spans],
         np.int64).reshape(-1, 4).T

@@ -67,7 +67,7 @@ def test_other_content_is_another_key(tmp_path, episodes):
 
 
 def test_damaged_caches_are_built_again(bag, episodes, cache):
-    for name, size in (('frames', None), ('frames', 200), ('masks', None), ('masks', 200),
+    for name, size in (('frame', None), ('frame', 200), ('mask', None), ('mask', 200),
                        ('columns.safetensors', None), ('columns.safetensors', 0),
                        ('columns.safetensors', 100), ('columns.safetensors', -1)):
         open_recordings(bag)

@@ -8,6 +8,8 @@ import io
 import cv2
 from made_bags import camera, gripper, IMAGE, message, read, record, SECOND
 from made_episodes import make_episode
+from mcap.reader import make_reader
+from mcap.writer import Writer
 import numpy as np
 from PIL import Image as Picture
 import pytest
@@ -16,6 +18,7 @@ from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.crop import Crop
 from tap_ros.recording.bags import check_first_picture, reading_like
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.messages import schema_text
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import EpisodeWriter
@@ -44,6 +47,23 @@ def compressed(t, picture, log=None, form='JPEG'):
                    data=np.frombuffer(data, np.uint8))
 
 
+def rewrite_with_empty(path, topic):
+    """Copy the messages of a file into another that announces one topic more."""
+    with open(path, 'rb') as stream:
+        messages = list(make_reader(stream).iter_messages())
+    with open(path, 'wb') as stream:
+        writer, channels = Writer(stream), {}
+        writer.start('ros2')
+        kind = writer.register_schema(IMAGE, 'ros2msg', schema_text(IMAGE).encode())
+        writer.register_channel(topic, 'cdr', kind)
+        for schema, channel, one in messages:
+            if channel.topic not in channels:
+                kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, 'cdr', kind)
+            writer.add_message(channels[channel.topic], one.log_time, one.data, one.publish_time)
+        writer.finish()
+
+
 def record_scenes(folder, times, *size):
     """Write compressed pictures of so many seconds into a bag without marks."""
     return record(folder, [compressed(t, scene(i, *size)) for i, t in enumerate(times)])
@@ -67,7 +87,7 @@ def test_a_compressed_picture_that_cannot_be_read_is_named_and_left_out(tmp_path
         found, (text,) = read(record(tmp_path / str(number), [
             compressed(t, picture) for t, picture in enumerate((scene(0), bad, scene(2)), 1)]))
         assert f'{TOPIC}: 1 message cannot be used: ' in text and words in text
-        assert [len(episode) for episode in found] == [1, 1]  # cut where one is missing
+        assert [len(episode) for episode in found] == [2]  # whole, but for one
 
 
 def test_pictures_are_cut_and_scaled_while_they_are_decoded(tmp_path):
@@ -81,7 +101,7 @@ def test_pictures_are_cut_and_scaled_while_they_are_decoded(tmp_path):
     (episode,) = iter_episodes(bag, Reading(crop='centre', size=64))
     np.testing.assert_array_equal(episode.frames, expected)
     # What is kept is as large as what is used.
-    assert sum(f.stat().st_size for f in (tmp_path / 'cache').rglob('frames')) < 5 * 64 * 64 * 3
+    assert sum(f.stat().st_size for f in (tmp_path / 'cache').rglob('frame')) < 5 * 64 * 64 * 3
     whole = open_recordings(bag, tmp_path / 'cache')
     np.testing.assert_array_equal(whole[0].frames, pictures)
     assert whole.data_hash != store.data_hash
@@ -142,12 +162,36 @@ def test_a_clock_that_is_set_back_begins_an_episode_and_does_not_stop_the_rate(t
     assert [e.frames[:, 0, 0, 0].tolist() for e in found] == [[*range(6)], [*range(6, 12)]]
 
 
-def test_depth_beside_compressed_colour_makes_the_topic_be_named(tmp_path):
-    bag = record(tmp_path / 'bag', [
-        message('/depth/image_rect', IMAGE, 1),
-        message('/color/image_raw/compressed', COMPRESSED, 2)])
-    with pytest.raises(RecordingError, match='--image-topic.*/color/image_raw/compressed'):
+def deep(t, topic, form='16UC1'):
+    return camera(t, np.zeros((48, 64), np.uint8), topic=topic, encoding=form, step=128,
+                  data=bytes(48 * 128))
+
+
+def test_of_several_topics_of_pictures_the_colour_camera_is_taken(tmp_path):
+    colour = [compressed(t, scene(t)) for t in range(1, 41)]
+    grey = [camera(t, scene(t)[..., 0], topic='/infra/image_rect', encoding='mono8')
+            for t in range(1, 41)]
+    depth = bytes(12) + packed(np.full((48, 64), 700, np.uint16), 'PNG')
+    for number, others in enumerate((
+            [deep(t, '/depth/image_rect') for t in range(1, 41)], [deep(1, '/a', '32FC1')], grey,
+            [camera(5, scene(5), topic='/debug/overlay')],
+            [message('/depth/compressedDepth', COMPRESSED, t, data=np.frombuffer(depth, np.uint8),
+                     format='16UC1; compressedDepth png') for t in range(1, 41)])):
+        found, told = read(record(tmp_path / str(number), [*colour, *others]))
+        assert sum(map(len, found)) == 40 and not told
+    bag = record(tmp_path / 'bag', [*colour, *(
+        camera(t, scene(t), topic='/side/image_rect') for t in range(1, 31))])
+    with pytest.raises(RecordingError, match=r'several .*image_raw/compressed \(40 messages\), '
+                       r'/side/image_rect \(30 messages\); name the camera .*--image-topic'):
         open_recordings(bag)
+
+
+def test_an_empty_topic_is_not_the_camera_though_its_name_says_so(tmp_path):
+    bag = record(tmp_path / 'bag', [camera(t, topic='/front/rgb') for t in (1, 2, 3)])
+    for path in bag.glob('*.mcap'):
+        rewrite_with_empty(path, '/camera/image_raw')
+    (episode,), _ = read(bag)
+    assert len(episode) == 3
 
 
 def test_one_part_of_two_cameras_is_refused_before_training(tmp_path):

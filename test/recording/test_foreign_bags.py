@@ -9,7 +9,7 @@ from made_bags import (
     IMAGE,
     joints,
     mark,
-    OBJECTS,
+    message,
     objects,
     read,
     record,
@@ -24,10 +24,10 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
 from tap_ros.errors import RecordingError
-from tap_ros.messages.topics import resolve
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import Reading
+from tap_ros.recording.topic_choice import find_topics
 from tap_ros.recording.writer import EpisodeWriter
 
 
@@ -60,18 +60,21 @@ def test_another_image_topic_is_found_where_it_is_the_only_one_else_named(tmp_pa
         assert episode.frames[:, 0, 0, 0].tolist() == [1, 2, 3]
     bag = record(tmp_path / 'bag', [
         camera(t, topic='/front/rgb' if t < 4 else '/side/rgb') for t in range(1, 7)])
-    with pytest.raises(RecordingError, match='--image-topic.*/front/rgb.*/side/rgb'):
+    with pytest.raises(RecordingError, match='/front/rgb.*/side/rgb.*--image-topic'):
         open_recordings(bag)
     (episode,), _ = read(bag, reading=Reading('/side/rgb'))
     assert episode.frames[:, 0, 0, 0].tolist() == [4, 5, 6]
 
 
 def test_topics_of_another_meaning_or_type_are_not_taken(tmp_path):
+    goal, mask = (camera(1, topic=topic) for topic in ('/goal/image', '/camera/robot_mask'))
+    bag = record(tmp_path / 'none', [goal, mask])
     with pytest.raises(RecordingError, match='no topic ends in /camera/image_raw'):
-        resolve({'/goal/image': IMAGE, '/camera/robot_mask': IMAGE}, 'bag')
-    assert resolve({'/camera/image_raw': IMAGE, '/goal/objects': OBJECTS,
-                    '/objects': 'vision_msgs/msg/Detection2DArray'}, 'bag') == {
-        'frame': '/camera/image_raw', 'goal_object': '/goal/objects'}
+        open_recordings(bag)
+    bag = record(tmp_path / 'some', [
+        camera(1), objects(1, '/goal/objects', a=1), message('/objects', IMAGE, 1)])
+    assert find_topics(list(bag.glob('*.mcap'))) == {
+        '/camera/image_raw': 'frame', '/goal/objects': 'goal_object'}
 
 
 def test_topics_in_a_namespace(tmp_path, episodes):
@@ -86,15 +89,15 @@ def test_topics_in_a_namespace(tmp_path, episodes):
     assert_all_equal(iter_episodes(tmp_path / 'bag'), episodes)
 
 
-def test_two_robots_are_told_apart_by_the_image_topic():
-    kinds = {'camera/image_raw': IMAGE, 'joint_states': 'sensor_msgs/msg/JointState',
-             'objects': OBJECTS, 'goal/objects': OBJECTS}
-    available = {f'/{robot}/{name}': kind for robot in 'ab' for name, kind in kinds.items()}
-    with pytest.raises(RecordingError, match='several topics could be /camera/image_raw'):
-        resolve(available, 'bag')
-    assert resolve(available, 'bag', '/b/camera/image_raw') == {
-        columns: f'/b/{name}' for columns, name in zip(
-            ('frame', 'joint', 'object', 'goal_object'), kinds)}
+def test_two_robots_are_told_apart_by_the_image_topic(tmp_path):
+    bag = record(tmp_path / 'bag', [one for robot in 'ab' for one in (
+        camera(1, topic=f'/{robot}/camera/image_raw'), objects(1, f'/{robot}/objects', a=1),
+        message(f'/{robot}/joint_states', 'sensor_msgs/msg/JointState', 1))])
+    with pytest.raises(RecordingError, match='several topics could be /camera/image_raw: '
+                       r'/a/camera/image_raw \(1 messages\), /b/camera/image_raw'):
+        open_recordings(bag)
+    assert find_topics(list(bag.glob('*.mcap')), '/b/camera/image_raw') == {
+        '/b/camera/image_raw': 'frame', '/b/objects': 'object', '/b/joint_states': 'joint'}
 
 
 def test_actions_belong_to_the_frame_before_them(tmp_path):

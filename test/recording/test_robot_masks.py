@@ -76,7 +76,7 @@ def test_a_bad_mask_is_named_and_costs_the_masks_of_its_episode(tmp_path):
     episode = cover(make_episode())
     for number, (at, wrong, words) in enumerate((at, *case) for at in (0, 3) for case in (
             (np.full((8, 12), 1, np.uint8), 'value 1; expected 0 .free., 128 .hand. or 255 .arm.'),
-            (np.zeros((4, 6), np.uint8), '6x4 pixels among pictures of 12x8'),
+            (np.zeros((4, 6), np.uint8), '6x4 pixels among those of 12x8'),
             (np.zeros((8, 12, 3), np.uint8), "encoding 'rgb8' cannot be used; .*: mono8"),
             (np.zeros((0, 0), np.uint8), 'is empty'))):
         masks = stream(episode.robot_masks, -1e-6)  # before its picture, which tells the size

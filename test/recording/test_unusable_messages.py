@@ -6,7 +6,6 @@ import re
 
 from made_bags import (
     camera,
-    gripper,
     mark,
     message,
     OBJECTS,
@@ -17,12 +16,9 @@ from made_bags import (
     SECOND,
 )
 from made_episodes import make_episode
-from mcap.writer import CompressionType, Writer
 import pytest
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.errors import ConfigError
 from tap_ros.evaluation import inspect_files
-from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.messages import schema_text
 from tap_ros.recording.writer import EpisodeWriter
 
 BAD = {
@@ -32,25 +28,19 @@ BAD = {
     'empty': {'height': 0, 'width': 0, 'step': 0, 'data': b''}, 'wrong step': {'step': 8}}
 
 
-@pytest.mark.parametrize('at, expected, outcomes', [
-    (1, [[2, 3, 4, 5, 6]], ['success']), (4, [[1, 2, 3], [5, 6]], ['interrupted', 'success']),
-    (6, [[1, 2, 3, 4, 5]], ['interrupted'])])
-def test_a_bad_picture_costs_itself_and_cuts_its_episode(tmp_path, at, expected, outcomes):
-    whole = [mark(1, 0), gripper(2, 0.5), *map(camera, range(1, 7)), mark(6, 1, 'success'),
-             mark(8, 0), camera(8), mark(8, 1, 'failure')]
-    topic, kind, data, log = camera(at)
-    for number, bad in enumerate([
-            *(camera(at, **changes) for changes in BAD.values()), (topic, kind, data[:40], log)]):
-        messages = [bad if m == (topic, kind, data, log) else m for m in whole]
-        found, (text,) = read(record(
-            tmp_path / str(number) / 'bag', sorted(messages, key=lambda m: m[3])))
-        assert re.search(
-            f'bag_0.mcap: topic /camera/image_raw: 1 message .*log time {at}.000000000 s', text)
-        assert [e.frames[:, 0, 0, 0].tolist() for e in found] == [*expected, [8]]
-        assert [e.outcome for e in found] == [*outcomes, 'failure']
-        assert {(e.task, e.seed) for e in found} == {('push2', 3)}
-        if at == 4:  # the opening holds beyond the cut
-            assert [e.actions[:, 3].tolist() for e in found[:2]] == [[0, 0.5, 0], [0.5, 0]]
+def test_a_bad_picture_costs_itself_alone(tmp_path):
+    whole = [mark(1, 0), *map(camera, range(1, 7)), mark(6, 1, 'success'), mark(8, 0), camera(8),
+             mark(8, 1, 'failure')]
+    for at in (1, 4, 6):
+        topic, kind, data, log = camera(at)
+        bad = [camera(at, **changes) for changes in BAD.values()] if at == 4 else []
+        for number, one in enumerate([*bad, (topic, kind, data[:40], log)]):
+            found, (text,) = read(record(tmp_path / str(at) / str(number) / 'bag', [
+                one if m == (topic, kind, data, log) else m for m in whole]))
+            assert re.search(f'topic /camera/image_raw: 1 message .*log time {at}.000000000', text)
+            assert [e.frames[:, 0, 0, 0].tolist() for e in found] == [
+                [t for t in range(1, 7) if t != at], [8]]
+            assert [e.outcome for e in found] == ['success', 'failure']
 
 
 def test_the_size_of_most_pictures_wins_though_the_first_is_another(tmp_path):
@@ -64,7 +54,7 @@ def test_many_bad_pictures_are_one_warning(tmp_path):
     found, (text,) = read(record(tmp_path / 'bag', [
         camera(t, **(BAD['rgb16'] if t % 2 else {})) for t in range(1, 100)]))
     assert '50 messages cannot be used: encoding' in text and 'and 47 more' in text
-    assert [len(e) for e in found] == [1] * 49
+    assert [len(e) for e in found] == [10, 10, 9, 10, 10]
 
 
 def test_goals_that_cannot_be_used_take_back_those_before(tmp_path):
@@ -97,32 +87,8 @@ def test_a_goal_does_not_hold_beyond_a_file_that_is_cut_off(tmp_path):
     assert second.frames[:, 0, 0, 0].tolist() == [3] and second.goal_frame is None
 
 
-def bomb(path, messages):
-    """Write messages into one packed chunk without an index."""
-    with open(path, 'wb') as stream:
-        writer = Writer(stream, chunk_size=2**30, compression=CompressionType.ZSTD)
-        writer.start('ros2')
-        channels = {}
-        for topic, kind, data, _ in messages:
-            if topic not in channels:
-                schema = writer.register_schema(kind, 'ros2msg', schema_text(kind).encode())
-                channels[topic] = writer.register_channel(topic, 'cdr', schema)
-            writer.add_message(channels[topic], 0, data, 0)
-        writer._Writer__finalize_chunk()
-
-
 def many(count):
     return message('/objects', OBJECTS, 1, objects=[{'name': 'a'}] * count)
-
-
-def test_objects_that_would_take_minutes_or_much_memory_are_refused(tmp_path):
-    bomb(tmp_path / 'a.mcap', [camera(1), *[many(1000)] * 400])
-    assert (tmp_path / 'a.mcap').stat().st_size < 100000
-    with pytest.raises(RecordingError, match='a.mcap: more than .* bytes of messages that are no'):
-        open_recordings(tmp_path)
-    bomb(tmp_path / 'a.mcap', [camera(1), *[many(1)] * 5000, many(4000)])
-    with pytest.raises(RecordingError, match='a.mcap: messages of up to 4000 objects'):
-        open_recordings(tmp_path)
 
 
 def test_a_huge_message_costs_itself(tmp_path):
