@@ -4,20 +4,23 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-import queue
 from queue import SimpleQueue
 import threading
 import time
 from typing import Any, Self, TYPE_CHECKING
 
 from action_msgs.msg import GoalStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import numpy as np
+from rcl_interfaces.srv import GetParameters, SetParameters
 import rclpy
 from rclpy.action import ActionClient
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
@@ -30,14 +33,7 @@ from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoals
-from tap_ros.nodes.clients import (
-    call,
-    CallError,
-    cancel_goal,
-    send_goal,
-    Spinner,
-    wait_for_result,
-)
+from tap_ros.nodes.calls import call, CallError, cancel_goal, send_goal, Spinner, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
@@ -55,7 +51,10 @@ SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offer
     'set_goal': (SetGoal, 'sim/set_goal', 'sim_node'),
     'step': (StepScene, 'sim/step', 'sim_node'),
     'pause': (SetBool, 'sim/pause', 'sim_node'),
-    'record': (SetBool, 'recorder/record', 'recorder_node')}
+    'record': (SetBool, 'recorder/record', 'recorder_node'),
+    'get': (GetParameters, 'predictor_node/get_parameters', 'predictor_node'),
+    'set': (SetParameters, 'predictor_node/set_parameters', 'predictor_node'),
+    'change': (ChangeState, 'predictor_node/change_state', 'predictor_node')}
 READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'recorder_node': 'record'}
 PLANNER = 'visual_mpc_node'
 ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_CANCELED: 'cancelled',
@@ -116,16 +115,13 @@ class Reaching:
                  deadline: float, server: Liveness) -> None:
         self.handle = handle
         self._feedback, self._deadline, self._server = feedback, deadline, server
-        self._result: ReachResult | Exception | None = None
+        self._result: ReachResult | Exception = CallError('reach_goal: ended without a result')
         self._thread = threading.Thread(target=self._wait, name='reaching', daemon=True)
         self._thread.start()
 
     def __iter__(self) -> Iterator[ReachGoal.Feedback]:
-        while self._thread.is_alive() or not self._feedback.empty():
-            try:
-                yield self._feedback.get(timeout=0.05)
-            except queue.Empty:
-                continue
+        yield from iter(self._feedback.get, None)
+        self._feedback.put(None)
         self.result()  # raises what has ended it
 
     def cancel(self) -> None:
@@ -140,8 +136,8 @@ class Reaching:
             the goal is cancelled.
         """
         self._thread.join()
-        if not isinstance(self._result, ReachResult):
-            raise self._result or CallError('reach_goal: ended without a result')
+        if isinstance(self._result, Exception):
+            raise self._result
         return self._result
 
     def _wait(self) -> None:
@@ -153,6 +149,7 @@ class Reaching:
                 result.expected_distance)
         except Exception as error:
             self._result = error
+        self._feedback.put(None)
 
 
 class Client:
@@ -209,20 +206,17 @@ class Client:
             return bool(self._planner().server_is_ready())
         return bool(self._service(READY.get(name, name)).service_is_ready())
 
-    def wait_until_ready(self, *names: str, timeout_s: float = 90.0,
-                         check: Callable[[], object] = lambda: None) -> None:
+    def wait_until_ready(self, *names: str, timeout_s: float = 90.0) -> None:
         """
         Wait until nodes are ready.
 
         :param names: of the nodes, such as 'predictor_node'; none: predictor and planner.
         :param timeout_s: most seconds to wait.
-        :param check: called ten times a second; what it raises ends the wait.
         :raises CallError: naming those that are not ready in time.
         """
         deadline = time.monotonic() + timeout_s
         waiting = names or ('predictor_node', PLANNER)
         while waiting := tuple(name for name in waiting if not self.is_ready(name)):
-            check()
             if time.monotonic() > deadline:
                 raise CallError(f'{", ".join(waiting)}: not ready after {timeout_s:g} s; start '
                                 'what is missing, and see its log')
@@ -243,8 +237,9 @@ class Client:
         client, request = self._service(service), _message(kind.Request, fields)
         response = call(client, request, timeout_s or self.timeout_s, give_up,
                         self._liveness(server))
-        if not response.success:
-            raise CallError(f'{client.service_name} refused: {escaped(response.message, 1000)}')
+        if not getattr(response, 'success', True):
+            reason = getattr(response, 'message', 'the log of its node says why')
+            raise CallError(f'{client.service_name} refused: {escaped(reason, 1000)}')
         return response
 
     # Subgoals and goals
@@ -302,6 +297,27 @@ class Client:
                            on_feedback or feedback.put, self._liveness(PLANNER))
         return Reaching(handle, feedback, deadline, self._liveness(PLANNER))
 
+    def weights(self) -> str:
+        """Return the predictor's weights, a name or a file."""
+        return str(self.call('get', names=['weights']).values[0].string_value)
+
+    def use_weights(self, weights: str) -> None:
+        """
+        Have the predictor go on with other weights, by name or file of its machine.
+
+        :raises CallError: when it cannot load them; then it has none.
+        """
+        def change(*transitions: int) -> None:
+            for transition in transitions:
+                self.call('change', transition=Transition(id=transition))
+
+        change(Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+        parameter = Parameter('weights', value=weights).to_parameter_msg()
+        answer, = self.call('set', parameters=[parameter]).results
+        if not answer.successful:
+            raise CallError(f'predictor_node, weights {weights}: {escaped(answer.reason, 500)}')
+        change(Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+
     # Simulator and recorder
 
     def reset(self, task: str = 'push2', seed: int = 0,
@@ -326,13 +342,9 @@ class Client:
         """Pause the simulator, or let it go on."""
         self.call('pause', data=paused)
 
-    def start_recording(self) -> str:
-        """Have recorder_node begin a recording; return what it says."""
-        return str(self.call('record', data=True).message)
-
-    def stop_recording(self) -> str:
-        """End the recording; return what the node says."""
-        return str(self.call('record', data=False).message)
+    def record(self, active: bool = True) -> str:
+        """Have recorder_node begin a recording, or end it; return what it says."""
+        return str(self.call('record', data=active).message)
 
     # What is seen
 
@@ -369,31 +381,28 @@ class Client:
         return self._once('reach_goal', lambda: ActionClient(
             self.node, ReachGoal, 'reach_goal', callback_group=self._group))
 
-    def _liveness(self, name: str) -> Liveness:
-        liveness: Liveness = self._once(name, lambda: Liveness(self.node, name, self._group))
-        return liveness
+    def _liveness(self, name: str) -> Any:
+        return self._once(name, lambda: Liveness(self.node, name, self._group))
 
-    def _views(self, name: str) -> Observations:
+    def _views(self, name: str) -> Any:
         def subscribed() -> Observations:
             views = Observations(*VIEWS[name], latched=name == 'goal')
             views.subscribe(self.node, VIEWS[name], LATCHED if name == 'goal' else STREAM,
                             self._group)
             return views
-        views: Observations = self._once(name, subscribed)
-        return views
+        return self._once(name, subscribed)
 
     def _view(self, name: str, after_ns: int, objects: bool, timeout_s: float | None) -> View:
         views, timeout_s = self._views(name), timeout_s or self.timeout_s
         found = views.wait(('image', 'objects') if objects else ('image',), timeout_s, after_ns)
-        topics = {each: topic for each, (_, topic) in VIEWS[name].items()}
         if found is None:
             silent = 'objects' if views.newest('image', after_ns=after_ns) else 'image'
             raise CallError(f'{views.names([silent], explained=True)}: '
                             f'nothing new came within {timeout_s:g} s')
         listed = found.get('objects', ObjectStates())
-        names, pixels = decode_objects(listed, topics['objects'])
-        return View(decode_image(found['image'], topics['image']), names, pixels,
-                    positions_of(listed), to_nanoseconds(found['image'].header.stamp))
+        return View(decode_image(found['image'], VIEWS[name]['image'][1]),
+                    *decode_objects(listed, VIEWS[name]['objects'][1]), positions_of(listed),
+                    to_nanoseconds(found['image'].header.stamp))
 
 
 def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any]:

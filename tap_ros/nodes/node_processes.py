@@ -3,14 +3,18 @@
 """Start nodes as processes of their own, with logs, and end them all."""
 
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
+import time
 from typing import Any, Self
 
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
 import yaml
+
+READY_S, LOOK_S = 120.0, 0.1
 
 
 class NodeEnded(TapError):
@@ -37,8 +41,7 @@ class NodeProcesses:
         :param parameters: its ROS parameters.
         """
         command = [sys.executable, '-m', NODE_MODULES[name], '--ros-args']
-        if parameters:
-            # In a file that others cannot read: a token is no argument for all to see.
+        if parameters:  # in a file that others cannot read: a token is no argument for all to see
             file = self._folder / f'{name}.yaml'
             file.touch(mode=0o600)
             file.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
@@ -64,24 +67,38 @@ class NodeProcesses:
                     f'{name} ended with exit code {process.returncode}; the end of '
                     f'{self._log(name)}:\n' + '\n'.join(lines[-5:]))
 
-    def stop(self, timeout_s: float = 15) -> dict[str, int]:
-        """End all nodes, politely first; return the exit code of each."""
-        running = [p for p in self._processes.values() if p.poll() is None]
-        for process in running:
-            process.send_signal(signal.SIGINT)
-        for process in running:
-            try:
-                process.wait(timeout_s)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        return {name: process.returncode for name, process in self._processes.items()}
+    def wait_until_ready(self) -> str:
+        """
+        Wait until each node's log says that it is ready.
+
+        :return: what the node that was started last says behind that.
+        :raises TapError: when a node ends, or is not ready after READY_S.
+        """
+        deadline, said = time.monotonic() + READY_S, ''
+        for name in self._processes:
+            while not (found := re.search(r'ready: (?:open )?(.*)',
+                                         self._log(name).read_text(errors='replace'))):
+                self.check()
+                if time.monotonic() > deadline:
+                    raise TapError(f'{self._log(name)}: {name} is not ready after {READY_S:g} s')
+                time.sleep(LOOK_S)
+            said = found[1]
+        return said
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.stop()
+        """End all nodes, politely first."""
+        running = [p for p in self._processes.values() if p.poll() is None]
+        for process in running:
+            process.send_signal(signal.SIGINT)
+        for process in running:
+            try:
+                process.wait(15)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
     def _log(self, name: str) -> Path:
         return self._folder / f'{name}.log'

@@ -39,5 +39,5 @@ def pytest_pyfunc_call(pyfuncitem):
     finally:
         folder = pyfuncitem.config.getoption('--report')
         if folder and trials is not None and not isinstance(error, KeyboardInterrupt):
-            name = pyfuncitem.name.removeprefix('test_').replace('_', '-')
-            save(folder, trials.row(name.replace('[', '-').rstrip(']'), error))
+            name = pyfuncitem.name.removeprefix('test_').replace('_', '-').replace('[', '-')
+            save(folder, trials.row(name.strip('-]'), error))

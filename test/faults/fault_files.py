@@ -3,27 +3,28 @@
 """Recordings to damage, and child processes that read them within limits of time and memory."""
 
 from dataclasses import dataclass
+import hashlib
 from io import BytesIO
-import json
+import multiprocessing
 import os
 from pathlib import Path
 import resource
-import select
 import signal
 import struct
 import subprocess
-import sys
 import time
+import traceback
+import warnings
 
 from made_episodes import make_episode
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
+from tap_ros.errors import TapError
 from tap_ros.recording.messages import schema_text
 from tap_ros.recording.writer import EpisodeWriter
 import zstandard
 
 ROOT = Path(__file__).parents[2]
-READER = [sys.executable, str(Path(__file__).with_name('fault_reader.py'))]
 MAGIC = b'\x89MCAP0\r\n'
 CHUNK = 6  # opcode of an MCAP record
 IMAGE = 'sensor_msgs/msg/Image'
@@ -107,8 +108,64 @@ def message_bomb(messages, data=b''):
     return out.getvalue()
 
 
+# What the process of a Reader does
+
+
+def read_recording(path):
+    """Return what a recording holds: for each episode a hash of the whole and of each frame."""
+    from tap_ros.recording.reader import iter_episodes
+    episodes = []
+    for episode in iter_episodes(path):
+        whole = hashlib.sha1()
+        for field in vars(episode).values():
+            whole.update(field.tobytes() if hasattr(field, 'tobytes') else repr(field).encode())
+        frames = [hashlib.sha1(frame.tobytes() + stamp.tobytes()).hexdigest()[:12]
+                  for frame, stamp in zip(episode.frames, episode.stamps)]
+        episodes.append([whole.hexdigest(), frames])
+    return episodes
+
+
+def read_weights(path):
+    """Return a hash of what a weights file makes the planner's forward model compute with."""
+    from tap_ros.planning.forward_model import LearnedForwardModel
+    model = LearnedForwardModel.load(path, precision='float32')
+    found = hashlib.sha1(repr(model.config).encode())
+    for name, tensor in sorted(model.state_dict().items()):
+        found.update(name.encode() + tensor.contiguous().numpy().tobytes())
+    return found.hexdigest()
+
+
+def read_predictor(path):
+    """Load the network of a predictor; return what its training says of itself."""
+    from tap_ros.prediction.predictor import load_network
+    return sorted(load_network(path)[1])
+
+
+READERS = {'recording': read_recording, 'weights': read_weights, 'predictor': read_predictor}
+
+
+def answer(pipe):
+    """Answer what to read and a file by what came of it, again and again."""
+    while True:
+        what, path = pipe.recv()
+        begin = time.monotonic()
+        found = {'content': None, 'error': None, 'kind': None, 'expected': False}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter('always')
+            try:
+                found['content'] = READERS[what](path)
+            except Exception as error:
+                last = traceback.extract_tb(error.__traceback__)[-1]
+                found |= {'error': str(error), 'expected': isinstance(error, TapError), 'kind': (
+                    f'{type(error).__name__} in {Path(last.filename).name}:{last.lineno}')}
+        # getrusage would count its parent's memory.
+        peak_kb = Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0]
+        pipe.send(found | {'warnings': [str(warning.message) for warning in caught],
+                           'seconds': time.monotonic() - begin, 'peak_mb': int(peak_kb) / 1024})
+
+
 class Reader:
-    """The process of fault_reader.py, started anew whenever a file has ended it."""
+    """A process that reads files, started anew whenever one has ended it."""
 
     def __init__(self):
         self._process = None
@@ -123,39 +180,40 @@ class Reader:
         """
         Read a file.
 
-        :param what: a key of fault_reader.READERS.
+        :param what: a key of READERS.
         :param path: the file.
         :param timeout_s: after so long it is a hang, and the process is killed.
-        :return: the dict of fault_reader.answer.
+        :return: the dict of answer.
         :raises AssertionError: if the file ends or hangs the process.
         """
         if self._process is None:
-            self._process = subprocess.Popen(
-                READER, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                cwd=ROOT, start_new_session=True)
+            context = multiprocessing.get_context('spawn')
+            self._pipe, other = context.Pipe()
+            self._process = context.Process(target=answer, args=(other,), daemon=True)
+            self._process.start()
+            other.close()
             self._ask(what, os.devnull, 120.0)  # what is imported on the way is not timed
         return self._ask(what, path, timeout_s)
 
     def _ask(self, what, path, timeout_s):
-        self._process.stdin.write((json.dumps([what, str(path)]) + '\n').encode())
-        self._process.stdin.flush()
-        if not select.select([self._process.stdout], [], [], timeout_s)[0]:
-            self.end()
-            raise AssertionError(f'hang: no answer in {timeout_s:g} s')
-        line = self._process.stdout.readline()
-        if not line:
-            self._process.wait(5.0)
-            raise AssertionError(f'crash: {describe_exit(self.end())}')
-        return json.loads(line)
+        try:
+            self._pipe.send((what, str(path)))
+            if self._pipe.poll(timeout_s):
+                return self._pipe.recv()
+        except (EOFError, OSError) as error:
+            self._process.join(5.0)
+            raise AssertionError(f'crash: {describe_exit(self.end())}') from error
+        self.end()
+        raise AssertionError(f'hang: no answer in {timeout_s:g} s')
 
     def end(self):
         """End the process; return its exit code."""
         if self._process is None:
             return None
-        end_group(self._process)
-        self._process.stdin.close()
-        self._process.stdout.close()
-        code, self._process = self._process.returncode, None
+        self._process.kill()
+        self._process.join()
+        self._pipe.close()
+        code, self._process = self._process.exitcode, None
         return code
 
 
@@ -190,17 +248,10 @@ def run_limited(command, timeout_s, file_bytes=None):
         text, _ = process.communicate(timeout=timeout_s)
         code = process.returncode
     except subprocess.TimeoutExpired:
-        end_group(process)
+        os.killpg(process.pid, signal.SIGKILL)
         text, _ = process.communicate()
         code = None
     return Ended(code, text.decode(errors='replace'), time.monotonic() - begin)
-
-
-def end_group(process):
-    """Kill a process and all that it started, if it still runs."""
-    if process.poll() is None:
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
 
 
 def describe_exit(code):

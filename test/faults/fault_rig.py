@@ -1,158 +1,155 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes under attack as processes, a client of them, and what the arm would have been told."""
+"""Nodes under attack, a client of them, a world of its own, and what the arm would be told."""
 
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-import os
+from functools import cache
 from pathlib import Path
 import signal
-import subprocess
-import sys
 import threading
 import time
 
-from fault_files import end_group
-from fault_world import goal_fields, predict_fields, World
 from geometry_msgs.msg import TwistStamped
-from sensor_msgs.msg import JointState
-from tap_ros.contract import NODE_MODULES
+import numpy as np
+from processes import Newest, NodeProcess
+from sensor_msgs.msg import Image, JointState
+from sim_bridge.simulator import Simulator
+from tap_msgs.msg import CommandRefused, ObjectStates
+from tap_ros.contract import CAMERA_FRAME, NODE_MODULES, WORLD_FRAME
 from tap_ros.errors import TapError
-from tap_ros.nodes.client import Client, PLANNER, READY
-from tap_ros.nodes.clients import Newest
+from tap_ros.nodes.client import Client, PLANNER, READY, request_fields
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.topics import STREAM
+from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
+from tap_ros.nodes.topics import STREAM, to_stamp
 
 CALL_S = 20.0
-START_S = 90.0
 MOVING_S = 60.0  # a plan takes seconds where other programs run
 STOP_S = 0.5
 SIM_MODES = {'lock-step': {'lock_step': True}, 'real': {'lock_step': False}}
+TOPICS = {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects'),
+          'joints': (JointState, 'joint_states')}
+SEED = 1_000_003
 
 
-def _hear_signals():
-    """Take back what nohup and background jobs of a shell ignore."""
-    for number in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
+@cache
+def first_pictures():
+    """Return the first Observation of a scene and its goal, from the simulator itself."""
+    simulator = Simulator('push2')
+    try:
+        return simulator.reset(SEED), simulator.goal()
+    finally:
+        simulator.close()
 
 
-class Attacked:
+def objects_message(observation, stamp, pixels=None, names=None):
+    """Return tap_msgs/ObjectStates of an Observation, with other pixels or names if given."""
+    pixels = observation.object_pixels if pixels is None else pixels
+    names = observation.object_names if names is None else names
+    poses = np.resize(observation.object_poses, (len(names), 7))
+    return encode_objects(names, pixels, poses, stamp, WORLD_FRAME,
+                          ObjectStates.SOURCE_GROUND_TRUTH)
+
+
+def goal_fields(mode='direct', **fields):
+    """Return arguments of Client.reach for a goal that needs no goal topics."""
+    _, goal = first_pictures()
+    pixels = dict(zip(goal.object_names, goal.object_pixels))
+    return {'goal': goal.image, 'goal_pixels': pixels, 'mode': mode, 'step_budget': 1000, **fields}
+
+
+def predict_fields(**fields):
+    """Return fields of a whole predict_subgoal request."""
+    start, goal = first_pictures()
+    return request_fields(
+        start.object_names, start=start.image, goal=goal.image, start_objects=start.object_pixels,
+        goal_objects=goal.object_pixels) | fields
+
+
+class World:
     """
-    One node in a process group of its own, that is killed, stopped and started again.
+    Publish the first moment of a scene again and again, with the stamps of the wall clock.
 
-    :param name: a name of NODE_MODULES.
-    :param log: file for what it prints; a new start adds to it.
-    :param parameters: {name: value} of its ROS parameters.
-    :param arguments: more arguments after --ros-args.
+    Whatever the arm is told, nothing moves, so that a goal goes on for as long as a trial needs.
+
+    :param node: rclpy Node.
+    :param rate_hz: how often.
+    :ivar silent: names of what is not published, of TOPICS.
+    :ivar objects: (K, 2) pixels and K names published, each None for the true ones.
+    :ivar gripper: (4,) published, None for the true one.
+    :ivar shift_s: added to all stamps.
+    :ivar frozen: the stamp in ns of all messages, None: that of the moment.
+    :ivar sent: when each topic was published last, time.monotonic().
     """
 
-    def __init__(self, name, log, parameters=None, arguments=()):
-        self.name, self.log = name, Path(log)
-        self.parameters, self._arguments = dict(parameters or {}), tuple(arguments)
-        self._from = 0  # where the log of the present process begins
-        self.process = None
+    def __init__(self, node, rate_hz=10.0):
+        self.sent = {}
+        self.restore()
+        self._seen = first_pictures()[0]
+        self._node, self._period = node, 1.0 / rate_hz
+        self._publishers = {topic: node.create_publisher(kind, name, STREAM)
+                            for topic, (kind, name) in TOPICS.items()}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='world', daemon=True)
 
-    def start(self):
-        """Start it, without waiting."""
-        command = [sys.executable, '-m', NODE_MODULES[self.name], '--ros-args', *self._arguments]
-        for key, value in self.parameters.items():
-            text = str(value).lower() if isinstance(value, bool) else str(value)
-            command += ['-p', f'{key}:={text}']
-        self._from = self.log.stat().st_size if self.log.exists() else 0
-        with self.log.open('ab') as log:
-            self.process = subprocess.Popen(
-                command, stdout=log, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-                start_new_session=True, preexec_fn=_hear_signals)
+    def __enter__(self):
+        self._thread.start()
         return self
 
-    @property
-    def alive(self):
-        """Whether it runs."""
-        return self.process is not None and self.process.poll() is None
+    def __exit__(self, *_):
+        self._stop.set()
+        self._thread.join()
+        for publisher in self._publishers.values():
+            self._node.destroy_publisher(publisher)
 
-    @property
-    def text(self):
-        """What the present process has printed."""
-        with self.log.open('rb') as log:
-            log.seek(self._from)
-            return log.read().decode(errors='replace')
+    def restore(self):
+        """Publish everything as it is again."""
+        self.silent, self.frozen, self.shift_s = set(), None, 0.0
+        self.objects, self.gripper = (None, None), None
 
-    def wait_for(self, words, timeout_s=START_S):
-        """Wait until it prints something; raise TapError when it does not."""
-        deadline = time.monotonic() + timeout_s
-        while words not in self.text:
-            self.check()
-            if time.monotonic() > deadline:
-                raise TapError(f'{self.name} did not print {words!r} in {timeout_s:g} s: '
-                               f'{self.last_line()}')
-            time.sleep(0.02)
-        return self
+    def silence(self, *topics):
+        """Publish these no longer; return when the last of them was sent."""
+        self.silent |= set(topics)
+        time.sleep(self._period / 2)  # what is on its way
+        return max(self.sent.get(topic, time.monotonic()) for topic in topics)
 
-    def check(self):
-        """Raise TapError when it has ended."""
-        if not self.alive:
-            raise TapError(f'{self.name} ended with code {self.process.returncode}: '
-                           f'{self.last_line()}')
+    def messages(self, stamp):
+        """Return {topic: message} of this moment."""
+        gripper = self._seen.gripper if self.gripper is None else self.gripper
+        return {'joints': encode_joints(gripper, stamp, WORLD_FRAME),
+                'objects': objects_message(self._seen, stamp, *self.objects),
+                'image': encode_image(self._seen.image, stamp, CAMERA_FRAME)}
 
-    def last_line(self):
-        """Return the last line that it printed."""
-        return (self.text.strip().splitlines() or ['it printed nothing'])[-1]
+    def publish(self, messages):
+        """Publish some messages by topic, but those of what is silent."""
+        for topic, message in messages.items():
+            if topic not in self.silent:
+                self._publishers[topic].publish(message)
+                self.sent[topic] = time.monotonic()
 
-    def send(self, number):
-        """Send a signal, if it runs."""
-        if self.alive:
-            self.process.send_signal(number)
-
-    def kill(self):
-        """Kill it, as the kernel does when memory is short; return the moment."""
-        moment = time.monotonic()
-        if self.process is not None:
-            end_group(self.process)
-        return moment
-
-    def end(self, number=signal.SIGINT, timeout_s=10.0):
-        """End it politely; return its exit code, None when it had to be killed after a time."""
-        self.send(number)
-        try:
-            return self.process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            return None
-
-    def memory_mb(self):
-        """Return the memory that it holds (resident set), in MB."""
-        pages = Path(f'/proc/{self.process.pid}/statm').read_text().split()[1]
-        return int(pages) * os.sysconf('SC_PAGE_SIZE') / 1e6
+    def _run(self):
+        while not self._stop.wait(self._period):
+            now = time.time_ns() + int(self.shift_s * 1e9)
+            self.publish(self.messages(to_stamp(self.frozen or now)))
 
 
-@dataclass(frozen=True)
-class Command:
-    """A twist command that came; metres."""
-
-    at: float  # time.monotonic() of its arrival
-    move: tuple
-
-    @property
-    def is_stop(self):
-        """Whether it says to stand still."""
-        return not any(self.move)
-
-
-class Commands:
+class Arm:
     """
     Keep every twist command, as a driver of the arm would get it.
 
     :param node: rclpy Node that another thread spins.
+    :ivar refusing: whether it refuses each command, as after a protective stop.
     """
 
     def __init__(self, node):
-        self._kept, self._changed = [], threading.Condition()
+        self.refusing = False
+        self._kept, self._changed = [], threading.Condition()  # (time.monotonic(), whether a move)
+        self._refused = node.create_publisher(CommandRefused, 'arm/refused', STREAM)
         node.create_subscription(TwistStamped, 'arm/delta_twist_cmds', self._put, STREAM)
 
     def moves(self, moment):
-        """Return the commands after a moment of time.monotonic() that are no stops."""
+        """Return when the commands after a moment of time.monotonic() came that are no stops."""
         with self._changed:
-            return [one for one in self._kept if one.at > moment and not one.is_stop]
+            return [at for at, move in self._kept if at > moment and move]
 
     def forget(self):
         """Drop all."""
@@ -163,8 +160,7 @@ class Commands:
         """Wait until so many moves have come after a moment; tell whether they have."""
         with self._changed:
             return self._changed.wait_for(
-                lambda: sum(c.at > moment and not c.is_stop for c in self._kept) >= count,
-                timeout_s)
+                lambda: sum(at > moment and move for at, move in self._kept) >= count, timeout_s)
 
     def seconds_to_stop(self, moment):
         """
@@ -174,23 +170,29 @@ class Commands:
         """
         with self._changed:
             kept = list(self._kept)
-        moves = [index for index, command in enumerate(kept) if not command.is_stop]
-        rest = kept[moves[-1] + 1 if moves else 0:]
-        return max(0.0, rest[0].at - moment) if rest else float('inf')
+        last = max((index for index, (_, move) in enumerate(kept) if move), default=-1)
+        return max(0.0, kept[last + 1][0] - moment) if kept[last + 1:] else float('inf')
+
+    def assert_still(self, moment):
+        """Raise AssertionError if a move came after a moment."""
+        moves = self.moves(moment)
+        assert not moves, f'{len(moves)} moves, the last {moves[-1] - moment:.1f} s too late'
 
     def assert_stopped(self, moment, limit_s=STOP_S):
         """Raise AssertionError unless a stop came within a limit, and no move after that."""
-        late = [command.at - moment for command in self.moves(moment + limit_s)]
-        assert not late, f'a move was sent after {max(late):.1f} s'
+        self.assert_still(moment + limit_s)
         seconds = self.seconds_to_stop(moment)
         assert seconds <= limit_s, f'the stop came after {seconds:.2f} s'
-        return seconds
 
     def _put(self, message):
         linear = message.twist.linear
+        move = any((linear.x, linear.y, linear.z))
         with self._changed:
-            self._kept.append(Command(time.monotonic(), (linear.x, linear.y, linear.z)))
+            self._kept.append((time.monotonic(), move))
             self._changed.notify_all()
+        if move and self.refusing:
+            self._refused.publish(CommandRefused(
+                header=message.header, message='protective stop; release it on the pendant'))
 
 
 class Rig:
@@ -206,7 +208,7 @@ class Rig:
         self.node = self.client.node
         self._reaching = None
         self.joints = Newest(self.node, JointState, 'joint_states', STREAM)
-        self.commands = Commands(self.node)
+        self.arm = Arm(self.node)
         self.alive = {name: Liveness(self.node, name) for name in NODE_MODULES}
 
     def __enter__(self):
@@ -233,30 +235,29 @@ class Rig:
         if sim is not None:
             wanted['sim_node'] = SIM_MODES[sim]
         wanted = {name: own | (parameters or {}).get(name, {}) for name, own in wanted.items()}
-        for name, attacked in list(self.processes.items()):
-            if name not in wanted or attacked.parameters != wanted[name] or not attacked.alive:
+        for name, process in list(self.processes.items()):
+            if name not in wanted or process.parameters != wanted[name] or not process.alive:
                 self.remove(name)
         new = [self.start(name, **parameters) for name, parameters in wanted.items()
                if name not in self.processes]
-        for attacked in new:
-            attacked.wait_for('ready')
+        for process in new:
+            process.wait_for('ready')
         if new:
             for name in wanted.keys() & {*READY, PLANNER}:
                 self.client.wait_until_ready(name, timeout_s=CALL_S)
             if 'predictor_node' in wanted:
                 self.expect_prediction(CALL_S)
             time.sleep(0.5)  # what has no name to wait for: its subscriptions
-        elif self._reaching is not None and 'visual_mpc_node' in wanted:
+        elif self._reaching is not None and PLANNER in wanted:
             with suppress(TapError):  # it may have ended, or looked dead on a busy machine
                 self.finish(self._reaching)
             time.sleep(1.0)
-        self._reaching = None
-        self.commands.forget()
+        self._reaching, self.arm.refusing = None, False
+        self.arm.forget()
 
-    def start(self, name, arguments=(), **parameters):
-        """Start a node without waiting; return the Attacked."""
-        self.processes[name] = Attacked(
-            name, self.folder / f'{name}.log', parameters, arguments).start()
+    def start(self, name, **parameters):
+        """Start a node without waiting; return the NodeProcess."""
+        self.processes[name] = NodeProcess(name, self.folder / f'{name}.log', parameters)
         return self.processes[name]
 
     def restart(self, name):
@@ -266,14 +267,12 @@ class Rig:
 
     def remove(self, name):
         """End a node, politely first."""
-        attacked = self.processes.pop(name)
-        if attacked.alive:
-            attacked.end()
+        self.processes.pop(name).end(signal.SIGINT, 10.0)
 
     def check(self):
-        """Raise TapError when a node has ended."""
-        for attacked in self.processes.values():
-            attacked.check()
+        """Raise AssertionError when a node has ended."""
+        for process in self.processes.values():
+            process.check()
 
     @contextmanager
     def world(self, rate_hz=10.0):
@@ -301,7 +300,7 @@ class Rig:
         """Send a goal, and wait until the arm moves."""
         begin = time.monotonic()
         reaching = self.begin(**fields)
-        if not self.commands.wait_for_moves(begin, moves):
+        if not self.arm.wait_for_moves(begin, moves):
             end = self.finish(reaching)
             raise TapError(f'nothing moved within {MOVING_S:g} s; the goal {end}')
         return reaching

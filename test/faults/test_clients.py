@@ -8,7 +8,7 @@ import time
 
 from experiments.bench.nodes.service import compare_latency, measure_load, streaming
 from fault_report import fault
-from fault_world import predict_fields
+from fault_rig import predict_fields
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image

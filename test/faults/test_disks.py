@@ -134,7 +134,7 @@ def test_disk_full_recorder(trials, rig, tmp_path):
                     time.sleep(0.1)
                 fill(disk / 'rest')
                 with pytest.raises(TapError, match='refused'):
-                    rig.client.start_recording()
+                    rig.client.record()
             assert node.alive, f'it ended: {node.last_line()}'
             assert node.end(), 'exit code 0 though the recording is not whole'
             assert 'Traceback' not in node.text, 'a traceback'

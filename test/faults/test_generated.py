@@ -15,7 +15,7 @@ from tap_msgs.action import ReachGoal
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
 from tap_ros.nodes import heartbeat
-from tap_ros.nodes.clients import call, cancel_goal, in_executor, wait_for_future
+from tap_ros.nodes.calls import call, cancel_goal, in_executor, wait_for_future
 from tap_ros.nodes.topics import LATCHED
 
 pytestmark = pytest.mark.ros

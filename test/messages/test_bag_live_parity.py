@@ -34,7 +34,7 @@ from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import GRIPPER_JOINTS, ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.images.crop import Crop, TrainedCrop
-from tap_ros.nodes.clients import Spinner
+from tap_ros.nodes.calls import Spinner
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.predictor.requests import RequestReader
 from tap_ros.nodes.ros_messages import encode_image, encode_mask, encode_objects

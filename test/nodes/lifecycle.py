@@ -7,7 +7,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from tap_ros.nodes.clients import call
+from tap_ros.nodes.calls import call
 
 
 class Lifecycle:

@@ -11,7 +11,7 @@ from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
 from lifecycle import Lifecycle
 import numpy as np
-from processes import Client, LocalNode, NodeProcess, until
+from processes import Client, LocalNode, Newest, NodeProcess, until
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
@@ -24,7 +24,7 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal, ResetScene
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call, Newest, send_goal, wait_for_result
+from tap_ros.nodes.calls import call, send_goal, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.topics import LATCHED, STREAM

@@ -13,7 +13,7 @@ from sensor_msgs.msg import JointState
 from sim_bridge.simulator import Simulator
 from tap_msgs.action import ReachGoal
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import send_goal, wait_for_result
+from tap_ros.nodes.calls import send_goal, wait_for_result
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.topics import STREAM, to_stamp
 from tap_ros.robots.ur10e import UR10E

@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 import tap_ros
-from tap_ros.nodes.clients import CallError
+from tap_ros.nodes.calls import CallError
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import DEFAULT_PREDICTOR
 
@@ -47,15 +47,15 @@ def test_it_does_with_the_nodes_what_the_classes_do(loop):
         assert client.goal(goal.stamp_ns).pixels[0] == pytest.approx((u + 1, v), abs=0.5)
         with pytest.raises(CallError, match=r'/predict_subgoal refused: .*start_objects'):
             client.predict(start.image, goal.image, start.pixels + 1000, goal.pixels)
-        client.stop_recording()
-        client.start_recording()
+        client.record(False)
+        client.record()
 
 
 def test_it_names_who_is_silent():
     with tap_ros.Client('/nobody', timeout_s=0.5) as client:
         for ask, silent in (
                 (client.predict, '/nobody/predict_subgoal: nobody offers it'),
-                (client.reach, 'visual_mpc_node'), (client.start_recording, 'recorder_node'),
+                (client.reach, 'visual_mpc_node'), (client.record, 'recorder_node'),
                 (client.reset, '/nobody/camera/image_raw'), (client.goal, '/nobody/goal/image'),
                 (lambda: client.wait_until_ready('sim_node', timeout_s=0.2), 'sim_node')):
             with pytest.raises(CallError, match=silent):

@@ -7,10 +7,9 @@ from threading import Thread
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
-from processes import LocalNode
+from processes import LocalNode, Newest
 import pytest
 from sensor_msgs.msg import JointState
-from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.diagnostics import Diagnostics, Record
 from tap_ros.nodes.recorder.node import RecorderNode
 from tap_ros.nodes.topics import STREAM

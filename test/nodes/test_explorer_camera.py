@@ -8,11 +8,10 @@ import json
 import time
 
 import numpy as np
-from processes import Client, NodeProcess, page_address, until
+from processes import Client, Newest, NodeProcess, page_address, until
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
-from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from websockets.sync.client import connect

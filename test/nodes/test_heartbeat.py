@@ -7,13 +7,13 @@ import signal
 import threading
 import time
 
-from processes import Client, NodeProcess, until
+from processes import Client, Newest, NodeProcess, until
 import pytest
 from rclpy.node import Node
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call, CallError, in_executor, Newest
+from tap_ros.nodes.calls import call, CallError, in_executor
 from tap_ros.nodes.heartbeat import Liveness, QOS
 from tap_ros.nodes.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
 

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from loop import SEED
 from mcap.reader import make_reader
 import numpy as np
-from processes import LocalNode, until
+from processes import LocalNode, Newest, until
 import pytest
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
@@ -21,7 +21,7 @@ from tap_ros.images.drawing import OBJECT_COLOURS
 from tap_ros.messages.images import decode_image, decode_map
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call, Newest, send_goal
+from tap_ros.nodes.calls import call, send_goal
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.planner.plan_view import CHOSEN
 from tap_ros.nodes.predictor.node import OVERLAY_SCALE, PredictorNode

@@ -8,7 +8,7 @@ from lifecycle import Lifecycle
 from lifecycle_msgs.msg import State, Transition
 from lively import lively_network
 import numpy as np
-from processes import Client, LocalNode, NodeProcess, until
+from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
@@ -16,7 +16,7 @@ from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.messages.images import decode_image
-from tap_ros.nodes.clients import call, Newest, wait_for_future
+from tap_ros.nodes.calls import call, wait_for_future
 from tap_ros.nodes.predictor.node import main, PredictorNode
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp

@@ -11,13 +11,14 @@ from lifecycle import Lifecycle
 from lively import lively_network
 from loop import acts_like, planned, SEED
 import numpy as np
+from processes import Newest
 import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.srv import ResetScene
-from tap_ros.nodes.clients import call, CallError, cancel_goal, Newest, send_goal
+from tap_ros.nodes.calls import call, CallError, cancel_goal, send_goal
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.training.weights import save_weights, stored_digest

@@ -19,7 +19,7 @@ from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 from tap_ros.errors import TapError
-from tap_ros.nodes.clients import call
+from tap_ros.nodes.calls import call
 from tap_ros.nodes.recorder.node import RecorderNode
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp

@@ -5,7 +5,7 @@
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 import numpy as np
-from processes import LocalNode, NodeProcess
+from processes import LocalNode, Newest, NodeProcess
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
@@ -14,7 +14,6 @@ from tap_ros.errors import ImageError, TapError
 from tap_ros.messages.images import decode_camera_info, decode_mask
 from tap_ros.messages.joints import decode_gripper
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import Newest
 from tap_ros.nodes.robot_mask.node import RobotMaskNode
 from tap_ros.nodes.ros_messages import encode_camera_info
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp

@@ -11,7 +11,7 @@ from tap_msgs.msg import ObjectState, ObjectStates
 from tap_msgs.srv import SetGoal
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call
+from tap_ros.nodes.calls import call
 from tap_ros.recording.reader import iter_episodes
 
 pytestmark = pytest.mark.slow

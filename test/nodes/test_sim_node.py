@@ -4,7 +4,7 @@
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
-from processes import Client, LocalNode, NodeProcess, until
+from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -21,7 +21,7 @@ from tap_ros.errors import TapError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import decode_gripper
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import call, Newest
+from tap_ros.nodes.calls import call
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 
 PERIOD_NS = 250_000_000

@@ -9,7 +9,7 @@ import threading
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import TwistStamped, Vector3
 import numpy as np
-from processes import Client, NodeProcess
+from processes import Client, Newest, NodeProcess
 import pytest
 from rclpy.action import ActionClient
 from sensor_msgs.msg import Image, JointState
@@ -20,14 +20,7 @@ from tap_msgs.srv import ResetScene, StepScene
 from tap_ros.contract import CONTROL_PERIOD
 from tap_ros.messages.joints import decode_gripper
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import (
-    call,
-    cancel_goal,
-    Newest,
-    send_goal,
-    wait_for_future,
-    wait_for_result,
-)
+from tap_ros.nodes.calls import call, cancel_goal, send_goal, wait_for_future, wait_for_result
 from tap_ros.nodes.topics import STREAM
 
 srv = pytest.importorskip('simulation_interfaces.srv', reason='no simulation_interfaces here')

@@ -24,8 +24,8 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_msgs.srv import PredictSubgoal
+from tap_ros.nodes.calls import call, CallError
 from tap_ros.nodes.client import Client, request_fields
-from tap_ros.nodes.clients import call, CallError
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.topics import SERVICE_QOS, STREAM, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor

@@ -31,13 +31,13 @@ from tap_ros.contract import step_budget
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import Client, positions_of, View
-from tap_ros.nodes.clients import CallError
-from tap_ros.nodes.demo.film import write_film
 from tap_ros.nodes.demo.report import (
     results_table,
     Run,
     SceneRuns,
+    write_film,
     write_overview,
     write_report,
 )
@@ -253,19 +253,17 @@ def _facts() -> dict[str, str]:
 
 def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
     """Run the scenes of one task with nodes of its own, or with those that run already."""
-    nodes = ['sim_node', 'predictor_node']
-    nodes += [] if get_task(task).gripping else ['visual_mpc_node']
     with NodeProcesses(folder / 'logs' / task) as processes, Client() as client:
         watch, world = Watch(client.node), {'look': args.look, 'arm': args.arm}
         if args.attach:
             print(f'{task}: waiting for the nodes that run already', flush=True)
+            client.wait_until_ready('sim_node', 'predictor_node', *(
+                [] if get_task(task).gripping else ['visual_mpc_node']))
         else:
             print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
                   flush=True)
             start_nodes(processes, folder, task, world)
-        for name in nodes:
-            client.wait_until_ready(name, check=processes.check)
-            print(f'  {name} is ready', flush=True)
+            processes.wait_until_ready()
         scenes = []
         for i in range(args.scenes):
             print(f'  scene {args.seed + i} ({i + 1} of {args.scenes})', flush=True)

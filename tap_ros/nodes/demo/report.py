@@ -1,25 +1,36 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""One self-contained HTML page about a few scenes and the subgoals predicted for them."""
+"""What the demo leaves of its scenes: a table, a self-contained HTML page, a film, a picture."""
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-import html
 import io
 from itertools import groupby
 from pathlib import Path
 from types import MappingProxyType
 
+import cv2
+from jinja2 import Environment
 from matplotlib.figure import Figure
 import numpy as np
 from PIL import Image
 from tap_ros.files import write_atomically
-from tap_ros.images.drawing import enlarge, film_strip, grid, overlay, png_bytes
+from tap_ros.images.drawing import (
+    enlarge,
+    film_strip,
+    grid,
+    OBJECT_COLOURS,
+    overlay,
+    png_bytes,
+)
 
 SCALE = 4
-FRAME_MS, HOLD_MS = 120, 2000  # of a film: of each frame, and of the last one
-FILM_QUALITY = 70  # 0 to 100
+SMALL = 128  # pixels, side of goal and subgoal, one above the other on the left of the film
+GAP, HEAD = 8, 24  # pixels between panels of the film, and above them for the names
+HEIGHT = 2 * SMALL + HEAD  # of a run's picture beside both
+FRAME_MS, HOLD_MS = 100, 1800  # of a film: of each frame, and of the end of a scene
+QUALITY = 70  # of films, 0 to 100
 MODE_NAMES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
 MODE_COLOURS = {'direct': '#648fff', 'subgoal': '#dc267f'}
 
@@ -34,11 +45,6 @@ class Run:
     planning_ms: float  # median time of one plan
     side: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 from the side, if there are any
     plans: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 of what the planner considered
-
-    @property
-    def pictures(self) -> Sequence[np.ndarray]:
-        """Those from the side, or where there are none the camera's."""
-        return self.side if len(self.side) else self.frames
 
 
 @dataclass(frozen=True)
@@ -57,56 +63,31 @@ class SceneRuns:
     side_goal_pixels: np.ndarray | None = None  # (K, 2) in pictures from the side
     expert: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 from the side of its own attempt
 
-    @property
-    def name(self) -> str:
-        """Task and seed."""
-        return f'{self.task} {self.seed}'
+
+def final_distances(scenes: Sequence[SceneRuns]) -> Iterator[tuple[str, np.ndarray]]:
+    """
+    Yield how far from their goals the objects ended, of each scene and as the mean of a task.
+
+    :param scenes: SceneRuns with the same modes, those of a task together.
+    :return: iterator of a label, and cm, mean over the objects: nothing done, then each mode.
+    """
+    for task, group in groupby(scenes, lambda scene: scene.task):
+        kept = []
+        for scene in group:
+            ends = [run.distances[-1].mean() for run in scene.runs.values()]
+            start = next(iter(scene.runs.values())).distances[0].mean()
+            kept.append(100 * np.array([start, *ends]))
+            yield f'{scene.task} {scene.seed}', kept[-1]
+        yield f'{task}, mean of {len(kept)}', np.mean(kept, 0)
 
 
 def results_table(scenes: Sequence[SceneRuns]) -> str:
-    """
-    Say in plain text how far from their goals the objects ended.
-
-    :param scenes: list of SceneRuns with the same modes, those of a task together.
-    :return: lines of text; distances in cm, mean over the objects.
-    """
-    modes, rows = list(scenes[0].runs), list[str]()
-    for task, group in groupby(scenes, lambda scene: scene.task):
-        distances = []
-        for scene in group:
-            distances.append([scene.runs[modes[0]].distances[0].mean(),
-                              *(scene.runs[m].distances[-1].mean() for m in modes)])
-            rows.append(_row(scene.name, distances[-1]))
-        rows.append(_row(f'{task}, mean of {len(distances)}', np.mean(distances, 0)))
-    head = f'{"final mean distance, cm":<26}{"do nothing":>12}' + ''.join(
-        f'{m:>12}' for m in modes)
-    rule = '-' * len(head)
-    return '\n'.join([head, rule, *rows])
-
-
-def _row(label: str, distances: Iterable[float]) -> str:
-    return f'{label:<26}' + ''.join(f'{100 * d:>12.1f}' for d in distances)
-
-
-def _html_table(scenes: Sequence[SceneRuns]) -> str:
-    """Return the same as results_table as HTML."""
-    modes, rows = list(scenes[0].runs), list[str]()
-
-    def row(label: str, distances: Iterable[float], kind: str = '') -> None:
-        cells = ''.join(f'<td>{100 * d:.1f}</td>' for d in distances)
-        rows.append(f'<tr class="{kind}"><th scope="row">{html.escape(label)}</th>{cells}</tr>')
-
-    for task, group in groupby(scenes, lambda scene: scene.task):
-        kept = list(group)
-        distances = [[scene.runs[modes[0]].distances[0].mean(),
-                      *(scene.runs[mode].distances[-1].mean() for mode in modes)]
-                     for scene in kept]
-        for scene, found in zip(kept, distances):
-            row(scene.name, found)
-        row(f'{task}, mean of {len(kept)}', np.mean(distances, 0), 'mean')
-    head = ''.join(f'<th scope="col">{html.escape(text)}</th>' for text in (
-        'final mean distance, cm', 'nothing done', *(MODE_NAMES[mode] for mode in modes)))
-    return f'<table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
+    """Return final_distances as lines of text."""
+    head = f'{"final mean distance, cm":<26}' + ''.join(
+        f'{name:>12}' for name in ('do nothing', *scenes[0].runs))
+    return '\n'.join([head, '-' * len(head), *(
+        f'{label:<26}' + ''.join(f'{d:>12.1f}' for d in distances)
+        for label, distances in final_distances(scenes))])
 
 
 def write_report(path: str | Path, scenes: Sequence[SceneRuns], note: str = '',
@@ -119,119 +100,120 @@ def write_report(path: str | Path, scenes: Sequence[SceneRuns], note: str = '',
     :param note: a sentence on how the numbers were made.
     :param facts: what made the page: name and value, such as date, commit and command.
     """
-    made = ''.join(f'<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>'
-                   for name, value in facts.items())
-    body = ''.join(_scene_section(scene) for scene in scenes)
+    template = Path(__file__).with_name('report.html').read_text()
     pushed = [scene for scene in scenes if scene.runs]
-    table = _html_table(pushed) if pushed else ''
-    page = f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<title>tap_ros: demo</title>
-<style>
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 1120px; margin: 2rem auto;
-  padding: 0 1rem; color: #222; background: #fff; }}
-h1 {{ font-size: 1.5rem; }} h2 {{ font-size: 1.15rem; margin: 2.2rem 0 .6rem; }}
-figure {{ display: inline-block; margin: 0 .8rem .8rem 0; vertical-align: top; }}
-figcaption {{ font-size: .85rem; color: #555; max-width: 16rem; }}
-img {{ image-rendering: pixelated; display: block; max-width: 100%; }}
-img.smooth {{ image-rendering: auto; }}
-table {{ border-collapse: collapse; font-variant-numeric: tabular-nums; }}
-th, td {{ padding: .25rem .9rem; text-align: right; }} th:first-child {{ text-align: left; }}
-thead th {{ border-bottom: 2px solid #222; }} tbody th {{ font-weight: normal; }}
-tr.mean > * {{ font-weight: bold; border-bottom: 1px solid #ccc; }}
-dl {{ display: grid; grid-template-columns: max-content 1fr; gap: .1rem 1rem; font-size: .85rem;
-  color: #555; }} dd {{ margin: 0; overflow-wrap: anywhere; }}
-</style>
-<h1>Predicted subgoals, and objects pushed to a goal picture via them</h1>
-<p>The subgoal is what <code>/predict_subgoal</code> returned: a picture of a moment on the way,
-with a probability map of where every object should then be. Where objects are pushed, each scene
-was pushed twice: directly, and via the subgoal. Where a gripper is needed nothing was planned; the
-film shows the expert whose recordings the predictor learned from.</p>
-{table}
-<p>{html.escape(note)}</p>
-<dl>{made}</dl>
-{body}</html>
-"""
-    write_atomically(path, page)
+    write_atomically(path, Environment(autoescape=True).from_string(template).render(
+        rows=list(final_distances(pushed)),
+        modes=[MODE_NAMES[mode] for mode in pushed[0].runs] if pushed else (),
+        note=note, facts=facts, scenes=[
+            (f'{scene.task} {scene.seed}', list(_figures(scene))) for scene in scenes]))
 
 
 def write_overview(path: str | Path, scenes: Sequence[SceneRuns]) -> None:
-    """
-    Write one picture: a row for each scene with start, goal, subgoal and its object maps.
+    """Write a PNG: a row for each scene with start, goal, subgoal and its object maps."""
+    write_atomically(path, png_bytes(grid(
+        [[picture for _, picture in _prediction(scene)] for scene in scenes])))
 
-    :param path: of the PNG file.
-    :param scenes: list of SceneRuns.
+
+def write_film(path: str | Path, scenes: Sequence[SceneRuns]) -> None:
     """
-    rows = [[picture for _, picture in _prediction(scene)] for scene in scenes]
-    write_atomically(path, png_bytes(grid(rows)))
+    Write the scenes one after the other: direct beside via the subgoal, seen from the side.
+
+    :param path: of the WebP file.
+    :param scenes: list of SceneRuns with the same modes; crosses mark where objects should end.
+    """
+    pictures, times = [], list[int]()
+    for scene in scenes:
+        left = np.concatenate([
+            _panel(scene.goal, SMALL, 'goal', scene.goal_pixels),
+            _panel(scene.subgoal, SMALL, 'predicted subgoal', ())])
+        views = {mode: run.side if len(run.side) else run.frames
+                 for mode, run in scene.runs.items()}
+        length = max(map(len, views.values()))
+        for t in range(length):
+            panels = [left]
+            for mode, run in scene.runs.items():
+                distances, picture = (values[min(t, len(values) - 1)]
+                                      for values in (run.distances, views[mode]))
+                goals = scene.side_goal_pixels if len(run.side) else scene.goal_pixels
+                panels += [np.full((len(left), GAP, 3), 255, np.uint8), _panel(
+                    picture, HEIGHT, f'{MODE_NAMES[mode]}: {100 * distances.mean():.1f} cm',
+                    () if goals is None else goals)]
+            pictures.append(np.concatenate(panels, axis=1))
+        times += [FRAME_MS] * (length - 1) + [HOLD_MS]
+    write_atomically(path, _film(pictures, times))
+
+
+def _panel(picture: np.ndarray, height: int, name: str,
+           goals: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
+    """Return a picture of a height under its name, with crosses at goals (u, v)."""
+    scale = height / len(picture)
+    picture = cv2.resize(picture, (round(scale * picture.shape[1]), height),
+                         interpolation=cv2.INTER_NEAREST)
+    for k, (u, v) in enumerate((np.asarray(goals).reshape(-1, 2) + 0.5) * scale):
+        cv2.drawMarker(picture, (int(u), int(v)), OBJECT_COLOURS[k % len(OBJECT_COLOURS)],
+                       cv2.MARKER_TILTED_CROSS, 10, 2, cv2.LINE_AA)
+    head = np.full((HEAD, picture.shape[1], 3), 255, np.uint8)
+    cv2.putText(head, name, (0, HEAD - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (34, 34, 34), 1,
+                cv2.LINE_AA)
+    return np.concatenate([head, picture])
+
+
+def _film(pictures: Sequence[np.ndarray], times: Sequence[int] = ()) -> bytes:
+    """Return an animated WebP of pictures and ms that begins anew for ever."""
+    first, *others = (Image.fromarray(picture) for picture in pictures)
+    buffer = io.BytesIO()
+    first.save(buffer, 'webp', save_all=True, append_images=others, quality=QUALITY, loop=0,
+               duration=list(times) or [FRAME_MS] * len(others) + [HOLD_MS])
+    return buffer.getvalue()
 
 
 def _prediction(scene: SceneRuns) -> list[tuple[str, np.ndarray]]:
     """Return (caption, picture) of start, goal, subgoal and object maps."""
-    k = len(scene.object_maps)
     maps = overlay(
         scene.start // 3, scene.object_maps, SCALE, scene.start_pixels, scene.goal_pixels)
     return [
         ('start', enlarge(scene.start, SCALE)), ('goal', enlarge(scene.goal, SCALE)),
         ('predicted subgoal', enlarge(scene.subgoal, SCALE)),
-        (f'its object maps: {k} colours; circles mark the starts, crosses the goals', maps)]
+        (f'its object maps: {len(scene.object_maps)} colours; circles mark the starts, crosses '
+         'the goals', maps)]
 
 
-def _scene_section(scene: SceneRuns) -> str:
-    """Return the HTML of one scene."""
-    pictures = _prediction(scene)
+def _figures(scene: SceneRuns) -> Iterator[tuple[str, str]]:
+    """Yield (caption, data URI) of all that the page shows of a scene."""
+    films = [('the expert, seen from the side', scene.expert)]
     for mode, run in scene.runs.items():
-        final = 100 * run.distances[-1].mean()
-        pictures.append((
-            f'end, {MODE_NAMES[mode]}: {final:.1f} cm. {run.message}',
-            enlarge(run.frames[-1], SCALE)))
-    figures = ''.join(
-        _figure(f'{MODE_NAMES[mode]}, seen from the side', _film(run.side), 'smooth', 'webp')
-        for mode, run in scene.runs.items() if len(run.side))
-    figures += ''.join(
-        _figure(f'{MODE_NAMES[mode]}: ways that the planner considered; bold: the chosen one; '
-                'crosses: where it pushes to', _film(run.plans), 'smooth', 'webp')
-        for mode, run in scene.runs.items() if len(run.plans))
-    if len(scene.expert):
-        figures += _figure('the expert, seen from the side', _film(scene.expert), 'smooth', 'webp')
-    figures += ''.join(_figure(caption, png_bytes(image)) for caption, image in pictures)
-    strips = ''.join(
-        _figure(f'{MODE_NAMES[mode]}: frames 0 to {len(run.frames) - 1}, median planning time '
-                f'{run.planning_ms:.0f} ms', png_bytes(grid([film_strip(run.frames)], scale=2)))
-        for mode, run in scene.runs.items())
-    plot = _figure('error over time', _error_plot(scene), 'smooth') if scene.runs else ''
-    return f'<h2>{html.escape(scene.name)}</h2>{figures}{plot}{strips}'
+        films += [(f'{MODE_NAMES[mode]}, seen from the side', run.side),
+                  (f'{MODE_NAMES[mode]}: ways that the planner considered; bold: the chosen one; '
+                   'crosses: where it pushes to', run.plans)]
+    for caption, pictures in films:
+        if len(pictures):
+            yield caption, _uri('webp', _film(pictures))
+    for caption, picture in _prediction(scene):
+        yield caption, _uri('png', png_bytes(picture))
+    for mode, run in scene.runs.items():
+        yield (f'{MODE_NAMES[mode]}: {100 * run.distances[-1].mean():.1f} cm after '
+               f'{len(run.frames) - 1} steps, median planning time {run.planning_ms:.0f} ms. '
+               f'{run.message}', _uri('png', png_bytes(grid([film_strip(run.frames)], scale=2))))
+    if scene.runs:
+        yield 'error over time', _uri('svg+xml', _error_plot(scene))
 
 
-def _film(pictures: Sequence[np.ndarray]) -> bytes:
-    """Return an animated WebP that begins anew after it has stood still for a while."""
-    first, *others = (Image.fromarray(picture) for picture in pictures)
-    buffer = io.BytesIO()
-    times = [FRAME_MS] * len(others) + [HOLD_MS]
-    first.save(buffer, 'webp', save_all=True, append_images=others, duration=times, loop=0,
-               quality=FILM_QUALITY)
-    return buffer.getvalue()
-
-
-def _figure(caption: str, picture: bytes, kind: str = '', form: str = 'png') -> str:
-    data = base64.b64encode(picture).decode()
-    return (f'<figure><img class="{kind}" alt="{html.escape(caption)}" '
-            f'src="data:image/{form};base64,{data}"><figcaption>{html.escape(caption)}'
-            '</figcaption></figure>')
+def _uri(kind: str, data: bytes) -> str:
+    return f'data:image/{kind};base64,{base64.b64encode(data).decode()}'
 
 
 def _error_plot(scene: SceneRuns) -> bytes:
-    """Plot the mean distance of the objects to their goals over time; return PNG bytes."""
-    figure = Figure(figsize=(5.2, 2.6), dpi=100, layout='constrained')
+    """Plot the distances of the objects to their goals over time; return SVG bytes."""
+    figure = Figure(figsize=(5.2, 2.6), layout='constrained')
     axes = figure.subplots()
     for mode, run in scene.runs.items():
         colour = MODE_COLOURS[mode]
         axes.plot(100 * run.distances.mean(1), color=colour, label=MODE_NAMES[mode], lw=2)
         axes.plot(100 * run.distances, color=colour, lw=0.7, alpha=0.6)
     axes.plot([], color='#555', lw=0.7, label='thin: each object; thick: their mean')
-    axes.axhline(20, color='#999', ls=':', label='do nothing')
     axes.set(xlabel='step', ylabel='distance to the goal, cm', ylim=(0, None))
     axes.legend(fontsize=8)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format='png')
+    figure.savefig(buffer, format='svg')
     return buffer.getvalue()

@@ -7,13 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 import json
 import threading
 import time
-import traceback
 from typing import Any, TYPE_CHECKING
 
 from tap_ros.errors import TapError
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import Client, Reaching
-from tap_ros.nodes.clients import CallError
+from tap_ros.nodes.services import internal_error, log_error
 from tap_ros.text import escaped
+from tap_ros.weights import PREDICTORS
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -38,8 +39,8 @@ def _whole(low: int, high: int) -> tuple[str, Callable[[Any], bool]]:
             lambda value: type(value) is int and low <= value <= high)
 
 
-_TEXT = (f'a text of at most {MAX_NAME} characters',
-         lambda value: isinstance(value, str) and len(value) <= MAX_NAME)
+_TEXT = (f'a text of at most {MAX_NAME} characters that print', lambda value: (
+    isinstance(value, str) and len(value) <= MAX_NAME and value.isprintable()))
 _PIXEL = ('a number', lambda value: type(value) in (int, float) and abs(value) < LARGEST)
 _SEED = _whole(0, 2**62)
 _NUMBERS = {
@@ -86,14 +87,14 @@ class ExplorerCalls:
 
     :param node: rclpy Node that another thread spins.
     :param told: called with a text for people when something has happened; any thread.
-    :param failed: likewise, when something could not be done.
+    :param failed: likewise, when something could not be done; and whether by a fault of ours.
     :param answered: called with a PredictSubgoal.Response, a success.
     :param photographed: called without arguments; takes the camera's picture as the goal.
     :ivar stage: what the goal in progress is doing, '' without one.
     """
 
     def __init__(self, node: 'Node', told: Callable[[str], object],
-                 failed: Callable[[str], object],
+                 failed: Callable[[str, bool], object],
                  answered: 'Callable[[PredictSubgoal.Response], object]',
                  photographed: Callable[[], object]) -> None:
         self._node, self._told, self._failed = node, told, failed
@@ -105,7 +106,6 @@ class ExplorerCalls:
         self._running = self._cancelled = self._ending = False
         self.stage = ''
         self._pool = ThreadPoolExecutor(4, 'explorer')
-        self._stopper = ThreadPoolExecutor(1, 'explorer cancel')  # nothing may wait before it
 
     @property
     def running(self) -> bool:
@@ -128,8 +128,8 @@ class ExplorerCalls:
                 if not self._running:
                     raise CommandError('there is no goal to cancel')
                 self._cancelled = True  # also one that is about to begin
-                if self._goal is not None:
-                    self._stopper.submit(self._send_cancel, self._goal)
+                if self._goal is not None and self._node.executor is not None:
+                    self._node.executor.create_task(self._goal.handle.cancel_goal_async)
                 return
             if self._waiting >= WAITING:
                 raise CommandError('busy: earlier commands wait for their answers; try again')
@@ -150,7 +150,6 @@ class ExplorerCalls:
         while self._running and executor is not None and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)  # nobody else does any more
         self._pool.shutdown(wait=False, cancel_futures=True)
-        self._stopper.shutdown(wait=False, cancel_futures=True)
 
     # In the threads of the pool
 
@@ -158,12 +157,12 @@ class ExplorerCalls:
         try:
             getattr(self, f'_{do}')(**fields)
         except TapError as error:
-            self._failed(escaped(error, 1000))
+            self._failed(escaped(error, 1000), False)
         except Exception as error:
             if self._ending:  # the node is being taken down
                 return
-            self._node.get_logger().error(traceback.format_exc())
-            self._failed(f'internal error: {type(error).__name__}: {escaped(error)}')
+            log_error(self._node, do, error)
+            self._failed(internal_error(error), True)
         finally:
             with self._lock:
                 self._waiting -= 1
@@ -173,6 +172,13 @@ class ExplorerCalls:
     def _reset(self, task: str, seed: int) -> None:
         response = self._client.call('reset', give_up=self._is_ending, task=task, seed=seed)
         self._told(f'reset: {escaped(response.message)}')
+        if task in PREDICTORS and self._client.is_ready('predict'):
+            weights = self._client.weights()
+            if weights not in PREDICTORS:
+                self._told(f'the predictor keeps {escaped(weights)}, which may not know {task}')
+            elif weights != task and not weights.startswith(f'{task}_'):
+                self._client.use_weights(task)
+                self._told(f'the predictor has the weights of {task} now')
 
     def _move(self, name: str, u: float, v: float) -> None:
         self._client.set_goal({name: (u, v)})
@@ -192,28 +198,19 @@ class ExplorerCalls:
     def _reach(self, mode: str, samples: int, levels: int, seed: int) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self.stage = f'{words}: waiting for the planner'
-        if self._is_cancelled():
+        if self._cancelled:
             raise CallError(f'{words}: cancelled before it began')
         goal = self._client.reach(
             mode=mode, num_samples=samples, recursion_depth=levels, seed=seed,
             on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
         with self._lock:
             self._goal = goal
-        if self._is_cancelled():  # meanwhile
+        if self._cancelled:  # meanwhile
             goal.cancel()
         self._told(f'{words}: begun')
         result = goal.result()
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
         self._told(f'{words}: {end} ({result.steps} steps)')
-
-    def _send_cancel(self, goal: Reaching) -> None:
-        try:
-            goal.cancel()
-        except CallError as error:
-            self._failed(f'cancel: {escaped(error)}')
-
-    def _is_cancelled(self) -> bool:
-        return self._cancelled
 
     def _is_ending(self) -> bool:
         return self._ending

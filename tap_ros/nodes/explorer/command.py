@@ -3,21 +3,16 @@
 """The command `python -m tap_ros explore`: all nodes, and a page in the browser to try them."""
 
 from dataclasses import dataclass
-from pathlib import Path
-import re
 import time
 from typing import Annotated
 
 from sim_bridge.tasks.tasks import task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
-from tap_ros.errors import ConfigError, TapError
+from tap_ros.errors import ConfigError
 from tap_ros.nodes.demo.command import new_folder
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.options import Folder, one_of
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
-
-_READY_S = 120.0
-_LOOK_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -63,21 +58,8 @@ def run(args: Options) -> None:
         token = {'token': args.token} if args.token else {}
         processes.start('explorer_node', host=args.host, port=args.port, **token)
         print(f'starting nodes; their logs are in {folder}', flush=True)
-        for name in ('sim_node', 'predictor_node', 'visual_mpc_node', 'explorer_node'):
-            found = _wait_until_ready(processes, folder / f'{name}.log')
-        print(f'open {found} in a browser; Ctrl-C ends all nodes', flush=True)
+        print(f'open {processes.wait_until_ready()} in a browser; Ctrl-C ends all nodes',
+              flush=True)
         while True:
-            time.sleep(_LOOK_S)
+            time.sleep(0.2)
             processes.check()
-
-
-def _wait_until_ready(processes: NodeProcesses, log: Path) -> str:
-    """Wait until a node says that it is ready; return the address in what it says, if any."""
-    deadline = time.monotonic() + _READY_S
-    while time.monotonic() < deadline:
-        processes.check()
-        found = re.search(r'ready: (?:open (\S+))?', log.read_text(errors='replace'))
-        if found:
-            return found[1] or ''
-        time.sleep(_LOOK_S)
-    raise TapError(f'{log}: the node is not ready after {_READY_S:g} s')

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A page for browsers: see camera, goal, subgoal and plan, and try them."""
 
-from collections import deque, OrderedDict
+from collections import deque
 from collections.abc import Mapping
 import json
 import math
@@ -24,18 +24,18 @@ from tap_ros.images.drawing import grid, overlay, png_bytes
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.messages.subgoals import decode_subgoal, decode_subgoals
-from tap_ros.nodes.clients import CallError
+from tap_ros.messages.subgoals import decode_subgoal
+from tap_ros.nodes.calls import CallError
+from tap_ros.nodes.client import positions_of, subgoals_of
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.explorer.board import Board
 from tap_ros.nodes.explorer.calls import ExplorerCalls
-from tap_ros.nodes.explorer.distances import Distances
 from tap_ros.nodes.explorer.server import ExplorerServer
-from tap_ros.nodes.observations import reception_time
+from tap_ros.nodes.observations import Observations, reception_time
 from tap_ros.nodes.parameters import declare_transport, Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
 from tap_ros.nodes.topics import camera_image, LATCHED, STREAM
+from tap_ros.planning.mpc_config import PLANNING_TASKS
 from tap_ros.plugins import names
 from tap_ros.text import escaped
 
@@ -45,10 +45,12 @@ LARGEST = 640  # px; larger pictures are made smaller for the page
 LOSSLESS = 256  # px; larger ones are sent as JPEG
 STALE = 3  # of diagnostic_msgs/DiagnosticStatus
 LOG_LINES = 50
-RECENT = 10  # pictures and lists of objects that are kept; a picture of 1080p has 6 MB
 FORGOTTEN_S = 60.0  # after which a node that is silent is shown no more
-KEPT = ('camera', 'objects', 'goal', 'goal_objects')  # whose age /diagnostics tells
+PICTURES = ('camera', 'goal', 'subgoal', 'plan')
 COLUMNS, MAX_SHOWN = 4, 12  # subgoals of one answer in the page
+HISTORY_S, POINTS = 600.0, 300  # of distances: what is kept, and how many of them are shown
+
+Place = tuple[float, ...]  # x, y, z in m, u, v in pixels
 
 
 class ExplorerNode(Node):
@@ -64,10 +66,8 @@ class ExplorerNode(Node):
         self.params = declare_parameters(self)
         self._lock = threading.Lock()
         self._newest: dict[str, tuple[Any, float]] = {}  # kind -> message, when it came
-        # The last pictures and objects by their stamps, for a photograph.
-        self._recent: dict[str, OrderedDict[int, tuple[Any, float]]] = {
-            'camera': OrderedDict(), 'objects': OrderedDict()}
-        self._changed: set[str] = set()  # kinds of pictures that are to be encoded
+        self._moments = Observations('camera', 'objects')  # the last ones, for a photograph
+        self._changed: set[str] = set()  # kinds whose newest message was not shown yet
         self._sizes: dict[str, tuple[int, int]] = {}  # (width, height) before it is made smaller
         self._distances = Distances()
         self._diagnostics: dict[str, tuple[int, str, float]] = {}  # level, text, when it came
@@ -76,26 +76,25 @@ class ExplorerNode(Node):
         self._task, self._note = '', ''
         self._problem: dict[str, Any] = {'count': 0, 'text': ''}
         self._sheet_stamp: Any = None  # of the picture whose subgoals are shown side by side
+        self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
         self._goal_publishers: Any = None
-        self._board = Board()
         self._calls = ExplorerCalls(
             self, self._tell, self._complain, self._on_answer, self._photograph)
+        self._server = ExplorerServer(
+            self._calls.do, self.params['host'], self.params['port'], self.params['token'])
         kind, topic = camera_image(self.params)
         self._service = Diagnostics(self, {topic: SILENT_S, 'objects': SILENT_S,
                                            'goal/image': math.inf, 'goal/objects': math.inf})
         self._heard = [
             self._hear(kind, topic, 'camera', STREAM),
             self._hear(Image, 'goal/image', 'goal', LATCHED),
-            self._hear(Subgoal, 'subgoal', 'subgoal', LATCHED),
+            self._hear(Subgoal, 'subgoal', 'subgoal', LATCHED, counted=False),
             self._hear(ObjectStates, 'objects', 'objects', STREAM),
             self._hear(ObjectStates, 'goal/objects', 'goal_objects', LATCHED),
             AdaptiveSubscription(self, Episode, 'episode', self._on_episode, STREAM),
             AdaptiveSubscription(
                 self, DiagnosticArray, '/diagnostics', self._on_diagnostics, STREAM)]
         self._plan: AdaptiveSubscription | None = None  # drawn only while somebody listens
-        self._server = ExplorerServer(
-            self._board, self._calls.do, self.params['host'], self.params['port'],
-            self.params['token'])
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, self._show, clock=clock)
         self.create_timer(ADAPT_PERIOD, self._look_after, clock=clock)
@@ -108,27 +107,42 @@ class ExplorerNode(Node):
 
     # What comes
 
-    def _hear(self, kind: type, topic: str, name: str, qos: Any) -> AdaptiveSubscription:
+    def _hear(self, kind: type, topic: str, name: str, qos: Any,
+              counted: bool = True) -> AdaptiveSubscription:
         """Keep the newest message of a topic."""
         def keep(message: Any, info: Mapping[str, Any]) -> None:
+            if counted:
+                self._service.received(topic)
             with self._lock:
+                before, _ = self._newest.get(name, (None, 0.0))
+                if name == 'goal' and before not in (None, message):
+                    self._forget_plans()
+                if name in ('subgoal', 'plan') and self._is_old(message):
+                    return
                 self._newest[name] = message, reception_time(info)
                 self._changed.add(name)
-                if name in self._recent:
-                    recent = self._recent[name]
-                    recent[to_nanoseconds(message.header.stamp)] = self._newest[name]
-                    if len(recent) > RECENT:
-                        recent.popitem(last=False)
-            if name in KEPT:
-                self._service.received(topic)
+            if name in ('camera', 'objects'):
+                self._moments.put(name, message, reception_time(info))
         return AdaptiveSubscription(self, kind, topic, keep, qos)
+
+    def _forget_plans(self) -> None:
+        """Show no more what was predicted and planned for another goal."""
+        for kind in ('subgoal', 'plan'):
+            self._newest.pop(kind, None)
+            self._changed.discard(kind)
+            self._server.put(kind, b'')
+        self._note = ''
+
+    def _is_old(self, message: Any) -> bool:
+        """Tell whether what was made of a picture belongs to an old scene; stamp 0: of a file."""
+        return 0 < to_nanoseconds(message.header.stamp) < self._scene_ns
 
     def _look_after(self) -> None:
         for heard in self._heard:
             heard.adapt()
-        if self._board.watched and self._plan is None:
-            self._plan = self._hear(Image, 'plan/overlay', 'plan', STREAM)
-        elif not self._board.watched and self._plan is not None:
+        if self._server.browsers and self._plan is None:
+            self._plan = self._hear(Image, 'plan/overlay', 'plan', STREAM, counted=False)
+        elif not self._server.browsers and self._plan is not None:
             self.destroy_subscription(self._plan.subscription)
             self._plan = None
 
@@ -136,12 +150,15 @@ class ExplorerNode(Node):
         if message.event == Episode.START:
             self._task = escaped(message.task, 40)
             self._distances.clear()
+            with self._lock:
+                if self._calls.offered('reset'):  # stamps are the simulator's
+                    self._scene_ns = to_nanoseconds(message.header.stamp)
+                self._forget_plans()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         now = time.monotonic()
-        for name in [name for name, (*_, came) in self._diagnostics.items()
-                     if now - came > FORGOTTEN_S]:
-            del self._diagnostics[name]
+        self._diagnostics = {name: found for name, found in self._diagnostics.items()
+                             if now - found[-1] < FORGOTTEN_S}
         for status in message.status:
             name = escaped(status.name, 100)
             if name in self._diagnostics or len(self._diagnostics) < 200:
@@ -149,20 +166,18 @@ class ExplorerNode(Node):
 
     def _on_answer(self, response: PredictSubgoal.Response) -> None:
         """Show all subgoals of an answer side by side; runs in a thread of the calls."""
-        first = response.subgoals[0]
-        names = tuple(first.object_names)
-        subgoals = decode_subgoals(
-            response, names, (first.image.height, first.image.width))[:MAX_SHOWN]
+        if self._is_old(response.subgoals[0]):
+            return
+        subgoals = subgoals_of(response)
         self._sheet_stamp = None
         if len(subgoals) > 1:
-            panels = [overlay(one.image, one.object_maps) for one in subgoals]
-            panels += [np.full_like(panels[0], 255)] * (-len(panels) % min(COLUMNS, len(panels)))
+            panels = [overlay(one.image, one.object_maps) for one in subgoals[:MAX_SHOWN]]
             width = min(COLUMNS, len(panels))
+            panels += [np.full_like(panels[0], 255)] * (-len(panels) % width)
             sheet = grid([panels[i:i + width] for i in range(0, len(panels), width)])
-            self._sheet_stamp = first.header.stamp
-            self._board.put('subgoal', png_bytes(sheet))
-        self._note = (f'{len(response.subgoals)} subgoals'
-                      if len(response.subgoals) > 1 else '')
+            self._sheet_stamp = response.subgoals[0].header.stamp
+            self._server.put('subgoal', png_bytes(sheet))
+        self._note = f'{len(subgoals)} subgoals' if len(subgoals) > 1 else ''
 
     def _photograph(self) -> None:
         """
@@ -172,21 +187,16 @@ class ExplorerNode(Node):
         """
         if self._calls.offered('reset'):
             raise CallError('photograph: the simulator takes its goal pictures itself')
-        with self._lock:
-            pictures, objects = (dict(self._recent[name]) for name in ('camera', 'objects'))
-            told = {'objects', 'goal_objects'} & set(self._newest)
-        fresh = [stamp for stamp, (_, came) in pictures.items()
-                 if time.monotonic() - came < SILENT_S]
-        if not fresh:
-            raise CallError('photograph: the camera is silent; no picture to take')
+        since = time.monotonic() - SILENT_S
+        told = {'objects', 'goal_objects'} & set(self._newest)
         # Objects of another moment would be taken for the goal.
-        both = [stamp for stamp in fresh if stamp in objects]
-        if told and not both:
+        found = self._moments.newest('camera', *['objects'] if told else [], since=since)
+        if found is None:
             raise CallError("photograph: no objects have the stamp of one of the camera's newest "
-                            'pictures; publish them with it')
-        stamp = (both or fresh)[-1]
-        picture = pictures[stamp][0]
-        if not isinstance(picture, Image):
+                            'pictures; publish them with it' if self._moments.newest(
+                                'camera', since=since) else
+                            'photograph: the camera is silent; no picture to take')
+        if not isinstance(found['camera'], Image):
             raise CallError('photograph: a goal picture is sensor_msgs/Image; start with '
                             'image_transport:=raw')
         if self._goal_publishers is None:
@@ -194,9 +204,9 @@ class ExplorerNode(Node):
                 self.create_publisher(ObjectStates, 'goal/objects', LATCHED),
                 self.create_publisher(Image, 'goal/image', LATCHED))
         to_objects, to_image = self._goal_publishers
-        if both:
-            to_objects.publish(objects[stamp][0])
-        to_image.publish(picture)
+        if told:
+            to_objects.publish(found['objects'])
+        to_image.publish(found['camera'])
 
     # What is shown
 
@@ -206,21 +216,21 @@ class ExplorerNode(Node):
             self._log.append(text)
             self._log_count += 1
 
-    def _complain(self, text: str) -> None:
-        """Say to all browsers what could not be done."""
+    def _complain(self, text: str, ours: bool) -> None:
+        """Say to all browsers what could not be done, and to /diagnostics what we did wrong."""
         self._tell(text)
-        self._service.error(text)
+        if ours:
+            self._service.error(text)
         with self._lock:
             self._problem = {'count': self._problem['count'] + 1, 'text': text}
 
     def _show(self) -> None:
-        """Bring the board up to date."""
+        """Bring what browsers see up to date."""
         # Before the log: how a run ended is told first, so that who sees no run sees how it ended.
-        running = self._calls.running
+        running, watched = self._calls.running, self._server.browsers
         with self._lock:
             newest = dict(self._newest)
-            changed = self._changed if self._board.watched else self._changed - {
-                'camera', 'goal', 'subgoal', 'plan'}
+            changed = self._changed if watched else self._changed - {*PICTURES}
             self._changed = self._changed - changed
             log, log_count, problem = list(self._log), self._log_count, self._problem
         objects, goals = (self._decode(newest, name) for name in ('objects', 'goal_objects'))
@@ -229,9 +239,9 @@ class ExplorerNode(Node):
         if 'objects' in changed and objects and goals:
             stamp = to_nanoseconds(newest['objects'][0].header.stamp)
             self._distances.add(stamp / 1e9, objects, goals)
-        if not self._board.watched:
+        if not watched:
             return
-        for kind in ('camera', 'goal', 'subgoal', 'plan'):
+        for kind in PICTURES:
             # The first subgoal of an answer comes by topic, too.
             if kind in changed and not (
                     kind == 'subgoal' and newest[kind][0].header.stamp == self._sheet_stamp):
@@ -239,18 +249,17 @@ class ExplorerNode(Node):
                     self._show_picture(kind, _picture_of(newest[kind][0], kind))
                 except TapError as error:
                     self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
-        now = time.monotonic()
-        ages = {kind: now - came for kind, (_, came) in newest.items()}
-        self._board.put('state', json.dumps({
+        now, simulator = time.monotonic(), self._calls.offered('reset')
+        self._server.put('state', json.dumps({
             'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
-            'simulator': self._calls.offered('reset'),
+            'simulator': simulator,
+            'plans': not (simulator and self._task) or self._task in PLANNING_TASKS,
             'movable': self._calls.offered('set_goal') and bool(goals) and not running,
             'camera': {**self._size('camera'), 'objects': _listed(objects),
                        'targets': _listed({n: goals[n] for n in objects if n in goals}),
-                       'note': _silence(ages.get('camera'))},
+                       'note': _silence(now, newest.get('camera'))},
             'goal': {**self._size('goal'), 'objects': _listed(goals),
-                     'note': '' if 'goal' in ages else 'none yet',
-                     'hint': 'The goal of the planner.'},
+                     'note': '' if 'goal' in newest else 'none yet'},
             'subgoal_note': self._note, 'problem': problem,
             'run': {'running': running, 'stage': self._calls.stage if running else '',
                     'text': self._calls.stage or 'starting' if running else 'idle'},
@@ -259,22 +268,20 @@ class ExplorerNode(Node):
                  'message': 'silent' if now - came > SILENT_S + 1 else text}
                 for name, (level, text, came) in sorted(self._diagnostics.items())],
             'log': log, 'log_count': log_count}))
-        self._board.put('history', json.dumps({'kind': 'history', **self._distances.shown()}))
+        self._server.put('history', json.dumps({'kind': 'history', **self._distances.shown()}))
 
-    def _decode(self, newest: Mapping[str, tuple[Any, float]],
-                name: str) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
-        """Return objects by name: ((x, y, z), (u, v)); empty where they cannot be used."""
+    def _decode(self, newest: Mapping[str, tuple[Any, float]], name: str) -> dict[str, Place]:
+        """Return the places of objects by name; empty where they cannot be used."""
         if name not in newest:
             return {}
         message = newest[name][0]
         try:
-            names, pixels = decode_objects(message, name)
+            found, pixels = decode_objects(message, name)
         except TapError as error:
             self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
             return {}
-        places = [one.pose.position for one in message.objects]
-        return {each: ((place.x, place.y, place.z), tuple(pixel.tolist()))
-                for each, place, pixel in zip(names, places, pixels)}
+        return {each: (*position, *pixel) for each, position, pixel in zip(
+            found, positions_of(message).tolist(), pixels.tolist())}
 
     def _show_picture(self, kind: str, image: np.ndarray) -> None:
         height, width = image.shape[:2]
@@ -285,20 +292,65 @@ class ExplorerNode(Node):
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         if kind == 'subgoal':
             self._note = ''
-        if max(width, height) <= LOSSLESS or kind == 'plan':
-            self._board.put(kind, png_bytes(image))
-        else:
-            self._board.put(kind, cv2.imencode('.jpg', image[..., ::-1])[1].tobytes())
+        lossless = max(width, height) <= LOSSLESS or kind == 'plan'
+        self._server.put(kind, png_bytes(image) if lossless else cv2.imencode(
+            '.jpg', image[..., ::-1])[1].tobytes())
 
     def _size(self, kind: str) -> dict[str, int]:
         width, height = self._sizes.get(kind, (0, 0))
         return {'width': width, 'height': height}
 
 
-def _listed(objects: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
-            ) -> list[dict[str, Any]]:
+class Distances:
+    """Distances from objects to their goals over time; a new goal or scene begins anew."""
+
+    def __init__(self) -> None:
+        self._of: tuple[tuple[str, ...], str] = (), ''  # names, unit
+        self._points: deque[tuple[float, tuple[float, ...]]] = deque()
+
+    def clear(self) -> None:
+        """Forget what was."""
+        self._points.clear()
+
+    def add(self, time: float, objects: Mapping[str, Place], goals: Mapping[str, Place]) -> None:
+        """
+        Note where objects are; in centimetres where all their poses are known, else in pixels.
+
+        :param time: s; one that is before the newest begins anew.
+        :param objects: places by name; NaN where unknown.
+        :param goals: likewise; objects without one are left out.
+        """
+        names = tuple(name for name in objects if name in goals)
+        metres = all(math.isfinite(x) for name in names for side in (objects, goals)
+                     for x in side[name][:3])
+        unit, part, factor = ('cm', slice(3), 100.0) if metres else ('px', slice(3, 5), 1.0)
+        if (names, unit) != self._of or (self._points and time < self._points[-1][0]):
+            self.clear()
+        self._of = names, unit
+        values = tuple(factor * math.dist(objects[name][part], goals[name][part])
+                       for name in names)
+        if not names or not all(map(math.isfinite, values)):
+            return
+        if self._points and self._points[-1][0] == time:
+            self._points.pop()
+        self._points.append((time, values))
+        while self._points[0][0] < time - HISTORY_S:
+            self._points.popleft()
+
+    def shown(self) -> dict[str, Any]:
+        """Return unit, names, times (s) and values (a list for each name) of POINTS moments."""
+        points = list(self._points)
+        points = points[::-1][::max(1, math.ceil(len(points) / POINTS))][::-1]  # with the newest
+        names, unit = self._of
+        return {'unit': unit if points else '', 'names': list(names),
+                'times': [round(time, 2) for time, _ in points],
+                'values': [[round(values[k], 2) for _, values in points]
+                           for k in range(len(names))]}
+
+
+def _listed(objects: Mapping[str, Place]) -> list[dict[str, Any]]:
     return [{'name': name, 'u': round(u, 2), 'v': round(v, 2)}
-            for name, (_, (u, v)) in objects.items()]
+            for name, (*_, u, v) in objects.items()]
 
 
 def _picture_of(message: Any, kind: str) -> np.ndarray:
@@ -310,10 +362,11 @@ def _picture_of(message: Any, kind: str) -> np.ndarray:
     return overlay(one.image, one.object_maps)
 
 
-def _silence(age: float | None) -> str:
+def _silence(now: float, newest: tuple[Any, float] | None) -> str:
     """Say since when a topic is silent, in steps that do not change with every look."""
-    if age is None:
+    if newest is None:
         return 'nothing has come yet'
+    age = now - newest[1]
     return f'silent for {age:.0f} s' if age > SILENT_S else ''
 
 

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, quote, urlsplit
 
 from tap_ros.errors import ConfigError, TapError
-from tap_ros.nodes.explorer.board import Board
 from tap_ros.text import escaped
 from websockets.asyncio.server import serve
 from websockets.datastructures import Headers
@@ -45,30 +44,34 @@ _START_S, _END_S = 10.0, 5.0
 
 class ExplorerServer:
     """
-    Shows a Board to browsers and takes their commands.
+    Shows browsers the newest of each kind of content, and takes their commands.
 
-    :param board: Board.
+    Nothing is queued: who is slow misses what was replaced meanwhile, and gets the newest.
+
     :param on_command: called with the text of each command, in the server's thread: it must not
         block. A TapError that it raises is told to the browser that asked.
     :param host: address to listen at.
     :param port: to listen at; 0: any that is free.
     :param token: that browsers must know; '' where host is of this machine alone: none is needed,
         else one is made up.
+    :ivar browsers: how many are connected.
     :raises ConfigError: when the address cannot be used; the message says why.
     """
 
-    def __init__(self, board: Board, on_command: Callable[[str | bytes], object],
-                 host: str = '127.0.0.1', port: int = 8000, token: str = '') -> None:
+    def __init__(self, on_command: Callable[[str | bytes], object], host: str = '127.0.0.1',
+                 port: int = 8000, token: str = '') -> None:
         if not host:
             raise ConfigError('parameter host: is empty; name an address, such as 127.0.0.1')
-        self._board, self._on_command, self._host = board, on_command, host
+        self._on_command, self._host = on_command, host
         self._token = token or ('' if is_loopback(host) else secrets.token_urlsafe(16))
+        self._contents: dict[str, tuple[int, str | bytes]] = {}  # kind -> (number, content)
+        self._count = 0  # of changes
+        self._changed: set[asyncio.Event] = set()  # one for each browser
         self._loop = asyncio.new_event_loop()
         self._ended = asyncio.Event()
         self._started = threading.Event()
         self._error: Exception | None = None
-        self._browsers = 0
-        self.port = port
+        self.port, self.browsers = port, 0
         self._thread = threading.Thread(target=self._run, name='explorer', daemon=True)
         self._thread.start()
         if not self._started.wait(_START_S) or self._error:
@@ -83,10 +86,10 @@ class ExplorerServer:
         return f'http://{host}:{self.port}/' + (
             f'?token={quote(self._token, safe="")}' if self._token else '')
 
-    @property
-    def browsers(self) -> int:
-        """How many are connected."""
-        return self._browsers
+    def put(self, kind: str, content: str | bytes) -> None:
+        """Replace the content of a kind; an equal one changes nothing. From any thread."""
+        with contextlib.suppress(RuntimeError):  # the server has ended
+            self._loop.call_soon_threadsafe(self._put, kind, content)
 
     def close(self) -> None:
         """Say goodbye to all browsers and free the port."""
@@ -117,18 +120,28 @@ class ExplorerServer:
             self._started.set()
             await self._ended.wait()
 
+    def _put(self, kind: str, content: str | bytes) -> None:
+        if self._contents.get(kind, (0, None))[1] != content:
+            self._count += 1
+            self._contents[kind] = self._count, content
+            for changed in self._changed:
+                changed.set()
+
     def _answer(self, _: 'ServerConnection', request: 'Request') -> Response | None:
         """Answer a request that is not to become a WebSocket; None lets it become one."""
-        url = urlsplit(request.path)
-        if not self._is_own(request):
+        try:
+            url = urlsplit(request.path)
+            own, known = self._is_own(request), self._knows_token(url.query)
+        except ValueError:  # an address or a header that is none
+            return _page(HTTPStatus.BAD_REQUEST, 'This address cannot be read.')
+        if not own:
             return _page(HTTPStatus.FORBIDDEN, 'This page may not be used from there.')
         # The page asks for its own files without the token, in which there is nothing to hide.
-        if url.path in ('/', SOCKET) and self._token and not secrets.compare_digest(
-                ''.join(parse_qs(url.query).get('token', [])).encode(), self._token.encode()):
+        if url.path in ('/', SOCKET) and not known:
             return _page(HTTPStatus.UNAUTHORIZED, 'A token is needed: open the address that '
                                                   'explorer_node printed when it started.')
         if url.path == SOCKET:
-            if self._browsers >= MAX_BROWSERS:
+            if self.browsers >= MAX_BROWSERS:
                 return _page(HTTPStatus.SERVICE_UNAVAILABLE, 'Too many browsers are connected.')
             return None
         if url.path not in _PAGE:
@@ -144,46 +157,44 @@ class ExplorerServer:
         if any(urlsplit(origin).netloc != host for origin in origins):
             return False  # another page
         # Else a name of another machine could be made to lead here.
-        return bool(self._token) or is_loopback(urlsplit(f'//{host}').hostname or '')
+        return is_loopback(urlsplit(f'//{host}').hostname or '') or bool(self._token)
+
+    def _knows_token(self, query: str) -> bool:
+        token = ''.join(parse_qs(query).get('token', []))
+        return not self._token or secrets.compare_digest(token.encode(), self._token.encode())
 
     async def _converse(self, browser: 'ServerConnection') -> None:
         """Send what changes and take commands until the browser goes."""
-        self._browsers += 1
+        self.browsers += 1
         changed = asyncio.Event()
-
-        def tell() -> None:
-            with contextlib.suppress(RuntimeError):  # the server has ended meanwhile
-                self._loop.call_soon_threadsafe(changed.set)
-
-        self._board.watch(tell)
+        self._changed.add(changed)
         sender = asyncio.create_task(self._send(browser, changed))
         try:
             async for text in browser:
                 try:
                     self._on_command(text)
                 except TapError as error:
-                    await browser.send(message('error', str(error)))
+                    await browser.send(json.dumps({'kind': 'error', 'text': str(error)}))
         except ConnectionClosed:
             pass
         finally:
-            self._board.leave(tell)
-            self._browsers -= 1
+            self._changed.remove(changed)
+            self.browsers -= 1
             sender.cancel()
 
     async def _send(self, browser: 'ServerConnection', changed: asyncio.Event) -> None:
-        """Send the newest of each kind; waits for a slow browser, and then skips what is old."""
-        number = 0
-        try:
+        """Send the newest of each kind, the oldest change first, to a browser that may be slow."""
+        sent = 0
+        with contextlib.suppress(ConnectionClosed):
             while True:
                 changed.clear()
-                number, contents = self._board.since(number)
-                for kind, content in contents.items():
-                    if isinstance(content, bytes):
-                        content = kind.encode() + b'\0' + content
-                    await browser.send(content)
+                new = sorted((number, kind, content) for kind, (number, content)
+                             in self._contents.items() if number > sent)
+                sent = self._count
+                for _, kind, content in new:
+                    await browser.send(content if isinstance(content, str)
+                                       else kind.encode() + b'\0' + content)
                 await changed.wait()
-        except ConnectionClosed:
-            pass
 
 
 def is_loopback(host: str) -> bool:
@@ -194,11 +205,6 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-def message(kind: str, text: str) -> str:
-    """Return a message of text for browsers."""
-    return json.dumps({'kind': kind, 'text': text})
 
 
 def _page(status: HTTPStatus, body: str | bytes, kind: str = 'text/plain') -> Response:

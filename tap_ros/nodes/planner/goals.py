@@ -14,7 +14,7 @@ from tap_ros.errors import PlanningError
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
-from tap_ros.nodes.clients import call
+from tap_ros.nodes.calls import call
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs

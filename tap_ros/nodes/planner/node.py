@@ -23,7 +23,7 @@ from tap_ros.errors import PlanningError, TapError
 from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
-from tap_ros.nodes.clients import CallError
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.planner.arm import ArmCommander

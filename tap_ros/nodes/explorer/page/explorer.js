@@ -9,6 +9,7 @@ const NEAR = 0.08;  // share of the picture's width within which a press takes a
 
 const $ = (id) => document.getElementById(id);
 const pictures = {};  // kind -> ImageBitmap
+const numbers = {};  // kind -> how many have come
 let state = null;
 let socket = null;
 let drag = null;  // {name, u, v} while an object is dragged
@@ -54,20 +55,23 @@ function take(message) {
 async function takePicture(bytes) {
   const end = bytes.indexOf(0);
   const kind = new TextDecoder().decode(bytes.subarray(0, end));
-  const bitmap = await createImageBitmap(new Blob([bytes.subarray(end + 1)]));
+  const content = bytes.subarray(end + 1);  // empty: there is none any more
+  const number = numbers[kind] = (numbers[kind] ?? 0) + 1;
+  const bitmap = content.length ? await createImageBitmap(new Blob([content])) : null;
+  if (number !== numbers[kind]) return;  // a newer one was decoded sooner
   if (pictures[kind]) pictures[kind].close();
   pictures[kind] = bitmap;
+  if (!bitmap) $(kind).getContext('2d').reset();
   draw(kind);
 }
 
 function send(command) {
-  $('error').hidden = true;
+  $('error').textContent = '';
   if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(command));
 }
 
 function complain(text) {
   $('error').textContent = text;
-  $('error').hidden = false;
   moved = null;
   drawGoal();
 }
@@ -80,7 +84,7 @@ function show(id, text, mark = '') {
 function enable(connected) {
   const running = !connected || state.run.running;
   for (const id of ['predict', 'photograph']) $(id).disabled = !connected;
-  for (const id of ['direct', 'subgoal-run']) $(id).disabled = running;
+  for (const id of ['direct', 'subgoal-run']) $(id).disabled = running || !state.plans;
   $('scene').querySelector('button').disabled = running || !state.simulator;
   $('cancel').disabled = !connected || !state.run.running;
 }
@@ -96,7 +100,10 @@ function showState() {
   $('photograph').hidden = state.simulator;
   $('goal').classList.toggle('fixed', !state.movable);
   $('goal-hint').textContent = state.movable
-    ? 'Drag an object to where it should be.' : run.running ? '' : goal.hint;
+    ? 'Drag an object to where it should be.' : 'The goal of the planner.';
+  $('plan-hint').textContent = state.plans
+    ? 'Ways of the fingertips that the planner considered; bold: the chosen one.'
+    : `Nothing plans how to grasp: for ${state.task} subgoals are predicted only.`;
   if (state.tasks.join() !== [...$('task').options].map((o) => o.value).join()) {
     $('task').replaceChildren(...state.tasks.map((task) => new Option(task, task)));
     $('task').value = '';
@@ -317,7 +324,7 @@ function niceStep(least) {
 
 // Buttons
 
-const numbers = () => ({
+const choices = () => ({
   samples: Number($('samples').value), levels: Number($('levels').value), seed: 0});
 
 for (const id of ['samples', 'levels']) {
@@ -329,9 +336,9 @@ $('scene').addEventListener('submit', (event) => {
   event.preventDefault();
   send({do: 'reset', task: $('task').value, seed: Math.max(0, Math.round(Number($('seed').value)))});
 });
-$('predict').addEventListener('click', () => send({do: 'predict', ...numbers()}));
-$('direct').addEventListener('click', () => send({do: 'reach', mode: 'direct', ...numbers()}));
-$('subgoal-run').addEventListener('click', () => send({do: 'reach', mode: 'subgoal', ...numbers()}));
+$('predict').addEventListener('click', () => send({do: 'predict', ...choices()}));
+$('direct').addEventListener('click', () => send({do: 'reach', mode: 'direct', ...choices()}));
+$('subgoal-run').addEventListener('click', () => send({do: 'reach', mode: 'subgoal', ...choices()}));
 $('cancel').addEventListener('click', () => send({do: 'cancel'}));
 $('photograph').addEventListener('click', () => send({do: 'photograph'}));
 

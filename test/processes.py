@@ -16,10 +16,10 @@ from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from tap_ros.contract import NODE_MODULES
-from tap_ros.nodes.clients import Spinner
+from tap_ros.nodes.calls import CallError, Spinner
 from tap_ros.nodes.heartbeat import Heartbeat
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 
 
 def until(accept, seconds=30.0, pause=0.02):
@@ -30,51 +30,92 @@ def until(accept, seconds=30.0, pause=0.02):
     return found
 
 
+def _hear_signals():
+    """Take back what nohup and background jobs of a shell ignore."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 class NodeProcess:
     """
     One node in a process group of its own.
 
     :param name: of the node, one of NODE_MODULES.
-    :param log: file for what it prints.
+    :param log: file for what it prints; a new start adds to it.
     :param parameters: its ROS parameters.
     :param remaps: further arguments after --ros-args.
     """
 
     def __init__(self, name, log, parameters=None, remaps=()):
-        self.log = Path(log)
-        arguments = [f'-p {name}:={value}' for name, value in (parameters or {}).items()]
-        command = [sys.executable, '-m', NODE_MODULES[name], '--ros-args',
-                   *' '.join([*arguments, *remaps]).split()]
-        with open(self.log, 'wb') as output:
+        self.name, self.log, self.parameters = name, Path(log), dict(parameters or {})
+        values = {key: str(value).lower() if isinstance(value, bool) else value
+                  for key, value in self.parameters.items()}
+        self._command = [sys.executable, '-m', NODE_MODULES[name], '--ros-args', *' '.join(
+            [*(f'-p {key}:={value}' for key, value in values.items()), *remaps]).split()]
+        self.start()
+
+    def start(self):
+        """Start it, perhaps again, without waiting."""
+        with open(self.log, 'ab') as output:
+            self._from = output.tell()  # where the log of the present process begins
             self.process = subprocess.Popen(
-                command, stdout=output, stderr=subprocess.STDOUT, cwd=ROOT,
-                start_new_session=True)
+                self._command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                cwd=ROOT, start_new_session=True, preexec_fn=_hear_signals)
+        return self
+
+    @property
+    def alive(self):
+        """Whether it runs."""
+        return self.process.poll() is None
 
     @property
     def text(self):
-        """Everything printed so far."""
-        return self.log.read_text(errors='replace')
+        """Everything that the present process has printed."""
+        return self.log.read_bytes()[self._from:].decode(errors='replace')
 
-    def wait_for(self, words, timeout_s=60):
+    def wait_for(self, words, timeout_s=90):
         """Wait until the node prints something."""
         def printed():
-            assert words in self.text or self.process.poll() is None, self.text
+            assert words in self.text or self.alive, self.text
             return words in self.text
 
         assert until(printed, timeout_s), f'no {words!r} in time:\n{self.text}'
         return self
 
-    def end(self, number=signal.SIGTERM, timeout_s=20):
-        """Send a signal and return the exit code."""
-        if self.process.poll() is None:
+    def check(self):
+        """Raise AssertionError when it has ended."""
+        assert self.alive, f'{self.name} ended with {self.process.returncode}: {self.last_line()}'
+
+    def last_line(self):
+        """Return the last line that it printed."""
+        return (self.text.strip().splitlines() or ['it printed nothing'])[-1]
+
+    def send(self, number):
+        """Send a signal, if it runs."""
+        if self.alive:
             self.process.send_signal(number)
-        return self.process.wait(timeout_s)
+
+    def end(self, number=signal.SIGTERM, timeout_s=20):
+        """Send a signal; return the exit code, None when it had to be killed after a time."""
+        self.send(number)
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return None
 
     def kill(self):
-        """Leave nothing running."""
-        if self.process.poll() is None:
+        """Leave nothing running; return the moment."""
+        moment = time.monotonic()
+        if self.alive:
             os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()
+        return moment
+
+    def memory_mb(self):
+        """Return the memory that it holds (resident set), in MB."""
+        pages = Path(f'/proc/{self.process.pid}/statm').read_text().split()[1]
+        return int(pages) * os.sysconf('SC_PAGE_SIZE') / 1e6
 
 
 class Client:
@@ -94,6 +135,47 @@ class Client:
         self.spinner.__exit__()
         self.node.destroy_node()
         self.context.try_shutdown()
+
+
+class Newest:
+    """
+    Keep the newest message of a topic.
+
+    :param node: rclpy Node that another thread spins.
+    :param message_type: type of the topic.
+    :param topic: its name.
+    :param qos: its QoSProfile.
+    :ivar count: messages received so far.
+    """
+
+    def __init__(self, node, message_type, topic, qos):
+        self._topic = topic
+        self._condition = threading.Condition()
+        self.count = 0
+        self._message = None
+        node.create_subscription(message_type, topic, self._put, qos)
+
+    def wait(self, timeout_s, accept=lambda message: True):
+        """
+        Return the newest message once it is acceptable.
+
+        :param timeout_s: most seconds to wait.
+        :param accept: called with a message; whether it is the one waited for.
+        :return: the message.
+        :raises CallError: when none comes in time.
+        """
+        with self._condition:
+            if self._condition.wait_for(
+                    lambda: self._message is not None and accept(self._message), timeout_s):
+                return self._message
+        got = f'{self.count} messages, none of them as wanted' if self.count else 'no message'
+        raise CallError(f'topic {self._topic}: {got} within {timeout_s:g} s')
+
+    def _put(self, message):
+        with self._condition:
+            self._message = message
+            self.count += 1
+            self._condition.notify_all()
 
 
 class LocalNode:

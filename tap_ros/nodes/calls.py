@@ -1,8 +1,9 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Calls with a time-out, goals, and the newest messages, of a node that another thread spins."""
+"""Calls and goals with a time-out, of a node that another thread spins."""
 
 from collections.abc import Callable
+from concurrent import futures
 import threading
 import time
 from typing import Any, Self, TYPE_CHECKING, TypeVar
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from rclpy.action.client import ClientGoalHandle
     from rclpy.client import Client
     from rclpy.node import Node
-    from rclpy.qos import QoSProfile
     from rclpy.task import Future
     from tap_ros.nodes.heartbeat import Liveness
 
@@ -105,38 +105,22 @@ def in_executor(node: 'Node', function: Callable[[], Found], timeout_s: float) -
     :return: what the function returns; what it raises is raised.
     :raises CallError: when the node is not spun, or its thread is busy for too long.
     """
-    done = threading.Event()
-    outcome: list[tuple[Any, Exception | None]] = []
+    outcome: futures.Future[Found] = futures.Future()
 
     def run() -> None:
         try:
-            outcome.append((function(), None))
+            outcome.set_result(function())
         except Exception as error:  # it would end the executor
-            outcome.append((None, error))
-        done.set()
+            outcome.set_exception(error)
 
     if node.executor is None:
         raise CallError(f'node {node.get_name()} is not spun')
     node.executor.create_task(run)
-    if not done.wait(timeout_s):
+    try:
+        return outcome.result(timeout_s)
+    except futures.TimeoutError as error:
         raise CallError(f'node {node.get_name()}: its callbacks have kept it busy for '
-                        f'{timeout_s:g} s')
-    (found, failed), = outcome
-    if failed is not None:
-        raise failed
-    return found
-
-
-def cancel_goal(handle: 'ClientGoalHandle', timeout_s: float = 1.0) -> 'Future':
-    """
-    Ask for the end of a goal.
-
-    :param handle: goal handle of send_goal.
-    :param timeout_s: most seconds until the request is sent.
-    :return: future of the answer.
-    :raises CallError: as in_executor.
-    """
-    return in_executor(handle._action_client._node, handle.cancel_goal_async, timeout_s)
+                        f'{timeout_s:g} s') from error
 
 
 def wait_for_future(future: 'Future', timeout_s: float) -> bool:
@@ -177,14 +161,16 @@ def send_goal(action_client: 'ActionClient', goal: Any, timeout_s: float,
     return handle
 
 
+def cancel_goal(handle: 'ClientGoalHandle', timeout_s: float = 1.0) -> 'Future':
+    """Ask for the end of a goal, as in_executor; return the future of the answer."""
+    return in_executor(handle._action_client._node, handle.cancel_goal_async, timeout_s)
+
+
 def wait_for_result(handle: 'ClientGoalHandle', timeout_s: float,
                     server: 'Liveness | None' = None) -> tuple[int, Any]:
     """
     Wait for the end of a goal; cancel it when it takes too long.
 
-    :param handle: goal handle of send_goal.
-    :param timeout_s: most seconds to wait.
-    :param server: heartbeat.Liveness of the node that offers it, as in call.
     :return: status, one of the STATUS_ constants of action_msgs/GoalStatus, and the result.
     :raises CallError: when it has not ended in time, or the node that pursues it has.
     """
@@ -202,51 +188,6 @@ def wait_for_result(handle: 'ClientGoalHandle', timeout_s: float,
     if answer.status == GoalStatus.STATUS_UNKNOWN:
         raise CallError('the action server does not know the goal; was it started anew?')
     return answer.status, answer.result
-
-
-class Newest:
-    """
-    Keep the newest message of a topic.
-
-    :param node: rclpy Node that another thread spins.
-    :param message_type: type of the topic.
-    :param topic: its name.
-    :param qos: its QoSProfile.
-    """
-
-    def __init__(self, node: 'Node', message_type: type, topic: str, qos: 'QoSProfile') -> None:
-        self._topic = topic
-        self._condition = threading.Condition()
-        self._count = 0
-        self._message: Any = None
-        node.create_subscription(message_type, topic, self._put, qos)
-
-    @property
-    def count(self) -> int:
-        """Number of messages received so far."""
-        return self._count
-
-    def wait(self, timeout_s: float, accept: Callable[[Any], bool] = lambda message: True) -> Any:
-        """
-        Return the newest message once it is acceptable.
-
-        :param timeout_s: most seconds to wait.
-        :param accept: called with a message; whether it is the one waited for.
-        :return: the message.
-        :raises CallError: when none comes in time.
-        """
-        with self._condition:
-            if self._condition.wait_for(
-                    lambda: self._message is not None and accept(self._message), timeout_s):
-                return self._message
-        got = f'{self._count} messages, none of them as wanted' if self._count else 'no message'
-        raise CallError(f'topic {self._topic}: {got} within {timeout_s:g} s')
-
-    def _put(self, message: Any) -> None:
-        with self._condition:
-            self._message = message
-            self._count += 1
-            self._condition.notify_all()
 
 
 def _named(server: 'Liveness | None') -> str:

@@ -1,0 +1,269 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes that are started wrongly or ended at any moment, forged text, latecomers, an hour."""
+
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+import signal
+import socket
+import time
+
+from fault_files import describe_exit
+from fault_report import fault
+from fault_rig import first_pictures, goal_fields, objects_message, predict_fields
+import numpy as np
+from processes import Client, Newest, NodeProcess, page_address
+import pytest
+from sensor_msgs.msg import Image
+from tap_msgs.msg import Episode, ObjectStates, Subgoal
+from tap_ros.contract import NODE_MODULES
+from tap_ros.errors import TapError
+from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
+from websockets.sync.client import connect
+
+pytestmark = pytest.mark.ros
+
+END_S = 10.0
+JOIN_S = 5.0
+WARM_UP = 0.15  # share of the time that the slope of memory leaves out
+GOALS_PER_HOUR = 500  # about what fits; the share of them is the share of the hour
+MOST_MB_PER_HOUR = 20.0
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+FORGED = 'FORGED LINE'
+NAMES = (f'red\n{FORGED}', f'\x1b[31m{FORGED}\x1b[0m', f'a\r{FORGED}', f'a\x85{FORGED}',
+         f'a\u2028{FORGED}', '\x1b]0;title\x07', f'a\x00\n{FORGED}')
+
+
+@pytest.mark.parametrize('name', ('sim_node', 'predictor_node', 'visual_mpc_node',
+                                  'recorder_node'))
+@fault('a node is started and ended at any moment', f'ends within {END_S:g} s, exit code 0 (or '
+       'by the signal, while Python imports), no traceback', 200,
+       's until it had ended')
+def test_start_stop(trials, tmp_path, name):
+    random = np.random.default_rng(0)
+
+    def node(number):
+        parameters = ({'folder': tmp_path / f'bag{number}'} if name == 'recorder_node' else {})
+        return NodeProcess(name, tmp_path / f'{number}.log', parameters)
+
+    def once(trial, early_s, late_s):
+        """Start and end a node; return it, the signal, and the seconds and code of its end."""
+        process = node(trial)
+        if trial % 2:
+            time.sleep(early_s)
+        else:
+            process.wait_for('ready')
+            time.sleep(late_s)
+        began = '[INFO]' in process.text
+        number = SIGNALS[trial // 2 % len(SIGNALS)]
+        asked = time.monotonic()
+        code = process.end(number, END_S)
+        return process, began, number, time.monotonic() - asked, code
+
+    with ThreadPoolExecutor(2) as pool:
+        begin = time.monotonic()
+        for first in list(pool.map(node, ('usual0', 'usual1'))):
+            first.wait_for('ready').kill()
+        usual_s = time.monotonic() - begin
+        early = 0
+        for process, began, number, seconds, code in pool.map(
+                once, *zip(*[(trial, random.uniform(0, 1.2 * usual_s), random.uniform(0, 0.5))
+                             for trial in trials])):
+            trials.measured(seconds)
+            text = process.text
+            if not began and ', in run_node' not in text and (
+                    code == -number or 'KeyboardInterrupt' in text):
+                early += 1  # before Python has run the first line of the node
+                trials.record()
+                continue
+            with trials.one():
+                assert code is not None, f'did not end within {END_S:g} s of {number.name}'
+                assert 'Traceback' not in text, f'a traceback after {number.name}'
+                assert code == 0, (
+                    f'{describe_exit(code)} after {number.name}: {process.last_line()}')
+    trials.note = f'{early} by the signal'
+
+
+@pytest.mark.parametrize('given', [
+    {'wieghts': 'push2'}, {'weights': 'push2'}, {'image_topic': '/camera/image_raw'}],
+    ids=lambda given: next(iter(given)))
+@fault('parameters that a node does not have, or weights by name, to each node', 'it works with '
+       'them, or one line in the log names the parameter; no traceback', 2 * len(NODE_MODULES))
+def test_parameters(trials, tmp_path, given):
+    (parameter, value), = given.items()
+    for trial in trials:
+        name = list(NODE_MODULES)[trial % len(NODE_MODULES)]
+        own = {'folder': tmp_path / 'bag'} if name == 'recorder_node' else (
+            {'port': 0} if name == 'explorer_node' else {})
+        process = NodeProcess(name, tmp_path / f'{name}.log', own | {parameter: value})
+        with trials.one():
+            deadline = time.monotonic() + 60.0
+            while process.alive and 'ready' not in process.text:
+                assert time.monotonic() < deadline, 'neither ready nor ended'
+                time.sleep(0.1)
+            time.sleep(0.5)
+            assert 'Traceback' not in process.text, f'{name}: a traceback'
+            assert (name, parameter) == ('predictor_node', 'weights') and process.alive or any(
+                parameter in line and ('WARN' in line or 'FATAL' in line or 'ERROR' in line)
+                for line in process.text.splitlines()), f'{name}: {parameter} is not named'
+        process.end(signal.SIGINT)
+
+
+@fault('malformed addresses, headers and commands to the explorer, surrogates in them',
+       'refused (HTTP 4xx, or an error that says what is expected) or closed; the page is served '
+       'and commands are taken after it', 1000)
+def test_explorer_requests(trials, tmp_path):
+    random = np.random.default_rng(0)
+    targets = (b'/', b'/socket', b'//[', b'/?token=%ED%A0%80', b'/socket?token=\xff', b'http://[',
+               b'/%00', b'/\xf0\x9f', b'*', b'/..;/')
+    headers = (b'localhost', b'[', b'[::1', b'\xff', b'evil.example', b'localhost:99999999', b'')
+    texts = ('{"do": "\\ud800"}', '{"do": "reset", "task": "\\udfff", "seed": 1}', '\x00', '[[[',
+             '{"do": "move", "name": "\\ud83d", "u": 1, "v": 1e999}', '{"do": null}')
+    process = NodeProcess('explorer_node', tmp_path / 'explorer.log', {'port': 0})
+    try:
+        url = page_address(process)
+        port = int(url.split(':')[2].strip('/'))
+
+        def status(target, host, origin=b''):
+            lines = [b'GET ' + target + b' HTTP/1.1', b'Host: ' + host]
+            lines += [b'Origin: ' + origin] if origin else []
+            with socket.create_connection(('127.0.0.1', port), 10.0) as connection:
+                connection.sendall(b'\r\n'.join([*lines, b'', b'']))
+                answer = b''.join(iter(lambda: connection.recv(4096), b''))
+            return int(answer.split(None, 2)[1]) if answer else None
+
+        with connect(url.replace('http', 'ws') + 'socket', max_size=2**24) as browser:
+            for trial in trials:
+                with trials.one():
+                    target, host, origin = (
+                        bytes(random.choice(each)) for each in (targets, headers, (
+                            b'', b'http://[', b'null', b'http://[::1', b'\xed\xa0\x80')))
+                    if trial % 2:
+                        target += random.bytes(4).translate(None, b' \r\n\t')
+                    found = status(target, host, origin)
+                    assert found is None or found == 200 or 400 <= found < 500, (
+                        f'{target} of {host}, {origin}: {found}')
+                    browser.send(texts[trial % len(texts)])
+                    while '"kind": "error"' not in str(browser.recv(10.0)):
+                        pass
+                    assert status(b'/', b'localhost') == 200, 'the page is gone'
+    finally:
+        process.end()
+
+
+@fault('newlines and control characters in names', 'logs and answers show them escaped, in one '
+       'line', 28)
+def test_forged_names(rig, trials):
+    nodes = ('visual_mpc_node', 'predictor_node', 'recorder_node')
+    rig.need(*nodes, sim='real')
+    rogue = rig.node.create_publisher(ObjectStates, 'objects', STREAM)
+    episodes = rig.node.create_publisher(Episode, 'episode', STREAM)
+    seen = first_pictures()[0]
+
+    def said_of(call, *args, **options):
+        """Return what a call is answered: an end or an error."""
+        try:
+            return call(*args, **options) or ''
+        except TapError as error:
+            return str(error)
+    try:
+        for trial in trials:
+            name = NAMES[trial % len(NAMES)]
+            objects = objects_message(seen, to_stamp(0), names=(name, name))
+            with trials.one():
+                said = [said_of(rig.reset, 0, name)]
+                for fields in ({'mode': name}, {'start_objects': objects}, {
+                        'start': Image(width=64, height=64, encoding=name, step=192)}):
+                    with pytest.raises(TapError) as refused:
+                        rig.client.call('predict', 10.0, **predict_fields(**fields))
+                    said.append(str(refused.value))
+                rogue.publish(objects)
+                episodes.publish(Episode(event=Episode.START, task=name, outcome=name))
+                said += [said_of(lambda fields=fields: rig.result(
+                    rig.begin(**goal_fields(**fields, timeout_s=15.0))))
+                    for fields in ({'mode': name}, {'goal_pixels': {name: (9, 9)}})]
+                wrong = [node for node, process in rig.processes.items()
+                         if is_forged(process.text)]
+                if wrong:  # what is in a log stays there
+                    for node in list(rig.processes):
+                        rig.remove(node)
+                    rig.need(*nodes, sim='real')
+                assert not wrong, f'a forged line in the log of {", ".join(wrong)}'
+                assert all(text.isprintable() for text in said), 'an answer that does not print'
+                rig.check()
+    finally:
+        rig.node.destroy_publisher(rogue)
+        rig.node.destroy_publisher(episodes)
+
+
+def is_forged(text):
+    """Tell whether a log holds control characters, or a line that a name has made."""
+    return any(line.startswith(FORGED) or not line.isprintable()
+               for line in text.replace('\t', ' ').split('\n'))
+
+
+@fault('subscribers that come late', 'picture, goal picture and subgoal come within '
+       f'{JOIN_S:g} s', 100, 's until all three were there')
+def test_late_joiners(rig, trials):
+    rig.need('predictor_node', sim='lock-step')
+    for trial in trials:
+        if trial % 10 == 0:
+            rig.reset(trial)
+            deadline = time.monotonic() + 10  # what a prediction needs may be on its way
+            while time.monotonic() < deadline:
+                with suppress(TapError):
+                    rig.client.predict()
+                    break
+                time.sleep(0.1)
+        begin = time.monotonic()
+        with trials.one(), Client('late') as node:
+            topics = [Newest(node, Image, 'camera/image_raw', STREAM),
+                      Newest(node, Image, 'goal/image', LATCHED),
+                      Newest(node, Subgoal, 'subgoal', LATCHED)]
+            for newest in topics:
+                newest.wait(JOIN_S)
+            trials.measured(time.monotonic() - begin)
+
+
+@fault('an hour of goals, predictions, resets and recording', 'each goal ends as it should; no '
+       f'node grows by more than {MOST_MB_PER_HOUR:g} MB an hour', GOALS_PER_HOUR,
+       'MB/h by which the node that grows most grows')
+def test_soak(rig, trials, tmp_path):
+    rig.need('visual_mpc_node', 'predictor_node', sim='real')
+    rig.start('recorder_node', folder=tmp_path / 'bag').wait_for('ready')
+    hours = trials.count / GOALS_PER_HOUR
+    begin, goals, kept = time.monotonic(), 0, []
+    while (time.monotonic() - begin) / 3600 < hours:
+        with trials.one():
+            push_once(rig, goals)
+        kept.append([(time.monotonic() - begin) / 3600,
+                     *(process.memory_mb() for process in rig.processes.values())])
+        rig.check()
+        goals += 1
+        for data in (False, True) if goals % 20 == 0 else ():
+            rig.client.record(data)
+    kept = np.array(kept)
+    warm = kept[kept[:, 0] >= WARM_UP * kept[-1, 0]]
+    half = len(warm) // 2
+    if half > 20:  # the median of slopes between samples
+        change = warm[-half:] - warm[:half]
+        slopes = np.median(change[:, 1:] / change[:, :1], axis=0)
+        trials.note = 'MB/h: ' + ', '.join(
+            f'{name} {slope:+.1f}' for name, slope in zip(rig.processes, slopes))
+        trials.measured(slopes.max())
+        if slopes.max() > MOST_MB_PER_HOUR:
+            trials.record(f'memory grows: {trials.note}')
+    rig.remove('recorder_node')
+
+
+def push_once(rig, number):
+    """Reset, predict and push a little; raise AssertionError for what goes wrong."""
+    rig.reset(number)
+    for _ in range(3):
+        rig.expect_prediction(20.0)
+    time.sleep(0.5)  # real time: let the pictures of the new scene come
+    handle = rig.begin(mode=('direct', 'subgoal')[number % 2], step_budget=8)
+    if number % 10 == 9:
+        rig.finish(handle)
+    else:
+        rig.expect_end(handle, 'succeeded')
