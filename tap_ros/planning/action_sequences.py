@@ -110,10 +110,9 @@ class SequenceShape:
 
     def actions(self, parameters: np.ndarray, height: float) -> np.ndarray:
         """
-        Expand parameters.
+        Expand parameters (N, D) to actions (N, HORIZON, 4), float32, gripper closed (0).
 
-        :param parameters: (N, D); height: of the gripper now, m.
-        :return: (N, HORIZON, 4) float32: metres per control period, gripper closed (0).
+        :param height: of the gripper now, m.
         """
         moves, lifted, phase = split(parameters)
         climb, sideways = self.climbs(lifted, phase, height)
@@ -159,10 +158,9 @@ def shift(parameters: np.ndarray) -> np.ndarray:
 
 def landings(actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     """
-    Find where the gripper comes down: passes LOW + VERTICAL.
+    Find where, (N, 2) metres, the gripper comes down: passes LOW + VERTICAL; NaN if it does not.
 
     :param actions: (N, HORIZON, 4); gripper: (4,).
-    :return: (N, 2) metres; NaN for sequences that stay up or low.
     """
     path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, HORIZON, 3)
     before = path[..., 2] - actions[..., 2]
@@ -185,12 +183,11 @@ def gripper_after(gripper: np.ndarray, actions: np.ndarray) -> np.ndarray:
 def push_proposals(shape: SequenceShape, gripper: np.ndarray, objects: np.ndarray,
                    goals: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """
-    Propose pushes.
+    Propose P pushes, parameters (P, D); none when every object is at its goal.
 
     :param gripper: (4,) metres.
     :param objects: (K, 2) metres on the table; goals (K, 2).
     :param count: P, how many.
-    :return: (P, D) parameters, none when every object is at its goal.
     """
     gaps = goals - objects
     distances = np.linalg.norm(gaps, axis=1)

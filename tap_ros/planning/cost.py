@@ -72,11 +72,9 @@ class PlanCost:
 
 def distances_to_pixels(maps: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     """
-    Compute the expected distance of each map to a place of its own.
+    Compute the expected distance (...), in pixels, of each map to a place of its own.
 
-    :param maps: (..., H, W), each sums to 1.
-    :param pixels: (..., 2), (u, v).
-    :return: (...), in pixels.
+    :param maps: (..., H, W), each sums to 1; pixels: (..., 2), (u, v).
     """
     H, W = maps.shape[-2:]
     u = torch.arange(W, device=maps.device) - pixels[..., 0, None, None]
@@ -86,11 +84,9 @@ def distances_to_pixels(maps: torch.Tensor, pixels: torch.Tensor) -> torch.Tenso
 
 def distances_to_places(maps: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     """
-    Compute the expected distance of each map to many places.
+    Compute the expected distance (K, N), in pixels, of each map to many places.
 
-    :param maps: (K, H, W), each of positive mass.
-    :param places: (N, 2), (u, v), also between pixels.
-    :return: (K, N), in pixels.
+    :param maps: (K, H, W), each of positive mass; places: (N, 2), (u, v), also between pixels.
     """
     weights = maps.flatten(1)
     weights = weights / weights.sum(1, keepdim=True)
@@ -99,12 +95,7 @@ def distances_to_places(maps: torch.Tensor, places: torch.Tensor) -> torch.Tenso
 
 
 def distances_to_all_pixels(maps: np.ndarray) -> np.ndarray:
-    """
-    Compute the expected distance of each map to every pixel of the picture.
-
-    :param maps: numpy float32 (K, H, W), each of positive mass.
-    :return: numpy float32 (K, H, W), in pixels.
-    """
+    """Return the expected distance (K, H, W), px, of each map (K, H, W) to every pixel."""
     H, W = maps.shape[1:]
     gaps = np.hypot(*np.mgrid[1 - H:H, 1 - W:W]).astype(np.float32)
     return np.stack([cv2.filter2D(m / m.sum(), -1, gaps, borderType=cv2.BORDER_CONSTANT)

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from tap_ros.contract import ACTION_LIMIT, CLEAR, ROBOT_MASKS, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.contract import ACTION_LIMIT, CLEAR, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import ConfigError
 from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
@@ -41,6 +41,7 @@ from tap_ros.planning.table import (
 )
 from tap_ros.training.devices import has_bfloat16, placed
 from tap_ros.training.robot_mask import RobotMask
+from tap_ros.training.settings import check_fields
 from tap_ros.training.weights import LATER, load_weights, make_network
 import torch
 from torch import nn
@@ -83,21 +84,14 @@ class ForwardModelConfig:
             raise ConfigError(
                 f'forward model: image_size {self.image_size} must be a multiple of 4 and '
                 f'crop_cells {self.crop_cells} even')
-        for name in ('image_size', 'table_cells', 'window_cells', 'features', 'width', 'blocks',
-                     'encoder_width', 'sprite_size'):
-            if not 1 <= getattr(self, name) <= 1024:
-                raise ConfigError(
-                    f'forward model: {name}: expected 1..1024, got {getattr(self, name)}')
         if len(self.crop_cells) != 2 or not all(
                 isinstance(n, int) and 2 <= n <= 1024 for n in self.crop_cells):
             raise ConfigError('forward model: crop_cells: expected 2 whole numbers of 2..1024, '
                               f'got {self.crop_cells}')
-        if self.robot_mask not in ROBOT_MASKS:
-            raise ConfigError(f'forward model: robot_mask: expected one of '
-                              f'{", ".join(ROBOT_MASKS)}, got {self.robot_mask!r}')
-        if not 2 <= self.window_cells <= self.table_cells:
-            raise ConfigError(f'forward model: window_cells: expected 2..{self.table_cells} '
-                              f'(table_cells), got {self.window_cells}')
+        sizes = ('image_size', 'table_cells', 'features', 'width', 'blocks', 'encoder_width',
+                 'sprite_size')
+        check_fields(self, {**dict.fromkeys(sizes, (1, 1024)),
+                            'window_cells': (2, self.table_cells)})
 
 
 @dataclass

@@ -52,10 +52,9 @@ class Table:
 
 def project(matrix: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
     """
-    Apply a homography (3, 3) or a camera (3, 4) to points.
+    Apply a homography (3, 3) or a camera (3, 4) to points (..., N, D) in metres.
 
     :param matrix: (..., 3, D + 1), broadcast against the points' leading axes but the last.
-    :param points: (..., N, D) metres.
     :return: (..., N, 2) pixels (u, v).
     """
     rays = points @ matrix[..., :-1].transpose(-1, -2) + matrix[..., None, :, -1]
@@ -81,13 +80,7 @@ def pixel_points(size: Sequence[int]) -> torch.Tensor:
 
 def sample_picture(images: torch.Tensor, pixels: torch.Tensor,
                    padding: str = 'border') -> torch.Tensor:
-    """
-    Read pictures at pixel positions, bilinearly.
-
-    :param images: (B, C, H, W).
-    :param pixels: (B, h, w, 2) as (u, v).
-    :return: (B, C, h, w).
-    """
+    """Read pictures (B, C, H, W) at pixels (B, h, w, 2), (u, v), bilinearly: (B, C, h, w)."""
     height, width = images.shape[-2:]
     scale = pixels.new_tensor([2 / (width - 1), 2 / (height - 1)])
     return F.grid_sample(
@@ -95,13 +88,7 @@ def sample_picture(images: torch.Tensor, pixels: torch.Tensor,
 
 
 def sample(fields: torch.Tensor, points: torch.Tensor, padding: str = 'border') -> torch.Tensor:
-    """
-    Read fields on the table grid at points, bilinearly.
-
-    :param fields: (B, C, n, n), row y, column x, from -1 to 1.
-    :param points: (B, h, w, 2) table units.
-    :return: (B, C, h, w).
-    """
+    """Read fields (B, C, n, n) on the table grid at points (B, h, w, 2): (B, C, h, w)."""
     return F.grid_sample(fields, points, padding_mode=padding, align_corners=True)
 
 
@@ -210,7 +197,7 @@ def fit_arm(episodes: Iterable['Episode']) -> np.ndarray:
         good &= np.isfinite(middle).all(1)
         points.append(middle[good])
         pixels.append(changed[good])
-    points = np.concatenate(points) if points else np.zeros((0, 3))
+    points = np.concatenate(points)
     if len(points) < 50 or points[:, :2].std(0).min() < 0.01:
         raise RecordingError(
             '/joint_states: the forward model needs gripper positions of a moving arm '
@@ -237,17 +224,18 @@ def fit_table(episodes: Iterable['Episode'], arm: np.ndarray) -> np.ndarray:
     :param arm: (3, 4), see fit_arm.
     :return: (3, 3) float64.
     """
-    points, pixels = [], []
-    for episode in episodes:
-        xy = episode.object_poses[..., :2].reshape(-1, 2)
-        uv = episode.object_pixels.reshape(-1, 2)
-        good = np.isfinite(xy).all(1) & np.isfinite(uv).all(1)
-        points.append(xy[good])
-        pixels.append(uv[good])
-    points = np.concatenate(points) if points else np.zeros((0, 2))
+    points, pixels = map(np.concatenate, zip(*map(_seen_places, episodes)))
     if len(points) < 50 or points.std(0).min() < 0.01:
         return arm[:, [0, 1, 3]]
-    return fit_projection(points.astype(np.float64), np.concatenate(pixels).astype(np.float64))
+    return fit_projection(points.astype(np.float64), pixels.astype(np.float64))
+
+
+def _seen_places(episode: 'Episode') -> tuple[np.ndarray, np.ndarray]:
+    """Return where objects are, metres on the table and pixels, both (N, 2), as far as known."""
+    xy = episode.object_poses[..., :2].reshape(-1, 2)
+    uv = episode.object_pixels.reshape(-1, 2)
+    good = np.isfinite(xy).all(1) & np.isfinite(uv).all(1)
+    return xy[good], uv[good]
 
 
 def fit_shift(episode: 'Episode', table: np.ndarray) -> np.ndarray:
@@ -258,11 +246,9 @@ def fit_shift(episode: 'Episode', table: np.ndarray) -> np.ndarray:
     :param table: (3, 3), see fit_table.
     :return: (3, 3) float64, the table of this episode.
     """
-    xy = episode.object_poses[..., :2].reshape(-1, 2)
-    uv = episode.object_pixels.reshape(-1, 2)
-    good = np.isfinite(xy).all(1) & np.isfinite(uv).all(1)
+    xy, uv = _seen_places(episode)
     shifted = np.eye(3)
-    if good.any():
-        rays = np.column_stack([xy[good], np.ones(good.sum())]) @ table.T
-        shifted[:2, 2] = np.median(uv[good] - rays[:, :2] / rays[:, 2:], axis=0)
+    if len(xy):
+        rays = np.column_stack([xy, np.ones(len(xy))]) @ table.T
+        shifted[:2, 2] = np.median(uv - rays[:, :2] / rays[:, 2:], axis=0)
     return shifted @ table

@@ -107,13 +107,10 @@ class Sampling:
 
 def episode_order(num_episodes: int, batch_size: int, seed: int, step: int) -> np.ndarray:
     """
-    Say which episodes the batch of a step has: shuffled passes over all of them.
+    Say which episodes the batch of a step has, int64 (B,): shuffled passes over all of them.
 
     :param num_episodes: how many there are.
-    :param batch_size: B.
-    :param seed: of the training run.
-    :param step: number of the step.
-    :return: int64 (B,), positions among the episodes.
+    :param seed: of the training run; step: number of the step.
     """
     at = np.arange(step * batch_size, (step + 1) * batch_size)
     orders = {epoch: np.random.default_rng([seed, 1, epoch]).permutation(num_episodes)
@@ -279,11 +276,8 @@ class Augmentation:
         """
         Draw one for each episode of a batch.
 
-        :param batch_size: B.
-        :param flip: whether to mirror half of them.
-        :param colour: whether to permute their colour channels.
+        :param flip: whether to mirror half of them; colour: to permute their colour channels.
         :param brightness: gains lie within 1 +- this.
-        :return: Augmentation.
         """
         order = np.argsort(rng.random((batch_size, 3)), 1)
         if not colour:
@@ -302,23 +296,13 @@ class Augmentation:
         return Augmentation(self.flip.to(device), self.order.to(device), self.gain.to(device))
 
     def apply(self, images: torch.Tensor) -> torch.Tensor:
-        """
-        Change pictures.
-
-        :param images: (B, N, 3, H, W) in [-1, 1].
-        :return: the same shape; beyond 1 where a gain brightens what was bright.
-        """
+        """Change pictures (B, N, 3, H, W) in [-1, 1]; a gain may brighten them beyond 1."""
         images = _take_channels(images, self.order)
         images = (images + 1) * self.gain[:, None, :, None, None] - 1
         return torch.where(self.flip[:, None, None, None, None], images.flip(-1), images)
 
     def undo(self, images: torch.Tensor) -> torch.Tensor:
-        """
-        Change pictures back.
-
-        :param images: (B, N, 3, H, W), as apply returned them.
-        :return: the same shape.
-        """
+        """Change pictures (B, N, 3, H, W), as apply returned them, back."""
         images = torch.where(self.flip[:, None, None, None, None], images.flip(-1), images)
         images = (images + 1) / self.gain[:, None, :, None, None] - 1
         return _take_channels(images, self.order.argsort(1))

@@ -20,13 +20,7 @@ CHANGED = 0.075  # on [0, 1]; a pixel that differs by more has changed
 
 
 def l1_error(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
-    """
-    Measure the l1 error of pictures, on [0, 1].
-
-    :param images: (..., 3, H, W) in [-1, 1].
-    :param targets: the same shape and range, or one that broadcasts to it.
-    :return: (...), the per-pixel mean; has a gradient.
-    """
+    """Return the l1 errors (...) on [0, 1] of pictures (..., 3, H, W) in [-1, 1]."""
     return (images - targets).abs().mean((-3, -2, -1)) / 2
 
 
@@ -34,8 +28,7 @@ def changed_pixels(targets: torch.Tensor, context: torch.Tensor) -> torch.Tensor
     """
     Find the pixels of a frame that differ from every input: what copying in place cannot give.
 
-    :param targets: (B, 3, H, W) in [-1, 1].
-    :param context: (B, C, 3, H, W) in [-1, 1].
+    :param targets: (B, 3, H, W) in [-1, 1]; context: (B, C, 3, H, W) likewise.
     :return: bool (B, 1, H, W).
     """
     difference = (targets[:, None] - context).abs().amax(2, keepdim=True)  # B, C, 1, H, W
@@ -180,8 +173,7 @@ def linear_preference(times: torch.Tensor, last: torch.Tensor | float,
     """
     Prefer later frames, for forward prediction: w(t) = beta + t / last (section 4).
 
-    :param times: (B, T) times of the targets.
-    :param last: (B, 1) or number, the last time.
+    :param times: (B, T) times of the targets; last: (B, 1) or number, the last time.
     :param beta: the smaller, the later; infinity prefers none.
     :return: w(t), (B, T).
     """
@@ -199,9 +191,8 @@ def relative_to_copying(error: torch.Tensor, copy_error: torch.Tensor,
     Not in the paper, though Eq. 5 allows it: with E_t / w(t) alone, the frames beside the context
     win, because predicting them is copying. Here copying is worth 1 everywhere.
 
-    :param error: (B, T).
+    :param error: (B, T); preference: (B, T), w(t).
     :param copy_error: (B, C, T), errors of the context pictures against the targets.
-    :param preference: (B, T), w(t).
     :return: (B, T).
     """
     return error / (copy_error.amin(1).clamp(min=_MIN_COPY_DISTANCE) * preference)

@@ -10,12 +10,11 @@ CPU `channels_last` is the faster one.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
-from typing import get_args
 
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.training_config import Decoder
 from tap_ros.prediction.warp import combine, warp
-from tap_ros.text import escaped
+from tap_ros.training.settings import check_fields
 from tap_ros.training.weights import LATER
 import torch
 from torch import nn
@@ -53,30 +52,18 @@ class PredictorConfig:
 
     def __post_init__(self) -> None:
         """Refuse shapes that the network cannot have."""
-        if self.decoder not in get_args(Decoder):
-            raise ConfigError(f'decoder: expected one of {", ".join(get_args(Decoder))}, '
-                              f'got {escaped(repr(self.decoder), 60)}')
+        check_fields(self, {
+            'base_width': (1, 2 ** 15), 'num_context': (1, 64), 'code_size': (1, 2 ** 13),
+            'latent_size': (0, 2 ** 13), 'flow_scale': (1e-6, 2 ** 16)})
         if self.skips and self.decoder != 'shared':
             raise ConfigError("skips: they go with decoder 'shared'; appendix C has none")
-        levels = math.log2(self.image_size) if self.image_size > 0 else 0.5
-        if self.image_size < 16 or levels != int(levels):
+        if self.image_size < 16 or self.image_size & (self.image_size - 1):
             raise ConfigError(f'image_size: expected a power of two from 16 on, such as 64, '
                               f'got {self.image_size}')
-        for name in ('base_width', 'num_context', 'code_size'):
-            if getattr(self, name) < 1:
-                raise ConfigError(f'{name}: expected at least 1, got {getattr(self, name)}')
-        if self.latent_size < 0:
-            raise ConfigError(f'latent_size: expected 0 or more, got {self.latent_size}')
-        if not 0 < self.flow_scale <= 16 * self.image_size:
-            raise ConfigError(f'flow_scale: expected more than 0 and at most 16 times image_size, '
-                              f'got {self.flow_scale}')
         # Beyond this a network takes many gigabytes; it is a wrong number rather than a wish.
         if self.image_size * self.base_width > 2 ** 15:
             raise ConfigError(f'image_size times base_width: expected at most {2 ** 15}, got '
                               f'{self.image_size} times {self.base_width}')
-        for name, most in (('num_context', 64), ('code_size', 2 ** 13), ('latent_size', 2 ** 13)):
-            if getattr(self, name) > most:
-                raise ConfigError(f'{name}: expected at most {most}, got {getattr(self, name)}')
 
     @property
     def widths(self) -> tuple[int, ...]:

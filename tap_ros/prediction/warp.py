@@ -86,12 +86,7 @@ def one_hot_maps(pixels: torch.Tensor, size: Sequence[int]) -> torch.Tensor:
 
 
 def expected_pixels(maps: torch.Tensor) -> torch.Tensor:
-    """
-    Take the mean position under each map.
-
-    :param maps: (..., H, W), each sums to 1.
-    :return: (..., 2) in (u, v) order.
-    """
+    """Return the mean position (..., 2), (u, v), under each map (..., H, W) that sums to 1."""
     H, W = maps.shape[-2:]
     u = maps.sum(-2) @ torch.arange(W, device=maps.device, dtype=maps.dtype)
     v = maps.sum(-1) @ torch.arange(H, device=maps.device, dtype=maps.dtype)
@@ -130,13 +125,7 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor, masks: torch.Tensor
 
 
 def blur(maps: torch.Tensor, sigma: float = 1.0) -> torch.Tensor:
-    """
-    Blur maps by a Gaussian; at the border mass stays inside.
-
-    :param maps: (..., H, W).
-    :param sigma: its standard deviation in pixels.
-    :return: (..., H, W).
-    """
+    """Blur maps (..., H, W) by a Gaussian of sigma pixels; at the border mass stays inside."""
     for dim in (-1, -2):
         at = torch.arange(maps.shape[dim], device=maps.device, dtype=maps.dtype)
         kernel = torch.exp(-((at[:, None] - at) ** 2) / (2 * sigma ** 2))

@@ -55,8 +55,7 @@ def has_bfloat16(device: torch.device | str) -> bool:
     """
     Say whether a device has instructions for bfloat16; others emulate it many times slower.
 
-    :param device: torch device or its name.
-    :return: bool; of CPUs, those with AVX512_BF16.
+    Of CPUs those with AVX512_BF16 have.
     """
     if torch.device(device).type == 'cuda':
         return True
@@ -71,12 +70,7 @@ def pick_precision(precision: str, device: torch.device) -> str:
 
 
 def make_autocast(precision: str, device: torch.device) -> Autocast:
-    """
-    Make what networks run in.
-
-    :param precision: 'float32' or 'bfloat16'.
-    :return: function that makes a context manager.
-    """
+    """Return what makes a context manager to run networks in, for 'float32' or 'bfloat16'."""
     return partial(torch.autocast, device.type, torch.bfloat16, enabled=precision == 'bfloat16')
 
 
@@ -175,10 +169,6 @@ def joined(device: torch.device) -> Iterator[Processes]:
 
 
 def share_batch_norm(module: nn.Module, processes: Processes) -> None:
-    """
-    Let batch normalisation use the statistics of the whole batch.
-
-    :param module: changed in place; its weights and their names stay.
-    """
+    """Let batch normalisation use the statistics of the whole batch; weights and names stay."""
     if processes.count > 1:
         nn.SyncBatchNorm.convert_sync_batchnorm(module)

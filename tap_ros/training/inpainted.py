@@ -44,30 +44,34 @@ class FilledStore:
 
     def __init__(self, store: 'EpisodeStore', robot_mask: RobotMask,
                  progress: bool = False, filling: Filling = fill_in_time) -> None:
-        self._store = store
+        self._store, self._robot_mask, self._filling = store, robot_mask, filling
         self.lengths, self.num_frames = store.lengths, store.num_frames
         self.image_size = store.image_size
         self.seen = np.ones((len(store), *store.image_size), bool)
-        # Rows of an episode's first frame and of its goal picture in the file.
-        self._first, self._goal = np.full((2, len(store)), -1)
-        folder, rows = cache_folder(), 0
+        # Rows of the file: of each episode its frames, then its goal picture.
+        self._first = np.concatenate([[0], np.cumsum(store.lengths + 1)])
+        folder = cache_folder()
         with storage_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        with storage_errors(folder), tempfile.TemporaryFile(dir=folder) as file:
-            for i in tqdm(range(len(store)), 'filling behind the robot', disable=not progress):
-                episode = store[i]
-                if episode.robot_masks is None:
-                    continue
-                frames, self.seen[i] = filling(
-                    episode.frames, episode.robot_masks, robot_mask)
-                file.write(frames.data)
-                self._first[i], rows = rows, rows + len(frames)
-                if episode.goal_frame is not None:
-                    file.write(_fill_goal(episode, frames[-1], robot_mask).data)
-                    self._goal[i], rows = rows, rows + 1
-            file.flush()
-            self._frames = np.memmap(file, np.uint8, 'r', 0, (rows, *store.image_size, 3)) \
-                if rows else np.empty((0, *store.image_size, 3), np.uint8)
+            with tempfile.TemporaryFile(dir=folder) as file:
+                for i in tqdm(range(len(store)), 'filling behind the robot', disable=not progress):
+                    for pictures in self._fill(i):
+                        file.write(np.ascontiguousarray(pictures).data)
+                file.flush()
+                self._frames = np.memmap(
+                    file, np.uint8, 'r', 0, (int(self._first[-1]), *store.image_size, 3))
+
+    def _fill(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the filled frames of an episode and its goal picture, else the last frame."""
+        episode = self._store[i]
+        frames, goal, mask = episode.frames, episode.goal_frame, episode.goal_mask
+        if episode.robot_masks is None:
+            return frames, frames[-1] if goal is None else goal
+        filled, self.seen[i] = self._filling(frames, episode.robot_masks, self._robot_mask)
+        if goal is None or mask is None:
+            return filled, filled[-1]
+        behind = last_free(frames, episode.robot_masks)
+        return filled, np.where(hidden_pixels(mask, self._robot_mask)[..., None], behind, goal)
 
     def __len__(self) -> int:
         """Return the number of episodes."""
@@ -75,10 +79,7 @@ class FilledStore:
 
     def frames(self, i: int) -> np.ndarray:
         """Return the frames of episode i, (T, H, W, 3) uint8."""
-        first = self._first[i]
-        if first < 0:
-            return self._store.frames(i)
-        return self._frames[first:first + self.lengths[i]]
+        return self._frames[self._first[i]:self._first[i + 1] - 1]
 
     def __getitem__(self, i: int) -> 'Episode':
         """
@@ -88,17 +89,8 @@ class FilledStore:
         tells what that is, the goal picture is the filled last frame.
         """
         episode = self._store[i]
-        goal = episode.goal_frame if self._goal[i] < 0 else self._frames[self._goal[i]]
+        goal = None if episode.goal_frame is None else self._frames[self._first[i + 1] - 1]
         return replace(episode, frames=self.frames(i), goal_frame=goal)
-
-
-def _fill_goal(episode: 'Episode', last: np.ndarray, robot_mask: RobotMask) -> np.ndarray:
-    """Return the filled goal picture of an episode with this filled last frame."""
-    if episode.goal_frame is None or episode.goal_mask is None or episode.robot_masks is None:
-        return last
-    gaps = hidden_pixels(episode.goal_mask, robot_mask)[..., None]
-    behind = last_free(episode.frames, episode.robot_masks)
-    return np.where(gaps, behind, episode.goal_frame)
 
 
 Episodes = Union['EpisodeStore', FilledStore]

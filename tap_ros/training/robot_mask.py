@@ -67,8 +67,12 @@ def fill_in_time(frames: np.ndarray, masks: np.ndarray,
     now = np.arange(len(frames), dtype=np.int32)[:, None, None]
     past = np.maximum.accumulate(np.where(free, now, -_FAR), 0)
     future = np.minimum.accumulate(np.where(free, now, _FAR)[::-1], 0)[::-1]
-    return _filled(frames, hidden_pixels(masks, robot_mask),
-                   np.where(now - past <= future - now, past, future))
+    source = np.where(now - past <= future - now, past, future)
+    there, hidden = (source >= 0) & (source < len(frames)), hidden_pixels(masks, robot_mask)
+    filled = np.array(frames)
+    t, v, u = np.nonzero(hidden & there)
+    filled[t, v, u] = frames[source[t, v, u], v, u]
+    return filled, np.logical_not((hidden & ~there).any(0))
 
 
 def fill_from_past(frames: np.ndarray, masks: np.ndarray,
@@ -82,27 +86,17 @@ def fill_from_past(frames: np.ndarray, masks: np.ndarray,
     :return: uint8 (T, H, W, 3); bool (H, W), False where a pixel is hidden before it is ever free:
         until then such ones stay as they are.
     """
-    now = np.arange(len(frames), dtype=np.int32)[:, None, None]
-    past = np.maximum.accumulate(np.where(masks == ROBOT_MASK_FREE, now, -_FAR), 0)
-    return _filled(frames, hidden_pixels(masks, robot_mask), past)
-
-
-def _filled(frames: np.ndarray, hidden: np.ndarray,
-            source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fill hidden pixels (T, H, W) from the frames `source` (T, H, W), if there are such."""
-    there = (source >= 0) & (source < len(frames))
-    filled = np.array(frames)
-    t, v, u = np.nonzero(hidden & there)
-    filled[t, v, u] = frames[source[t, v, u], v, u]
-    return filled, np.logical_not((hidden & ~there).any(0))
+    view = FreeView(robot_mask)
+    filled = np.stack([view.update(*both) for both in zip(frames, masks)])
+    known = np.maximum.accumulate(masks == ROBOT_MASK_FREE, 0)
+    return filled, np.logical_not((hidden_pixels(masks, robot_mask) & ~known).any(0))
 
 
 def last_free(frames: np.ndarray, masks: np.ndarray) -> np.ndarray:
     """
-    Return what was seen free last at each pixel, the last frame where it never was.
+    Return what was seen free last at each pixel (H, W, 3), the last frame where it never was.
 
     :param frames: uint8 (T, H, W, 3), an episode; masks: uint8 (T, H, W), its robot masks.
-    :return: uint8 (H, W, 3).
     """
     back = np.argmax((masks == ROBOT_MASK_FREE)[::-1], 0)  # frames before the last one
     v, u = np.indices(back.shape)

@@ -10,6 +10,7 @@ from typing import Annotated, Any, get_args, get_origin, Literal
 from tap_ros.errors import ConfigError
 from tap_ros.options import default_text, Folder
 from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.text import escaped
 from tap_ros.training.split import TEST_FRACTION
 from tyro import conf
 
@@ -74,20 +75,29 @@ def check_settings(config: Any, ranges: Mapping[str, tuple[float, float]]) -> No
     Raise ConfigError for settings of a training that are none of the choices, or out of range.
 
     :param config: a dataclass with the fields of RunSettings.
-    :param ranges: least and largest value of numbers, beside those that all trainings share.
+    :param ranges: see check_fields, beside those that all trainings share.
     """
     if not config.recordings:
         raise ConfigError('recordings: expected at least one .mcap file or bag folder')
-    ranges = {**_RANGES, **ranges}
+    check_fields(config, {**_RANGES, **ranges})
+
+
+def check_fields(config: Any, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """
+    Raise ConfigError for fields of a dataclass that are none of the choices, or out of range.
+
+    :param ranges: least and largest value of numbers, by the name of the field.
+    """
     for field in fields(config):
-        value = getattr(config, field.name)
+        value, wanted = getattr(config, field.name), ''
         if get_origin(field.type) is Literal and value not in get_args(field.type):
-            raise ConfigError(f'{field.name}: expected one of {", ".join(get_args(field.type))}, '
-                              f'got {value!r}')
+            wanted = 'one of ' + ', '.join(get_args(field.type))
         low, high = ranges.get(field.name, (-math.inf, math.inf))
         if field.name in ranges and not low <= value <= high:
             wanted = f'{low}..{high}' if high < math.inf else f'at least {low}'
-            raise ConfigError(f'{field.name}: expected {wanted}, got {value}')
+        if wanted:
+            raise ConfigError(
+                f'{field.name}: expected {wanted}, got {escaped(repr(value), 60)}')
 
 
 @dataclass(frozen=True)

@@ -102,13 +102,6 @@ def test_proposals_end_beyond_the_object_on_its_way_to_the_goal():
     assert (lifted % 3 > 0).any()  # no longer than needed
 
 
-def test_a_gripper_already_behind_the_object_is_not_lifted():
-    gripper = np.array([-0.12, 0.0, 0.01, 0.0])
-    proposals = push_proposals(
-        SHAPE, gripper, np.zeros((1, 2)), np.array([[0.15, 0.0]]), 20, np.random.default_rng(0))
-    assert (proposals[:, -2] == 0).mean() > 0.7
-
-
 class Means:
     """A Generator that draws the mean of every distribution."""
 
@@ -129,26 +122,6 @@ def test_a_push_ends_with_the_object_in_its_place_however_few_periods_it_takes(d
     actions, = SHAPE.actions(SHAPE.clip(proposal), LOW)
     end = gripper[:2] + actions[:, :2].sum(0)
     np.testing.assert_allclose(end, [distance + 0.07 - 0.135, 0], atol=1e-6)
-
-
-def test_nothing_is_proposed_when_all_is_in_place():
-    places = np.array([[0.1, 0.1]])
-    rng = np.random.default_rng(0)
-    assert len(push_proposals(SHAPE, LOW_GRIPPER, places, places, 10, rng)) == 0
-
-
-def test_with_a_small_limit_the_gripper_climbs_in_several_periods_and_waits_meanwhile():
-    shape = SequenceShape(Limits(climb=0.03))
-    parameters = np.full((1, SIZE), 0.05)
-    parameters[0, -2:] = 4, 0
-    actions = shape.actions(parameters, LOW)[0]
-    assert np.abs(actions[:, 2]).max() <= 0.03 + 1e-7
-    heights = LOW + actions[:, 2].cumsum()
-    assert heights.max() == pytest.approx(LIFTED, abs=1e-6)
-    still = ~actions[:, :2].any(1)
-    assert still[0] and heights[still][0] < heights[~still].max()
-    landing, = landings(actions[None], np.array([0, 0, LOW, 0]))
-    assert np.isfinite(landing).all()  # it comes down again, in steps
 
 
 @pytest.mark.parametrize('limit', [0.02, 0.04, 0.09, 0.15])

@@ -71,19 +71,6 @@ def test_pictures_are_composed_as_they_were_recorded(model, episodes):
     assert error < 0.45 * still, (error, still)
 
 
-def test_a_planner_is_loaded_with_its_settings(episodes):
-    config = VisualMPCConfig(search=SearchConfig(4, 1, 2), proposals=2)
-    mpc = VisualMPC.load(FORWARD_MODEL, config)
-    assert mpc.config == config and mpc.image_size == (64, 64)
-    assert VisualMPC.load(FORWARD_MODEL).config == VisualMPCConfig()
-    goal = mpc.goal(episodes[0].goal_pixels)
-    near = mpc.model.table.pixels().flatten(0, 1).numpy()
-    for place, pixel in zip(goal.places, episodes[0].goal_pixels, strict=True):
-        cell = np.abs(mpc.model.table.points().numpy() - place).sum(1).argmin()
-        assert np.linalg.norm(near[cell] - pixel) == pytest.approx(
-            np.linalg.norm(near - pixel, axis=1).min(), abs=1e-3)
-
-
 def test_pictures_and_positions_may_be_views(episodes):
     mpc = VisualMPC.load(FORWARD_MODEL, VisualMPCConfig(search=SearchConfig(4, 1, 2), proposals=2))
     seen = episodes[0]

@@ -130,12 +130,6 @@ def test_an_object_that_is_lost_is_as_far_as_can_be(model):
     assert lost.expected_distance == pytest.approx(farthest, abs=0.01)
 
 
-def test_expected_distance_is_in_pixels_whatever_the_cost_adds(model):
-    for config in (PLAIN, replace(PLAIN, unfinished=4.0)):
-        found = plan(steady(model, away(6, 2)), config)
-        assert found.expected_distance == pytest.approx(4, abs=0.2)
-
-
 def dives(actions, _):
     """Bring the objects nearer only by coming down at once."""
     down = (actions[:, 0, 2] < 0)[:, None, None, None]
@@ -234,26 +228,6 @@ def test_a_push_that_succeeds_from_one_place_only_is_not_taken(model):
     assert np.array_equal(sure[0].actions, sure[1].actions) and sure[0].cost == sure[1].cost
 
 
-def test_the_best_of_all_that_were_judged_is_taken(model):
-    def miss(actions):
-        return 20 * np.abs(actions[..., 0].sum(1) - 0.2) + 4 * np.abs(actions[..., 2]).sum(1)
-
-    puppets = Puppets(model, lambda actions, _: GOALS + miss(actions)[:, None, None, None]
-                      * np.ones((1, HORIZON, 2, 1)))
-    found = plan(puppets, replace(PLAIN, search=SearchConfig(60, 3, 6), batch_size=7))
-    judged = np.concatenate(puppets.judged)
-    assert len(judged) > 180 and miss(found.actions[None])[0] <= miss(judged).min() + 0.01
-
-
-def test_every_plan_draws_candidates_of_its_own(model):
-    puppets = steady(model, away(5, 5))
-    first = plan(puppets)
-    second, other = plan(puppets, memory=first.memory), plan(puppets, memory=Memory(1))
-    assert not np.array_equal(first.actions, second.actions)
-    assert not np.array_equal(first.actions, other.actions)
-    assert second.memory.count == 2 and second.memory.seed == 0
-
-
 def candidates(model, height=LOW, limits=FULL, **changes):
     """Return the actions (N, T, 4) that are judged, and the heights (N, T) at their ends."""
     puppets = steady(model, away(5, 5))
@@ -277,18 +251,6 @@ def test_a_gripper_that_stands_upon_something_goes_up_before_it_pushes(model):
         assert (heights[:, 0] > 0.1).all() == first
 
 
-def test_the_model_is_told_whether_the_arm_is_hidden(model):
-    for hidden in (True, False):
-        puppets = Puppets(model, dives)
-        plan(puppets, replace(PLAIN, arm_hidden=hidden))
-        assert puppets.arm_hidden is hidden
-
-
-def test_an_unfinished_object_costs_all_of_its_price_from_3_px_on():
-    cost = PlanCost(unfinished=4.0).prices(torch.tensor([[0.0, 1.5, 3.0, 6.0]]))
-    torch.testing.assert_close(cost, torch.tensor([[0.0, 3.5, 7.0, 10.0]]))
-
-
 def test_what_stands_costs_the_same_however_often_it_is_looked_at():
     maps = torch.full((1, 2, 1, 2), 0.5)  # two objects, each half in either cell
     for seen in (2, 3, 5, HORIZON):
@@ -300,12 +262,6 @@ def test_landing_too_near_costs_100_px_and_10_for_each_missing_centimetre():
     landings = np.array([[0.0, 0.0], [0.125, 0.0], [0.25, 0.0], [0.9, 1.0], [np.nan, np.nan]])
     cost = PlanCost(clearance=0.25).of_landings(landings, np.array([[0.0, 0.0], [1.0, 1.0]]))
     np.testing.assert_allclose(cost, [350, 225, 0, 250, 0])
-
-
-def test_distances_to_a_sure_position_are_plain_distances():
-    maps = one_hot_maps(torch.tensor([[3.0, 4.0]]), PICTURE)
-    assert distances_to_pixels(maps, torch.tensor([[0.0, 0.0]])) == 5
-    assert distances_to_pixels(maps, torch.tensor([[3.0, 4.0]])) == 0
 
 
 def test_distance_is_expected_over_the_map_not_from_its_mean():

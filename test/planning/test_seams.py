@@ -14,28 +14,9 @@ from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
 from tap_ros.planning.reach import Command, End, Reach, ReachConfig, Seen
-from tap_ros.planning.table import Table
-import torch
-from toy_world import SCALE, SIZE, TABLE
+from toy_world import SCALE, SIZE, Telekinesis
 
 START, GOAL = np.array([[8.0, 20.0]], np.float32), np.array([[20.0, 12.0]], np.float32)
-
-
-class Telekinesis:
-    """A forward model: all objects go where the gripper goes, whether it touches them or not."""
-
-    table = Table(torch.tensor(TABLE).view(3, 3), (SIZE, SIZE))
-
-    def begin(self, image, gripper, arm_hidden=False):
-        return None
-
-    def carried_maps(self, start, gripper, maps, actions, /, every=1):
-        here = maps.flatten(1) @ self.table.pixels().flatten(0, 1)  # (K, 2)
-        for t in range(every, actions.shape[1] + 1, every):
-            way = actions[:, :t, :2].sum(1) * torch.tensor([SCALE, -SCALE])
-            at = here + way[:, None]  # (N, K, 2)
-            carried = self.table.seed_maps(at.flatten(0, 1))
-            yield carried.view(*at.shape[:2], *carried.shape[1:])
 
 
 def best_of_some(problem: Problem, config: SearchConfig, rng: np.random.Generator) -> Solution:
@@ -47,9 +28,9 @@ def best_of_some(problem: Problem, config: SearchConfig, rng: np.random.Generato
     return Solution(samples[order[0]], float(costs[order[0]]), samples[order])
 
 
-def reach(mpc):
+def reach(mpc, budget=60):
     """Push in a world of telekinesis; return the End and the steps."""
-    loop, pixels, step = Reach(mpc, ReachConfig(60, reached=2.0), seed=1), START, 0
+    loop, pixels, step = Reach(mpc, ReachConfig(budget, reached=2.0), seed=1), START, 0
     while True:
         seen = Seen(np.zeros((SIZE, SIZE, 3), np.uint8), np.zeros(4, np.float32), ('a',), pixels,
                     step)
@@ -79,7 +60,7 @@ def test_a_cost_of_ones_own_is_minimised_with_the_same_model():
             return -distances
 
     config = VisualMPCConfig(recheck=0, threads=1)
-    end, _ = reach(VisualMPC(Telekinesis(), config, Away()))
+    end, _ = reach(VisualMPC(Telekinesis(), config, Away()), 10)
     assert end.outcome == 'spent'
 
 

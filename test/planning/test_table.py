@@ -5,8 +5,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
-from tap_ros.errors import RecordingError
 from tap_ros.planning.table import (
     fit_arm,
     fit_projection,
@@ -47,12 +45,6 @@ def test_without_object_positions_the_table_is_the_grippers_plane():
              for seed in range(3)]
     arm = np.reshape(ARM, (3, 4))
     np.testing.assert_array_equal(fit_table(blind, arm), arm[:, [0, 1, 3]])
-
-
-def test_recordings_without_grippers_are_refused_by_topic():
-    blind = [replace(make_episode(0), grippers=np.full((18, 4), np.nan, np.float32))]
-    with pytest.raises(RecordingError, match='/joint_states'):
-        fit_arm(blind)
 
 
 def test_splatted_maps_sum_to_one_and_have_their_mean_at_the_pixel():

@@ -3,7 +3,9 @@
 """A small world seen from above: squares that a dot pushes along without turning them."""
 
 import numpy as np
+from tap_ros.planning.table import Table
 from tap_ros.recording.episode import Episode
+import torch
 
 SIZE = 32
 SCALE = 30  # pixels per metre
@@ -71,3 +73,20 @@ def make_episode(seed, length=18):
         object_names=('object_0', 'object_1'), object_pixels=pixels, object_poses=poses,
         goal_frame=frames[-1], goal_pixels=pixels[-1], goal_poses=poses[-1], task='push2',
         seed=seed, outcome='success')
+
+
+class Telekinesis:
+    """A forward model: all objects go where the gripper goes, whether it touches them or not."""
+
+    table = Table(torch.tensor(TABLE).view(3, 3), (SIZE, SIZE))
+
+    def begin(self, image, gripper, arm_hidden=False):
+        return None
+
+    def carried_maps(self, start, gripper, maps, actions, /, every=1):
+        here = maps.flatten(1) @ self.table.pixels().flatten(0, 1)  # (K, 2)
+        for t in range(every, actions.shape[1] + 1, every):
+            way = actions[:, :t, :2].sum(1) * torch.tensor([SCALE, -SCALE])
+            at = here + way[:, None]  # (N, K, 2)
+            carried = self.table.seed_maps(at.flatten(0, 1))
+            yield carried.view(*at.shape[:2], *carried.shape[1:])

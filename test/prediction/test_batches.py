@@ -52,13 +52,6 @@ def test_forward_context_is_the_start_alone_and_targets_all_later_frames(store):
         assert np.array_equal(batch.targets[b][batch.valid[b]], frames[1:])
 
 
-def test_few_targets_are_drawn_without_repetition(store):
-    batch = make_batch(store, [4] * 20, Sampling(num_targets=3), rng=np.random.default_rng(0))
-    assert batch.targets.shape[1] == 3
-    assert (batch.times.diff(dim=1) > 0).all()
-    assert len(batch.times.unique()) == len(store.frames(4)) - 2
-
-
 def test_fixed_time_is_a_share_of_the_episode(store):
     batch = make_batch(store, [0, 1], Sampling(fraction=0.5))
     assert batch.times.tolist() == [[3], [4]]
@@ -68,16 +61,6 @@ def test_fixed_time_is_a_share_of_the_episode(store):
         batch = make_batch(store, [4], Sampling(fraction=fraction, forward=True))
         assert batch.times.tolist() == [[expected]]
     assert make_batch(store, [4], Sampling(fraction=1.0)).times.tolist() == [[end - 1]]
-
-
-def test_others_beside_the_fixed_frame_are_other_targets(store):
-    batch = make_batch(store, [4] * 30, Sampling(fraction=0.5, num_others=1),
-                       rng=np.random.default_rng(0))
-    assert (batch.times[:, 0] == (store.lengths[4]) // 2).all()
-    assert (batch.times[:, 1] != batch.times[:, 0]).all() and batch.valid.all()
-    assert len(batch.times[:, 1].unique()) > 3
-    for b in range(30):
-        assert np.array_equal(batch.targets[b, 1], store.frames(4)[batch.times[b, 1]])
 
 
 def test_the_video_is_the_whole_episode(store):

@@ -19,7 +19,6 @@ from tap_ros.prediction.objective import (
     predictor_loss,
 )
 from tap_ros.prediction.selection import selection_errors
-from tap_ros.prediction.training import held_out_scores
 from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
@@ -92,23 +91,6 @@ def test_a_concave_outer_error_prefers_either_bottleneck_to_their_blend():
     assert loss(first, 1.0) == pytest.approx(loss(blend, 1.0), rel=1e-5)
     assert loss(first, 0.5) == pytest.approx(loss(second, 0.5), rel=1e-5)
     assert loss(first, 0.5) < 0.9 * loss(blend, 0.5)
-
-
-def test_held_out_scores_are_means_over_episodes():
-    batches = [make_batch(B=3, seed=1), make_batch(B=1, seed=2)]
-    shown = torch.cat([to_float(batch.targets[:, 2]) for batch in batches])
-
-    class Next(torch.nn.Module):
-
-        def forward(self, context, z=None):
-            nonlocal shown
-            image, shown = shown[:len(context)], shown[len(context):]
-            return Prediction(image, None, None, None)
-
-    scores = held_out_scores(Next(), batches, CONFIG)
-    assert scores['loss'] == pytest.approx(0, abs=1e-6)
-    assert scores['match_fraction'] == pytest.approx(3 / 7)
-    assert scores['match_fraction_std'] == pytest.approx(0, abs=1e-6)
 
 
 def test_forward_genmin_prefers_later_frames_the_more_the_smaller_beta():
@@ -242,18 +224,6 @@ def test_free_nats_cost_nothing():
                                  still_draws(batch))
         assert outcome.parts['kl'].item() == pytest.approx(0.01 * price, rel=1e-4)
         assert outcome.nats.item() == pytest.approx(nats, rel=1e-4)
-
-
-@pytest.mark.parametrize('posterior', ['video', 'frame'])
-def test_a_share_of_the_weight_is_a_share_of_the_price(posterior):
-    batch = replace(make_batch(B=4), video=make_batch(B=4, seed=7).targets)
-    config = replace(CONFIG, **method_fields('min-vae'), posterior=posterior, kl_weight=0.01)
-    whole, none, quarter = (
-        predictor_loss(Networks(Shade(), Brightness(6 if posterior == 'video' else 1)), batch,
-                       None, replace(config, kl_weight=weight), still_draws(batch), kl_share=share)
-        for weight, share in ((0.01, 1.0), (0.01, 0.0), (0.04, 0.25)))
-    assert whole.parts['kl'] > 0 and none.parts['kl'] == 0
-    assert quarter.loss.item() == pytest.approx(whole.loss.item(), rel=1e-6)
 
 
 def test_appendix_b_is_the_minimum_over_the_whole_loss(monkeypatch):

@@ -90,21 +90,6 @@ def test_what_waits_is_answered_together_oldest_first_and_within_the_limits(made
     assert rig.batches == [[0], [1, 2, 3], [4, 5], [6], [50], [1]]
 
 
-def test_beyond_the_most_that_wait_one_is_told_how_many_do(made):
-    rig = made(max_waiting=5)
-    rig.hold()
-    for one in range(1, 6):
-        rig.put(one)
-    assert len(rig.queue) == 5
-    for one in (6, 7):
-        with pytest.raises(Busy, match='^busy: 5 requests are waiting'):
-            rig.put(one)
-    rig.go.set()
-    assert rig.wait(6) == {n: -n for n in range(6)}
-    rig.put(8)  # there is room again
-    assert rig.wait(7)[8] == -8
-
-
 @pytest.mark.parametrize('bad', [{3}, {1, 5}, {1, 2, 3, 4, 5}])
 def test_an_error_reaches_only_who_caused_it(made, bad):
     def work(batch):
@@ -143,27 +128,6 @@ def test_at_the_end_all_that_wait_are_told_and_the_batch_is_finished(made):
     ending.join(TIMEOUT)
     assert not ending.is_alive()
     assert rig.wait(4)[0] == 0 and len(rig.answers) == 4
-
-
-def test_what_is_prepared_is_prepared_in_the_thread_that_works():
-    threads = []
-
-    def prepare():
-        threads.append(threading.current_thread())
-        return lambda batch: threads.append(threading.current_thread()) or batch
-
-    queue, answered = RequestQueue(prepare, len, 1, 1, 1), threading.Event()
-    assert len(threads) == 1
-    queue.put('one', lambda found: answered.set())
-    assert answered.wait(TIMEOUT)
-    queue.close()
-    assert threads[0] is threads[1] is not threading.current_thread()
-
-    def fail():
-        raise OSError('no such file')
-
-    with pytest.raises(OSError, match='no such file'):
-        RequestQueue(fail, len, 1, 1, 1)
 
 
 def test_an_answer_that_cannot_be_given_leaves_the_others_theirs(capsys):

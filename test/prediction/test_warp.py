@@ -117,31 +117,6 @@ def test_an_object_that_everything_avoids_stays_where_it_was():
     assert expected_pixels(hidden.maps)[0].allclose((start + goal) / 2, atol=1e-4)
 
 
-def test_a_lost_object_does_not_change_the_others():
-    flow = constant_flow(0, 0)
-    flow[..., 15:] = 1000  # the right half reads the corner
-    pixels = torch.tensor([[5.0, 5.0], [20.0, 5.0]])
-    maps = one_hot_maps(pixels, SIZE).expand(1, 2, 2, *SIZE)
-    both = warp_object_maps(maps, flow, masks_for([0.5, 0.5]))
-    one = warp_object_maps(maps[:, :, :1], flow, masks_for([0.5, 0.5]))
-    assert both.mass[0, 1] < 0.05
-    assert both.maps[:, 0].allclose(one.maps[:, 0])
-
-
-def test_no_objects_give_no_maps():
-    maps = one_hot_maps(torch.zeros(0, 2), SIZE).expand(1, 2, 0, *SIZE)
-    warped = warp_object_maps(maps, constant_flow(1, 1), masks_for([0.5, 0.5]))
-    assert warped.maps.shape == (1, 0, *SIZE) and warped.mass.shape == (1, 0)
-
-
-def test_blur_keeps_the_mass_even_at_the_border():
-    maps = one_hot_maps(torch.tensor([[0.0, 0.0], [12.0, 9.0]]), SIZE)
-    blurred = blur(maps)
-    assert blurred.sum((-2, -1)).allclose(torch.ones(2))
-    assert expected_pixels(blurred)[1].allclose(torch.tensor([12.0, 9.0]), atol=1e-4)
-    assert blurred.max() < 0.8
-
-
 def test_blur_has_its_deviation_in_both_directions_one_pixel_unless_told():
     maps = one_hot_maps(torch.tensor([15.0, 10.0]), SIZE)
     for sigma, blurred in ((1.0, blur(maps)), (1.0, blur(maps, 1.0)), (2.0, blur(maps, 2.0))):

@@ -51,18 +51,6 @@ def test_the_hand_stays_with_arm_and_goes_with_all():
 
 
 @pytest.mark.parametrize('robot_mask', ['arm', 'all'])
-def test_a_scene_that_stands_still_comes_back_where_it_is_ever_seen(robot_mask):
-    scene, episode = still()
-    filled, seen = fill_in_time(episode.frames, episode.robot_masks, robot_mask)
-    assert seen.sum() == seen.size - 4  # all but the base
-    hand = (episode.robot_masks == ROBOT_MASK_HAND) & (robot_mask == 'arm')
-    np.testing.assert_array_equal(filled[:, seen][~hand[:, seen]],
-                                  scene.frames[:, seen][~hand[:, seen]])
-    np.testing.assert_array_equal(filled[hand], episode.frames[hand])
-    np.testing.assert_array_equal(filled[:, ~seen], episode.frames[:, ~seen])  # as recorded
-
-
-@pytest.mark.parametrize('robot_mask', ['arm', 'all'])
 def test_the_nearest_frame_fills_and_of_two_the_earlier_one(robot_mask):
     T = 7
     frames, masks = make_episode(1, T=T).frames, random_masks(T)
@@ -88,23 +76,6 @@ def test_a_stream_is_filled_with_what_was_seen_last(robot_mask):
             free = [s for s in range(t + 1) if masks[s, v, u] == ROBOT_MASK_FREE]
             source = free[-1] if free and hidden[t, v, u] else t
             assert filled[v, u].tolist() == frames[source, v, u].tolist()
-
-
-def test_a_view_remembers_only_what_it_is_shown_to_remember():
-    scene, episode = still()
-    view, frame, mask = FreeView('all'), episode.frames, episode.robot_masks
-    np.testing.assert_array_equal(view.fill(frame[0], mask[0]), frame[0])  # nothing is known
-    first = view.update(frame[0], mask[0])
-    np.testing.assert_array_equal(first, frame[0])
-    for _ in range(2):
-        np.testing.assert_array_equal(view.fill(frame[8], mask[8])[mask[0] == 0],
-                                      scene.frames[0][mask[0] == 0])
-    view.clear()
-    np.testing.assert_array_equal(view.fill(frame[8], mask[8]), frame[8])
-    view.update(frame[0], mask[0])
-    larger = np.zeros((9, 12, 3), np.uint8)
-    np.testing.assert_array_equal(view.update(larger, np.zeros((9, 12), np.uint8)), larger)
-    assert not np.array_equal(frame[0], first * 0)  # what was given stays as it is
 
 
 @pytest.mark.parametrize('robot_mask', ['arm', 'all'])
