@@ -29,7 +29,9 @@ Run: TypeAlias = Callable[[Any], int | None]
 
 COMMANDS: dict[str, tuple[str, Module]] = {
     'collect': ('simulate the expert and record it', 'sim_bridge.collect_command'),
-    'import-bair': ('import the BAIR robot pushing data set', 'tap_ros.recording.formats.bair'),
+    'import-video': ('import video files', 'tap_ros.recording.formats.pictures'),
+    'import-tfrecord': ('import TFRecord files: RLDS data sets, BAIR',
+                        'tap_ros.recording.formats.tfrecord'),
     'import-lerobot': ('import a LeRobot data set', 'tap_ros.recording.formats.lerobot'),
     'export-lerobot': ('export recordings as a LeRobot data set',
                        'tap_ros.recording.formats.lerobot_export'),
@@ -66,7 +68,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                 'tap_ros.evaluation.inspect_files'),
 }
 EXTRAS = {  # what only some commands need, and what pip installs for it
-    'google': "'.[bair]'", 'google_crc32c': "'.[bair]'", 'huggingface_hub': "'.[hub]'",
+    'google': "'.[tfrecord]'", 'google_crc32c': "'.[tfrecord]'", 'huggingface_hub': "'.[hub]'",
     'jinja2': '-r requirements-experiments.txt', 'pandas': '-r requirements-experiments.txt',
     'pyarrow': "'.[lerobot]'", 'ray': "'.[ray]'", 'websockets': "'.[explorer]'"}
 PROG = 'python -m tap_ros'

@@ -112,11 +112,11 @@ def test_commands_that_are_shown_are_valid():
 
 
 @pytest.mark.parametrize('line, named', [
-    ('', 'Expected one of {collect, import-bair'), ('colect', 'colect'),
+    ('', 'Expected one of {collect, import-video'), ('colect', 'colect'),
     ('evaluate', 'planning'), ('evaluate nothing', 'nothing'), ('bench nothing', 'nothing'),
     ('collect', '--out'), ('collect --out a --episodes many', '--episodes'),
     ('collect --out a --nothing 3', '--nothing'), ('collect --out a b', 'b'),
-    ('train other', 'other'), ('import-bair --out a', 'PATH'), ('paper --only', '--only')])
+    ('train other', 'other'), ('import-video --out a', 'PATH'), ('paper --only', '--only')])
 def test_words_that_are_wrong_are_named(line, named, capsys):
     assert named in refused(line, capsys)
 

@@ -14,21 +14,22 @@ from pathlib import Path
 import re
 import shutil
 import subprocess
-import sys
 
+import cv2
 import numpy as np
 import pyarrow
 from pyarrow import parquet
+import pyarrow.compute
 import pytest
 from tap_ros.cli import main
 from tap_ros.recording.formats import lerobot_export
-from tap_ros.recording.formats.lerobot import ACTION, CAMERA, OBJECTS, STATE, video_frames
+from tap_ros.recording.formats.lerobot import ACTION, CAMERA, OBJECTS, STATE
+from tap_ros.recording.formats.pictures import video_frames
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import Reading
 
 SAMPLE = 'bags/sample_push2'
 LOADER = """
-import sys
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 data = LeRobotDataset('local/test', root=sys.argv[1])
@@ -116,13 +117,6 @@ def test_lerobots_own_loader_reads_the_same(exported, truth, tmp_path):
     assert found['task'].tolist() == [e.task for e in truth for _ in e.frames]
 
 
-def test_a_video_of_an_unknown_codec_is_named_with_the_remedy(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'av', None)
-    (tmp_path / 'a.mp4').write_bytes(b'no video')
-    with pytest.raises(ValueError, match='a.mp4: OpenCV knows no decoder .*pip install av'):
-        next(video_frames(tmp_path / 'a.mp4'))
-
-
 def test_what_opencv_cannot_decode_pyav_does(tmp_path):
     av = pytest.importorskip('av', reason='PyAV is no dependency')
     pictures = [np.full((64, 64, 3), 20 * t, np.uint8) for t in range(8)]
@@ -135,7 +129,7 @@ def test_what_opencv_cannot_decode_pyav_does(tmp_path):
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)
-    found = list(video_frames(tmp_path / 'a.mp4'))
+    found = [picture for _, picture in video_frames(tmp_path / 'a.mp4')]
     assert len(found) == 8
     assert np.abs(np.array(found).astype(int) - pictures).max() <= 6
 
@@ -200,7 +194,7 @@ def test_damage_is_named_in_one_line_and_leaves_no_half_file(lossless, tmp_path,
     for path, content, words in (
             (info, None, 'info.json: cannot be read, so this is no LeRobot data set: No such'),
             (info, b'{', 'not the description'),
-            (info, text.replace('v3.0', 'v2.1').encode(), 'expected v3 .*convert_dataset_v21'),
+            (info, text.replace('v3.0', 'v1.6').encode(), 'v1.6, .* expected v2 or v3'),
             (info, text.replace('"features"', '"other"').encode(), "garbles 'features'"),
             (data, None, 'file-000.parquet: cannot be read'),
             (data, (lossless / data).read_bytes()[:5000], 'file-000.parquet: cannot be read'),
@@ -217,10 +211,107 @@ def test_damage_is_named_in_one_line_and_leaves_no_half_file(lossless, tmp_path,
         shutil.rmtree(folder)
 
 
-def test_a_folder_that_is_there_is_not_touched(tmp_path, capsys):
-    (tmp_path / 'a').mkdir()
-    (tmp_path / 'a' / 'precious').write_text('1')
-    assert main(['export-lerobot', '--recordings', SAMPLE, '--out', str(tmp_path / 'a')]) == 1
-    assert 'is there already' in capsys.readouterr().err
-    assert main(['import-lerobot', str(tmp_path), '--out', str(tmp_path / 'a')]) == 1
-    assert [p.name for p in (tmp_path / 'a').iterdir()] == ['precious']
+def rewrite(folder, path, change):
+    """Change a table of a set."""
+    file = folder / path / 'chunk-000' / 'file-000.parquet'
+    parquet.write_table(change(parquet.read_table(file)), file)
+
+
+def test_version_2_comes_as_version_3_does(lossless, truth, tmp_path):
+    """Version 2 has a file an episode, lines of JSON instead of tables, and other paths."""
+    folder = tmp_path / 'set'
+    shutil.copytree(lossless, folder)
+    tables = [parquet.read_table(path) for path in sorted(folder.glob('data/*/*.parquet'))]
+    for path in folder.glob('data/*/*'):
+        path.unlink()
+    rows = [(e, part) for table in tables for e in dict.fromkeys(
+        table['episode_index'].to_pylist()) for part in [table.filter(
+            pyarrow.compute.equal(table['episode_index'], e))]]
+    for e, part in rows:
+        parquet.write_table(part, folder / f'data/chunk-000/episode_{e:06d}.parquet')
+    shutil.rmtree(folder / 'meta' / 'episodes')
+    (folder / 'meta' / 'episodes.jsonl').write_text(''.join(json.dumps(
+        {'episode_index': e, 'tasks': ['push'], 'length': len(part)}) + '\n' for e, part in rows))
+    info = json.loads((folder / 'meta' / 'info.json').read_text())
+    info |= {'codebase_version': 'v2.1', 'data_path':
+             'data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet'}
+    info['features'][CAMERA]['shape'] = [3, 64, 64]  # channels first, as some sets have it
+    (folder / 'meta' / 'info.json').write_text(json.dumps(info))
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 0
+    for new, old in zip(iter_episodes(tmp_path / 'bag'), truth, strict=True):
+        np.testing.assert_array_equal(new.frames, old.frames)
+        np.testing.assert_allclose(new.object_pixels, old.object_pixels)
+        assert new.task == 'push'
+
+
+@pytest.fixture
+def filmed(tmp_path):
+    """
+    Return a set of two episodes of 8 rows at 4 Hz that was filmed at 12 Hz.
+
+    The grey of a picture tells the number of its row, counted through both episodes.
+    """
+    folder, key, N = tmp_path / 'filmed', 'observation.images.top', 16
+    for name in ('data', 'meta/episodes', f'videos/{key}'):
+        (folder / name / 'chunk-000').mkdir(parents=True)
+    place = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
+    (folder / 'meta' / 'info.json').write_text(json.dumps({
+        'codebase_version': 'v3.0', 'fps': 4, 'data_path': f'data/{place}.parquet',
+        'video_path': f'videos/{{video_key}}/{place}.mp4',
+        'features': {key: {'dtype': 'video', 'shape': [64, 64, 3]}}}))
+    index = np.arange(N)
+    parquet.write_table(pyarrow.table({
+        'timestamp': (index % 8 / 4).astype(np.float32), 'index': index,
+        'episode_index': index // 8}), folder / 'data/chunk-000/file-000.parquet')
+    parquet.write_table(pyarrow.Table.from_pylist([{
+        'episode_index': e, 'length': 8, 'tasks': ['push'], 'dataset_from_index': 8 * e,
+        **{f'{part}/{name}_index': 0 for part in ('data', f'videos/{key}')
+           for name in ('chunk', 'file')}, f'videos/{key}/from_timestamp': 2.0 * e}
+        for e in range(2)]), folder / 'meta/episodes/chunk-000/file-000.parquet')
+    video = cv2.VideoWriter(str(folder / f'videos/{key}/chunk-000/file-000.mp4'),
+                            cv2.VideoWriter.fourcc(*'mp4v'), 12, (64, 64))
+    for i in range(3 * N):
+        video.write(np.full((64, 64, 3), i // 3 * 15, np.uint8))
+    video.release()
+    return folder, key
+
+
+@pytest.mark.parametrize('second', [2.0, 1.5, 0.0])
+def test_frames_are_those_of_the_rows_times_and_of_one_episode_each(
+        filmed, tmp_path, second, recwarn):
+    folder, key = filmed
+    name = f'videos/{key}/from_timestamp'
+    rewrite(folder, 'meta/episodes', lambda table: table.set_column(
+        table.column_names.index(name), name, pyarrow.array([0.0, second])))
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 0
+    seen = np.concatenate([e.frames.mean((1, 2, 3)) for e in iter_episodes(tmp_path / 'bag')])
+    assert np.abs(seen - 15 * np.arange(16)).max() < 5
+    assert any('within the one before' in str(each.message) for each in recwarn) == (second < 2)
+
+
+def test_a_video_that_ends_early_is_named(filmed, tmp_path, capsys):
+    folder, key = filmed
+    rewrite(folder, 'data', lambda table: table.set_column(
+        0, 'timestamp', pyarrow.array(np.float32(table['timestamp']) * 3)))
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 1
+    assert 'has no frame at' in capsys.readouterr().err
+
+
+def test_a_depth_camera_is_no_candidate(lossless, truth, tmp_path, capsys):
+    folder, depth = tmp_path / 'set', 'observation.images.depth'
+    shutil.copytree(lossless, folder)
+    info = json.loads((folder / 'meta' / 'info.json').read_text())
+    info['features'] = {depth: {'dtype': 'image', 'shape': [64, 64, 1]}, **info['features']}
+    (folder / 'meta' / 'info.json').write_text(json.dumps(info))
+    data = cv2.imencode('.png', np.full((64, 64), 900, np.uint16))[1].tobytes()
+    for file in folder.glob('data/*/*.parquet'):
+        table = parquet.read_table(file)
+        parquet.write_table(table.append_column(depth, pyarrow.array(
+            [{'bytes': data, 'path': ''}] * len(table))), file)
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 0
+    assert depth in capsys.readouterr().out
+    np.testing.assert_array_equal(
+        next(iter_episodes(tmp_path / 'bag')).frames, truth[0].frames)
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'b'), '--camera',
+                 depth]) == 1
+    assert 'more than 8 bits' in capsys.readouterr().err

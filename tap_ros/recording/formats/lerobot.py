@@ -1,14 +1,15 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Import a LeRobotDataset v3.0 as recordings.
+Import a LeRobotDataset of version 2 or 3 as recordings.
 
 Pictures of one camera, and the task as text. Actions, states and objects only of sets that have
 ours: four numbers called dx, dy, dz and opening, and so on; of other robots they would be an arm's
 command with another meaning.
 
-In such a set meta/info.json, stats.json and tasks.parquet describe it, meta/episodes has a row an
-episode, data a row a frame. Pictures are files in the rows, or videos of several episodes.
+In such a set meta/info.json describes it, and meta/episodes has a row an episode (v2: a line of
+episodes.jsonl), data a row a frame. Pictures are files in the rows, or videos, of several episodes
+(v2: of one), from which the frame nearest to a row's time is taken.
 """
 
 from collections.abc import Iterator
@@ -16,20 +17,16 @@ from dataclasses import dataclass
 import json
 from pathlib import Path
 from typing import Annotated, Any
+import warnings
 
-import cv2
 import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ConfigError, ImageError, RecordingError
-from tap_ros.files import only_writer
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
-from tap_ros.options import Folder
-from tap_ros.recording.episode import Episode, OUTCOMES
-from tap_ros.recording.reading_options import Part
-from tap_ros.recording.writer import EpisodeWriter, write_metadata
+from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
+from tap_ros.recording.formats.pictures import make_episode, Target, video_frames, write_bag
 from tap_ros.text import escaped, listing
-from tqdm import tqdm
 from tyro import conf
 
 INFO = 'meta/info.json'
@@ -38,29 +35,22 @@ STATE, OBJECTS, ACTION = 'observation.state', 'observation.environment_state', '
 NAMES = {ACTION: ['dx', 'dy', 'dz', 'opening'], STATE: list(GRIPPER_JOINTS)}  # of our numbers
 INDICES = ('frame_index', 'episode_index', 'index', 'task_index')  # columns that all sets have
 SEED, OUTCOME = 'tap_ros/seed', 'tap_ros/outcome'  # columns of ours beside LeRobot's
-EPISODES_PER_FILE = 25
-EPISODE_SPACING_NS = 60 * 10**9  # between the end of an episode and the start of the next
 _INFO_BYTES = 2**24
+_DAMAGE = (KeyError, TypeError, ValueError, IndexError, ImageError, OSError)
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(Target):
     """
     Options of the command.
 
     :param path: folder of the data set, with meta/info.json.
-    :param out: folder of the bag; must not exist, or be empty.
-    :param camera: feature whose pictures are taken; needed where the set has several cameras.
-    :param crop: square part of the pictures that is kept, as in train --help.
-    :param size: pixels a side that they are scaled to; 0: not scaled.
+    :param camera: feature whose pictures are taken; needed where the set has several of colour.
     """
 
     path: Annotated[conf.Positional[str], conf.arg(metavar='PATH')]
-    out: Folder
     camera: Annotated[str, conf.arg(metavar='FEATURE', help_behavior_hint=(
         '(default: the only one)'))] = ''
-    crop: Part = ''
-    size: int = 0
 
 
 def run(args: Options) -> None:
@@ -69,31 +59,19 @@ def run(args: Options) -> None:
 
     :raises TapError: for a set that cannot be read, and a folder that holds something.
     """
-    data, out, crop = DataSet(args.path, args.camera), Path(args.out), Crop(args.crop, args.size)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f'--out {escaped(out)}: is not empty; name a new folder')
-    with only_writer(out):
-        episodes = iter(tqdm(data.episodes(crop), 'importing', len(data.rows), unit='episode',
-                             delay=1))
-        count = frames = 0
-        for number in range(-(-len(data.rows) // EPISODES_PER_FILE)):
-            with EpisodeWriter(out / f'{out.resolve().name}_{number}.mcap') as writer:
-                for _, episode in zip(range(EPISODES_PER_FILE), episodes):
-                    writer.write(episode)
-                    count, frames = count + 1, frames + len(episode)
-        write_metadata(out)
-    print(f'{escaped(out)}: {count} episodes, {frames} frames of {data.camera}')
+    data = DataSet(args.path, args.camera)
+    print(f'{write_bag(args, data.episodes(args.cut), len(data.rows))} of {data.camera}')
     if data.unused:
         print(f'not taken: {listing(data.unused)}')
 
 
 class DataSet:
     """
-    A LeRobotDataset v3.0 in a folder.
+    A LeRobotDataset in a folder.
 
     :param folder: of the set.
-    :param camera: feature whose pictures are taken; '': the only one.
-    :ivar rows: of meta/episodes, dicts in the order of the episodes.
+    :param camera: feature whose pictures are taken; '': the only one of colour.
+    :ivar rows: of meta/episodes, dicts in the order of the episodes, in the form of version 3.
     :ivar unused: features that are not taken over.
     :raises RecordingError: when it is none, or damaged.
     :raises ConfigError: for a camera that it has not, or has not alone.
@@ -108,33 +86,32 @@ class DataSet:
             version, self.fps = str(info['codebase_version']), float(info['fps'])
             self.features = dict(info['features'])
             self._data_path, self._video_path = str(info['data_path']), info.get('video_path')
-            cameras = [name for name, feature in self.features.items()
-                       if feature['dtype'] in ('image', 'video')]
+            self._chunk = int(info.get('chunks_size', 1000))
+            cameras = {name: feature for name, feature in self.features.items()
+                       if feature['dtype'] in ('image', 'video')}
         except OSError as error:
             raise RecordingError(f'{place}: cannot be read, so this is no LeRobot data set: '
                                  f'{error.strerror}') from error
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise RecordingError(f'{place}: not the description of a LeRobot data set; it lacks '
                                  f'or garbles {escaped(error)}') from error
-        if not version.startswith('v3.') or not 0 < self.fps <= 1e6:
-            raise RecordingError(
-                f'{escaped(self.folder)}: version {escaped(version, 20)}, {self.fps} frames a '
-                'second; expected v3 (python -m lerobot.scripts.convert_dataset_v21_to_v30 makes '
-                'one of v2.1)')
-        if not cameras:
-            raise RecordingError(f'{escaped(self.folder)}: no feature is of pictures')
-        if camera not in cameras and (camera or len(cameras) > 1):
-            raise ConfigError(f'--camera: expected one of {", ".join(map(escaped, cameras))}')
-        self.camera = camera or cameras[0]
+        if not version.startswith(('v2.', 'v3.')) or not 0 < self.fps <= 1e6:
+            raise RecordingError(f'{escaped(self.folder)}: version {escaped(version, 20)}, '
+                                 f'{self.fps} frames a second; expected v2 or v3')
+        self._file: tuple[Path, Any] | None = None  # data file in memory
+        self.rows = self._read_rows()
+        colour = [name for name in cameras if not self._is_depth(name)]
+        if camera not in cameras and (camera or len(colour) != 1):
+            raise ConfigError(f'{escaped(self.folder)}: --camera: expected one of '
+                              f'{listing(colour or cameras) or "its cameras, but there are none"}')
+        self.camera = camera or colour[0]
         self._objects = self._object_names()
         taken = {self.camera, 'timestamp', *INDICES, *filter(self._is_ours, NAMES)}
         if self._objects:
             taken.add(OBJECTS)
         self.unused = sorted(self.features.keys() - taken)
-        self.rows = self._read_rows()
-        self._file: tuple[Path, Any] | None = None  # data file in memory
-        # Path, frames and number of the next one of a video.
-        self._video: tuple[Path, Iterator[np.ndarray], int] | None = None
+        self._starts = self._find_starts() if self._is_video else {}
+        self._video: _Video | None = None
 
     def episodes(self, crop: Crop) -> Iterator[Episode]:
         """
@@ -143,16 +120,17 @@ class DataSet:
         :param crop: Crop of the pictures.
         :raises RecordingError: for what cannot be read; it names the file.
         """
-        begin = 10**9
         for row in self.rows:
             try:
-                episode = self._episode(row, crop, begin)
-            except (KeyError, TypeError, ValueError, IndexError, ImageError, OSError) as error:
+                yield self._episode(row, crop)
+            except _DAMAGE as error:
                 raise RecordingError(
                     f'{escaped(self.folder)}: episode {escaped(row["episode_index"], 20)} cannot '
                     f'be read: {escaped(error, 200)}') from error
-            begin = int(episode.stamps[-1]) + EPISODE_SPACING_NS
-            yield episode
+
+    @property
+    def _is_video(self) -> bool:
+        return bool(self.features[self.camera]['dtype'] == 'video')
 
     def _flat_names(self, key: str) -> list[Any]:
         """Return the names of a feature's numbers; some sets have them in a dict, or none."""
@@ -173,109 +151,141 @@ class DataSet:
         return names if object_columns(names) == columns else ()
 
     def _read_rows(self) -> list[dict[str, Any]]:
-        """Return the rows of meta/episodes."""
+        """Return the rows of meta/episodes, or the lines of episodes.jsonl."""
         rows: list[dict[str, Any]] = []
         for file in sorted((self.folder / 'meta' / 'episodes').glob('*/*.parquet')):
             table = _read_parquet(file)
             rows += table.select(
                 [name for name in table.column_names if not name.startswith('stats/')]).to_pylist()
+        lines = self.folder / 'meta' / 'episodes.jsonl'
+        try:
+            if not rows and lines.exists():
+                rows = [json.loads(line) for line in lines.read_text().splitlines() if line]
+            rows = sorted(rows, key=lambda row: (int(row['episode_index']), int(row['length'])))
+        except _DAMAGE as error:
+            raise RecordingError(f'{escaped(lines)}: cannot be read: {escaped(error)}') from error
         if not rows:
             raise RecordingError(f'{escaped(self.folder)}: meta/episodes holds no episode')
-        return sorted(rows, key=lambda row: row['episode_index'])
+        return rows
 
-    def _episode(self, row: dict[str, Any], crop: Crop, begin: int) -> Episode:
-        """Return the episode of a row, its stamps from `begin` on."""
-        path = self.folder / self._data_path.format(
-            chunk_index=row['data/chunk_index'], file_index=row['data/file_index'])
+    def _is_depth(self, camera: str) -> bool:
+        """Tell whether a feature is of depth: by its description, or 16 bits a pixel."""
+        about = self.features[camera].get('info') or {}
+        if any(about.get(name) for name in ('video.is_depth_map', 'is_depth_map')):
+            return True
+        if self.features[camera]['dtype'] == 'video':
+            return False
+        try:
+            data = self._file_of(self._rows_of(self.rows[0])[camera][0].as_py())
+        except _DAMAGE:
+            return False
+        return data.startswith(b'\x89PNG') and data[24] == 16
+
+    def _path(self, pattern: object, row: dict[str, Any], part: str) -> Path:
+        """Return the path of a file of an episode; part is data, or videos/ and the camera."""
+        index = int(row['episode_index'])
+        return self.folder / str(pattern).format(
+            video_key=self.camera if part != 'data' else '', episode_index=index,
+            episode_chunk=index // self._chunk, **{
+                name: row.get(f'{part}/{name}', 0) for name in ('chunk_index', 'file_index')})
+
+    def _rows_of(self, row: dict[str, Any]) -> Any:
+        """Return the rows of an episode as a table."""
+        path = self._path(self._data_path, row, 'data')
         if self._file is None or self._file[0] != path:
             self._file = path, _read_parquet(path)
-        table, index, T = self._file[1], row['episode_index'], row['length']
-        part = table.slice(row['dataset_from_index'] - table['index'][0].as_py(), T)
-        if len(part) != T or set(part['episode_index'].to_pylist()) != {index}:
+        table, T = self._file[1], row['length']
+        first = table['index'][0].as_py()
+        part = table.slice(row.get('dataset_from_index', first) - first, T)
+        if len(part) != T or set(part['episode_index'].to_pylist()) != {row['episode_index']}:
             raise ValueError('its rows are not where meta/episodes says')
-        is_video = self.features[self.camera]['dtype'] == 'video'
-        pictures = self._decode(row, T) if is_video else map(
-            self._picture, part[self.camera].to_pylist())
-        frames = np.stack([crop.image(picture) for picture in pictures])
+        return part
+
+    def _find_starts(self) -> dict[int, float]:
+        """Return where in its video each episode begins, in seconds; episodes cannot overlap."""
+        starts: dict[int, float] = {}
+        ends: dict[Path, float] = {}  # of the episodes so far
+        overlaps = 0
+        for row in self.rows:
+            path = self._path(self._video_path, row, f'videos/{self.camera}')
+            told = row.get(f'videos/{self.camera}/from_timestamp', 0.0)
+            free = ends.get(path, told)
+            is_within = told < free - 0.5 / self.fps
+            overlaps += is_within
+            starts[row['episode_index']] = start = free if is_within else told
+            ends[path] = start + row['length'] / self.fps
+        if overlaps:
+            warnings.warn(f'{escaped(self.folder)}: {overlaps} episodes begin, by their '
+                          'from_timestamp, within the one before; they are taken one after the '
+                          'other', RecordingWarning, stacklevel=3)
+        return starts
+
+    def _episode(self, row: dict[str, Any], crop: Crop) -> Episode:
+        """Return the episode of a row."""
+        part, T, frames, size = self._rows_of(row), row['length'], [], (1, 1)
+        for picture in self._decode(row, part) if self._is_video else (
+                decompress(self._file_of(cell), 'unknown')
+                for cell in part[self.camera].to_pylist()):
+            frames.append(crop.image(picture))
+            size = picture.shape[:2]
 
         def numbers(key: str, width: int) -> np.ndarray:
             return np.array(part[key].to_pylist(), np.float32).reshape(T, width)
 
-        K = len(self._objects)
-        pixels = numbers(OBJECTS, 2 * K) if K else np.empty((T, 0), np.float32)
-        height, width = self.features[self.camera]['shape'][:2]
-        actions = np.zeros((T, 4), np.float32)
+        known: dict[str, Any] = {}
+        if self._objects:
+            pixels = numbers(OBJECTS, 2 * len(self._objects)).reshape(T, -1, 2)
+            known['object_pixels'] = crop.pixels(pixels, size)
         if self._is_ours(ACTION):  # nothing leads on from the last frame
-            actions[:-1] = numbers(ACTION, 4)[:-1]
-        poses, outcome = np.full((T, K, 7), np.nan), row.get(OUTCOME, '')
-        return Episode(
-            frames=frames, stamps=begin + (np.arange(T) * (1e9 / self.fps)).astype(np.int64),
-            actions=actions, grippers=numbers(STATE, 4) if self._is_ours(STATE) else np.full(
-                (T, 4), np.nan, np.float32),
-            object_names=self._objects,
-            object_pixels=crop.pixels(pixels.reshape(T, K, 2), (height, width)),
-            object_poses=poses, goal_frame=None,
-            goal_pixels=np.full((K, 2), np.nan, np.float32), goal_poses=poses[0],
-            object_source='imported', task=str((row.get('tasks') or [''])[0]),
-            seed=int(row.get(SEED, index)),
-            outcome=outcome if outcome in OUTCOMES else '')
+            known['actions'] = np.append(numbers(ACTION, 4)[:-1], np.zeros((1, 4), np.float32), 0)
+        if self._is_ours(STATE):
+            known['grippers'] = numbers(STATE, 4)
+        outcome = row.get(OUTCOME, '')
+        return make_episode(
+            frames, np.arange(T) / self.fps, self._objects,
+            task=str((row.get('tasks') or [''])[0]), seed=int(row.get(SEED, row['episode_index'])),
+            outcome=outcome if outcome in OUTCOMES else '', **known)
 
-    def _picture(self, cell: Any) -> np.ndarray:
-        """Return a picture of a row, uint8 (H, W, 3): bytes of a file, or the name of one."""
+    def _file_of(self, cell: Any) -> bytes:
+        """Return the picture file of a row: its bytes, or what has its name."""
         data = cell.get('bytes') if isinstance(cell, dict) else None
-        return decompress(data or (self.folder / str(cell['path'])).read_bytes(), 'unknown')
+        return data or (self.folder / str(cell['path'])).read_bytes()
 
-    def _decode(self, row: dict[str, Any], count: int) -> Iterator[np.ndarray]:
-        """Yield frames of a video; episodes follow each other, so that none is searched for."""
-        key = f'videos/{self.camera}/'
-        path = self.folder / str(self._video_path).format(
-            video_key=self.camera, chunk_index=row[key + 'chunk_index'],
-            file_index=row[key + 'file_index'])
-        first = round(row[key + 'from_timestamp'] * self.fps)
-        if self._video is None or self._video[0] != path or self._video[2] > first:
-            self._video = path, video_frames(path), 0
-        _, frames, at = self._video
-        for number in range(at, first + count):
-            frame = next(frames, None)
-            if frame is None:
-                raise ValueError(f'{path}: ends before frame {number}')
-            if number >= first:
-                yield frame
-        self._video = path, frames, first + count
+    def _decode(self, row: dict[str, Any], part: Any) -> Iterator[np.ndarray]:
+        """Yield the frames of a video at the times of rows."""
+        path = self._path(self._video_path, row, f'videos/{self.camera}')
+        times = self._starts[row['episode_index']] + np.array(part['timestamp'], float).ravel()
+        if self._video is None or self._video.path != path or self._video.now[0] > times[0]:
+            self._video = _Video(path)
+        for at in times.tolist():
+            seen, picture = self._video.at(at)
+            if abs(seen - at) > 1 / self.fps:
+                raise ValueError(f'{path}: has no frame at {at:.3f} s, the last is at {seen:.3f}')
+            yield picture
+
+
+class _Video:
+    """
+    A video from which frames are taken one after the other, by their times.
+
+    :param path: of the file.
+    :ivar now: (seconds, picture) that was taken last.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._frames = path, video_frames(path)
+        self.now, self._next = next(self._frames), next(self._frames, None)
+
+    def at(self, seconds: float) -> tuple[float, np.ndarray]:
+        """Return the frame nearest to a time, of those not before the last one."""
+        while self._next and abs(self._next[0] - seconds) <= abs(self.now[0] - seconds):
+            self.now, self._next = self._next, next(self._frames, None)
+        return self.now
 
 
 def object_columns(names: tuple[str, ...]) -> list[str]:
     """Return the names of the numbers in OBJECTS: u and v of each object."""
     return [f'{name}_{axis}' for name in names for axis in 'uv']
-
-
-def video_frames(path: Path) -> Iterator[np.ndarray]:
-    """
-    Decode a video: by OpenCV, or by PyAV where that cannot and PyAV is installed.
-
-    :param path: of the file.
-    :return: iterator over uint8 (H, W, 3) rgb.
-    :raises ValueError: when it is not there, or its codec is unknown.
-    """
-    if not path.is_file():
-        raise ValueError(f'{path} is not there')
-    capture = cv2.VideoCapture(str(path))
-    good, frame = capture.read()
-    if good:
-        while good:
-            yield np.ascontiguousarray(frame[..., ::-1])
-            good, frame = capture.read()
-        return
-    try:
-        import av  # no dependency: its wheels hold GPL libraries
-    except ImportError:
-        raise ValueError(
-            f'{path}: OpenCV knows no decoder for it, as for AV1; install PyAV (pip install av) '
-            'if its licence suits you, or make it anew: ffmpeg -i OLD.mp4 -c:v libvpx-vp9 NEW.mp4'
-        ) from None
-    with av.open(str(path)) as container:
-        for picture in container.decode(video=0):
-            yield picture.to_ndarray(format='rgb24')
 
 
 def _read_parquet(path: Path) -> Any:

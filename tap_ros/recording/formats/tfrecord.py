@@ -1,10 +1,22 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Read TFRecord files of tf.train.Example messages, without TensorFlow."""
+"""
+Import episodes from TFRecord files, without TensorFlow: RLDS data sets, and BAIR robot pushing.
 
+A record is an episode. Its pictures are the feature steps/observation/NAME, as RLDS data sets of
+Open X-Embodiment have it, or 0/NAME/encoded, 1/NAME/encoded and so on, as BAIR has them. Pictures
+and the instruction are taken; times are nominal, since records do not tell them.
+"""
+
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import count
+import math
 from pathlib import Path
+import re
 import struct
+from typing import Annotated, Any
 
 from google.protobuf import (
     descriptor_pb2,
@@ -15,7 +27,13 @@ from google.protobuf import (
 )
 import google_crc32c
 import numpy as np
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ConfigError, ImageError, RecordingError
+from tap_ros.images.encodings import decompress
+from tap_ros.options import default_text
+from tap_ros.recording.episode import Episode
+from tap_ros.recording.formats.pictures import make_episode, Paths, Target, write_bag
+from tap_ros.text import escaped, listing
+from tyro import conf
 
 # The messages of tensorflow/core/example/{example,feature}.proto.
 _PROTO = """
@@ -42,7 +60,109 @@ message_type { name: "Example"
 _POOL = descriptor_pool.DescriptorPool()  # its own, so that TensorFlow may be loaded beside it
 _POOL.Add(text_format.Parse(_PROTO, descriptor_pb2.FileDescriptorProto()))
 _Example = message_factory.GetMessageClass(_POOL.FindMessageTypeByName('tap_ros.Example'))
+_FILES = b'\xff\xd8\xff', b'\x89PNG'  # JPEG, PNG
 _REMEDY = 'fetch the file again or leave it out'
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Target):
+    """
+    Options of `python -m tap_ros import-tfrecord`.
+
+    :param paths: .tfrecord files, or folders that hold some at any depth.
+    :param camera: NAME of the pictures; needed where records have those of several cameras.
+    :param fps: frames a second.
+    """
+
+    paths: Paths
+    camera: Annotated[str, conf.arg(metavar='NAME', help_behavior_hint=default_text)] = ''
+    fps: float = 5.0
+
+
+def run(args: Options) -> None:
+    """
+    Import, and print what was; episodes that the camera has no picture of are left out.
+
+    :raises TapError: for records that cannot be read, and a folder that holds something.
+    """
+    if not 0 < args.fps <= 1000:
+        raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000')
+    files = [file for path in map(Path, args.paths) for file in (
+        sorted(path.rglob('*.tfrecord*'), key=_natural) if path.is_dir() else [path])]
+    camera, blank = args.camera, Counter[bool]()
+
+    def episodes() -> Iterator[Episode]:
+        nonlocal camera
+        numbers = count()
+        for file in files:
+            for record, data in enumerate(read_records(file)):
+                number = next(numbers)
+                try:
+                    features = parse_example(data)
+                    camera = _choose(features, camera)
+                    pictures = list(map(_picture, _pictures(features, camera)))
+                except (RecordingError, ImageError) as error:
+                    raise RecordingError(f'{escaped(file)}: record {record}: {error}') from error
+                blank[_is_blank(pictures[0])] += 1
+                if not _is_blank(pictures[0]):
+                    said: Any = features.get('steps/language_instruction') or [b'']
+                    yield make_episode(
+                        list(map(args.cut.image, pictures)), np.arange(len(pictures)) / args.fps,
+                        task=said[0].decode(errors='replace'), seed=number)
+
+    print(f'{write_bag(args, episodes())} of {escaped(camera)}')
+    if blank[True]:
+        print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
+
+
+def _choose(features: dict[str, Any], camera: str) -> str:
+    """Return the camera whose pictures are taken, with the number of steps in a batch."""
+    found = sorted({
+        match[1] or match[2] for name, value in features.items() if isinstance(value, list)
+        and (match := re.fullmatch(r'steps/observation/(.+)|0/(.+)/encoded', name))
+        and _is_picture(value[0] if value else b'')})
+    if camera in found:
+        return camera
+    if camera or not found:
+        raise ConfigError(f'--camera {escaped(camera)}: expected one of '
+                          f'{listing(found) or "those with pictures, but there are none"}')
+    seen = [name for name in found if not _is_blank(_picture(_pictures(features, name)[0]))]
+    if len(seen) > 1:
+        raise ConfigError(f'--camera: expected one of {listing(seen)}')
+    return (seen or found)[0]
+
+
+def _pictures(features: dict[str, Any], camera: str) -> list[bytes]:
+    """Return the encoded pictures of an episode."""
+    together = features.get(f'steps/observation/{camera}')
+    if together is None:
+        together = []
+        while one := features.get(f'{len(together)}/{camera}/encoded'):
+            together += one
+    return list(together)
+
+
+def _is_picture(data: bytes) -> bool:
+    """Tell whether bytes are a picture file, or the pixels of a square picture."""
+    side = math.isqrt(len(data) // 3)
+    return data.startswith(_FILES) or side >= 8 and side * side * 3 == len(data)
+
+
+def _picture(data: bytes) -> np.ndarray:
+    """Return a picture, uint8 (H, W, 3)."""
+    side = math.isqrt(len(data) // 3)
+    if data.startswith(_FILES) or side * side * 3 != len(data):
+        return decompress(data, 'unknown')
+    return np.frombuffer(data, np.uint8).reshape(side, side, 3)
+
+
+def _is_blank(picture: np.ndarray) -> bool:
+    return bool((picture == picture[0, 0]).all())
+
+
+def _natural(path: Path) -> list[int | str]:
+    """Sort traj_256_to_511 before traj_1024_to_1279."""
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', str(path))]
 
 
 def read_records(path: str | Path) -> Iterator[bytes]:

@@ -1,0 +1,173 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Pictures of other formats as the episodes of a bag; the command `python -m tap_ros import-video`.
+
+Of other robots pictures and the task as text are taken; their actions would be commands with
+another meaning.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.files import only_writer
+from tap_ros.images.crop import Crop
+from tap_ros.options import default_text, Folder
+from tap_ros.recording.episode import Episode
+from tap_ros.recording.reading_options import Part
+from tap_ros.recording.writer import EpisodeWriter, write_metadata
+from tap_ros.text import escaped
+from tqdm import tqdm
+from tyro import conf
+
+EPISODES_PER_FILE = 25
+EPISODE_SPACING_NS = 60 * 10**9  # between the end of an episode and the start of the next
+VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
+Paths = Annotated[conf.Positional[tuple[str, ...]], conf.arg(
+    metavar='PATH [PATH ...]', help_behavior_hint='(required)')]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """
+    Where imported episodes go, and what is kept of their pictures.
+
+    :param out: folder of the bag; must not exist, or be empty.
+    :param crop: square part of the pictures that is kept, as in train --help.
+    :param size: pixels a side that they are scaled to; 0: not scaled.
+    """
+
+    out: Folder
+    crop: Part = ''
+    size: int = 0
+
+    @property
+    def cut(self) -> Crop:
+        """What is made of a picture."""
+        return Crop(self.crop, self.size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Target):
+    """
+    Options of the command: one video is one demonstration.
+
+    :param paths: video files of one camera, in the order of the demonstrations.
+    :param fps: frames a second; 0: as the videos say.
+    :param task: what is done in them, as text.
+    """
+
+    paths: Paths
+    fps: float = 0.0
+    task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
+
+
+def run(args: Options) -> None:
+    """
+    Import videos, and print what was.
+
+    :raises TapError: for what cannot be read, and a folder that holds something.
+    """
+    if not 0 <= args.fps <= 1000:
+        raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000, or 0')
+
+    def episodes() -> Iterator[Episode]:
+        for number, path in enumerate(map(Path, args.paths)):
+            seconds, frames = zip(*(
+                (at, args.cut.image(frame)) for at, frame in video_frames(path)))
+            yield make_episode(frames, np.arange(len(frames)) / args.fps if args.fps else seconds,
+                               task=args.task, seed=number)
+
+    print(write_bag(args, episodes(), len(args.paths)))
+
+
+def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.ndarray,
+                 object_names: tuple[str, ...] = (), **known: Any) -> Episode:
+    """
+    Make an episode of pictures.
+
+    :param frames: T pictures, uint8 (H, W, 3).
+    :param seconds: (T,), when they were taken, increasing.
+    :param object_names: of K objects, whose pixels are known.
+    :param known: other fields of Episode; what is left out is unknown, actions are zeros.
+    :return: Episode.
+    """
+    T, K = len(frames), len(object_names)
+    unknown = np.full((T, K, 7), np.nan)
+    fields = {
+        'actions': np.zeros((T, 4), np.float32), 'grippers': np.full((T, 4), np.nan, np.float32),
+        'object_pixels': np.full((T, K, 2), np.nan, np.float32), 'object_poses': unknown,
+        'goal_frame': None, 'goal_pixels': np.full((K, 2), np.nan, np.float32),
+        'goal_poses': np.full((K, 7), np.nan), 'object_source': 'imported'}
+    return Episode(frames=np.stack(frames), object_names=object_names,
+                   stamps=np.round(np.asarray(seconds) * 1e9).astype(np.int64),
+                   **(fields | known))  # type: ignore[arg-type]
+
+
+def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = None) -> str:
+    """
+    Write episodes one after the other, in files of EPISODES_PER_FILE.
+
+    :param target: Target.
+    :param episodes: iterable of Episode, whose stamps count from anywhere.
+    :param count: how many there are, to show progress.
+    :return: a line that says what was written.
+    :raises ConfigError: for a folder that holds something.
+    :raises RecordingError: when there is no episode.
+    """
+    out, begin, frames, done = Path(target.out), 10**9, 0, 0
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f'--out {escaped(out)}: is not empty; name a new folder')
+    size = (0, 0)
+    with only_writer(out):
+        left = iter(tqdm(episodes, 'importing', count, unit='episode', delay=1))
+        while part := list(islice(left, EPISODES_PER_FILE)):
+            number = done // EPISODES_PER_FILE
+            with EpisodeWriter(out / f'{out.resolve().name}_{number}.mcap') as writer:
+                for episode in part:
+                    stamps = episode.stamps - episode.stamps[0] + begin
+                    writer.write(replace(episode, stamps=stamps))
+                    begin, size = int(stamps[-1]) + EPISODE_SPACING_NS, episode.frames.shape[1:3]
+                    frames, done = frames + len(episode), done + 1
+        if not done:
+            raise RecordingError(f'{escaped(out)}: there is no episode to import')
+        write_metadata(out)
+    return f'{escaped(out)}: {done} episodes, {frames} frames of {size[1]}x{size[0]} pixels'
+
+
+def video_frames(path: Path) -> Iterator[tuple[float, np.ndarray]]:
+    """
+    Decode a video: by OpenCV, or by PyAV where that cannot and PyAV is installed.
+
+    :param path: of the file.
+    :return: iterator over (seconds from the first frame, uint8 (H, W, 3) rgb).
+    :raises RecordingError: when it is not there, or its codec is unknown.
+    """
+    if not path.is_file():
+        raise RecordingError(f'{escaped(path)} is not there')
+    capture, last = cv2.VideoCapture(str(path)), -1.0
+    good, frame = capture.read()
+    if good:
+        period = 1 / (capture.get(cv2.CAP_PROP_FPS) or 25)
+        while good:
+            at = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            last = at if at > last else last + period  # a stream of packets has no times
+            yield last, np.ascontiguousarray(frame[..., ::-1])
+            good, frame = capture.read()
+        return
+    try:
+        import av  # no dependency: its wheels hold GPL libraries
+    except ImportError:
+        raise RecordingError(
+            f'{escaped(path)}: is no video, or OpenCV knows no decoder for it, as for AV1; install'
+            ' PyAV (pip install av) if its licence suits you, or make it anew: ffmpeg -i OLD.mp4 '
+            '-c:v libvpx-vp9 NEW.mp4') from None
+    with av.open(str(path)) as container:
+        for picture in container.decode(video=0):
+            yield float(picture.time), picture.to_ndarray(format='rgb24')
