@@ -24,7 +24,7 @@ from tap_ros.recording.reading import Reading, reading_of
 from tap_ros.recording.reading_options import ReadingOptions
 from tap_ros.recording.topic_choice import find_topics
 from tap_ros.text import escaped, listing
-from tap_ros.training.split import split_episodes, warn_if_none
+from tap_ros.training.split import split_episodes, warn_if_few
 from tyro import conf
 
 LARGE = 256  # px; pictures with a longer side are not decoded whole
@@ -106,7 +106,7 @@ def run(args: Options) -> None:
     check_trainable(store.image_size, 'the predictor')
     training, held_out = split_episodes(store)
     print(f'train       {len(training)} episodes to learn from, {len(held_out)} held out')
-    warn_if_none(held_out)
+    warn_if_few(held_out)
 
 
 def _told_apart(store: EpisodeStore, reading: Reading) -> str:

@@ -265,10 +265,12 @@ def run(args: Options) -> None:
     if store.image_size != (network.config.image_size,) * 2:
         raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
-    fraction = training.get('settings', {}).get('test_fraction', TEST_FRACTION)
+    settings = training.get('settings', {})
     robot_mask = (trained_robot_mask(training)[0] if args.robot_mask == 'weights'
                   else args.robot_mask)
-    kept, held_out = with_masks(store, split_episodes(store, fraction), robot_mask)
+    kept, held_out = with_masks(store, split_episodes(
+        store, settings.get('test_fraction', TEST_FRACTION),
+        held_out=() if args.all else settings.get('held_out', ())), robot_mask)
     episodes = np.sort(np.concatenate([kept, held_out])) if args.all else held_out
     if not len(episodes):
         raise ConfigError('recordings: no episode of them was held out from training; '

@@ -46,13 +46,17 @@ class EpisodeStore:
 
     :param tables: list of EpisodeTable.
     :param file_hashes: hex digests of the files, in order, and what else tells them apart.
+    :param sources: of each table, the first file of its bag.
     :ivar image_size: (height, width) of the frames.
     :ivar camera_size: likewise, as they were recorded; None where that differs.
     :ivar marked: whether marks tell episodes apart, in some of the recordings at least.
     """
 
-    def __init__(self, tables: Sequence[EpisodeTable], file_hashes: Iterable[str]) -> None:
+    def __init__(self, tables: Sequence[EpisodeTable], file_hashes: Iterable[str],
+                 sources: Sequence[Path]) -> None:
         self._index = [(table, i) for table in tables for i in range(len(table))]
+        self._sources = [source for table, source in zip(tables, sources, strict=True)
+                         for _ in range(len(table))]
         lengths = [np.diff(table.starts) for table in tables]
         self.lengths = np.concatenate([np.empty(0, np.int64), *lengths])  # (E,) frames
         self.num_frames = int(self.lengths.sum())
@@ -72,6 +76,10 @@ class EpisodeStore:
         """Return Episode i."""
         table, local = self._index[i]
         return table.episode(local)
+
+    def source(self, i: int) -> Path:
+        """Return the first file of the bag that episode i is in."""
+        return self._sources[i]
 
     def frames(self, i: int) -> np.ndarray:
         """Return the frames of episode i, (T, H, W, 3) uint8."""
@@ -120,13 +128,15 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
         warn_of_damage(part)
     arms = [read_mount(bag[0].parent) for bag in bags]
     cutting = for_bags(reading, len(bags))
-    tables = [
-        assemble(run, arm, cutting) for bag, arm in zip(columns, arms) for run in runs_of(bag)]
+    runs = [(run, arm, bag[0]) for parts, arm, bag in zip(columns, arms, bags)
+            for run in runs_of(parts)]
+    tables = [assemble(run, arm, cutting) for run, arm, _ in runs]
     # What is read depends on these, too.
     apart = [repr(arm) for arm in arms if arm != ArmMount()]
     if replace(reading, image_topic='') != AS_RECORDED:
         apart.append(repr(replace(reading, image_topic='')))
-    store = EpisodeStore(tables, [*(job.digest for bag in jobs for job in bag), *apart])
+    store = EpisodeStore(tables, [*(job.digest for bag in jobs for job in bag), *apart],
+                         [source for _, _, source in runs])
     if not len(store):
         raise RecordingError(f'{list_paths(paths)}: no camera image lies within an episode')
     return store

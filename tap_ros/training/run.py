@@ -22,13 +22,13 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 from tap_ros.files import only_writer, storage_errors, write_atomically
-from tap_ros.recording.bags import check_first_picture
+from tap_ros.recording.bags import check_first_picture, find_bags
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.reading import reading_of
 from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
 from tap_ros.training.devices import device_name, joined, pick_device, Processes
 from tap_ros.training.inpainted import with_masks
-from tap_ros.training.split import split_episodes, warn_if_none
+from tap_ros.training.split import split_episodes, warn_if_few
 from tap_ros.training.weights import save_weights
 import torch
 from torch.utils.tensorboard import SummaryWriter
@@ -127,17 +127,27 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
     with joined(device) as processes:
         progress = progress and processes.first
         reading = reading_of(config)
-        check_first_picture(config.recordings, reading, f'the {kind.replace("_", " ")}')
-        store = open_recordings(list(config.recordings), progress=progress, reading=reading)
+        paths = _paths(config)
+        check_first_picture(paths, reading, f'the {kind.replace("_", " ")}')
+        store = open_recordings(paths, progress=progress, reading=reading)
         with _run_folder(config.out) if processes.first else nullcontext():
-            parts = with_masks(store, split_episodes(store, config.test_fraction, min_frames),
-                               config.robot_mask)
-            warn_if_none(parts[1])
+            parts = with_masks(store, split_episodes(
+                store, config.test_fraction, min_frames, config.held_out), config.robot_mask)
+            warn_if_few(parts[1])
             torch.manual_seed(config.seed)
             this = Run(config, kind, device, store, *parts, processes, progress)
             _train(this, prepare(this), min(config.steps, stop_at or config.steps), deadline,
                    after_step)
     return str(Path(config.out) / f'{kind}.safetensors')
+
+
+def _paths(config: Any) -> list[str]:
+    """Return the recordings, and of those held out what is not among them."""
+    def files(path: str) -> set[Path]:
+        return {file.resolve() for bag in find_bags(path) for file in bag}
+
+    known = set().union(*map(files, config.recordings))
+    return [*config.recordings, *(path for path in config.held_out if not files(path) <= known)]
 
 
 def _train(run: Run, course: Course[Trained, Item], last: int, deadline: float,

@@ -32,6 +32,7 @@ class RunSettings:
     :param recordings: .mcap files, bag folders, or folders of these.
     :param out: the run's folder; if it holds a checkpoint, training goes on from there.
     :param test_fraction: share of episodes held out, by seed.
+    :param held_out: recordings that are held out instead, among those to train on or beside them.
     :param seed: of the weights, batches and augmentation.
     :param device: where the networks are: 'auto', 'cpu' or 'cuda'.
     :param threads: of the CPU; 0: as many as there are.
@@ -42,6 +43,7 @@ class RunSettings:
     recordings: tuple[str, ...]
     out: str
     test_fraction: float = TEST_FRACTION
+    held_out: tuple[str, ...] = ()
     seed: int = 0
     device: str = 'auto'
     threads: int = 0
@@ -106,6 +108,8 @@ class RunOptions(RunSettings):
 
     recordings: Recordings
     out: Folder = ''
+    held_out: Annotated[tuple[str, ...], conf.arg(
+        metavar='BAG [BAG ...]', help_behavior_hint='(default: none)')] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which episodes a network is trained on, and which it is measured on."""
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 import warnings
 import zlib
@@ -14,43 +16,72 @@ if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
 
 TEST_FRACTION = 0.05  # held out unless a training says otherwise
+FEW = 5  # held-out episodes, of which scores say little
 
 
 def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
-                   min_frames: int = 3) -> tuple[np.ndarray, np.ndarray]:
+                   min_frames: int = 3,
+                   held_out: Sequence[str | Path] = ()) -> tuple[np.ndarray, np.ndarray]:
     """
-    Split episodes into training and held-out ones, by task and seed.
+    Split episodes into training and held-out ones, by task and seed, or by recording.
 
-    Episodes of the same scene land on the same side, whichever recording they are in.
-    Recordings without seeds are split by position. Of two scenes or more one is always held out,
-    unless the share is 0.
+    Episodes of the same scene land on the same side, whichever recording they are in. Recordings
+    without seeds are split by position, and what several cameras saw of one demonstration stays
+    together. Of two scenes or more one is always held out, unless the share is 0.
 
+    :param store: the EpisodeStore.
     :param test_fraction: the held-out share, 0..1.
     :param min_frames: episodes with fewer frames are left out.
+    :param held_out: files or folders: what is recorded there is held out, and nothing else.
     :return: (training, held-out), int64 arrays of episode indices.
-    :raises RecordingError: if no episode is long enough to train on.
+    :raises RecordingError: if no episode is long enough to train on, or all are held out.
     """
     usable = [i for i in range(len(store)) if store.lengths[i] >= min_frames]
     if not usable:
         raise RecordingError(f'recordings: no episode has at least {min_frames} frames; '
                              'record longer ones')
-    keys = [(store[i].task, store[i].seed) for i in usable]
+    chosen = np.array(usable)
+    if held_out:
+        places = {Path(path).resolve() for path in held_out}
+        held = np.array([not places.isdisjoint((file, *file.parents)) for file in (
+            store.source(i).resolve() for i in usable)])
+        if held.all():
+            raise RecordingError('recordings: all of them are held out; name others to train on')
+        return chosen[~held], chosen[held]
+    keys: list[object] = [(store[i].task, store[i].seed) for i in usable]
     if len(set(keys)) == 1:
-        keys = usable
+        keys = list(_demonstrations(store, usable))
     # A hash rather than a random draw: adding episodes moves none to the other side.
     hashes = np.array([zlib.crc32(repr(key).encode()) for key in keys])
     held = hashes < test_fraction * 2 ** 32
     if test_fraction and not held.any():
         held = hashes == hashes.min()
     if held.all():
-        held[0] = False
-    chosen = np.array(usable)
+        held = hashes != hashes[0]
     return chosen[~held], chosen[held]
 
 
-def warn_if_none(held_out: np.ndarray) -> None:
-    """Say before a training that nothing will be measured, as no episode is held out."""
+def _demonstrations(store: 'EpisodeStore', episodes: Sequence[int]) -> list[int]:
+    """Return for each episode the first one of its recording that was seen at the same time."""
+    known: dict[Path, list[tuple[int, int, int]]] = {}  # of a recording: first, last stamp, number
+    found = []
+    for i in episodes:
+        begin, *_, end = store[i].stamps
+        spans = known.setdefault(store.source(i), [])
+        same = [number for first, last, number in spans if begin <= last and first <= end]
+        found.append(same[0] if same else i)
+        spans.append((begin, end, found[-1]))
+    return found
+
+
+def warn_if_few(held_out: np.ndarray) -> None:
+    """Say before a training that nothing will be measured, or that few episodes measure it."""
     if not len(held_out):
         warnings.warn('recordings: no episode is held out, so nothing is measured; record at '
                       'least two, and give a --test-fraction above 0', RecordingWarning,
                       stacklevel=3)
+    elif len(held_out) < FEW:
+        count = f'{len(held_out)} episode{"s are" if len(held_out) > 1 else " is"}'
+        warnings.warn(f'recordings: only {count} held out, and scores of fewer than {FEW} say '
+                      'little; record more, give a larger --test-fraction, or --held-out BAG',
+                      RecordingWarning, stacklevel=3)

@@ -58,6 +58,8 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
             near = get_close_matches(name, known, 1)
             raise ConfigError(f'setting {name!r} of a {model} is unknown'
                               + (f'; did you mean {near[0]!r}?' if near else ''))
+    if isinstance(settings.get('held_out'), str | Path):
+        settings['held_out'] = (str(settings['held_out']),)
     chosen = find_recipe(model, recipe or recipe_of(model, bags, settings))
     return Path(function(config_class(
         recordings=bags, out=str(out or f'runs/{model}'), **{**chosen.settings, **settings})))

@@ -2,26 +2,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the split into training and held-out episodes."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
+from made_episodes import make_episode, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import RecordingError
+from tap_ros.planning.forward_training_config import ForwardTrainingConfig
+from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.training.split import split_episodes, warn_if_none
+from tap_ros.training.run import _paths
+from tap_ros.training.split import split_episodes, warn_if_few
 
 
 class Store:
-    """Episodes of which only the task, the seed and the length are known."""
+    """Episodes of which only the task, the seed, the length and the time are known."""
 
-    def __init__(self, seeds, length=9):
+    def __init__(self, seeds, length=9, times=None):
         self._seeds, self.lengths = seeds, np.full(len(seeds), length)
+        self._times = times or range(len(seeds))
 
     def __len__(self):
         return len(self._seeds)
 
     def __getitem__(self, i):
-        return SimpleNamespace(task='push2', seed=self._seeds[i])
+        return SimpleNamespace(task='push2', seed=self._seeds[i],
+                               stamps=10 * self._times[i] + np.arange(9))
+
+    def source(self, i):
+        return Path('bag/bag_0.mcap')
 
 
 def test_split_is_complete_and_does_not_depend_on_what_else_there_is():
@@ -36,32 +46,56 @@ def test_episodes_of_the_same_scene_land_on_the_same_side():
     assert {i % 24 for i in training}.isdisjoint(i % 24 for i in held_out)
 
 
-def test_recordings_without_seeds_are_split_by_position():
-    training, held_out = split_episodes(Store([None] * 24), 0.3)
-    assert 0 < len(held_out) < len(training)
+@pytest.mark.parametrize('times', [
+    [*range(12)] * 2, [i // 2 for i in range(24)], [*range(12)] * 3,
+    [i + shift for shift in (0, 0.4) for i in range(12)]])  # that camera begins a little later
+def test_cameras_of_one_demonstration_stay_on_one_side_without_seeds_too(times):
+    for seed in (0, None):
+        training, held_out = split_episodes(Store([seed] * len(times), times=times), 0.3)
+        assert 0 < len(held_out) < len(training)
+        assert {int(times[i]) for i in training}.isdisjoint(int(times[i]) for i in held_out)
+    alone = Store([0, 0], times=[1, 1])
+    assert not len(split_episodes(alone, 0.3)[1])
 
 
-def test_something_is_left_to_train_on():
+def test_something_is_left_to_train_on_and_one_of_several_scenes_is_always_held_out():
     training, held_out = split_episodes(Store(range(3)), 1.0)
     assert training.tolist() == [0] and held_out.tolist() == [1, 2]
-
-
-def test_one_of_several_scenes_is_always_held_out():
     for seeds in (range(2), range(20), [None] * 3):
         training, held_out = split_episodes(Store(seeds), 0.001)
         assert len(held_out) == 1 and len(training) == len(seeds) - 1
     training, held_out = split_episodes(Store([5, 8, 5, 8]), 0.001)
     assert len(held_out) == 2 and {i % 2 for i in training}.isdisjoint(i % 2 for i in held_out)
     assert not len(split_episodes(Store(range(20)), 0.0)[1])
-
-
-def test_a_lone_episode_is_trained_on_and_a_warning_says_so():
-    training, held_out = split_episodes(Store([7]), 0.05)
-    assert training.tolist() == [0] and not len(held_out)
-    with pytest.warns(RecordingWarning, match='no episode is held out'):
-        warn_if_none(held_out)
-
-
-def test_nothing_to_train_on_is_said():
     with pytest.raises(RecordingError, match='no episode has at least 100 frames'):
         split_episodes(Store(range(24)), 0.1, min_frames=100)
+
+
+def test_few_held_out_episodes_are_warned_of(recwarn):
+    for count, said in ((0, 'no episode is held out'), (1, '1 episode is'), (4, '4 episodes are')):
+        with pytest.warns(RecordingWarning, match=said):
+            warn_if_few(np.arange(count))
+    recwarn.clear()
+    warn_if_few(np.arange(5))
+    assert not recwarn.list
+
+
+def test_recordings_that_are_named_are_held_out_wherever_they_are(tmp_path, monkeypatch):
+    for number in range(3):
+        write_bag(tmp_path / 'all' / f'bag{number}', [make_episode(number, start=(
+            number + 1) * 10**10)])
+    other = write_bag(tmp_path / 'other', [make_episode(7, start=10**12)])
+    monkeypatch.chdir(tmp_path)
+
+    def split(recordings, *held_out):
+        paths = _paths(ForwardTrainingConfig(tuple(recordings), 'x', held_out=held_out))
+        store = open_recordings(paths, tmp_path / 'cache', progress=False)
+        return [[store[i].seed for i in part]
+                for part in split_episodes(store, 0.3, held_out=held_out)]
+
+    assert split(['all'], 'all/bag1') == [[0, 2], [1]]
+    assert split(['all'], str(tmp_path / 'all/bag1/bag1_0.mcap')) == [[0, 2], [1]]
+    assert split(['all/bag0', 'all/bag1'], str(other)) == [[0, 1], [7]]
+    assert split(['all', 'other'], 'all') == [[7], [0, 1, 2]]
+    with pytest.raises(RecordingError, match='all of them are held out'):
+        split(['all'], 'all')
