@@ -20,8 +20,9 @@ MAX_PIXELS = 2**24  # of a camera
 
 
 def is_empty(message: Any) -> bool:
-    """Return whether a sensor_msgs/Image is as it is by default: no picture."""
-    return message.width == 0 and message.height == 0 and len(message.data) == 0
+    """Return whether a message is as it is by default: no picture."""
+    size = getattr(message, 'width', 0), getattr(message, 'height', 0)  # of one not compressed
+    return size == (0, 0) and len(message.data) == 0
 
 
 def decode_image(message: Any, name: str = '', size: Sequence[int] | None = None,

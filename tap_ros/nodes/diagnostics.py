@@ -3,7 +3,7 @@
 """The state of a node, once a second on /diagnostics, where rqt and Foxglove read it."""
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 import math
 import threading
 import time
@@ -14,12 +14,14 @@ import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from tap_ros.nodes.subscriptions import why_silent
 from tap_ros.text import escaped
 
 PERIOD = 1.0  # s
 RATE_SECONDS = 10.0  # over which rates are taken
 WORK_SECONDS = 60.0  # over which percentiles are taken
 ERROR_SECONDS = 10.0  # that the level is ERROR after an error
+SILENT_SECONDS = 5.0  # of an input, after which a warning says why
 LIMIT = 1000  # events of a kind that are remembered, the newest ones
 
 
@@ -64,6 +66,8 @@ class Diagnostics:
     """
     Publishes the state of a node's work and inputs; its methods may be called from any thread.
 
+    An input that falls silent, or never comes, is named in the log with the reason and the remedy.
+
     Of the work: ERROR for some seconds after an error, else WARN while `idle` says why, else OK.
     Of each input: NotReceived (WARN), Stale (STALE) when its newest message is older than its
     `max_age_s`, or OK.
@@ -73,16 +77,19 @@ class Diagnostics:
         on which nothing may come for long.
     :param queue: called without arguments, returns how many requests wait; None for no queue.
     :param idle: called without arguments, returns why the node does not work, '' if it does.
+    :param expected: inputs on which something has to come, though nothing may come for long.
     """
 
     def __init__(self, node: Node, inputs: Mapping[str, float],
                  queue: Callable[[], int] | None = None,
-                 idle: Callable[[], str] = lambda: '') -> None:
-        self._node = node
+                 idle: Callable[[], str] = lambda: '', expected: Iterable[str] = ()) -> None:
+        self._node, self._begun = node, time.monotonic()
         self._queue, self._idle = queue, idle
         self._lock = threading.Lock()
         self._inputs = {node.resolve_topic_name(topic): Record(RATE_SECONDS, max_age_s)
                         for topic, max_age_s in inputs.items()}
+        self._expected = {node.resolve_topic_name(topic) for topic in expected}
+        self._told: set[str] = set()  # topics whose silence has been told
         self._work: dict[str, Record] = {}
         self._errors, self._last_error, self._error_time = 0, '', -math.inf
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -116,6 +123,21 @@ class Diagnostics:
             for topic, source in self._inputs.items():
                 message.status.append(self._describe_input(topic, source, now))
         self._publisher.publish(message)
+        if not self._idle():
+            self._tell_silence(now)
+
+    def _tell_silence(self, now: float) -> None:
+        """Warn, once for each silence, of inputs on which something should come."""
+        silent = {topic for topic, source in self._inputs.items()
+                  if now - max(source.newest, self._begun) > SILENT_SECONDS and (
+                      source.max_age_s < math.inf or not source.count and topic in self._expected)}
+        types = {one.topic_name: one.msg_type for one in list(self._node.subscriptions)}
+        for topic in sorted(silent - self._told):
+            why = why_silent(self._node, topic, types.get(topic))
+            self._node.get_logger().warning(
+                f'nothing has come on {escaped(topic)} for {SILENT_SECONDS:g} s'
+                + (f': {why}' if why else ', though it is published'))
+        self._told = silent
 
     def _describe_work(self, queue: int | None, now: float) -> DiagnosticStatus:
         values: dict[str, int | str] = {} if queue is None else {'queue': queue}

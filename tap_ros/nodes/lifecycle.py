@@ -53,7 +53,7 @@ class LifecycleBase(LifecycleNode):
         self.active = False
         self._failure: Exception | None = None  # of the last transition
         self._starting = False  # a failure of autostart is raised, and logged by run_node
-        self._card = ''
+        self._loaded = self._card = ''
         self._cards = self.create_publisher(String, '~/model_card', LATCHED)
         self.add_on_set_parameters_callback(self._check_loaded)
         self._service_change_state.callback = self._answering(self._service_change_state.callback)
@@ -61,9 +61,9 @@ class LifecycleBase(LifecycleNode):
     # What a subclass implements
 
     @abstractmethod
-    def load(self) -> None:
+    def load(self) -> str:
         """
-        Load the weights.
+        Load the weights; return what the node works with, for the log.
 
         :raises TapError: when they cannot be used.
         """
@@ -71,10 +71,6 @@ class LifecycleBase(LifecycleNode):
     @abstractmethod
     def unload(self) -> None:
         """Release the weights."""
-
-    @abstractmethod
-    def described(self) -> str:
-        """Return what the node works with, for the log."""
 
     @abstractmethod
     def files(self) -> list[Path]:
@@ -127,19 +123,17 @@ class LifecycleBase(LifecycleNode):
         """Load the weights."""
         def load() -> None:
             card = '\n'.join(map(model_card, self.files()))
-            self.load()
-            self._card = card
+            self._loaded, self._card = self.load(), card
 
         return self._try('configure', load)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to work."""
         def begin() -> None:
-            ready = f'ready: {self.described()}'
             self._cards.publish(String(data=self._card))
             self.resume()
             self.active = True  # last: nothing may fail after it
-            self.get_logger().info(ready)
+            self.get_logger().info(f'ready: {self._loaded}')
 
         return self._try('activate', begin)
 

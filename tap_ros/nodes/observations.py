@@ -15,6 +15,7 @@ from typing import Any
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CompressedImage
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.subscriptions import (
     ADAPT_PERIOD,
@@ -83,7 +84,7 @@ class Observations:
                   others: Mapping[str, Callable[..., Any]] = MappingProxyType({}),
                   on_demand: bool = False) -> None:
         """
-        Subscribe to the topics.
+        Subscribe to the topics; latched pictures may come on NAME/compressed, too.
 
         :param types: {short name: (message type, topic name)}.
         :param qos: QoSProfile of all of them.
@@ -98,23 +99,30 @@ class Observations:
             on_message(types[topic][1])
 
         group = PollOnlyGroup() if on_demand else callback_group
+        made: list[tuple[str, AdaptiveSubscription]] = []
         for topic, (message_type, name) in types.items():
-            self._subscriptions[topic] = AdaptiveSubscription(
-                node, message_type, name, others.get(topic, partial(put, topic)), qos, group)
+            def subscribe(kind: type, name: str, topic: str = topic) -> AdaptiveSubscription:
+                made.append((topic, AdaptiveSubscription(
+                    node, kind, name, others.get(topic, partial(put, topic)), qos, group)))
+                return made[-1][1]
+
+            self._subscriptions[topic] = subscribe(message_type, name)
+            if self._latched and topic == 'image':
+                subscribe(CompressedImage, f'{name}/compressed')
         if not on_demand:
-            adapt_regularly(node, self._subscriptions.values(), callback_group)
+            adapt_regularly(node, [one for _, one in made], callback_group)
             return
         adapted = [-math.inf]  # monotonic time
 
         def poll() -> None:
             with self._changed:  # all topics together, in the order of reception
                 taken = sorted(((reception_time(info), topic, message, info)
-                                for topic, subscription in self._subscriptions.items()
+                                for topic, subscription in made
                                 for message, info in subscription.take(POLL_LIMIT)),
                                key=lambda one: one[0])
                 if time.monotonic() - adapted[0] > ADAPT_PERIOD:
                     adapted[0] = time.monotonic()
-                    for subscription in self._subscriptions.values():  # nothing waits in it now
+                    for _, subscription in made:  # nothing waits in it now
                         subscription.adapt()
                 for _, topic, message, info in taken:
                     put(topic, message, info)

@@ -3,6 +3,7 @@
 """Starting and ending a node process, and how Fast DDS is set up for it."""
 
 from collections.abc import Callable, MutableMapping
+from difflib import get_close_matches
 import os
 from pathlib import Path
 import signal
@@ -22,7 +23,7 @@ from rclpy.signals import SignalHandlerOptions
 from tap_ros.errors import TapError
 from tap_ros.nodes.heartbeat import Heartbeat
 from tap_ros.nodes.services import log_error
-from tap_ros.text import escaped
+from tap_ros.text import escaped, listing
 
 SUBNET = Path(__file__).with_name('fastdds_subnet.xml')
 LOCALHOST = Path(__file__).with_name('fastdds_localhost.xml')
@@ -68,6 +69,7 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
         configure_fast_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
+        warn_of_unknown_parameters(node)
         _handle_signals(lambda *_: stop.set())
         executor = (SingleThreadedExecutor() if num_threads == 1
                     else MultiThreadedExecutor(num_threads))
@@ -98,6 +100,16 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
             node.destroy_node()
         rclpy.try_shutdown()
     return code
+
+
+def warn_of_unknown_parameters(node: Node) -> None:
+    """Warn of parameters that were given to a node and that it does not have."""
+    known = list(node._parameters)
+    for name in sorted(set(node._parameter_overrides) - set(known)):
+        near = get_close_matches(name, known, 1) or known
+        node.get_logger().warning(
+            f'parameter {escaped(name)} is unknown to this node and has no effect; '
+            + (f'did you mean {near[0]}?' if len(near) == 1 else f'it has {listing(near, 50)}'))
 
 
 def configure_fast_dds(environ: MutableMapping[str, str] = os.environ) -> None:

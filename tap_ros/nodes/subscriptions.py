@@ -9,13 +9,15 @@ for what its publishers offer.
 
 from collections.abc import Callable, Iterable
 import copy
+from difflib import get_close_matches
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from tap_ros.text import escaped
+from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE_TYPE, TOPICS
+from tap_ros.text import escaped, listing
 
 ADAPT_PERIOD = 0.5  # s between two comparisons with what is offered
 
@@ -89,8 +91,8 @@ class AdaptiveSubscription:
         return taken
 
     def why_silent(self) -> str:
-        """Return why no message can arrive, '' if one can."""
-        return '' if self._publishers() else 'no node publishes it'
+        """Return why no message can arrive, and the remedy; '' if one can."""
+        return why_silent(self._node, self.topic, self._type)
 
     def _subscribe(self) -> None:
         self.subscription = self._node.create_subscription(
@@ -111,3 +113,35 @@ def adapt_regularly(node: Node, subscriptions: Iterable[AdaptiveSubscription],
 
     node.create_timer(ADAPT_PERIOD, adapt, callback_group=callback_group,
                       clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def why_silent(node: Node, topic: str, message_type: type | None) -> str:
+    """
+    Return why no message of a topic can arrive, what is published instead, and the remedy.
+
+    :param topic: full name; message_type: class of its messages, None if that is not known.
+    :return: '' where somebody publishes it.
+    """
+    kind = '' if message_type is None else (
+        f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}')
+    published = {name: types for name, types in node.get_topic_names_and_types()
+                 if node.count_publishers(name)}
+    here = {one.topic_type for one in node.get_publishers_info_by_topic(topic)}
+    if here and (not kind or kind in here):
+        return ''
+    if here:
+        why = f'what is published there is {listing(sorted(here))}; expected {kind}'
+    else:
+        why = 'no node publishes it'
+    beside = {IMAGE_TYPE: (f'{topic}/compressed', COMPRESSED_TYPE, 'compressed'),
+              COMPRESSED_TYPE: (topic.removesuffix('/compressed'), IMAGE_TYPE, 'raw')}
+    other, other_kind, transport = beside.get(kind, ('', '', ''))
+    if other_kind in published.get(other, ()) or other_kind in here:
+        return (f'{why}; {escaped(other)} is: start this node with '
+                f'-p image_transport:={transport}')
+    alike = sorted(name for name, types in published.items() if kind in types and not any(
+        one.is_called(name) and not one.is_called(topic) for one in TOPICS) and any(
+        one.node_name != node.get_name() for one in node.get_publishers_info_by_topic(name)))
+    alike = alike or get_close_matches(topic, list(published), 3, 0.7)
+    return why if not alike else (
+        f'{why}; published are {listing(alike, 5)}: remap one, -r {topic}:={escaped(alike[0])}')

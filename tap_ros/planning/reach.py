@@ -29,6 +29,8 @@ from tap_ros.planning.tracking import ObjectTracker
 from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
 from tap_ros.text import listing
 
+MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -144,7 +146,7 @@ class Reach:
         self._state: _State | None = None
         self._before: tuple[_State, Command | None, float] | None = None
         self._next: _State | None = None
-        self._refusal = ''
+        self._refusal, self._refused = '', 0  # why the last command was refused; how many in a row
         self._sent_at = now  # of the last command, or when there was reason to wait
         self.steps, self.distance = 0, float('nan')
         self.pixels: np.ndarray | None = None
@@ -175,6 +177,9 @@ class Reach:
         :return: Aim, Command, Wait or End.
         :raises PlanningError: for what cannot be planned with.
         """
+        if self._refused >= MOST_REFUSED:
+            return End('aborted', f'{self._refused} commands in a row were refused, the last one '
+                                  f'as: {self._refusal}')
         answer = self.interrupted(seen) or self._answer(seen, now, lacking)
         silence = now - self._sent_at
         if isinstance(answer, (Wait, Command)) and silence > self._config.timeout:
@@ -246,12 +251,13 @@ class Reach:
         """
         command, self._planned = self._planned, None
         assert command is not None and self._state is not None, 'a Command comes first'
+        if self._before is not None:  # the command before this one was carried out
+            self._refused = 0
         self._before = self._state, self._answered, self._sent_at
         self._sent_at = now
         self._state, self._answered = self._next, command
         self._after_ns = command.seen.stamp_ns if after_ns is None else after_ns
         self.steps += 1
-        self._refusal = ''
 
     def refused(self, stamp_ns: int, reason: str) -> bool:
         """
@@ -268,14 +274,14 @@ class Reach:
         self._next = self._state
         self._after_ns, self._planned = refused.seen.stamp_ns, None
         self.steps -= 1
-        self._refusal = reason
+        self._refusal, self._refused = reason, self._refused + 1
         return True
 
     def _unusable(self, seen: Seen, now: float, lacking: str) -> str:
         """Say why there is nothing to plan from; an empty string if there is."""
         if seen.stamp_ns <= self._after_ns:
-            return (f'the last command was refused: {self._refusal}' if self._refusal
-                    else lacking or 'no new picture since the last command')
+            return (f'the last command was refused: {self._refusal}' if self._before is None
+                    and self._refusal else lacking or 'no new picture since the last command')
         if seen.stamp_ns < seen.scene_ns:
             return 'the picture is of an old scene'
         age = now - seen.received

@@ -28,9 +28,7 @@ from tap_ros.nodes.calls import call, send_goal, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.planning.action_sequences import FULL
-from tap_ros.planning.mpc_inputs import Scene
-from tap_ros.planning.visual_mpc import Memory, VisualMPC
+from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import FORWARD_MODEL
 import torch
@@ -205,32 +203,6 @@ def running_loop(folder):
         finally:
             for process in loop.processes.values():
                 process.kill()
-
-
-def planned(seed, steps, prepare=lambda sim: None, gripper=lambda seen: seen.gripper,
-            sim=None, limits=FULL):
-    """
-    Plan and step in this process, directly to the goal.
-
-    :param prepare: called with the Simulator after its reset; gripper: what the planner is told
-        of what is seen.
-    :return: the moves (steps, 3), and the distance of the objects at the end.
-    """
-    sim, mpc = sim or Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
-    try:
-        seen = sim.reset(SEED)
-        prepare(sim)
-        wanted = sim.goal().object_pixels
-        goal, memory, moves = mpc.goal(wanted), Memory(seed), []
-        for _ in range(steps):
-            plan = mpc.plan(Scene(seen.image, gripper(seen), seen.object_pixels), goal, memory,
-                            limits)
-            memory = plan.memory
-            moves.append(plan.action[:3])
-            seen = sim.step(plan.action)
-        return np.array(moves), np.linalg.norm(seen.object_pixels - wanted, axis=1).mean()
-    finally:
-        sim.close()
 
 
 def acts_like(loop, method, weights, **fields):

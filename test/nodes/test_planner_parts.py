@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of visual_mpc_node without the node: checks of a goal, and plans drawn over pictures."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,7 +22,7 @@ from tap_ros.nodes.planner.plan_view import (
     SCALE,
     way,
 )
-from tap_ros.nodes.planner.settings import check_request
+from tap_ros.nodes.planner.settings import check_request, weights_file
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.weights import FORWARD_MODEL
 
@@ -43,6 +44,14 @@ def test_modes_budgets_and_samples_are_bounded():
             ({'num_samples': 33}, '33 x 2 = 66; at most 64 plans')):
         with pytest.raises(ConfigError, match=words):
             check_request(ReachGoal.Goal(**fields))
+
+
+def test_weights_are_found_by_name_and_those_of_predictors_are_refused():
+    for name in ('push', 'push2', 'order3'):
+        assert weights_file(name) == FORWARD_MODEL
+    assert weights_file('runs/a.safetensors') == Path('runs/a.safetensors')
+    with pytest.raises(ConfigError, match='grasp is a subgoal predictor.*push, push2'):
+        weights_file('grasp')
 
 
 def plan_of(*elites):

@@ -3,7 +3,6 @@
 """A goal that is moved: what the planner goes to, what it does meanwhile, what is recorded."""
 
 from action_msgs.msg import GoalStatus
-from loop import planned
 import numpy as np
 import pytest
 from std_srvs.srv import SetBool
@@ -30,29 +29,14 @@ def set_goal(loop, pixels):
     return decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
 
 
-def move(sim):
-    """Move the goal of a simulator of this process likewise."""
-    sim.move_goal(list(MOVED), np.array(list(MOVED.values())))
-
-
-def test_the_planner_goes_to_where_the_goal_was_moved(loop):
-    loop.reset()
-    drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
-    pixels = set_goal(loop, MOVED)
-    np.testing.assert_allclose(pixels, [drawn[0], MOVED['object_1']], atol=1e-4)
-    result = loop.reached(mode='direct', step_budget=3, seed=5)
-    moves, distance = planned(5, 3, prepare=move)
-    assert np.array_equal(loop.moves().astype(np.float32), moves)
-    assert result.expected_distance == pytest.approx(distance, abs=1e-3)
-
-
 def test_a_subgoal_is_predicted_for_the_goal_that_was_moved(loop):
     loop.reset()
+    drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
     before = loop.predict()
-    set_goal(loop, MOVED)
+    np.testing.assert_allclose(
+        set_goal(loop, MOVED), [drawn[0], MOVED['object_1']], atol=1e-4)
     after = loop.predict()
     assert before.success and after.success, after.message
-    assert list(after.subgoals[0].object_names) == ['object_0', 'object_1']
     assert len(after.subgoals[0].object_maps) == 2, 'objects and picture of the goal go together'
     assert before.subgoals[0].image.data != after.subgoals[0].image.data
 

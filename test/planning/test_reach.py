@@ -14,6 +14,7 @@ from tap_ros.planning.reach import (
     Aim,
     Command,
     End,
+    MOST_REFUSED,
     Reach,
     ReachConfig,
     scene_change,
@@ -138,6 +139,22 @@ def test_pictures_alone_do_not_keep_a_goal_alive(mpc):
         refused.sent(now=float(t))
         assert refused.refused((t + 1) * SECOND, 'it is paused')
     assert answer.outcome == 'aborted' and refused.steps == 0
+
+
+def test_an_arm_that_refuses_all_ends_the_goal_and_one_that_carries_out_some_does_not(mpc):
+    for carries_out, ends in ((lambda t: False, True), (lambda t: t % MOST_REFUSED == 0, False)):
+        reach = begun(mpc, ReachConfig(20))
+        for t in range(3 * MOST_REFUSED):
+            answer = reach.step(look(t), 0.1 * t)
+            if isinstance(answer, End):
+                break
+            reach.sent(now=0.1 * t)
+            if not carries_out(t):
+                reach.refused((t + 1) * SECOND, 'protective stop')
+        assert isinstance(answer, End) == ends
+        if ends:
+            assert (t, answer.outcome, reach.steps) == (MOST_REFUSED, 'aborted', 0)
+            assert 'protective stop' in answer.message
 
 
 def test_pictures_of_an_old_scene_are_not_used(mpc):

@@ -35,6 +35,7 @@ from tap_ros.nodes.planner.settings import (
     declare_parameters,
     load_planner,
     reach_config,
+    weights_file,
 )
 from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
@@ -106,12 +107,13 @@ class VisualMpcNode(LifecycleBase):
 
     # Lifecycle
 
-    def load(self) -> None:
-        """Load the weights."""
+    def load(self) -> str:
+        """Load the weights; return device and file."""
         self._check_idle()
         self._mpc = load_planner(self.params)
         warn_if_unlike(self, self.params['robot_mask'], [self._model.config.robot_mask],
                        'forward model')
+        return f'{self.params["device"]}, {self.params["weights"]}'
 
     def unload(self) -> None:
         """Release the weights."""
@@ -119,13 +121,9 @@ class VisualMpcNode(LifecycleBase):
         with suppress(AttributeError):  # where there are none
             del self._mpc
 
-    def described(self) -> str:
-        """Return device and file."""
-        return f'{self.params["device"]}, {self.params["weights"]}'
-
     def files(self) -> list[Path]:
         """Return the file of the weights."""
-        return [Path(self.params['weights'])]
+        return [weights_file(self.params['weights'])]
 
     def resume(self) -> None:
         """Serve goals again, once the last one has ended."""

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters, weights and requests of visual_mpc_node: what is checked before anything moves."""
 
+from pathlib import Path
+
 import numpy as np
 from rclpy.node import Node
 from tap_msgs.action import ReachGoal
@@ -26,15 +28,16 @@ from tap_ros.nodes.parameters import (
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.planning.mpc_config import PRESETS, SWITCHES, with_preset
+from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import ReachConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.plugins import names
 from tap_ros.text import escaped
-from tap_ros.weights import FORWARD_MODEL
+from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
 MODES = ('subgoal', 'direct')
+SHIPPED = ', '.join(('push', *PLANNING_TASKS))
 TRACKING = ('ground_truth', 'carried')
 MAX_BUDGET = 1000
 MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
@@ -44,9 +47,10 @@ def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     declare_autostart(parameters)
-    parameters.declare('weights', str(FORWARD_MODEL),
-                       'File of weights (.safetensors) of a forward model. Can be changed while '
-                       'the node is unconfigured.', read_only=False)
+    parameters.declare('weights', 'push',
+                       f'A forward model: the shipped one, by its name or a task ({SHIPPED}), or '
+                       'a file (.safetensors). Can be changed while the node is unconfigured.',
+                       read_only=False)
     declare_device(parameters)
     parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
                        'with more samples, or what the paper says.', choices=list(PRESETS))
@@ -110,6 +114,18 @@ def declare_parameters(node: Node) -> Parameters:
     return parameters
 
 
+def weights_file(weights: str) -> Path:
+    """
+    Return the file that the parameter weights names; a file named so can be given as './push2'.
+
+    :raises ConfigError: for the name of weights that are no forward model.
+    """
+    if weights in PREDICTORS and weights not in PLANNING_TASKS:
+        raise ConfigError(f'parameter weights: {weights} is a subgoal predictor, for '
+                          f'predictor_node; expected a forward model: a file, or {SHIPPED}')
+    return FORWARD_MODEL if weights in ('push', *PLANNING_TASKS) else Path(weights)
+
+
 def load_planner(parameters: Parameters) -> VisualMPC:
     """
     Load weights, and plan once, so that the first command comes as fast as the others.
@@ -122,7 +138,7 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     config = with_preset(
         parameters['preset'], solver=parameters['solver'],
         arm_hidden=parameters['arm_hidden'] or parameters['robot_mask'] == 'all')
-    mpc = VisualMPC.load(parameters['weights'], config, parameters['device'])
+    mpc = VisualMPC.load(weights_file(parameters['weights']), config, parameters['device'])
     height, width = mpc.image_size
     pixels = np.array([[width / 4, height / 4], [width / 2, height / 2]], np.float32)
     mpc.plan(Scene(np.full((height, width, 3), 128, np.uint8), np.zeros(4, np.float32), pixels),

@@ -93,8 +93,8 @@ class PredictorNode(LifecycleBase):
 
     # Lifecycle
 
-    def load(self) -> None:
-        """Load the weights, in the thread that will use them."""
+    def load(self) -> str:
+        """Load the weights, in the thread that will use them; return what is known of them."""
         def prepare() -> Callable[[list[PendingRequest]], list[Found]]:
             # OpenMP is slow where two threads have begun parallel work on few cores.
             check_device(self.params['device'])
@@ -104,22 +104,17 @@ class PredictorNode(LifecycleBase):
         self._queue = RequestQueue(
             prepare, lambda task: task.rows, MAX_WAITING, MAX_TOGETHER, MAX_ROWS)
         assert self._predictor is not None
+        mode, (height, width) = self._predictor.mode, self._predictor.image_size
         trained, share = trained_robot_mask(self._predictor.training)
         warn_if_unlike(self, self.params['robot_mask'], ['none'] * (share < 1)
-                       + [trained] * (share > 0), f'{self._predictor.mode} predictor')
+                       + [trained] * (share > 0), f'{mode} predictor')
+        return f'{mode} {width}x{height} pixels, {self.params["device"]}, {self.params["weights"]}'
 
     def unload(self) -> None:
         """Release the weights, once the running batch has ended."""
         if self._queue is not None:
             self._queue.close('the weights are no longer in use; ask again')
         self._queue = self._predictor = None
-
-    def described(self) -> str:
-        """Return mode, size of pictures, device and file."""
-        assert self._predictor is not None
-        height, width = self._predictor.image_size
-        return (f'{self._predictor.mode} {width}x{height} pixels, {self.params["device"]}, '
-                f'{self.params["weights"]}')
 
     def files(self) -> list[Path]:
         """Return the file of the weights."""

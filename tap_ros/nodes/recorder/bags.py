@@ -104,6 +104,11 @@ class Bags:
                 'was flushed before stays readable')
             self._report(self.failure)
             return self.failure
+        if not self.count:
+            self.failure = (f'{escaped(writer.folder)}: nothing was recorded, as nothing has come '
+                            'on any topic')
+            self._report(self.failure)
+            return self.failure
         return f'{self.count} messages in {escaped(writer.folder)}'
 
     def _write(self, topic: str, type_name: str, data: bytes, qos: Qos, received_ns: int,

@@ -13,14 +13,19 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError
-from tap_ros.messages.topics import BY_NAME, Qos, Topic
+from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.parameters import declare_arm, declare_opening, Parameters
+from tap_ros.nodes.parameters import (
+    declare_arm,
+    declare_opening,
+    declare_transport,
+    Parameters,
+)
 from tap_ros.nodes.recorder.bags import Bags
 from tap_ros.nodes.ros_messages import message_class
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import AdaptiveSubscription
-from tap_ros.nodes.topics import SERVICE_QOS
+from tap_ros.nodes.topics import camera_image, SERVICE_QOS
 from tap_ros.text import escaped
 
 DEPTH = 100  # messages that may wait while the disk is slow
@@ -41,12 +46,14 @@ class RecorderNode(Node):
         super().__init__('recorder_node', **options)
         self.params = declare_parameters(self)
         self._recorded: dict[str, AdaptiveSubscription] = {}  # by full name of the topic
-        self._wanted = list(self.params['topics'])
+        image = camera_image(self.params)[1]
+        self._wanted = [image if name == IMAGE.name else name for name in self.params['topics']]
         if not self._wanted:
             raise ConfigError('parameter topics: is empty; name at least one topic')
         self._diagnostics = Diagnostics(self, {
             name: MAX_AGE if (known := _known(name)) and known.periodic else math.inf
-            for name in self._wanted})
+            for name in self._wanted},
+            expected=self._wanted if 'topics' in self._parameter_overrides else ())
         self._bags = Bags(self.params, self._report)
         if self.params['record_on_start']:
             self._bags.start()
@@ -98,7 +105,9 @@ class RecorderNode(Node):
         for name in list(self._wanted):
             topic = self.resolve_topic_name(name)
             known = _known(name)
-            type_name = known.type if known else next(iter(found.get(topic, [])), None)
+            type_name = next(iter(found.get(topic, [])), None)
+            if known is not None:
+                type_name = COMPRESSED_TYPE if name.endswith('/compressed') else known.type
             if type_name is None:
                 continue
             self._wanted.remove(name)
@@ -147,8 +156,8 @@ class RecorderNode(Node):
 
 
 def _known(name: str) -> Topic | None:
-    """Return the Topic of this name, None for others."""
-    return BY_NAME.get(name.lstrip('/'))
+    """Return the Topic of this name, compressed or not, None for others."""
+    return BY_NAME.get(name.lstrip('/').removesuffix('/compressed'))
 
 
 def declare_parameters(node: Node) -> Parameters:
@@ -159,6 +168,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('topics', list(BY_NAME), 'Topics to record.')
     parameters.declare('compression', 'zstd', 'Compression of chunks.',
                        choices=['zstd', 'lz4', 'none'])
+    declare_transport(parameters)
     declare_arm(parameters)
     declare_opening(parameters)
     parameters.declare('record_on_start', True,
