@@ -80,37 +80,38 @@ def test_every_request_of_many_threads_is_answered_once_and_its_own_way(made):
     assert set(Counter(one for one, _ in rig.answers).values()) == {1}
 
 
-def test_what_waits_is_answered_together_oldest_first_and_within_the_limits(made):
-    rig = made(cost=lambda one: one, max_together=3, max_cost=10)
+def test_what_waits_is_answered_together_within_the_limits_and_beyond_them_refused(made):
+    rig = made(cost=lambda one: one, max_together=3, max_cost=10, max_waiting=8)
     rig.hold()
     for one in (1, 2, 3, 4, 5, 6, 50, 1):
         rig.put(one)
+    assert len(rig.queue) == 8
+    with pytest.raises(Busy, match='^busy: 8 requests are waiting'):
+        rig.put(7)
     rig.go.set()
     rig.wait(9)
     assert rig.batches == [[0], [1, 2, 3], [4, 5], [6], [50], [1]]
+    rig.put(8)  # there is room again
+    assert rig.wait(10)[8] == -8
 
 
-@pytest.mark.parametrize('bad', [{3}, {1, 5}, {1, 2, 3, 4, 5}])
-def test_an_error_reaches_only_who_caused_it(made, bad):
-    def work(batch):
-        if bad & set(batch):
-            raise MemoryError(f'{bad & set(batch)}')
-        return [-one for one in batch]
+def test_an_error_reaches_only_who_caused_it(made):
+    for bad in ({3}, {1, 5}, {1, 2, 3, 4, 5}):
+        def work(batch, bad=bad):
+            if bad & set(batch):
+                raise MemoryError(f'{bad & set(batch)}')
+            return [-one for one in batch]
 
-    rig = made(work)
-    rig.hold()
-    for one in range(1, 6):
-        rig.put(one)
-    rig.go.set()
-    found = rig.wait(6)
-    assert len(rig.answers) == 6
-    for one in range(1, 6):
-        if one in bad:
-            assert isinstance(found[one], MemoryError) and str(found[one]) == str({one})
-        else:
-            assert found[one] == -one
-    rig.put(9)
-    assert rig.wait(7)[9] == -9
+        rig = made(work)
+        rig.hold()
+        for one in range(1, 6):
+            rig.put(one)
+        rig.go.set()
+        found = rig.wait(6)
+        assert len(rig.answers) == 6
+        for one in range(1, 6):
+            assert str(found[one]) == (str({one}) if one in bad else str(-one))
+            assert isinstance(found[one], MemoryError) == (one in bad)
 
 
 def test_at_the_end_all_that_wait_are_told_and_the_batch_is_finished(made):
@@ -128,6 +129,27 @@ def test_at_the_end_all_that_wait_are_told_and_the_batch_is_finished(made):
     ending.join(TIMEOUT)
     assert not ending.is_alive()
     assert rig.wait(4)[0] == 0 and len(rig.answers) == 4
+
+
+def test_what_is_prepared_is_prepared_in_the_thread_that_works():
+    threads = []
+
+    def prepare():
+        threads.append(threading.current_thread())
+        return lambda batch: threads.append(threading.current_thread()) or batch
+
+    queue, answered = RequestQueue(prepare, len, 1, 1, 1), threading.Event()
+    assert len(threads) == 1
+    queue.put('one', lambda found: answered.set())
+    assert answered.wait(TIMEOUT)
+    queue.close()
+    assert threads[0] is threads[1] is not threading.current_thread()
+
+    def fail():
+        raise OSError('no such file')
+
+    with pytest.raises(OSError, match='no such file'):
+        RequestQueue(fail, len, 1, 1, 1)
 
 
 def test_an_answer_that_cannot_be_given_leaves_the_others_theirs(capsys):

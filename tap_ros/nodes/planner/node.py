@@ -4,6 +4,7 @@
 
 from collections import deque
 from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 import math
 from pathlib import Path
@@ -53,6 +54,7 @@ from tap_ros.text import escaped
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'
 STALE_S = 2.0  # s without a message after which diagnostics call an input stale
+RESULT_S = 60  # s that a result, and the pictures of its request, are kept for who asks for it
 
 
 class Cancelled(TapError):
@@ -61,7 +63,7 @@ class Cancelled(TapError):
 
 class VisualMpcNode(LifecycleBase):
     """
-    Executes one goal at a time, in a thread of the executor that callbacks do not need.
+    Executes one goal at a time, in a thread that callbacks do not need.
 
     A second goal is rejected meanwhile. Whatever the way a goal ends, the last command is zero.
     While the node is not active, goals are aborted with the reason.
@@ -77,6 +79,8 @@ class VisualMpcNode(LifecycleBase):
         self._cancelled: ServerGoalHandle | None = None  # the goal that was cancelled last
         self._busy = threading.Lock()  # held while a goal is executed
         self._refusals: deque[tuple[int, str]] = deque(maxlen=10)
+        # Plans in one thread: torch and malloc keep memory of their own for each that has planned.
+        self._worker = ThreadPoolExecutor(1, 'planning')
         self.autostart('configure')
         robot_mask = self.params['robot_mask']
         self._diagnostics = Diagnostics(self, {
@@ -96,7 +100,8 @@ class VisualMpcNode(LifecycleBase):
         self._subgoals = SubgoalClient(self, self._inputs, group)
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
-            goal_callback=self._on_goal, cancel_callback=self._on_cancel)
+            goal_callback=self._on_goal, cancel_callback=self._on_cancel,
+            result_timeout=RESULT_S)
         self.autostart('activate')
 
     def close(self) -> None:
@@ -104,13 +109,14 @@ class VisualMpcNode(LifecycleBase):
         self.active = False
         self._end_goal(ENDING)
         self._arm.close(1.0)
+        self._worker.shutdown(wait=False)
 
     # Lifecycle
 
     def load(self) -> str:
         """Load the weights; return device and file."""
         self._check_idle()
-        self._mpc = load_planner(self.params)
+        self._mpc = self._worker.submit(load_planner, self.params).result()
         warn_if_unlike(self, self.params['robot_mask'], [self._model.config.robot_mask],
                        'forward model')
         return f'{self.params["device"]}, {self.params["weights"]}'
@@ -184,7 +190,7 @@ class VisualMpcNode(LifecycleBase):
         try:
             self._arm.begin(handle)
             self._go_on(handle)
-            self._reach(handle, time.monotonic(), result)
+            self._worker.submit(self._reach, handle, time.monotonic(), result).result()
             handle.succeed()
         except Cancelled as error:
             result.message = str(error)

@@ -1,0 +1,115 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""visual_mpc_node with an arm that refuses, and with drivers that repeat one stamp."""
+
+import time
+
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import TwistStamped
+import numpy as np
+from processes import LocalNode, until
+import pytest
+from rclpy.action import ActionClient
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image, JointState
+from tap_msgs.action import ReachGoal
+from tap_msgs.msg import CommandRefused, ObjectStates
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.nodes.clients import send_goal, wait_for_result
+from tap_ros.nodes.planner.node import VisualMpcNode
+from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
+from tap_ros.nodes.topics import STREAM, to_stamp
+from tap_ros.planning.reach import MOST_REFUSED
+
+pytestmark = pytest.mark.slow
+PICTURE = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+
+
+class Rig:
+    """
+    A planner, and camera, objects and arm of the test's own, which publish ten times a second.
+
+    :ivar frozen: names of topics that repeat one stamp; clock: whether one says so.
+    :ivar refuses: whether the arm refuses every command.
+    """
+
+    def __init__(self, client):
+        self.frozen, self.clock, self.refuses, self.twists = (), False, False, []
+        self._publishers = {topic: client.create_publisher(kind, f'stubborn/{topic}', STREAM)
+                            for topic, kind in (
+                                ('clock', Clock), ('joint_states', JointState),
+                                ('objects', ObjectStates), ('camera/image_raw', Image))}
+        self._refused = client.create_publisher(CommandRefused, 'stubborn/arm/refused', STREAM)
+        client.create_subscription(
+            TwistStamped, 'stubborn/arm/delta_twist_cmds', self._on_twist, STREAM)
+        self._begun = time.time_ns()
+        client.create_timer(0.1, self._publish)
+        self.planner = LocalNode(VisualMpcNode, '/stubborn', num_threads=4, image_timeout=1.5)
+        self._action = ActionClient(client, ReachGoal, 'stubborn/reach_goal')
+        assert self._action.wait_for_server(30)
+        self.goal = encode_objects(['cup'], [(40, 40)], np.zeros((1, 7)), to_stamp(1), 'world',
+                                   ObjectStates.SOURCE_TRACKED)
+
+    def _publish(self):
+        now = time.time_ns()
+        if self.clock:
+            self._publishers['clock'].publish(Clock(clock=to_stamp(self._begun)))
+        for topic, encode in (
+                ('joint_states', lambda at: encode_joints([0, 0, 0.1, 0], at, 'world')),
+                ('objects', lambda at: encode_objects(
+                    ['cup'], [(20, 20)], np.zeros((1, 7)), at, 'world',
+                    ObjectStates.SOURCE_TRACKED)),
+                ('camera/image_raw', lambda at: encode_image(PICTURE, at, 'eye'))):
+            stamp = self._begun if topic in self.frozen else now
+            self._publishers[topic].publish(encode(to_stamp(stamp)))
+
+    def _on_twist(self, message):
+        self.twists.append(message)
+        if self.refuses and to_nanoseconds(message.header.stamp):
+            self._refused.publish(CommandRefused(header=message.header, message='emergency stop'))
+
+    def moves(self):
+        return sum(1 for twist in list(self.twists) if to_nanoseconds(twist.header.stamp))
+
+    def reach(self, **fields):
+        """Pursue a goal to its end; return status and result once the arm stands."""
+        self.twists.clear()
+        goal = ReachGoal.Goal(mode='direct', goal_objects=self.goal, **fields)
+        found = wait_for_result(send_goal(self._action, goal, 30), 100)
+        assert until(lambda: self.twists and not to_nanoseconds(self.twists[-1].header.stamp), 5)
+        return found
+
+
+@pytest.fixture(scope='module')
+def rig():
+    from processes import Client
+    with Client() as client:
+        rig = Rig(client)
+        yield rig
+        assert rig.planner.end() == 0
+
+
+def test_an_arm_that_refuses_everything_ends_the_goal_and_the_next_one_is_served(rig):
+    rig.refuses = True
+    status, result = rig.reach(step_budget=3)
+    rig.refuses = False
+    assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+    assert f'{MOST_REFUSED} commands in a row' in result.message
+    assert 'emergency stop' in result.message and rig.moves() == MOST_REFUSED
+    status, result = rig.reach(step_budget=2)
+    assert status == GoalStatus.STATUS_SUCCEEDED and result.steps == rig.moves() == 2
+
+
+def test_drivers_that_repeat_one_stamp_move_nothing_unless_a_clock_stands_still(rig):
+    everything = 'joint_states', 'objects', 'camera/image_raw'
+    for frozen in (everything, everything[2:], everything[:1]):
+        rig.frozen = frozen
+        time.sleep(0.5)
+        status, result = rig.reach(step_budget=2)
+        assert status == GoalStatus.STATUS_ABORTED and rig.moves() == 0, result.message
+        rig._begun = time.time_ns()
+    rig.frozen, rig.clock = everything, True
+    time.sleep(0.5)
+    status, result = rig.reach(step_budget=1)
+    assert rig.moves() == 1, result.message
+    rig.frozen, rig.clock = (), False
