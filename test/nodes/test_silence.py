@@ -11,7 +11,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from tap_msgs.msg import ObjectStates
 from tap_ros.nodes import diagnostics
-from tap_ros.nodes.clients import call
+from tap_ros.nodes.calls import call
 from tap_ros.nodes.recorder.node import RecorderNode
 from tap_ros.nodes.run import warn_of_unknown_parameters
 from tap_ros.nodes.subscriptions import why_silent

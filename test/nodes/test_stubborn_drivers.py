@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image, JointState
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused, ObjectStates
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.clients import send_goal, wait_for_result
+from tap_ros.nodes.calls import send_goal, wait_for_result
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
 from tap_ros.nodes.topics import STREAM, to_stamp
