@@ -198,19 +198,22 @@ class ExplorerCalls:
     def _reach(self, mode: str, samples: int, levels: int, seed: int) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self.stage = f'{words}: waiting for the planner'
-        if self._cancelled:
+        if self._is_cancelled():
             raise CallError(f'{words}: cancelled before it began')
         goal = self._client.reach(
             mode=mode, num_samples=samples, recursion_depth=levels, seed=seed,
             on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
         with self._lock:
             self._goal = goal
-        if self._cancelled:  # meanwhile
+        if self._is_cancelled():  # meanwhile
             goal.cancel()
         self._told(f'{words}: begun')
         result = goal.result()
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
         self._told(f'{words}: {end} ({result.steps} steps)')
+
+    def _is_cancelled(self) -> bool:
+        return self._cancelled
 
     def _is_ending(self) -> bool:
         return self._ending

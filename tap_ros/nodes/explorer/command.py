@@ -56,7 +56,7 @@ def run(args: Options) -> None:
                         else DEFAULT_PREDICTOR)
         processes.start('visual_mpc_node')
         token = {'token': args.token} if args.token else {}
-        processes.start('explorer_node', host=args.host, port=args.port, **token)
+        processes.start('explorer_node', host=args.host, port=args.port, task=args.task, **token)
         print(f'starting nodes; their logs are in {folder}', flush=True)
         print(f'open {processes.wait_until_ready()} in a browser; Ctrl-C ends all nodes',
               flush=True)

@@ -73,7 +73,7 @@ class ExplorerNode(Node):
         self._diagnostics: dict[str, tuple[int, str, float]] = {}  # level, text, when it came
         self._log: deque[str] = deque(maxlen=LOG_LINES)
         self._log_count = 0
-        self._task, self._note = '', ''
+        self._task, self._note = self.params['task'], ''
         self._problem: dict[str, Any] = {'count': 0, 'text': ''}
         self._sheet_stamp: Any = None  # of the picture whose subgoals are shown side by side
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
@@ -380,6 +380,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare(
         'token', '', 'That browsers must give as ?token=...; empty: none is needed where host is '
         'of this machine alone, else one is made up and printed.')
+    parameters.declare('task', '', "Of the simulator's first scene; resets are heard.")
     declare_transport(parameters)
     return parameters
 
