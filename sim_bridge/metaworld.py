@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Meta-World's environments, bound to GymWorld.
+Meta-World's environments as Worlds.
 
 Its table lies between robot and camera: our origin is its (0, 0.65, 0), turned by half a turn, so
 that x is to the right and y away from the camera, which stands opposite the robot.
@@ -13,6 +13,7 @@ import warnings
 
 import mujoco
 import numpy as np
+from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from tap_ros.contract import (
     CONTROL_PERIOD,
@@ -30,9 +31,9 @@ SOLVING_STEPS = 400  # environment steps that the scripted policy has at most
 SETTLING_STEPS = 5  # after the success
 
 
-class MetaWorld:
+class MetaWorld(GymWorld):
     """
-    One Meta-World environment with one object, a Binding.
+    The World 'metaworld': one environment with one object.
 
     :param task: its name, such as 'push-v3'.
     :param image_size: width and height of the pictures in pixels.
@@ -42,24 +43,25 @@ class MetaWorld:
 
     object_names: tuple[str, ...] = ('object_0',)
 
-    def __init__(self, task: str, image_size: int = 64) -> None:
+    def __init__(self, task: str = 'push-v3', image_size: int = 64) -> None:
         self.task_name = task
         self.env, self.policy = make_env(task)
         self.camera = replace(CAMERA, width=image_size, height=image_size)
         model = self.env.model
-        model.vis.global_.fovy = self.camera.fovy
+        eye = model.cam('corner')
+        eye.pos[:] = np.array(CAMERA.position) * TURN + ORIGIN
+        eye.quat[:], eye.fovy[:] = replace(CAMERA, turn=np.pi).quaternion, CAMERA.fovy
         model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0  # 7 ms instead of 300
         self._renderer = mujoco.Renderer(model, image_size, image_size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
-        self._view = _free_camera(self.camera)
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # the goal is drawn as a site
         self._labels = _labels(model)
         self._seen: np.ndarray = np.empty(0)
         self._info: dict[str, Any] = {}
 
-    def reset(self, seed: int) -> None:
+    def begin(self, seed: int) -> None:
         """Begin the scene of a seed."""
         self.env.seed(seed)
         self._seen, self._info = self.env.reset(seed=seed)
@@ -94,7 +96,7 @@ class MetaWorld:
     def draw(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the picture, without the marker of the goal, and the robot mask."""
         renderer = self._renderer
-        renderer.update_scene(self.env.data, self._view, self._option)
+        renderer.update_scene(self.env.data, 'corner', self._option)
         image = renderer.render()
         renderer.enable_segmentation_rendering()
         try:
@@ -167,18 +169,6 @@ def _reset_mocap_welds(self: Any) -> None:
     """Let the hand follow its mocap body without an offset."""
     welds = self.model.eq_type == mujoco.mjtEq.mjEQ_WELD
     self.model.eq_data[welds, :11] = (0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5)
-
-
-def _free_camera(camera: Camera) -> mujoco.MjvCamera:
-    """Return a camera of our frame for MuJoCo's renderer, in Meta-World's frame."""
-    place = np.array(camera.position) * TURN + ORIGIN
-    azimuth, elevation = camera.turn + 1.5 * np.pi, camera.tilt - np.pi / 2
-    ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
-                      np.sin(elevation)])
-    view = mujoco.MjvCamera()
-    view.lookat, view.distance = place + ahead, 1.0
-    view.azimuth, view.elevation = np.degrees(azimuth), np.degrees(elevation)
-    return view
 
 
 def _labels(model: mujoco.MjModel) -> np.ndarray:

@@ -4,10 +4,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
+from tap_ros.contract import ACTION_LIMIT
 from tap_ros.errors import SceneError
 from tap_ros.plugins import load_plugin
 from tap_ros.robots.arm import Arm
@@ -25,6 +27,15 @@ class Observation:
     object_poses: np.ndarray  # (K, 7) float64: x, y, z in m, quaternion x, y, z, w
     robot_mask: np.ndarray  # (H, W) uint8, values as in contract.py; zeros where it is not known
     arm_joints: np.ndarray  # (J,) float64 rad, as Arm.joints; empty where there is no arm
+
+
+class RunState(IntEnum):
+    """What a simulation does; the numbers are those of simulation_interfaces/SimulationState."""
+
+    STOPPED = 0  # paused at the start of a scene
+    PLAYING = 1
+    PAUSED = 2
+    QUITTING = 3
 
 
 class World(Protocol):
@@ -118,3 +129,22 @@ def ability(world: World, method: str) -> Callable[..., Any]:
         raise SceneError(f'the world of task {world.task_name} lacks {method}; '
                          'world mujoco_table has it')
     return getattr(world, method)
+
+
+def clip_action(action: ArrayLike) -> np.ndarray:
+    """
+    Limit an action to what is commanded in one control period.
+
+    :param action: (4,) displacement x, y, z in m and gripper opening in [0, 1].
+    :return: (4,) float64.
+    :raises SceneError: for another shape or values that are not finite.
+    """
+    action = np.asarray(action, np.float64)
+    if action.shape != (4,) or not np.isfinite(action).all():
+        raise SceneError(f'action {action}: expected 4 finite numbers (dx, dy, dz, opening)')
+    return np.append(clip_moves(action[:3]), np.clip(action[3], 0, 1))
+
+
+def clip_moves(moves: np.ndarray) -> np.ndarray:
+    """Limit displacements (..., 3), in m, to what is commanded in one control period."""
+    return np.clip(moves, np.negative(ACTION_LIMIT), ACTION_LIMIT)

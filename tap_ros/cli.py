@@ -28,7 +28,7 @@ Module: TypeAlias = 'str | dict[str, tuple[str, Module]]'
 Run: TypeAlias = Callable[[Any], int | None]
 
 COMMANDS: dict[str, tuple[str, Module]] = {
-    'collect': ('simulate the expert and record it', 'sim_bridge.collect_command'),
+    'collect': ('simulate the expert and record it', 'sim_bridge.collect'),
     'import-video': ('import video files', 'tap_ros.recording.formats.pictures'),
     'import-tfrecord': ('import TFRecord files: RLDS data sets, BAIR',
                         'tap_ros.recording.formats.tfrecord'),

@@ -18,7 +18,8 @@ def cross_entropy(draw: Draw, cost: Cost, num_iterations: int,
 
     :param draw: function of the elites (E, ...) of the iteration before, the cheapest first, or
         None in the first iteration, to new samples (N, ...).
-    :param cost: function of samples to costs (N,); NaN counts as worst.
+    :param cost: function of samples to costs (N,); NaN counts as worst, and minus infinity ends
+        the search.
     :param num_elites: how many samples of an iteration the next one is drawn from, at most.
     :return: the best num_elites samples of all iterations, and their costs, the cheapest first,
         and the earliest of equals.
@@ -32,10 +33,12 @@ def cross_entropy(draw: Draw, cost: Cost, num_iterations: int,
         best_costs = np.concatenate([best_costs, costs])
         first = np.argsort(best_costs, kind='stable')[:num_elites]
         best, best_costs = best[first], best_costs[first]
+        if best_costs[0] == -np.inf:
+            break
     assert best is not None, 'an iteration at least'
     return best, best_costs
 
 
 def finite(costs: Any) -> np.ndarray:
     """Return costs as float64, the worst where they are not numbers."""
-    return np.nan_to_num(np.asarray(costs, np.float64), nan=np.inf, posinf=np.inf)
+    return np.nan_to_num(np.asarray(costs, np.float64), nan=np.inf, posinf=np.inf, neginf=-np.inf)

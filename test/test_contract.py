@@ -11,7 +11,8 @@ import pytest
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode, task_names
 from sim_bridge.world.scene import HALF_HEIGHT
-from sim_bridge.world.table import clip_action, ramp_controls
+from sim_bridge.world.table import ramp_controls
+from sim_bridge.world_protocol import clip_action
 from tap_ros import contract
 from tap_ros.planning.action_sequences import Limits, SequenceShape
 from tap_ros.planning.forward_model import LearnedForwardModel
@@ -89,7 +90,7 @@ def test_the_arm_pushes_where_it_is_low_and_clears_all_objects_above(simulator):
 
 @pytest.mark.parametrize('simulator', task_names(), indirect=True)
 def test_what_an_expert_commands_is_what_the_arm_does(simulator):
-    observations, actions, _, _ = run_episode(simulator, 1)
+    observations, actions, _ = run_episode(simulator, 1)
     assert (np.abs(actions[:, :3]).max(0) <= np.array(contract.ACTION_LIMIT) + 1e-6).all()
     assert len(observations) <= simulator.task.num_frames
 

@@ -44,8 +44,8 @@ def run(args):
         simulator.observe()
     render = (time.perf_counter() - begin) / 200 * result['frames']
     seconds, episodes = result['seconds'], result['episodes']
-    physics = seconds['search'] + seconds['step'] - render
-    busy = seconds['search'] + seconds['step'] + seconds['write']
+    physics = seconds['act'] - render
+    busy = seconds['act'] + seconds['write']
     workers = args.workers or len(os.sched_getaffinity(0))
     print(f"""task {args.task}, seed 0, {episodes} episodes of {result['frames'] / episodes:.1f} \
 frames on average, {workers} workers

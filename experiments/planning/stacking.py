@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 
 from experiments.planning.episode import FilledView, shown_mask
 from experiments.planning.reading import Move, PictureReader, read_moves
-import mujoco.rollout
 import numpy as np
-from sim_bridge.tasks.stack import on_table, PickAndPlace, STACK_CONFIG
+from sim_bridge.tasks.stack import on_table, PickAndPlace
 from sim_bridge.tasks.tasks import run_episode as run_expert
 from tap_ros.contract import LIFTED, SUCCESS_DISTANCE
 from tap_ros.errors import ConfigError
@@ -72,8 +71,7 @@ def stack(simulator, method, seed, predictor=None):
     # The same order for all methods that know none, so that they are compared scene by scene.
     stream = simulator.task.stream
     order = np.random.default_rng([seed, stream, 2]).permutation(simulator.task.num_objects)
-    mover = PickAndPlace(simulator, np.random.default_rng([seed, stream, 3]), STACK_CONFIG,
-                         mujoco.rollout.Rollout(nthread=0))
+    mover = PickAndPlace(simulator, np.random.default_rng([seed, stream, 3]))
     stages, frames = [], [start.image]
     for picture in pictures:
         poses = simulator.object_poses()[:, :3]

@@ -15,49 +15,31 @@ from numpy.typing import ArrayLike
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import CameraInfo, Image, JointState
-from sim_bridge.ros.run_state import MAX_PERIODS, RunState
-from sim_bridge.ros.tf_publisher import TransformPublisher
-from sim_bridge.world.appearance import CHOICES
-from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
-from sim_bridge.world.transforms import arm_transforms, fixed_arm_transforms, Transform
-from sim_bridge.world_protocol import ability, make_world, Observation, World
-from std_msgs.msg import Float64, String
+from sim_bridge.ros.publishers import ScenePublishers
+from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
+from sim_bridge.world_protocol import ability, make_world, Observation, RunState, World
+from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
-from tap_msgs.msg import CommandRefused, Episode, ObjectStates
+from tap_msgs.msg import CommandRefused, Episode
 from tap_msgs.srv import ResetScene, SetGoal, StepScene
-from tap_ros.contract import (
-    ACTION_LIMIT,
-    CAMERA_FRAME,
-    CONTROL_PERIOD,
-    OBSERVER_FRAME,
-    WORLD_FRAME,
-)
+from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORLD_FRAME
 from tap_ros.errors import TapError
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.ros_messages import (
-    encode_camera_info,
-    encode_image,
-    encode_joints,
-    encode_mask,
-    encode_objects,
-)
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import answering
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
-from tap_ros.robots.description import robot_description
 
 PERIOD_NS = round(CONTROL_PERIOD * 1e9)
 FIRST_STAMP = 10**9  # ns; a stamp of zero means "unstamped", so time starts later
 RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
-MAX_TIMEOUT = 60.0  # s
+COMMAND_TIMEOUT, MAX_TIMEOUT = 1.0, 60.0  # s that a command is valid, unless its sender says so
+MAX_PERIODS = 100  # of a call that is answered when they have passed: about a second
 OPTIONS = {'look': DEFAULT_LOOK, 'appearance': 'usual', 'arm': DEFAULT_ARM}  # if taken
 LAST_WORDS_S = 1.0  # s that the end of the last episode may take to arrive
 
@@ -70,7 +52,8 @@ class SimNode(Node):
     Meanwhile the newest image, and what belongs to it, is sent again and again with the same
     stamp, so that who waits for it, or comes late, has it.
     Real time: a timer does, with the command that came since the last period, else standing still.
-    A command is valid for command_timeout after it came; later the arm stands still.
+    A command is valid for COMMAND_TIMEOUT, or what arm/command_timeout says, after it came; later
+    the arm stands still.
     A zero twist without a stamp means stop in both modes and lets no time pass. Whoever sends a
     command that is not carried out learns it from arm/refused.
     Paused or stopped: commands are refused, and what came before or meanwhile is not made up for.
@@ -81,13 +64,13 @@ class SimNode(Node):
         self.params = declare_parameters(self)
         task = self.params['task']
         self._sim = self._make_world(task)
-        self._seed, self._scenes = 0, 0  # of the present scene, and how many there were
+        self._seed = 0  # of the present scene
         self._hide_arm = False
         self._opening = 0.0  # the newest gripper command
         self._done_opening = 0.0  # that of the last period
         self._twist: np.ndarray | None = None  # real time: the command for the next period
         self._valid_until = 0.0  # monotonic time at which it runs out
-        self._timeout = self.params['command_timeout']  # s that a command is valid
+        self._timeout = COMMAND_TIMEOUT
         self._stamp_ns = FIRST_STAMP  # of the newest image; never goes back, unlike the physics
         self._answered_ns = 0  # stamp of the newest image that was answered by a command
         self._reset_ns = FIRST_STAMP
@@ -98,7 +81,9 @@ class SimNode(Node):
         self._played_at = 0.0  # monotonic time at which it was set so
         self._diagnostics = Diagnostics(
             self, {'arm/delta_twist_cmds': math.inf, 'gripper/command': math.inf})
-        self._create_publishers()
+        self._topics = ScenePublishers(self, self._sim, self.params['observer'])
+        self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
+        self._episode = self.create_publisher(Episode, 'episode', STREAM)
         # Subscribed before the twist, so that of two commands sent together it is taken first.
         for kind, topic, callback, qos in (
                 (Float64, 'gripper/command', self._on_gripper, STREAM),
@@ -117,7 +102,7 @@ class SimNode(Node):
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         if self.params['lock_step']:
             mode = 'lock-step'
-            self.create_timer(RESEND_S, self._send_newest, clock=clock)
+            self.create_timer(RESEND_S, self._topics.send_newest, clock=clock)
         else:
             factor = self.params['real_time_factor']
             self.create_timer(CONTROL_PERIOD / factor, self._on_timer, clock=clock)
@@ -130,26 +115,6 @@ class SimNode(Node):
         self._end_episode()
         self._sim.close()
         self._episode.wait_for_all_acked(Duration(seconds=LAST_WORDS_S))
-
-    def _create_publishers(self) -> None:
-        self._newest: dict[str, Any] = {}  # topic -> the message sent last
-        self._streams = {
-            topic: self.create_publisher(kind, topic, STREAM) for topic, kind in {
-                'clock': ClockMessage, 'joint_states': JointState, 'objects': ObjectStates,
-                'camera/camera_info': CameraInfo, 'camera/robot_mask': Image,
-                'camera/image_raw': Image}.items()}
-        self._goal_mask = self.create_publisher(Image, 'goal/robot_mask', LATCHED)
-        self._description = self.create_publisher(String, 'robot_description', LATCHED)
-        if self._sim.arm is not None:
-            self._description.publish(String(data=robot_description(self._sim.arm)))
-        if self.params['observer']:
-            self._streams['observer/image_raw'] = self.create_publisher(
-                Image, 'observer/image_raw', STREAM)
-        self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
-        self._transforms = TransformPublisher(self)
-        self._episode = self.create_publisher(Episode, 'episode', STREAM)
-        self._goal_image = self.create_publisher(Image, 'goal/image', LATCHED)
-        self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
 
     # Commands
 
@@ -297,11 +262,6 @@ class SimNode(Node):
         return self._sim
 
     @property
-    def scenes(self) -> int:
-        """Return how many scenes there were, with the present one."""
-        return self._scenes
-
-    @property
     def stamp(self) -> Time:
         """Return the stamp of the newest picture."""
         return to_stamp(self._stamp_ns)
@@ -359,7 +319,6 @@ class SimNode(Node):
         if sim is not self._sim:
             self._sim.close()
         self._sim, self._hide_arm, self._seed = sim, hide_arm, seed
-        self._scenes += 1
         self._leave_start()
         self._opening, self._done_opening, self._twist = 0.0, 0.0, None
         self._stamp_ns += PERIOD_NS
@@ -367,7 +326,7 @@ class SimNode(Node):
         self._num_steps = 0
         self._in_episode = True
         self._publish_episode(Episode.START, '')
-        self._publish_fixed_transforms()
+        self._topics.frames(sim, self.stamp)
         self._publish_goal()
         self._publish(observation)
 
@@ -392,49 +351,12 @@ class SimNode(Node):
     def _publish(self, observation: Observation) -> None:
         if self._hide_arm:
             observation = self._sim.observe(hide_arm=True)
-        stamp = to_stamp(self._stamp_ns)
-        arm = self._sim.arm
-        self._newest = {
-            'clock': ClockMessage(clock=stamp),
-            'joint_states': encode_joints(
-                observation.gripper, stamp, WORLD_FRAME,
-                dict(zip(arm.joints, observation.arm_joints)) if arm is not None else None),
-            'objects': encode_observed(observation, stamp),
-            'camera/camera_info': encode_camera_info(
-                self._sim.camera_matrix, observation.image.shape[:2], stamp, CAMERA_FRAME),
-            'camera/image_raw': encode_image(observation.image, stamp, CAMERA_FRAME),
-            'camera/robot_mask': encode_mask(observation.robot_mask, stamp, CAMERA_FRAME)}
-        if self.params['observer']:
-            self._newest['observer/image_raw'] = encode_image(
-                ability(self._sim, 'observer_picture')(), stamp, OBSERVER_FRAME)
-        if arm is not None:
-            self._transforms.moving(arm_transforms(arm, observation.arm_joints), stamp)
-        self._send_newest()
-
-    def _publish_fixed_transforms(self) -> None:
-        """Tell where the cameras and the foot of the arm are in this scene."""
-        poses = {CAMERA_FRAME: self._sim.camera_pose}
-        if hasattr(self._sim, 'observer_picture'):
-            poses[OBSERVER_FRAME] = OBSERVER.pose
-        fixed = [Transform(WORLD_FRAME, frame, pose)
-                 for frame, pose in poses.items() if pose is not None]
-        if self._sim.arm is not None:
-            fixed += fixed_arm_transforms(self._sim.arm)
-        self._transforms.fixed(fixed, to_stamp(self._stamp_ns))
-
-    def _send_newest(self) -> None:
-        """Send what the camera sees now, again if need be."""
-        for topic, message in self._newest.items():
-            self._streams[topic].publish(message)
+        self._topics.moment(self._sim, observation, self.stamp)
 
     def _publish_goal(self) -> None:
-        goal = self._sim.goal(self._hide_arm or self.params['hide_arm_in_goal'])
         # Goals are told apart by their stamps, also where no time has passed between them.
         self._goal_ns = max(self._stamp_ns, self._goal_ns + 1)
-        stamp = to_stamp(self._goal_ns)
-        self._goal_objects.publish(encode_observed(goal, stamp))
-        self._goal_image.publish(encode_image(goal.image, stamp, CAMERA_FRAME))
-        self._goal_mask.publish(encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
+        self._topics.goal(self._sim.goal(self._hide_arm), to_stamp(self._goal_ns))
 
     def _publish_episode(self, event: int, outcome: str) -> None:
         message = Episode(
@@ -470,21 +392,7 @@ def declare_parameters(node: Node) -> Parameters:
         'False: time passes by itself.')
     parameters.declare('real_time_factor', 1.0,
                        'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
-    parameters.declare('command_timeout', 1.0,
-                       'Simulated seconds that a command is valid after it came; then the arm '
-                       'stands still. Its sender may say otherwise on arm/command_timeout.',
-                       low=0.001, high=60.0)
-    parameters.declare('hide_arm_in_goal', False,
-                       'Leave the arm out of the goal picture, from the next one on.',
-                       read_only=False)
     return parameters
-
-
-def encode_observed(observation: Observation, stamp: Time) -> ObjectStates:
-    """Encode the objects of an Observation, which come from the simulator itself."""
-    return encode_objects(
-        observation.object_names, observation.object_pixels, observation.object_poses, stamp,
-        WORLD_FRAME, ObjectStates.SOURCE_GROUND_TRUTH)
 
 
 def main(args: list[str] | None = None) -> int:

@@ -19,10 +19,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-import mujoco
-import mujoco.rollout
 import numpy as np
-from sim_bridge.tasks.tasks import carry_out, Demonstration, Drawn, EpisodeRun, Task, TaskScene
+from sim_bridge.tasks.tasks import (
+    carry_out,
+    Demonstration,
+    EpisodeRun,
+    moves,
+    straight,
+    Task,
+    TaskScene,
+)
 from sim_bridge.world.looks import GRIP_SPREAD
 from sim_bridge.world.scene import (
     box_shape,
@@ -74,7 +80,7 @@ class GraspTask(Task):
     photographed: ClassVar[bool] = False
     lifts: ClassVar[bool] = True  # the object is to be in the fingers at the end
 
-    def draw(self, rng: np.random.Generator, spread: float) -> Drawn:
+    def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
         """Draw one object that can be held; its goal is lifted, or elsewhere."""
         shape = graspable_shape(rng)
         yaw = graspable_yaw(shape, rng)
@@ -85,9 +91,9 @@ class GraspTask(Task):
             angle = rng.uniform(0, 2 * np.pi)
             reach = spread * rng.uniform(*self.reach)
             gripper = start + reach * np.array([np.cos(angle), np.sin(angle)])
-        return Drawn((shape,), np.array([[*start, yaw]]),
-                     np.array([[*goal, grasp_place(shape, yaw)[1]]]),
-                     np.append(gripper, rng.uniform(0, GRIPPER_HEIGHT)), (0,))
+        return TaskScene((shape,), np.array([[*start, yaw]]),
+                         np.array([[*goal, grasp_place(shape, yaw)[1]]]),
+                         np.append(gripper, rng.uniform(0, GRIPPER_HEIGHT)), (0,))
 
     def _draw_goal(self, rng: np.random.Generator, start: np.ndarray,
                    spread: float) -> np.ndarray:
@@ -110,14 +116,10 @@ class GraspTask(Task):
         high = table.object_poses()[:, 2] - HALF_HEIGHT > SUCCESS_DISTANCE
         return bool(high.all() and table.touching())
 
-    def default_config(self, timing: str = 'natural') -> 'GraspConfig':
-        """Return how hard the expert searches."""
-        return GraspConfig()
-
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
                     rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
         """Act for exactly so many frames."""
-        expert = GraspExpert(table, rng, how.config, how.rollout, lifts=self.lifts)
+        expert = GraspExpert(table, rng, lifts=self.lifts)
         num_frames = how.num_frames or self.num_frames
         return carry_out(table, self.succeeds, first, _plans(expert, num_frames), num_frames)
 
@@ -241,18 +243,16 @@ class GraspExpert:
 
     :param table: Table with a scene.
     :param rng: numpy Generator; every whim of this expert comes from it.
-    :param config: GraspConfig.
-    :param rollout: mujoco.rollout.Rollout to share between episodes.
+    :param config: GraspConfig; None: the usual one.
     :param held: index of the object that is to be grasped.
     :param lifts: the episode ends with the lift.
     :ivar hover: m, height of the gripper before it drops.
     """
 
-    def __init__(self, table: Table, rng: np.random.Generator, config: GraspConfig,
-                 rollout: mujoco.rollout.Rollout, held: int = 0, lifts: bool = False) -> None:
-        self.table, self._rng, self._config, self.lifts = table, rng, config, lifts
-        self._rollout, self._held = rollout, held
-        self._scratch = mujoco.MjData(table.model)  # rollouts overwrite it
+    def __init__(self, table: Table, rng: np.random.Generator, config: GraspConfig | None = None,
+                 held: int = 0, lifts: bool = False) -> None:
+        self._config = config = config or GraspConfig()
+        self.table, self._rng, self.lifts, self._held = table, rng, lifts, held
         self.hover = rng.uniform(*config.hover)
         self._low = rng.uniform(*config.low)
         self._top = self._low + rng.uniform(*config.lift)
@@ -285,17 +285,10 @@ class GraspExpert:
         path = [here[:3]]
         if rise:
             path.append(np.append(here[:2], self.hover))
-        above, below = np.append(place, self.hover), np.append(place, self._low)
-        path += straight(path[-1], above, travel)
+        path += straight(path[-1], np.append(place, self.hover), travel)
         if far:
             path[-travel:] = [np.append(point[:2], self.hover) for point in path[-travel:]]
-        path += [above] * idle  # it waits above the object
-        path += straight(above, below, self._drop_steps)
-        opened = len(path) - 1
-        path += [below] + straight(below, np.append(place, self._top), lift_steps)
-        opening = np.zeros(len(path) - 1)
-        opening[:opened] = 1
-        return np.column_stack([np.diff(path, axis=0), opening])
+        return self._close_and_lift(path, place, idle, lift_steps)
 
     def pick_and_lift(self) -> np.ndarray:
         """
@@ -306,15 +299,16 @@ class GraspExpert:
         here = self.table.target
         place = self._search()
         travel, _ = self._travel_steps(place - here[:2])
-        above, below = np.append(place, self.hover), np.append(place, self._low)
-        path = [here[:3], *straight(here[:3], above, travel)]
-        path += [above] * int(self._rng.integers(3))  # it waits above the object
-        path += straight(above, below, self._drop_steps)
+        path = [here[:3], *straight(here[:3], np.append(place, self.hover), travel)]
+        return self._close_and_lift(path, place, int(self._rng.integers(3)), self._lift_steps)
+
+    def _close_and_lift(self, path: list[np.ndarray], place: np.ndarray, idle: int,
+                        lift_steps: int) -> np.ndarray:
+        """Go on from the end of a path above an object's place (2,): wait, drop, close, lift."""
+        above, below, top = (np.append(place, z) for z in (self.hover, self._low, self._top))
+        path = [*path, *[above] * idle, *straight(above, below, self._drop_steps)]
         opened = len(path) - 1
-        path += [below, *straight(below, np.append(place, self._top), self._lift_steps)]
-        opening = np.zeros(len(path) - 1)
-        opening[:opened] = 1
-        return np.column_stack([np.diff(path, axis=0), opening])
+        return moves([*path, below, *straight(below, top, lift_steps)], opened=opened)
 
     def _reserve(self, steps_left: int) -> int:
         """Hurry if there is little time; return the control periods that placing will take."""
@@ -357,9 +351,7 @@ class GraspExpert:
         while len(path) <= steps_left:
             path.append(path[-1] + rng.normal(0, [wiggle, wiggle, wiggle / 3]))
             path[-1] = np.clip(path[-1], [-reach, -reach, CLEAR], [reach, reach, 0.14])
-        opening = np.ones(len(path) - 1)
-        opening[:closed] = 0
-        return np.column_stack([np.diff(path, axis=0), opening])[:steps_left]
+        return moves(path, closed=closed)[:steps_left]
 
     def _travel_steps(self, way: np.ndarray) -> tuple[int, int]:
         """Draw how many control periods a way (2,) takes, and say how few would do."""
@@ -399,7 +391,7 @@ class GraspExpert:
         states = np.tile(table.state(), (len(places), 1))
         states[:, 1:3], states[:, 3] = places, self.hover
         states[:, 4:6] = controls[:, :1, 3:].squeeze(1)
-        ends, _ = self._rollout.rollout(table.model, self._scratch, states, controls)
+        ends = table.rollout(states, controls)
         before = table.object_poses()[:, :3]
         after = ends[:, -1, 1 + OBJECT_QPOS_START:1 + table.model.nq].reshape(
             len(places), -1, 7)
@@ -412,11 +404,6 @@ class GraspExpert:
         return lift - np.clip(lifted, 0, lift - 0.01) + 0.1 * (
             (upright < 0.95) | lost) + OTHERS * moved.sum(1) + OFF_CENTRE * np.linalg.norm(
                 places - before[self._held, :2], axis=1)
-
-
-def straight(start: np.ndarray, end: np.ndarray, steps: int) -> list[np.ndarray]:
-    """Return the points after start on a straight way of so many steps."""
-    return [start + share * (end - start) for share in np.linspace(0, 1, steps + 1)[1:]]
 
 
 def _plans(expert: GraspExpert, num_frames: int) -> Iterator[np.ndarray]:

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sim_bridge.tasks.push import Expert, GOAL_DISTANCE, OBJECT_RANGE, PushTask, with_yaws
-from sim_bridge.tasks.pushes import find_order, Moment
-from sim_bridge.tasks.tasks import apart, Drawn
+from sim_bridge.tasks.push import GOAL_DISTANCE, OBJECT_RANGE, PushTask, with_yaws
+from sim_bridge.tasks.tasks import apart, TaskScene
 from sim_bridge.world.scene import ObjectShape, random_shape
 from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE
 from tap_ros.contract import WORKSPACE_HIGH
@@ -41,7 +40,7 @@ class OrderTask(PushTask):
     ordered: ClassVar[bool] = True
     object_range: ClassVar[float] = EDGE_RANGE[1]
 
-    def draw(self, rng: np.random.Generator, spread: float) -> Drawn:
+    def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
         """Draw a scene in which the order of pushes matters."""
         shapes = draw_shapes(rng, self.num_objects)
         starts, goals, hand = draw_chain(rng, self.num_objects)
@@ -49,11 +48,7 @@ class OrderTask(PushTask):
         names = rng.permutation(self.num_objects)
         starts[names], goals[names] = starts.copy(), goals.copy()
         start_poses, goal_poses = with_yaws(rng, starts, goals)
-        return Drawn(shapes, start_poses, goal_poses, hand, tuple(int(k) for k in names[::-1]))
-
-    def next_object(self, expert: Expert, todo: list[int], now: Moment) -> int:
-        """Choose the first object in the best order."""
-        return find_order(expert.rollouts, now, expert.goals, todo, expert.rng)[0]
+        return TaskScene(shapes, start_poses, goal_poses, hand, tuple(int(k) for k in names[::-1]))
 
 
 ORDER2 = OrderTask('order2', num_objects=2, num_frames=55, stream=6)

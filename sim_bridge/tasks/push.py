@@ -23,19 +23,17 @@ simulator; no picture is moved in time.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import ClassVar
 
-import mujoco
-import mujoco.rollout
 import numpy as np
-from sim_bridge.tasks.pushes import Moment, Push, push_actions, PushRollouts
+from sim_bridge.tasks.pushes import after_plans, find_order, Moment, Push, push_actions
 from sim_bridge.tasks.tasks import (
     apart,
     carry_out,
     Demonstration,
-    Drawn,
     EpisodeRun,
+    moves,
     Task,
     TaskScene,
 )
@@ -43,6 +41,7 @@ from sim_bridge.world.scene import random_shape
 from sim_bridge.world.table import GRIPPER_HEIGHT, GRIPPER_MARGIN, GRIPPER_RANGE, lifted, Table
 from sim_bridge.world_protocol import Observation
 from tap_ros.contract import LIFTED, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.search import cross_entropy
 
 OBJECT_RANGE = 0.35  # m, |x| and |y| of object origins at start and goal
 GOAL_DISTANCE = 0.2  # m from start to goal of every object that is pushed
@@ -74,7 +73,7 @@ class PushTask(Task):
     kind: ClassVar[str] = 'push'
     object_range: ClassVar[float] = OBJECT_RANGE  # m, largest |x| and |y| at start and goal
 
-    def draw(self, rng: np.random.Generator, spread: float) -> Drawn:
+    def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
         """Draw separated starts and goals, and the gripper beside one object."""
         shapes = tuple(random_shape(rng) for _ in range(self.num_objects))
         # Separated starts may leave no room for separated goals: then both are drawn anew.
@@ -84,8 +83,8 @@ class PushTask(Task):
             goals = _draw_goals(rng, starts)
         start_poses, goal_poses = with_yaws(rng, starts, goals)
         hand = gripper_beside_one(rng, starts)
-        return Drawn(shapes, start_poses, goal_poses, hand,
-                     tuple(nearest_first(hand[:2], starts, goals)))
+        return TaskScene(shapes, start_poses, goal_poses, hand,
+                         tuple(nearest_first(hand[:2], starts, goals)))
 
     def _draw_starts(self, rng: np.random.Generator) -> np.ndarray:
         """Draw object origins (K, 2) that are far enough apart."""
@@ -99,36 +98,27 @@ class PushTask(Task):
         starts, goals = scene.start_poses[:, :2], scene.goal_poses[:, :2]
         k = scene.order[-1]
         along = (goals[k] - starts[k]) / np.linalg.norm(goals[k] - starts[k])
-        state = table.state()
-        for behind in np.arange(0.04, 0.16, 0.005):
-            gripper = np.append(goals[k] - behind * along, 0.01)
-            table.place(lifted(scene.goal_poses), gripper)
-            if not table.touching():
-                break
-        mujoco.mj_setState(table.model, table.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        with table.unmoved():
+            for behind in np.arange(0.04, 0.16, 0.005):
+                gripper = np.append(goals[k] - behind * along, 0.01)
+                table.place(lifted(scene.goal_poses), gripper)
+                if not table.touching():
+                    break
         return gripper
-
-    def default_config(self, timing: str = 'natural') -> 'ExpertConfig':
-        """Return how hard the expert searches."""
-        return ExpertConfig() if timing == 'natural' else TIMED_CONFIG
-
-    def next_object(self, expert: 'Expert', todo: list[int], now: Moment) -> int:
-        """Choose which of several objects is pushed next: the first one, then the nearest."""
-        return expert.first if expert.first in todo else expert.nearest(todo, now)
 
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
                     rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
         """Push, from the first motion of the arm to the last of an object."""
         natural = how.timing == 'natural'
         num_frames = how.num_frames or self.num_frames + (0 if natural else MORE_FRAMES)
-        expert = Expert(self, table, rng, how.config, how.rollout, how.misses)
+        expert = Expert(self, table, rng, ExpertConfig() if natural else TIMED_CONFIG, how.misses)
         plans = (_plans(expert, num_frames) if natural else
                  timed_plans(expert, draw_share(how.timing, rng), num_frames, rng))
-        observations, actions, outcome, seconds = carry_out(
+        observations, actions, outcome = carry_out(
             table, self.succeeds, first, plans, num_frames)
         length = _last_motion(np.array([o.object_poses[:, :3] for o in observations])) + 1
         done = np.concatenate([actions[:length - 1], np.zeros((1, 4), np.float32)])
-        return observations[:length], done, outcome, seconds
+        return observations[:length], done, outcome
 
 
 PUSH2 = PushTask('push2', num_objects=2, num_frames=50, stream=2, start_separation=0.35)
@@ -215,17 +205,14 @@ class Expert:
     :param table: Table with its scene.
     :param rng: numpy Generator; every whim of this expert comes from it.
     :param config: ExpertConfig.
-    :param rollout: mujoco.rollout.Rollout to share between episodes.
     :param misses: share of the pushes that are at random instead of searched.
     :ivar first: the object nearest to where the gripper started, wherever it walked since.
     """
 
     def __init__(self, task: PushTask, table: Table, rng: np.random.Generator,
-                 config: ExpertConfig, rollout: mujoco.rollout.Rollout,
-                 misses: float = 0.0) -> None:
-        self._task, self._table, self.rng, self._config = task, table, rng, config
+                 config: ExpertConfig, misses: float = 0.0) -> None:
+        self._task, self.table, self.rng, self._config = task, table, rng, config
         self._misses = misses
-        self.rollouts = PushRollouts(table, rollout)
         self.goals = table.goal_poses[:, :3]
         self._num_samples = rng.integers(*config.num_samples, endpoint=True)
         self._preference = rng.uniform(0, config.preference, task.num_objects)
@@ -238,20 +225,22 @@ class Expert:
 
     def undone(self) -> list[int]:
         """Return which objects are not at their goals yet."""
-        places = self._table.object_poses()[:, :3]
+        places = self.table.object_poses()[:, :3]
         distances = np.linalg.norm(places - self.goals, axis=1)
         return np.flatnonzero(distances > self._config.done_distance).tolist()
 
     def next_object(self) -> int | None:
         """
-        Choose an object to push, see PushTask.next_object.
+        Choose an object to push: the first in the best order, or `first`, then the nearest.
 
         :return: its number, or None when all are in place.
         """
-        todo, now = self.undone(), Moment.of(self._table)
+        todo, now = self.undone(), Moment.of(self.table)
         if len(todo) < 2:
             return todo[0] if todo else None
-        return self._task.next_object(self, todo, now)
+        if self._task.ordered:
+            return find_order(self.table, now, self.goals, todo, self.rng)[0]
+        return self.first if self.first in todo else self.nearest(todo, now)
 
     def nearest(self, objects: Sequence[int], now: Moment) -> int:
         """Return the object nearest to the gripper."""
@@ -273,12 +262,11 @@ class Expert:
         # As fast as it travels: pictures of a slow walk would be easy to predict from the start.
         angles = self.rng.uniform(0, 2 * np.pi, steps)
         lengths = self.rng.uniform(*self._config.travel_speed, steps)
-        here = self._table.target[:3]
+        here = self.table.target[:3]
         path = here[:2] + np.cumsum(
             lengths[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]), 0)
         path = np.clip(path, WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])
-        path = np.concatenate([here[None], np.column_stack([path, np.full(steps, LIFTED)])])
-        return np.column_stack([np.diff(path, axis=0), np.zeros(steps)])
+        return moves([here, *np.column_stack([path, np.full(steps, LIFTED)])])
 
     def plan(self, steps_left: int, only: int | None = None,
              part: float = 1.0) -> np.ndarray | None:
@@ -290,7 +278,7 @@ class Expert:
         :param part: of the way that object is pushed.
         :return: (n, 4) actions, or None when every object is in place.
         """
-        now, todo = Moment.of(self._table), self.undone()
+        now, todo = Moment.of(self.table), self.undone()
         first = self.next_object() if only is None else only
         if not todo or first is None:
             return None
@@ -301,25 +289,23 @@ class Expert:
             todo = [first]
             goals = goals.copy()
             goals[first] = now.places[first] + part * (goals[first] - now.places[first])
-        distances = np.linalg.norm(now.places - goals, axis=1)
-        best_cost, best = np.inf, None
-        mean = spread = None
-        for _ in range(self._config.num_iterations):
-            pushes = self._sample(todo, now.places, goals, mean, spread)
-            plans = [push_actions(push, now.target, now.places[k, :2], goals[k, :2])[:steps_left]
-                     for k, push in pushes]
-            costs = self._costs(now, plans, goals, distances, first)
-            if self.rng.random() < self._config.explore:
-                return plans[0]
-            order = np.argsort(costs, kind='stable')[:self._config.num_elites]
-            if costs[order[0]] < best_cost:
-                best_cost, best = costs[order[0]], plans[order[0]]
-            # Refit to the elites that push the same object as the best one does.
-            same = [i for i in order if pushes[i][0] == pushes[order[0]][0]]
-            parameters = np.array([astuple(pushes[i][1])[:4] for i in same])
-            todo = [pushes[order[0]][0]]
-            mean, spread = parameters.mean(0), parameters.std(0) + [0.08, 0.006, 0.01, 0.005]
-        return best
+        config, rng = self._config, self.rng
+
+        def actions_of(sample: np.ndarray) -> np.ndarray:
+            k = int(sample[0])
+            return push_actions(Push(*sample[1:]), now.target, now.places[k, :2],
+                                goals[k, :2])[:steps_left]
+
+        def cost(samples: np.ndarray) -> np.ndarray:
+            costs = self._costs(now, [actions_of(sample) for sample in samples], goals, first)
+            if rng.random() < config.explore:
+                costs[0] = -np.inf  # whatever comes of it
+            return costs
+
+        best, _ = cross_entropy(
+            lambda elites: self._sample(todo, now.places, goals, elites), cost,
+            config.num_iterations, config.num_elites)
+        return actions_of(best[0])
 
     def _random_push(self, now: Moment, steps_left: int) -> np.ndarray:
         """
@@ -339,38 +325,43 @@ class Expert:
             angle, speed = rng.uniform(0, 2 * np.pi), rng.uniform(*config.push_speed)
             step = speed * np.array([np.cos(angle), np.sin(angle), 0])
             path += [path[-1] + i * step for i in range(1, rng.integers(2, 6))]
-        path = np.clip(path, WORKSPACE_LOW, WORKSPACE_HIGH)
-        further = np.column_stack([np.diff(path, axis=0), np.zeros(len(path) - 1)])
+        further = moves(np.clip(path, WORKSPACE_LOW, WORKSPACE_HIGH))
         return np.concatenate([actions, further])[:steps_left]
 
     def _sample(self, todo: Sequence[int], places: np.ndarray, goals: np.ndarray,
-                mean: np.ndarray | None, spread: np.ndarray | None) -> list[tuple[int, Push]]:
-        """Draw objects and pushes of them."""
+                elites: np.ndarray | None) -> np.ndarray:
+        """
+        Draw (N, 6): objects, and pushes of them.
+
+        :param elites: pushes like those of the object that the best one pushes; None: others.
+        """
         rng, config = self.rng, self._config
-        pushes = []
+        if elites is not None:
+            todo = [int(elites[0, 0])]
+            near = elites[elites[:, 0] == todo[0], 1:5]
+            mean, spread = near.mean(0), near.std(0) + [0.08, 0.006, 0.01, 0.005]
+        samples = []
         for _ in range(self._num_samples):
             k = int(rng.choice(todo))
-            if mean is None or spread is None:
+            if elites is None:
                 gap = goals[k, :2] - places[k, :2]
-                parameters = np.array([
+                push = np.array([
                     np.arctan2(gap[1], gap[0]) + rng.normal(0, 0.35), rng.normal(0, 0.025),
                     rng.normal(0, 0.03), rng.uniform(*config.push_speed)])
             else:
-                parameters = rng.normal(mean, spread)
-                parameters[3] = np.clip(parameters[3], *config.push_speed)
-            angle, offset, overshoot, speed = parameters
-            travel_speed = rng.uniform(*config.travel_speed)
-            pushes.append((k, Push(angle, offset, overshoot, speed, travel_speed)))
-        return pushes
+                push = rng.normal(mean, spread)
+                push[3] = np.clip(push[3], *config.push_speed)
+            samples.append([k, *push, rng.uniform(*config.travel_speed)])
+        return np.array(samples)
 
     def _costs(self, now: Moment, plans: Sequence[np.ndarray], goals: np.ndarray,
-               distances: np.ndarray, first: int) -> np.ndarray:
+               first: int) -> np.ndarray:
         """Roll all plans out in the true simulator; return (N,) metres."""
-        moments, upright = self.rollouts(now, plans)
+        moments, upright = after_plans(self.table, now, plans)
         ends = np.linalg.norm(np.array([m.places for m in moments]) - goals, axis=-1)  # (N, K)
         costs = ends.sum(1) + TILT_COST * (~upright).sum(1)
         costs += self._config.step_cost * np.array([len(plan) for plan in plans])
-        untouched = np.abs(ends - distances) < 0.005
+        untouched = np.abs(ends - np.linalg.norm(now.places - goals, axis=1)) < 0.005
         return costs + (untouched * self._preference).sum(1) + self._config.nearest * untouched[
             :, first]
 

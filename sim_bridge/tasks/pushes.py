@@ -3,12 +3,11 @@
 """Pushes as actions, where they lead in the true simulator, and which order of them is best."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import permutations
+from typing import NamedTuple
 
-import mujoco
-import mujoco.rollout
 import numpy as np
+from sim_bridge.tasks.tasks import moves
 from sim_bridge.world.table import divided, OBJECT_QPOS_START, ramp_controls, SUBSTEPS, Table
 from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
 
@@ -21,8 +20,7 @@ SPEED, TRAVEL_SPEED = 0.05, 0.08  # m per control period
 TILT_COST = 0.2  # m, of an object that topples
 
 
-@dataclass(frozen=True)
-class Push:
+class Push(NamedTuple):
     """Go behind an object, come down, push it past its goal."""
 
     angle: float  # rad, of the way of the gripper
@@ -32,8 +30,7 @@ class Push:
     travel_speed: float  # m per control period, while lifted
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """The state of a table, from which pushes are rolled out."""
 
     state: np.ndarray  # as Table.state
@@ -76,46 +73,33 @@ def push_actions(push: Push, hand: np.ndarray, place: np.ndarray, goal: np.ndarr
         path = start + np.linspace(0, 1, steps + 1)[1:, None] * (end - start)
         waypoints.append(np.column_stack([path, np.full(steps, LOW)]))
     positions = np.concatenate([hand[None, :3], *waypoints])[:max_steps + 1]
-    return np.column_stack([np.diff(positions, axis=0), np.zeros(len(positions) - 1)])
+    return moves(positions)
 
 
-class PushRollouts:
+def after_plans(table: Table, moment: Moment,
+                plans: Sequence[np.ndarray]) -> tuple[list[Moment], np.ndarray]:
     """
-    Rolls out pushes from any moment of a scene in its true physics; the table stays.
+    Carry out each of N plans from a moment in the true physics; the table stays as it is.
 
-    :param table: Table, already reset.
-    :param rollout: mujoco.rollout.Rollout.
+    :param plans: N arrays (n, 4) of actions, none empty.
+    :return: the N moments after, and (N, K) bool, which objects are then upright.
     """
-
-    def __init__(self, table: Table, rollout: mujoco.rollout.Rollout) -> None:
-        self._model, self._rollout, self._arm = table.model, rollout, table.arm
-        self._scratch = mujoco.MjData(table.model)  # rollouts overwrite it
-
-    def __call__(self, moment: Moment,
-                 plans: Sequence[np.ndarray]) -> tuple[list[Moment], np.ndarray]:
-        """
-        Carry out each of N plans from a moment.
-
-        :param plans: N arrays (n, 4) of actions, none empty.
-        :return: the N moments after, and (N, K) bool, which objects are then upright.
-        """
-        plans = [divided(plan, self._arm.action_limit) for plan in plans]
-        lengths = np.array([len(plan) for plan in plans])
-        actions = np.zeros((len(plans), lengths.max(), 4))
-        for plan, padded in zip(plans, actions):
-            padded[:len(plan)] = plan
-        controls, targets = ramp_controls(moment.target, actions, self._arm.low, self._arm.high)
-        states, _ = self._rollout.rollout(
-            self._model, self._scratch, np.tile(moment.state, (len(plans), 1)), controls)
-        numbers = np.arange(len(plans))
-        last = states[numbers, lengths * SUBSTEPS - 1]  # (N, state)
-        objects = last[:, 1 + OBJECT_QPOS_START:1 + self._model.nq].reshape(len(plans), -1, 7)
-        upright = 1 - 2 * (objects[..., 4] ** 2 + objects[..., 5] ** 2) >= UPRIGHT
-        return [Moment(*moment) for moment in zip(
-            last, targets[numbers, lengths - 1], objects[..., :3])], upright
+    plans = [divided(plan, table.arm.action_limit) for plan in plans]
+    lengths = np.array([len(plan) for plan in plans])
+    actions = np.zeros((len(plans), lengths.max(), 4))
+    for plan, padded in zip(plans, actions):
+        padded[:len(plan)] = plan
+    controls, targets = ramp_controls(moment.target, actions, table.arm.low, table.arm.high)
+    states = table.rollout(np.tile(moment.state, (len(plans), 1)), controls)
+    numbers = np.arange(len(plans))
+    last = states[numbers, lengths * SUBSTEPS - 1]  # (N, state)
+    objects = last[:, 1 + OBJECT_QPOS_START:1 + table.model.nq].reshape(len(plans), -1, 7)
+    upright = 1 - 2 * (objects[..., 4] ** 2 + objects[..., 5] ** 2) >= UPRIGHT
+    return [Moment(*moment) for moment in zip(
+        last, targets[numbers, lengths - 1], objects[..., :3])], upright
 
 
-def find_order(rollouts: PushRollouts, moment: Moment, goals: np.ndarray, todo: Sequence[int],
+def find_order(table: Table, moment: Moment, goals: np.ndarray, todo: Sequence[int],
                rng: np.random.Generator) -> tuple[int, ...]:
     """
     Try all orders of pushing objects, one push for each, and return the best.
@@ -132,11 +116,11 @@ def find_order(rollouts: PushRollouts, moment: Moment, goals: np.ndarray, todo: 
         for n in range(1, len(order) + 1):
             if order[:n] not in after:
                 before, _ = after[order[:n - 1]]
-                after[order[:n]] = best_push(rollouts, before, goals, order[n - 1], rng)
+                after[order[:n]] = best_push(table, before, goals, order[n - 1], rng)
     return min(orders, key=lambda order: after[order][1])
 
 
-def best_push(rollouts: PushRollouts, moment: Moment, goals: np.ndarray, k: int,
+def best_push(table: Table, moment: Moment, goals: np.ndarray, k: int,
               rng: np.random.Generator) -> tuple[Moment, float]:
     """
     Sample pushes of object k and take the one after which least is missing.
@@ -146,7 +130,7 @@ def best_push(rollouts: PushRollouts, moment: Moment, goals: np.ndarray, k: int,
     gap = goals[k, :2] - moment.places[k, :2]
     spread = rng.normal(size=(SAMPLES, 3)) * (ANGLE_STD, OFFSET_STD, OVERSHOOT_STD)
     spread[0] = 0
-    moments, upright = rollouts(moment, [
+    moments, upright = after_plans(table, moment, [
         push_actions(Push(np.arctan2(gap[1], gap[0]) + angle, offset, overshoot, SPEED,
                           TRAVEL_SPEED), moment.target, moment.places[k, :2], goals[k, :2])
         for angle, offset, overshoot in spread])

@@ -9,19 +9,17 @@ episode ends when the last block is let go: frames after that would show the goa
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import ClassVar
 
-import mujoco
-import mujoco.rollout
 import numpy as np
-from sim_bridge.tasks.grasp import GRASP_HEIGHT, GRASP_YAW, GraspConfig, GraspExpert, straight
+from sim_bridge.tasks.grasp import GRASP_HEIGHT, GRASP_YAW, GraspConfig, GraspExpert
 from sim_bridge.tasks.tasks import (
     apart,
     carry_out,
     Demonstration,
-    Drawn,
     EpisodeRun,
+    moves,
+    straight,
     Task,
     TaskScene,
 )
@@ -39,7 +37,7 @@ STACK_OFFSET = 0.025  # m, most between the origins of a block and the one below
 LEVEL_TOLERANCE = 0.01  # m, of the height of a block above the one below
 SETTLE_STEPS = 2  # control periods after the last frame, then it counts whether the tower stands
 # High enough to carry a block over a tower of two, and no place at random: towers are to stand.
-STACK_CONFIG = GraspConfig(
+CONFIG = GraspConfig(
     explore=0.0, hover=(0.14, 0.148), low=(0.01, 0.014), lift=(0.132, 0.135),
     travel_speed=(0.045, 0.075))
 HELD = 0.09  # m, an object whose origin is lower was missed
@@ -54,11 +52,11 @@ class StackTask(Task):
     kind: ClassVar[str] = 'stack'
     gripping: ClassVar[bool] = True
 
-    def draw(self, rng: np.random.Generator, spread: float) -> Drawn:
+    def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
         """Draw blocks to be stacked; all but the first one are moved."""
         shapes = tuple(draw_block(rng) for _ in range(self.num_objects))
         starts, goals, hand = draw_blocks(rng, self.num_objects, spread)
-        return Drawn(shapes, starts, goals, hand, tuple(range(1, self.num_objects)))
+        return TaskScene(shapes, starts, goals, hand, tuple(range(1, self.num_objects)))
 
     @property
     def goal_heights(self) -> np.ndarray:
@@ -74,20 +72,17 @@ class StackTask(Task):
         """Return whether every block stands on the one below, let go."""
         return is_tower(table.object_poses()) and not table.touching()
 
-    def default_config(self, timing: str = 'natural') -> GraspConfig:
-        """Return how hard the expert searches."""
-        return STACK_CONFIG
-
     def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
                     rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
         """Act until the last block is let go; the outcome is that after SETTLE_STEPS more."""
-        mover = PickAndPlace(table, rng, how.config, how.rollout)
-        observations, actions, _, seconds = carry_out(
-            table, self.succeeds, first, _plans(table, scene, mover),
-            how.num_frames or self.num_frames)
+        mover = PickAndPlace(table, rng)
+        plans = (plan for k in scene.order
+                 for plan in mover.move(k, lambda below=k - 1: table.object_poses()[below, :3]))
+        observations, actions, _ = carry_out(
+            table, self.succeeds, first, plans, how.num_frames or self.num_frames)
         for _ in range(SETTLE_STEPS):
             table.step([0, 0, 0, table.target[3]])
-        return observations, actions, 'success' if self.succeeds(table) else 'failure', seconds
+        return observations, actions, 'success' if self.succeeds(table) else 'failure'
 
 
 STACK2 = StackTask('stack2', num_objects=2, num_frames=36, stream=8)
@@ -144,14 +139,10 @@ class PickAndPlace:
 
     :param table: Table with a scene and a gripper that holds.
     :param rng: numpy Generator; every whim of this planner comes from it.
-    :param config: GraspConfig.
-    :param rollout: mujoco.rollout.Rollout to share between episodes.
     """
 
-    def __init__(self, table: Table, rng: np.random.Generator, config: GraspConfig,
-                 rollout: mujoco.rollout.Rollout) -> None:
-        self._table, self._rng, self._config = table, rng, config
-        self._rollout = rollout
+    def __init__(self, table: Table, rng: np.random.Generator) -> None:
+        self._table, self._rng = table, rng
 
     def move(self, k: int, below: Callable[[], np.ndarray]) -> Iterator[np.ndarray]:
         """
@@ -161,9 +152,11 @@ class PickAndPlace:
         :param below: says (3,) m where the origin of what is to be below it is now, see on_table.
         """
         table = self._table
-        grasp = GraspExpert(table, self._rng, self._config, self._rollout, k)
+        grasp = GraspExpert(table, self._rng, CONFIG, k)
         for _ in range(TRIES):
-            yield self._rise(grasp)
+            here = table.target
+            if here[2] < CLEAR:  # straight up from among the objects
+                yield np.array([[0, 0, grasp.hover - here[2], here[3]]])
             yield grasp.pick_and_lift()
             if table.object_poses()[k, 2] > HELD:
                 break
@@ -171,26 +164,19 @@ class PickAndPlace:
         yield self._lower(k, below())
         yield np.array([[0, 0, 0, 0.5], [0, 0, 0, 1]])
 
-    def _rise(self, grasp: GraspExpert) -> np.ndarray:
-        """Go straight up from among the objects, if the gripper is there."""
-        here = self._table.target
-        if here[2] >= CLEAR:
-            return np.empty((0, 4))
-        return np.array([[0, 0, grasp.hover - here[2], here[3]]])
-
     def _carry(self, k: int, below: np.ndarray) -> np.ndarray:
         """Carry object k above its place."""
-        speed = self._rng.uniform(*self._config.travel_speed)
+        speed = self._rng.uniform(*CONFIG.travel_speed)
         gap = self._gap(k, below)
         path = straight(np.zeros(3), gap, max(1, int(np.ceil(np.linalg.norm(gap) / speed))))
-        return _moves([np.zeros(3), *path])
+        return moves([np.zeros(3), *path])
 
     def _lower(self, k: int, below: np.ndarray) -> np.ndarray:
         """Bring object k, as it hangs now, down onto what is below it and hold still."""
         down = below[2] + 2 * HALF_HEIGHT + GAP - self._table.object_poses()[k, 2]
         above = self._gap(k, below)
         path = straight(above, above + [0, 0, down], int(self._rng.integers(2, 4)))
-        return _moves([np.zeros(3), above, *path, path[-1]])
+        return moves([np.zeros(3), above, *path, path[-1]])
 
     def _gap(self, k: int, below: np.ndarray) -> np.ndarray:
         """Return the way (3,), level, from object k to above its place."""
@@ -200,19 +186,3 @@ class PickAndPlace:
 def on_table(place: np.ndarray) -> np.ndarray:
     """Return the origin (3,) of what would be below an object on the table at (2,) m."""
     return np.append(place, -HALF_HEIGHT)
-
-
-def _moves(path: list[np.ndarray]) -> np.ndarray:
-    """Return the actions along points (3,), with closed fingers."""
-    return np.column_stack([np.diff(path, axis=0), np.zeros(len(path) - 1)])
-
-
-def _plans(table: Table, scene: TaskScene, mover: PickAndPlace) -> Iterator[np.ndarray]:
-    """Yield the actions of one episode; each waits until those before are carried out."""
-    for k in scene.order:
-        yield from mover.move(k, partial(_place_of, table, k - 1))
-
-
-def _place_of(table: Table, k: int) -> np.ndarray:
-    """Return where the origin of object k is now, (3,) m."""
-    return table.object_poses()[k, :3]

@@ -7,12 +7,10 @@ push.py, order.py, grasp.py and stack.py have a family each. Another package add
 entry points 'tap_ros.tasks'; their names stand for Task objects.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-import time
 from typing import Any, ClassVar, NamedTuple
 
-import mujoco.rollout
 import numpy as np
 from sim_bridge.world.scene import ObjectShape
 from sim_bridge.world.table import divided, Table
@@ -25,7 +23,7 @@ Place = tuple[float, float, float]
 TIMINGS = ('natural', 'early', 'middle', 'late', 'mixed')  # of bottlenecks, see push.py
 
 
-class Drawn(NamedTuple):
+class TaskScene(NamedTuple):
     """What follows from the seed of a scene of K objects; planar poses are x, y (m), yaw (rad)."""
 
     shapes: tuple[ObjectShape, ...]
@@ -40,23 +38,18 @@ class Demonstration:
     """
     How an expert is to act.
 
-    :param config: of the expert; None: Task.default_config.
-    :param rollout: mujoco.rollout.Rollout to share between episodes.
     :param num_frames: of the longest episode; 0: the task's.
     :param timing: one of TIMINGS, when the first of several pushed objects is home.
     :param misses: share of the pushes that are at random, so that objects are missed, too.
     """
 
-    config: Any
-    rollout: mujoco.rollout.Rollout
     num_frames: int = 0
     timing: str = 'natural'
     misses: float = 0.0
 
 
-# Observations, (T, 4) float32 actions (the last row is zero), outcome, and seconds spent in the
-# search and in stepping and rendering.
-EpisodeRun = tuple[list[Observation], np.ndarray, str, dict[str, float]]
+# Observations, (T, 4) float32 actions, of which the last one is zero, and outcome.
+EpisodeRun = tuple[list[Observation], np.ndarray, str]
 
 
 @dataclass(frozen=True)
@@ -84,7 +77,7 @@ class Task:
     ordered: ClassVar[bool] = False
     photographed: ClassVar[bool] = True
 
-    def draw(self, rng: np.random.Generator, spread: float) -> Drawn:
+    def draw(self, rng: np.random.Generator, spread: float) -> TaskScene:
         """Draw a scene; spread is a factor of the ranges in which things to be gripped lie."""
         raise NotImplementedError
 
@@ -93,7 +86,7 @@ class Task:
         """Return how high above the table the goals are, m, or (K,) of each object."""
         return 0.0
 
-    def goal_gripper(self, table: Table, scene: 'TaskScene') -> np.ndarray | None:
+    def goal_gripper(self, table: Table, scene: TaskScene) -> np.ndarray | None:
         """
         Return where the arm is seen in the goal picture: (3,) m, or (4,) with its opening.
 
@@ -106,27 +99,10 @@ class Task:
         """Return whether every object is within SUCCESS_DISTANCE of its goal."""
         return bool((table.distances() < SUCCESS_DISTANCE).all())
 
-    def default_config(self, timing: str = 'natural') -> Any:
-        """Return what the expert does unless it is told otherwise, a dataclass."""
-        return None
-
-    def demonstrate(self, table: Table, scene: 'TaskScene', first: Observation,
+    def demonstrate(self, table: Table, scene: TaskScene, first: Observation,
                     rng: np.random.Generator, how: Demonstration) -> EpisodeRun:
         """Let the expert act from the start of a scene, of which `first` is seen."""
         raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class TaskScene:
-    """One draw of a task: planar poses are (x, y, yaw) in metres and radians."""
-
-    task: Task
-    seed: int
-    shapes: tuple[ObjectShape, ...]
-    start_poses: np.ndarray  # (K, 3)
-    goal_poses: np.ndarray  # (K, 3)
-    gripper_start: np.ndarray  # (3,) m
-    order: tuple[int, ...]
 
 
 def task_names() -> list[str]:
@@ -164,7 +140,7 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0, low: Place = WORKSP
         raise SceneError(f'seed {seed!r}: expected a non-negative integer')
     rng = np.random.default_rng([int(seed), task.stream])
     while True:
-        scene = TaskScene(task, int(seed), *task.draw(rng, spread))
+        scene = task.draw(rng, spread)
         starts, goals = scene.start_poses[:, :2], scene.goal_poses[:, :2]
         needed = np.concatenate(
             [starts, starts - (goals - starts) / 2, goals, scene.gripper_start[None, :2]])
@@ -172,23 +148,19 @@ def sample_scene(task: Task, seed: int, spread: float = 1.0, low: Place = WORKSP
             return scene
 
 
-def run_episode(
-        simulator: Any, seed: int, config: Any = None,
-        rollout: mujoco.rollout.Rollout | None = None, num_frames: int = 0,
-        timing: str = 'natural', misses: float = 0.0) -> EpisodeRun:
+def run_episode(simulator: Any, seed: int, num_frames: int = 0, timing: str = 'natural',
+                misses: float = 0.0) -> EpisodeRun:
     """
     Run one episode of a task's expert.
 
     :param simulator: Simulator; reset here.
     :param seed: of the scene and of the expert.
-    :param config: and the others: see Demonstration.
-    :return: EpisodeRun.
+    :param num_frames: and the others: see Demonstration.
     """
     task, first = simulator.task, simulator.reset(seed)
-    how = Demonstration(config or task.default_config(timing),
-                        rollout or mujoco.rollout.Rollout(nthread=0), num_frames, timing, misses)
-    rng = np.random.default_rng([seed, task.stream, 1])
-    return task.demonstrate(simulator, simulator.scene, first, rng, how)
+    return task.demonstrate(simulator, simulator.scene, first,
+                            np.random.default_rng([seed, task.stream, 1]),
+                            Demonstration(num_frames, timing, misses))
 
 
 def carry_out(table: Table, succeeds: Callable[[Table], bool], first: Observation,
@@ -200,24 +172,37 @@ def carry_out(table: Table, succeeds: Callable[[Table], bool], first: Observatio
     :param first: Observation at the start.
     :param plans: of (n, 4) actions; each is asked for when those before are carried out.
     :param num_frames: T at most.
-    :return: EpisodeRun.
     """
     observations, actions = [first], []
-    seconds = {'search': 0.0, 'step': 0.0}
-    begin = time.perf_counter()
     for plan in plans:
-        planned = time.perf_counter()
-        seconds['search'] += planned - begin
         plan = divided(plan, table.arm.action_limit)
         for action in plan[:num_frames - len(observations)]:
             observations.append(table.step(action))
             actions.append(action)
-        begin = time.perf_counter()
-        seconds['step'] += begin - planned
         if len(observations) == num_frames:
             break
     done = np.array([*actions, np.zeros(4)], np.float32)
-    return observations, done, 'success' if succeeds(table) else 'failure', seconds
+    return observations, done, 'success' if succeeds(table) else 'failure'
+
+
+def straight(start: np.ndarray, end: np.ndarray, steps: int) -> list[np.ndarray]:
+    """Return the points after start on a straight way of so many steps."""
+    return [start + share * (end - start) for share in np.linspace(0, 1, steps + 1)[1:]]
+
+
+def moves(path: np.ndarray | Sequence[np.ndarray], opened: int = 0,
+          closed: int | None = None) -> np.ndarray:
+    """
+    Return the actions (n, 4) along points (3,) in m.
+
+    :param opened: the fingers are open in so many actions at first.
+    :param closed: they are closed in so many at first, then open; None: in all others.
+    """
+    opening = np.zeros(len(path) - 1)
+    opening[:opened] = 1
+    if closed is not None:
+        opening[closed:] = 1
+    return np.column_stack([np.diff(path, axis=0), opening])
 
 
 def apart(positions: np.ndarray, separation: float) -> bool:

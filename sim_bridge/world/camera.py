@@ -9,7 +9,6 @@ import weakref
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.world.appearance import Appearance
 from sim_bridge.world.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.errors import SceneError
 
@@ -86,23 +85,14 @@ class Camera:
                 rays[..., 2] < 0, (np.asarray(height) - self.position[2]) / rays[..., 2], np.inf)
             return np.array(self.position[:2]) + far[..., None] * rays[..., :2]
 
-    def moved(self, appearance: Appearance) -> 'Camera':
-        """Return this camera where an Appearance puts it."""
-        x, y, z = np.add(self.position, appearance.camera_offset).tolist()
-        return replace(self, position=(x, y, z), tilt=self.tilt + appearance.camera_tilt)
+    def moved(self, offset: tuple[float, float, float], tilt: float) -> 'Camera':
+        """Return this camera elsewhere, by m along x, y, z, and tilted upwards by rad."""
+        x, y, z = np.add(self.position, offset).tolist()
+        return replace(self, position=(x, y, z), tilt=self.tilt + tilt)
 
     def resized(self, width: int, height: int) -> 'Camera':
         """Return a camera with the same view and other pixels."""
         return replace(self, width=width, height=height)
-
-
-@dataclass(frozen=True)
-class MaskedPicture:
-    """One picture, and where the robot is in it."""
-
-    picture: np.ndarray  # uint8 (H, W, 3) rgb
-    robot_mask: np.ndarray  # uint8 (H, W), values as in contract.py
-    arm_joints: np.ndarray  # (J,) rad, of the arm
 
 
 class OpenGL:

@@ -16,8 +16,8 @@ from functools import lru_cache
 
 import mujoco
 import numpy as np
-from sim_bridge.world.appearance import Appearance, USUAL
-from sim_bridge.world.camera import Camera, MaskedPicture, OpenGL
+from sim_bridge.world.camera import Camera, OpenGL
+from sim_bridge.world.looks import Appearance, USUAL
 from sim_bridge.world.scene import ARM_GEOM_GROUP
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import SceneError
@@ -58,11 +58,14 @@ class Studio:
         self._show, self._hide = mujoco.MjvOption(), mujoco.MjvOption()
         self._hide.geomgroup[ARM_GEOM_GROUP] = 0
         self._perturbation = mujoco.MjvPerturb()
-        self.dress(USUAL)
 
-    def dress(self, appearance: Appearance) -> None:
-        """Take the following pictures with this Appearance."""
-        camera = self._camera.moved(appearance)
+    def use(self, physics: mujoco.MjModel, appearance: Appearance = USUAL) -> Camera:
+        """Show a physics model with an Appearance from now on; return the camera as it is then."""
+        self._physics = physics
+        # What the mask says of each geom of the physics model.
+        hand = physics.geom_group == ARM_GEOM_GROUP
+        self._labels = np.where(hand, ROBOT_MASK_HAND, ROBOT_MASK_FREE).astype(np.uint8)
+        camera = self._camera.moved(appearance.camera_offset, appearance.camera_tilt)
         model = self._model
         model.cam('camera').pos[:] = camera.position
         model.cam('camera').quat[:] = camera.quaternion
@@ -77,21 +80,17 @@ class Studio:
         self._flatten[2, 2] = 1e-4
         self._table = _sees_table(camera)
         mujoco.mj_forward(model, self._data)
+        return camera
 
-    def use(self, model: mujoco.MjModel) -> None:
-        """Show this physics model from now on."""
-        self._physics = model
-        # What the mask says of each geom of the physics model.
-        hand = model.geom_group == ARM_GEOM_GROUP
-        self._labels = np.where(hand, ROBOT_MASK_HAND, ROBOT_MASK_FREE).astype(np.uint8)
-
-    def render(self, data: mujoco.MjData, hide_arm: bool = False) -> MaskedPicture:
+    def render(self, data: mujoco.MjData, hide_arm: bool = False,
+               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
         Take one picture.
 
         :param data: mujoco.MjData of the physics model, after mj_forward.
         :param hide_arm: leave arm and hand out of the picture.
-        :return: MaskedPicture.
+        :return: uint8 (H, W, 3) rgb; uint8 (H, W), where the robot is, values as in contract.py;
+            (J,) rad of the arm.
         """
         self._pose_arm(data.qpos[:3])
         scene, everything = self._scene, mujoco.mjtCatBit.mjCAT_ALL
@@ -110,7 +109,7 @@ class Studio:
         shaded = colours * shade[..., None]
         picture = sum(_samples(shaded)) / SAMPLES ** 2
         mask = np.maximum.reduce(_samples(label))  # the robot's if one of its samples is
-        return MaskedPicture(np.rint(picture).astype(np.uint8), mask, self._joints.copy())
+        return np.rint(picture).astype(np.uint8), mask, self._joints.copy()
 
     def close(self) -> None:
         """Free the OpenGL context."""

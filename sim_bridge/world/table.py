@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The MuJoCo table: gripper, objects and a camera, without a task. Knows nothing of ROS."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
 
 import mujoco
+import mujoco.rollout
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.world.appearance import choose_appearance, USUAL
-from sim_bridge.world.entities import check_free, check_pose, check_velocity
-from sim_bridge.world.looks import DEFAULT_LOOK, get_look, OBSERVER
+from sim_bridge.world.looks import choose_appearance, DEFAULT_LOOK, get_look, OBSERVER, USUAL
 from sim_bridge.world.scene import (
     build_scene,
     FINGER_TRAVEL,
@@ -21,11 +21,10 @@ from sim_bridge.world.scene import (
     TIMESTEP,
 )
 from sim_bridge.world.studio import Studio
-from sim_bridge.world_protocol import Observation
-from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
+from sim_bridge.world_protocol import clip_action, Observation
+from tap_ros.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import KinematicsError, SceneError
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
-from tap_ros.text import escaped
 
 SUBSTEPS = round(CONTROL_PERIOD / TIMESTEP)
 if abs(SUBSTEPS * TIMESTEP - CONTROL_PERIOD) > 1e-9:
@@ -37,25 +36,6 @@ GRIPPER_RANGE = 0.4  # m, |x| and |y| of the gripper at the start
 GRIPPER_HEIGHT = 0.14  # m, highest start of the gripper
 GRIPPER_MARGIN = 0.16  # m between the gripper and any object origin at the start
 OBJECT_QPOS_START = 5  # after gripper x, y, z and two fingers; of velocities, too
-
-
-def clip_action(action: ArrayLike) -> np.ndarray:
-    """
-    Limit an action to what is commanded in one control period.
-
-    :param action: (4,) displacement x, y, z in m and gripper opening in [0, 1].
-    :return: (4,) float64.
-    :raises SceneError: for another shape or values that are not finite.
-    """
-    action = np.asarray(action, np.float64)
-    if action.shape != (4,) or not np.isfinite(action).all():
-        raise SceneError(f'action {action}: expected 4 finite numbers (dx, dy, dz, opening)')
-    return np.append(clip_moves(action[:3]), np.clip(action[3], 0, 1))
-
-
-def clip_moves(moves: np.ndarray) -> np.ndarray:
-    """Limit displacements (..., 3), in m, to what is commanded in one control period."""
-    return np.clip(moves, np.negative(ACTION_LIMIT), ACTION_LIMIT)
 
 
 def divided(actions: np.ndarray, limit: Sequence[float]) -> np.ndarray:
@@ -101,6 +81,8 @@ class Table:
     :param appearance: name of an appearance, see appearance.CHOICES.
     :param arm: name of an arm, see robots.arm.get_arm.
     :ivar goal_poses: (K, 7) where the objects shall be, as object_poses.
+    :ivar object_names: K names, in the order of their poses.
+    :ivar seed: of the scene.
     :raises ConfigError: for an unknown arm.
     :raises SceneError: for an unknown look or appearance, a bad size, or when nothing can be
         rendered.
@@ -117,6 +99,7 @@ class Table:
         self._appearance, self._gripping = appearance, gripping
         self._usual_camera = self.look.camera(gripping, image_size, image_size)
         self.camera = self._usual_camera
+        self._rollout = mujoco.rollout.Rollout(nthread=0)
         self._renderer: Studio | None = None
         self._observer: Studio | None = None
         self._worn = USUAL  # the appearance of the present scene
@@ -141,15 +124,13 @@ class Table:
         :param gripper: (3,) m.
         :param seed: of the scene.
         """
-        self._seed, self._names = seed, object_names(len(shapes))
+        self.seed, self.object_names = seed, object_names(len(shapes))
         self.model = build_scene(shapes, self._gripping)
-        self.data = mujoco.MjData(self.model)
+        self.data, self._scratch = mujoco.MjData(self.model), mujoco.MjData(self.model)
         if self._renderer is None:
             self._renderer = Studio(self._usual_camera, self.arm, self.look.arm)
         self._worn = choose_appearance(self._appearance, seed)
-        self._renderer.dress(self._worn)
-        self._renderer.use(self.model)
-        self.camera = self._usual_camera.moved(self._worn)
+        self.camera = self._renderer.use(self.model, self._worn)
         self.target = np.append(gripper, 0.0)
         self.place(poses, gripper)
 
@@ -164,44 +145,20 @@ class Table:
         :param hide_arm: leave the arm out of the picture.
         :return: Observation.
         """
-        state, controls = self.state(), self.data.ctrl.copy()
         if gripper is None:
             gripper = self._beside(object_poses[:, :2])
-        self.place(object_poses, gripper)
-        observation = self.observe(hide_arm)
-        mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_setState(
-            self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        self.data.ctrl[:] = controls
-        mujoco.mj_forward(self.model, self.data)
-        return observation
+        with self.unmoved():
+            self.place(object_poses, gripper)
+            return self.observe(hide_arm)
 
-    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike = (0,) * 6) -> None:
-        """
-        Put an object elsewhere, as a hand would; no time passes, `scene` and goal stay.
-
-        :param name: one of the object_names of an Observation.
-        :param pose: (7,) x, y, z in m, quaternion x, y, z, w.
-        :param velocity: (6,) m/s and rad/s along the axes of the world.
-        :raises PoseError: for a pose that is none or out of reach, and where the object would
-            reach into something; then it stays where it was.
-        :raises SceneError: for a velocity that is not finite or too fast; likewise.
-        """
-        if name not in self._names:
-            raise SceneError(f'{escaped(name)} is not in the scene')
-        pose, velocity = check_pose(pose), check_velocity(velocity)
-        # Of a free joint MuJoCo turns the angular velocity with the body.
-        turning = np.empty(3)
-        mujoco.mju_rotVecQuat(turning, velocity[3:], pose[[6, 3, 4, 5]] * (1, -1, -1, -1))
+    @contextmanager
+    def unmoved(self) -> Iterator[None]:
+        """Put everything back, to the bit, when the block ends."""
         before = copy(self.data)
-        joint = self.data.joint(name)
-        joint.qpos, joint.qvel = pose[[0, 1, 2, 6, 3, 4, 5]], [*velocity[:3], *turning]
-        mujoco.mj_forward(self.model, self.data)
         try:
-            check_free(self.model, self.data, name)
-        except SceneError:
+            yield
+        finally:
             mujoco.mj_copyData(self.data, self.model, before)
-            raise
 
     def step(self, action: ArrayLike) -> Observation:
         """
@@ -220,12 +177,7 @@ class Table:
         return self.observe()
 
     def check_action(self, action: ArrayLike) -> None:
-        """
-        Accept an action or say why it cannot be done; nothing moves.
-
-        :param action: as for step.
-        :raises SceneError: as step does.
-        """
+        """Raise SceneError, as step does, for what cannot be done; nothing moves."""
         self._ramp(action)
 
     def _ramp(self, action: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -243,6 +195,15 @@ class Table:
                     raise
         return controls, targets[0]
 
+    def rollout(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """
+        Return where N runs of the true physics lead; the table stays as it is.
+
+        :param states: (N, S) as state; controls (N, T, 5) as of ramp_controls.
+        :return: (N, T, S), after each physics step.
+        """
+        return self._rollout.rollout(self.model, self._scratch, states, controls)[0]
+
     def observe(self, hide_arm: bool = False) -> Observation:
         """Return the Observation of this moment."""
         assert self._renderer is not None, 'reset comes first'
@@ -250,39 +211,27 @@ class Table:
         poses = self.object_poses()
         # Contact can press the fingers beyond closed or open, as it bends those of a real hand.
         opening = np.clip(self.data.qpos[3:5].mean() / FINGER_TRAVEL, -BENT, 1 + BENT)
-        view = self._renderer.render(self.data, hide_arm)
+        image, mask, joints = self._renderer.render(self.data, hide_arm)
         return Observation(
-            image=view.picture,
+            image=image,
             stamp_ns=round(self.data.time * 1e9),
             gripper=np.append(self.data.qpos[:3], opening).astype(np.float32),
-            object_names=self._names,
+            object_names=self.object_names,
             object_pixels=self.camera.project(poses[:, :3]).astype(np.float32),
-            object_poses=poses, robot_mask=view.robot_mask, arm_joints=view.arm_joints)
+            object_poses=poses, robot_mask=mask, arm_joints=joints)
 
     def observer_picture(self) -> np.ndarray:
         """Take a picture from the side, for people: uint8 (360, 480, 3) rgb."""
         if self._observer is None:
             self._observer = Studio(OBSERVER, self.arm, links=True)
-        self._observer.dress(replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
-        self._observer.use(self.model)
-        return self._observer.render(self.data).picture
+        self._observer.use(
+            self.model, replace(self._worn, camera_offset=(0, 0, 0), camera_tilt=0))
+        return self._observer.render(self.data)[0]
 
     def object_poses(self) -> np.ndarray:
         """Return (K, 7): x, y, z in m, quaternion x, y, z, w."""
         poses = self.data.qpos[OBJECT_QPOS_START:].reshape(-1, 7)
         return poses[:, [0, 1, 2, 4, 5, 6, 3]].copy()
-
-    def object_motions(self) -> np.ndarray:
-        """
-        Return (K, 2, 2, 3): velocities and accelerations along the axes of the world.
-
-        Of each the linear one in m/s, m/s^2 and the angular one in rad/s, rad/s^2.
-        """
-        rates = np.stack([self.data.qvel, self.data.qacc])[:, OBJECT_QPOS_START:]
-        motions = rates.reshape(2, -1, 2, 3).swapaxes(0, 1).copy()
-        for name, motion in zip(self._names, motions):
-            motion[:, 1] = motion[:, 1] @ self.data.body(name).xmat.reshape(3, 3).T
-        return motions
 
     def state(self) -> np.ndarray:
         """Return the full physics state, as mujoco.rollout takes it."""
@@ -320,7 +269,7 @@ class Table:
 
     def _beside(self, positions: np.ndarray) -> np.ndarray:
         """Draw a place of the gripper, (3,) m, that touches no object; positions (K, 2) m."""
-        rng, arm = np.random.default_rng([self._seed, 7]), self.arm
+        rng, arm = np.random.default_rng([self.seed, 7]), self.arm
         while True:
             place = rng.uniform(-GRIPPER_RANGE, GRIPPER_RANGE, 2)
             if np.linalg.norm(positions - place, axis=1).min() > GRIPPER_MARGIN and (

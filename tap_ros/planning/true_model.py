@@ -10,7 +10,8 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from sim_bridge.simulator import Simulator
-from sim_bridge.world.table import clip_moves, OBJECT_QPOS_START, ramp_controls, SUBSTEPS
+from sim_bridge.world.table import OBJECT_QPOS_START, ramp_controls, SUBSTEPS
+from sim_bridge.world_protocol import clip_moves
 from tap_ros.errors import ConfigError
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.table import Table

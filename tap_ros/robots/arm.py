@@ -10,10 +10,11 @@ last link the flange, at a place (m) that is rolled about x (rad).
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from tap_ros.contract import ACTION_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.contract import ACTION_LIMIT, WORKSPACE_HIGH, WORKSPACE_LOW, WORLD_FRAME
 from tap_ros.errors import KinematicsError
 from tap_ros.plugins import load_plugin, names
 
@@ -48,6 +49,14 @@ class Mount:
         pose[:2, :2] = [[c, -s], [s, c]]
         pose[:3, 3] = self.position
         return pose
+
+
+class Transform(NamedTuple):
+    """The pose of one frame in another, its parent, as tf tells it."""
+
+    parent: str
+    child: str
+    pose: np.ndarray  # (4, 4), rotation and metres
 
 
 @dataclass(frozen=True)
@@ -107,6 +116,19 @@ class Arm:
         for i in range(len(self.joints)):
             pose = pose @ turned(*self.origins[i], joints[..., i])
         return pose @ turned(*self.origins[-1], 0.0)
+
+    def transforms(self, joints: ArrayLike) -> list[Transform]:
+        """Return where each link is in the one before, from the base on; joints (J,) rad."""
+        return [Transform(parent, child, turned(*origin, angle)) for parent, child, origin, angle
+                in zip(self.links, self.links[1:], self.origins, np.asarray(joints, np.float64))]
+
+    @property
+    def fixed_transforms(self) -> list[Transform]:
+        """Return where the base and the fingertips are, which no joint changes."""
+        (x, y, z), roll = self.origins[-1]
+        return [Transform(WORLD_FRAME, BASE_FRAME, self.mount.pose),
+                Transform(self.links[-1], TIP_FRAME,
+                          turned((x, y, z + self.mount.tool), roll, 0.0))]
 
     def gripper_at(self, joints: ArrayLike, mount: Mount | None = None) -> np.ndarray:
         """

@@ -8,9 +8,13 @@ of a convex polyhedron that just contains it.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+from itertools import product
+from typing import NamedTuple
 from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.text import escaped, listing
@@ -21,16 +25,14 @@ MOVING = ('revolute', 'continuous', 'prismatic')
 _SIDES = 24  # of a circle
 
 
-@dataclass(frozen=True)
-class Shape:
+class Shape(NamedTuple):
     """A convex part of a link."""
 
     link: str
     corners: np.ndarray  # (N, 3) m, in the frame of the link
 
 
-@dataclass(frozen=True)
-class Joint:
+class Joint(NamedTuple):
     """How a link is held by another."""
 
     name: str
@@ -40,8 +42,8 @@ class Joint:
     origin: np.ndarray  # (4, 4), of the child in the parent where the joint is at zero
     axis: np.ndarray  # (3,), of length 1
     leader: str  # the joint whose position counts; its own name unless it mimics another
-    factor: float = 1.0  # its position is factor * leader's + offset
-    offset: float = 0.0
+    factor: float  # its position is factor * leader's + offset
+    offset: float
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,12 @@ class Robot:
     root: str
     joints: tuple[Joint, ...]  # parents first
     shapes: tuple[Shape, ...]
-    positions: tuple[str, ...] = field(init=False)  # names of joints whose positions are needed
 
-    def __post_init__(self) -> None:
-        leaders = (joint.leader for joint in self.joints if joint.kind in MOVING)
-        object.__setattr__(self, 'positions', tuple(dict.fromkeys(leaders)))
+    @property
+    def positions(self) -> tuple[str, ...]:
+        """Names of the joints whose positions are needed."""
+        return tuple(dict.fromkeys(
+            joint.leader for joint in self.joints if joint.kind in MOVING))
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -70,16 +73,14 @@ class Robot:
         """
         poses = {self.root: np.eye(4)}
         for joint in self.joints:
-            pose = poses[joint.parent] @ joint.origin
+            move = np.eye(4)
             if joint.kind in MOVING:
-                value = joint.factor * positions[joint.leader] + joint.offset
-                move = np.eye(4)
+                way = (joint.factor * positions[joint.leader] + joint.offset) * joint.axis
                 if joint.kind == 'prismatic':
-                    move[:3, 3] = value * joint.axis
+                    move[:3, 3] = way
                 else:
-                    move[:3, :3] = _rotation(joint.axis, value)
-                pose = pose @ move
-            poses[joint.child] = pose
+                    move[:3, :3] = cv2.Rodrigues(way)[0]
+            poses[joint.child] = poses[joint.parent] @ joint.origin @ move
         return poses
 
     def held_by(self, link: str) -> set[str]:
@@ -132,26 +133,22 @@ def read_urdf(text: str, source: str) -> Robot:
 
 def _tree(links: list[str], joints: dict[str, Joint], shapes: tuple[Shape, ...]) -> Robot:
     """Put joints in order, parents first."""
-    parents = {joint.child: joint for joint in joints.values()}
-    children: dict[str, list[Joint]] = {link: [] for link in links}
     for joint in joints.values():
-        if joint.parent not in children or joint.child not in children:
+        if joint.parent not in links or joint.child not in links:
             raise ConfigError(f'joint {escaped(joint.name)} holds a link that is not there')
         if joint.leader not in joints or joints[joint.leader].leader != joint.leader:
             raise ConfigError(f'joint {escaped(joint.name)} mimics {escaped(joint.leader)}, which '
                               'is no joint, or mimics another')
-        children[joint.parent].append(joint)
-    roots = [link for link in links if link not in parents]
-    # A link with two parents could be reached for ever; a loop of others is not reached.
-    ordered, waiting = [], list(roots) if len(parents) == len(joints) else []
-    while waiting:
-        held = children[waiting.pop()]
-        ordered += held
-        waiting += [joint.child for joint in held]
-    if len(ordered) != len(joints) or len(set(links)) != len(ordered) + 1:
+    holders = {joint.child: joint for joint in joints.values()}
+    try:
+        order = list(TopologicalSorter(
+            {child: [joint.parent] for child, joint in holders.items()}).static_order()) or links
+    except CycleError:
+        order = []
+    if not len(order) == len(links) == len(joints) + 1 == len(holders) + 1:
         raise ConfigError('its links are no tree: expected one root, and one joint that holds '
                           'each other link')
-    return Robot(roots[0], tuple(ordered), shapes)
+    return Robot(order[0], tuple(holders[link] for link in order[1:]), shapes)
 
 
 def _joint(element: ElementTree.Element) -> Joint:
@@ -182,7 +179,7 @@ def _corners(collision: ElementTree.Element, link: str) -> np.ndarray:
     shape = geometry[0] if geometry is not None and len(geometry) else None
     kind = '' if shape is None else shape.tag
     if kind == 'box':
-        corners = _box(_numbers(shape, 'size', '', 3))
+        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * _numbers(shape, 'size', '', 3)
     elif kind in ('sphere', 'cylinder', 'capsule'):
         radius, = _numbers(shape, 'radius', '', 1)
         length, = _numbers(shape, 'length', '', 1) if kind != 'sphere' else [0.0]
@@ -195,10 +192,6 @@ def _corners(collision: ElementTree.Element, link: str) -> np.ndarray:
             'box, cylinder, sphere or capsule: replace meshes by such shapes')
     origin = _origin(collision)
     return corners @ origin[:3, :3].T + origin[:3, 3]
-
-
-def _box(size: np.ndarray) -> np.ndarray:
-    return (np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), -1).reshape(-1, 3)) * size
 
 
 def _circles(radius: float) -> np.ndarray:
@@ -220,18 +213,10 @@ def _ball(radius: float) -> np.ndarray:
 def _origin(element: ElementTree.Element) -> np.ndarray:
     """Return the pose (4, 4) that <origin> says."""
     origin, pose = element.find('origin'), np.eye(4)
-    roll, pitch, yaw = _numbers(origin, 'rpy', '0 0 0', 3)
-    x, y, z = np.eye(3)
-    pose[:3, :3] = _rotation(z, yaw) @ _rotation(y, pitch) @ _rotation(x, roll)
+    for axis, angle in zip(np.eye(3), _numbers(origin, 'rpy', '0 0 0', 3)):
+        pose[:3, :3] = cv2.Rodrigues(angle * axis)[0] @ pose[:3, :3]
     pose[:3, 3] = _numbers(origin, 'xyz', '0 0 0', 3)
     return pose
-
-
-def _rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the rotation (3, 3) about an axis (3,) of length 1 by rad."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def _numbers(element: ElementTree.Element | None, name: str, default: str,

@@ -19,7 +19,7 @@ CARRYING = 8  # a frame in which the hand is at the object
 @pytest.fixture(scope='module')
 def episode():
     simulator = Simulator('pick_place', look='hand')
-    observations, actions, outcome, _ = run_episode(simulator, 3)
+    observations, actions, outcome = run_episode(simulator, 3)
     return make_episode(simulator, observations, actions, outcome)
 
 

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
-from sim_bridge.world.transforms import arm_transforms, fixed_arm_transforms
 from tap_ros import plugins
 from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE
 from tap_ros.errors import ConfigError, KinematicsError
@@ -64,8 +63,8 @@ def test_urdf_transforms_and_kinematics_agree(arm):
         mujoco.mj_kinematics(model, data)
         assert np.allclose(data.body(TIP_FRAME).xpos, arm.gripper_at(joints))
         poses = {'world': np.eye(4)}
-        base, tip = fixed_arm_transforms(arm)
-        for one in (base, *arm_transforms(arm, joints), tip):
+        base, tip = arm.fixed_transforms
+        for one in (base, *arm.transforms(joints), tip):
             poses[one.child] = poses[one.parent] @ one.pose
         wanted = robot.poses(dict(zip(arm.joints, joints)))
         assert set(poses) == set(wanted) == {'world', *arm.links, TIP_FRAME}

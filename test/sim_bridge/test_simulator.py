@@ -7,7 +7,7 @@ import pytest
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import sample_scene
 from sim_bridge.world.scene import FINGER_TRAVEL
-from sim_bridge.world.table import ramp_controls, SUBSTEPS
+from sim_bridge.world.table import ramp_controls
 from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 from tap_ros.planning.mpc_inputs import GRIPPER_HIGH, GRIPPER_LOW
@@ -32,13 +32,6 @@ def test_the_same_actions_give_the_same_pictures_to_the_bit(simulator):
         assert a.stamp_ns == b.stamp_ns
 
 
-def test_doing_nothing_leaves_everything_20_cm_from_the_goal(simulator):
-    simulator.reset(1)
-    for _ in range(5):
-        simulator.step(np.zeros(4))
-    np.testing.assert_allclose(simulator.distances(), 0.2, atol=1e-3)
-
-
 def test_the_arm_goes_where_the_action_says(simulator):
     before = simulator.reset(0)
     simulator.step([0, 0, 0.15, 0])
@@ -57,26 +50,13 @@ def test_actions_are_limited_and_the_arm_stays_in_the_workspace(simulator):
     np.testing.assert_allclose(targets[0, :3], ACTION_LIMIT)
 
 
-@pytest.mark.parametrize('action', [[0, 0, 0], [0, 0, np.nan, 0], [0, np.inf, 0, 0]])
-def test_an_impossible_action_is_refused_and_nothing_moves(simulator, action):
+def test_an_impossible_action_is_refused_and_nothing_moves(simulator):
     simulator.reset(0)
     before = simulator.state()
-    with pytest.raises(SceneError, match='action'):
-        simulator.step(action)
+    for action in ([0, 0, 0], [0, 0, np.nan, 0], [0, np.inf, 0, 0]):
+        with pytest.raises(SceneError, match='action'):
+            simulator.step(action)
     np.testing.assert_array_equal(simulator.state(), before)
-
-
-def test_ramps_are_the_same_one_by_one_and_at_once():
-    actions = np.random.default_rng(1).uniform(-0.08, 0.08, (3, 6, 4))
-    start = np.array([0.4, 0, 0.01, 0])
-    controls, targets = ramp_controls(start, actions)
-    assert controls.shape == (3, 6 * SUBSTEPS, 5)
-    one_by_one = start
-    for t in range(6):
-        control, target = ramp_controls(one_by_one, actions[1, t:t + 1])
-        one_by_one = target[0]
-        np.testing.assert_allclose(control, controls[1, t * SUBSTEPS:(t + 1) * SUBSTEPS])
-    np.testing.assert_allclose(one_by_one, targets[1, -1])
 
 
 def test_the_arm_can_be_left_out_of_the_picture(simulator):
@@ -85,43 +65,6 @@ def test_the_arm_can_be_left_out_of_the_picture(simulator):
     u, v = simulator.camera.project(with_arm.gripper[:3].astype(float)).round().astype(int)
     fingers, table = (seen.image[v - 2, u].astype(int) for seen in (with_arm, without))
     assert np.ptp(fingers) < 20 and np.ptp(table) > 40, 'grey on brown'
-
-
-def test_the_fingers_open_and_close(simulator):
-    simulator.reset(0)
-    assert abs(simulator.step([0, 0, 0.1, 0]).gripper[3]) < 0.05
-    assert simulator.step([0, 0, 0, 1]).gripper[3] > 0.9
-
-
-def test_the_gripper_pushes_an_object(simulator):
-    seen = simulator.reset(0)
-    x, y = seen.object_poses[0, :2]
-
-    def go(position):
-        for _ in range(12):
-            gap = np.array(position) - simulator.target[:3]
-            simulator.step([*gap, 0])
-    go([*simulator.target[:2], 0.14])
-    go([x - 0.14, y, 0.14])
-    go([x - 0.14, y, 0.01])
-    go([x, y, 0.01])
-    assert simulator.object_poses()[0, 0] - x > 0.05
-
-
-def test_taking_a_photograph_moves_nothing(simulator):
-    actions = np.random.default_rng(2).uniform(-1, 1, (6, 4)) * [0.08, 0.08, 0.15, 1]
-    runs = []
-    for look in (False, True):
-        simulator.reset(4)
-        for action in actions:
-            seen = simulator.step(action)
-            if look:
-                poses = simulator.goal().object_poses
-                photograph = simulator.photograph(poses)
-                np.testing.assert_allclose(photograph.object_poses, poses, atol=1e-9)
-        runs.append(seen)
-    np.testing.assert_array_equal(runs[0].image, runs[1].image)
-    np.testing.assert_allclose(runs[0].object_poses, runs[1].object_poses, atol=1e-9)
 
 
 def test_a_disc_on_its_rim_comes_to_rest(simulator):
@@ -137,21 +80,13 @@ def test_a_disc_on_its_rim_comes_to_rest(simulator):
     assert np.linalg.norm(after.object_poses[0, :2] - before) < 0.005
 
 
-def test_closing_one_simulator_leaves_the_pictures_of_another_alone(simulator):
-    other = Simulator('push3')
-    other.reset(1)
-    before = simulator.reset(1).image
-    other.close()
-    np.testing.assert_array_equal(simulator.observe().image, before)
-
-
-@pytest.mark.parametrize('pressed', [-0.3, 1.3])
-def test_fingers_pressed_beyond_their_ends_are_told_as_a_planner_accepts_them(simulator, pressed):
+def test_fingers_pressed_beyond_their_ends_are_told_as_a_planner_accepts_them(simulator):
     simulator.reset(2)
-    simulator.data.qpos[3:5] = pressed * FINGER_TRAVEL
-    gripper = simulator.observe().gripper
-    assert (gripper >= GRIPPER_LOW).all() and (gripper <= GRIPPER_HIGH).all()
-    assert abs(gripper[3] - np.clip(pressed, 0, 1)) == pytest.approx(0.1)
+    for pressed, end in ((-0.3, 0), (1.3, 1)):
+        simulator.data.qpos[3:5] = pressed * FINGER_TRAVEL
+        gripper = simulator.observe().gripper
+        assert (gripper >= GRIPPER_LOW).all() and (gripper <= GRIPPER_HIGH).all()
+        assert abs(gripper[3] - end) == pytest.approx(0.1)
 
 
 def test_a_dropped_simulator_leaves_the_pictures_of_others_alone(simulator):

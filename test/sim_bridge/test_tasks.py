@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.tasks import carry_out, Drawn, Task, task_names
+from sim_bridge.tasks.tasks import carry_out, Task, task_names, TaskScene
 from sim_bridge.world.scene import random_shape
 from tap_ros import plugins
 from tap_ros.recording.reader import iter_episodes
@@ -22,7 +22,7 @@ class Visit(Task):
 
     def draw(self, rng, spread):
         pose = np.array([[*rng.uniform(-0.1, 0.1, 2), 0.0]])
-        return Drawn((random_shape(rng),), pose, pose, np.array([0.3, 0.3, 0.1]), (0,))
+        return TaskScene((random_shape(rng),), pose, pose, np.array([0.3, 0.3, 0.1]), (0,))
 
     def succeeds(self, table):
         return table.target[0] < -0.3

@@ -159,7 +159,7 @@ def film_expert(task: str, seed: int, world: dict[str, Any]) -> list[np.ndarray]
     """Return pictures from the side of the expert doing a task, without ROS."""
     simulator = Simulator(task, **world)
     try:
-        _, actions, _, _ = run_episode(simulator, seed)
+        _, actions, _ = run_episode(simulator, seed)
         simulator.reset(seed)
         pictures = [simulator.observer_picture()]
         for action in actions:

@@ -1,0 +1,126 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the simulator's node publishes of a world: its clock, pictures, objects, joints and tf."""
+
+from collections.abc import Iterable
+from importlib.util import find_spec
+from typing import Any
+
+from builtin_interfaces.msg import Time
+import mujoco
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from sim_bridge.world.looks import OBSERVER
+from sim_bridge.world_protocol import ability, Observation, World
+from std_msgs.msg import String
+from tap_msgs.msg import ObjectStates
+from tap_ros.contract import CAMERA_FRAME, OBSERVER_FRAME, WORLD_FRAME
+from tap_ros.nodes.ros_messages import (
+    encode_camera_info,
+    encode_image,
+    encode_joints,
+    encode_mask,
+    encode_objects,
+    make_message,
+)
+from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.robots.arm import Transform
+from tap_ros.robots.description import robot_description
+
+STREAMS = {'clock': Clock, 'joint_states': JointState, 'objects': ObjectStates,
+           'camera/camera_info': CameraInfo, 'camera/robot_mask': Image, 'camera/image_raw': Image}
+GOAL = {'goal/objects': ObjectStates, 'goal/image': Image, 'goal/robot_mask': Image}
+
+
+class ScenePublishers:
+    """
+    Publishes what is seen of a world.
+
+    :param node: rclpy Node.
+    :param world: World; its arm is described once, for those who come later, too.
+    :param observer: publish observer/image_raw, a view from the side, as well.
+    """
+
+    def __init__(self, node: Node, world: World, observer: bool) -> None:
+        self._newest: dict[str, Any] = {}  # topic -> the message sent last
+        streams = STREAMS | ({'observer/image_raw': Image} if observer else {})
+        self._publishers = {topic: node.create_publisher(kind, topic, qos)
+                            for kinds, qos in ((streams, STREAM), (GOAL, LATCHED))
+                            for topic, kind in kinds.items()}
+        self._observer = observer
+        self._description = node.create_publisher(String, 'robot_description', LATCHED)
+        if world.arm is not None:
+            self._description.publish(String(data=robot_description(world.arm)))
+        self._moving = self._fixed = None
+        if find_spec('tf2_msgs') is not None:  # no wheel has it
+            from tf2_msgs.msg import TFMessage
+            # Qualities as of tf2_ros' broadcasters.
+            self._moving = node.create_publisher(TFMessage, '/tf', QoSProfile(depth=100))
+            self._fixed = node.create_publisher(TFMessage, '/tf_static', LATCHED)
+
+    def moment(self, world: World, seen: Observation, stamp: Time) -> None:
+        """Publish a moment; its transforms once: of a second time listeners would complain."""
+        arm = world.arm
+        self._newest = {
+            'clock': Clock(clock=stamp),
+            'joint_states': encode_joints(
+                seen.gripper, stamp, WORLD_FRAME,
+                dict(zip(arm.joints, seen.arm_joints)) if arm is not None else None),
+            'objects': _objects(seen, stamp),
+            'camera/camera_info': encode_camera_info(
+                world.camera_matrix, seen.image.shape[:2], stamp, CAMERA_FRAME),
+            'camera/image_raw': encode_image(seen.image, stamp, CAMERA_FRAME),
+            'camera/robot_mask': encode_mask(seen.robot_mask, stamp, CAMERA_FRAME)}
+        if self._observer:
+            self._newest['observer/image_raw'] = encode_image(
+                ability(world, 'observer_picture')(), stamp, OBSERVER_FRAME)
+        if arm is not None:
+            _send(self._moving, arm.transforms(seen.arm_joints), stamp)
+        self.send_newest()
+
+    def send_newest(self) -> None:
+        """Send the newest moment, again if need be."""
+        for topic, message in self._newest.items():
+            self._publishers[topic].publish(message)
+
+    def goal(self, goal: Observation, stamp: Time) -> None:
+        """Publish the goal of a scene."""
+        self._publishers['goal/objects'].publish(_objects(goal, stamp))
+        self._publishers['goal/image'].publish(encode_image(goal.image, stamp, CAMERA_FRAME))
+        self._publishers['goal/robot_mask'].publish(
+            encode_mask(goal.robot_mask, stamp, CAMERA_FRAME))
+
+    def frames(self, world: World, stamp: Time) -> None:
+        """Tell where the cameras and the ends of the arm are in this scene."""
+        fixed = [] if world.arm is None else world.arm.fixed_transforms
+        if world.camera_pose is not None:
+            fixed.append(Transform(WORLD_FRAME, CAMERA_FRAME, world.camera_pose))
+        if hasattr(world, 'observer_picture'):
+            fixed.append(Transform(WORLD_FRAME, OBSERVER_FRAME, OBSERVER.pose))
+        _send(self._fixed, fixed, stamp)
+
+
+def _objects(observation: Observation, stamp: Time) -> ObjectStates:
+    """Encode the objects of an Observation, which come from the simulator itself."""
+    return encode_objects(
+        observation.object_names, observation.object_pixels, observation.object_poses, stamp,
+        WORLD_FRAME, ObjectStates.SOURCE_GROUND_TRUTH)
+
+
+def _send(publisher: Any, transforms: Iterable[Transform], stamp: Time) -> None:
+    """Publish transforms, where there is a publisher."""
+    if publisher is None:
+        return
+    fields = []
+    for parent, child, pose in transforms:
+        quaternion = np.empty(4)  # w, x, y, z
+        mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
+        fields.append({
+            'header': {'stamp': {'sec': stamp.sec, 'nanosec': stamp.nanosec}, 'frame_id': parent},
+            'child_frame_id': child,
+            'transform': {'translation': dict(zip('xyz', pose[:3, 3].tolist())),
+                          'rotation': dict(zip('wxyz', quaternion.tolist()))}})
+    publisher.publish(make_message(publisher.msg_type, {'transforms': fields}))
