@@ -16,14 +16,9 @@ from sim_bridge.collect import collect, CollectConfig, make_episode
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.push import draw_share, SHARES
 from sim_bridge.tasks.tasks import get_task, run_episode
-<<<<<<< HEAD
-from tap_ros.engines import Engine
-from tap_ros.errors import ConfigError, StorageError
-=======
 from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError, SceneError, StorageError
 from tap_ros.evaluation.bottleneck import bottleneck_share
->>>>>>> f4b92ad (Simulator: one scene type, experts search by the shared cross-entropy method, objects are put by the simulator itself, publishers stand apart from the node; standard services are those that viewers call)
 from tap_ros.files import only_writer
 from tap_ros.recording.reader import iter_episodes
 
