@@ -7,9 +7,11 @@ A new encoding is a row of ENCODINGS; recordings and nodes read it then.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 import io
 import re
+import struct
 
 import numpy as np
 from tap_ros.contract import MAX_PICTURE_BYTES
@@ -102,31 +104,36 @@ def to_rgb(pixels: np.ndarray, name: str) -> np.ndarray:
     return np.ascontiguousarray(encoding.to_rgb(np.ascontiguousarray(pixels)))
 
 
-def decompress(data: bytes | memoryview | np.ndarray, description: str) -> np.ndarray:
+def decompress(data: bytes | memoryview | np.ndarray, description: str,
+               most: int = MAX_PICTURE_BYTES) -> np.ndarray:
     """
     Decode a compressed picture.
 
     :param data: of sensor_msgs/CompressedImage: a JPEG, PNG or WebP file.
     :param description: its field `format`, such as 'rgb8; jpeg compressed bgr8'.
-    :return: uint8 (H, W, 3) rgb.
+    :param most: bytes of rgb.
+    :return: uint8 (H, W, 3) rgb, turned upright as its EXIF data say.
     :raises ImageError: for another format, more than 8 bits a channel, damage, or too many pixels.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image, ImageOps, UnidentifiedImageError
     if 'compresseddepth' in description.lower():
         raise ImageError('a compressed depth picture; name the topic of the colour camera')
     try:
         with Image.open(io.BytesIO(bytes(data)), formats=_COMPRESSED) as file:
             width, height = file.size
-            if width * height * 3 > MAX_PICTURE_BYTES:
-                raise ImageError(f'{width}x{height} pixels are more than {MAX_PICTURE_BYTES} '
-                                 'bytes of rgb; send a smaller picture')
+            if width * height * 3 > most:
+                raise ImageError(f'{width}x{height} pixels are more than {most} bytes '
+                                 'of rgb; send a smaller picture')
             encoding = description.split(';')[0].strip()
             if file.mode == 'L' and encoding.startswith('bayer_') and encoding in ENCODINGS:
                 return to_rgb(np.array(file)[..., None], encoding)  # the raw mosaic
             raw = file.tile[0][3] if file.tile else ''  # such as RGB;16B
             if file.mode[:1] in 'IF' or (isinstance(raw, str) and ';16' in raw):
                 raise ImageError('a compressed picture with more than 8 bits a channel; send 8')
-            return np.array(file.convert('RGB'))
+            picture = file.convert('RGB')
+            with suppress(struct.error, SyntaxError, TypeError, ValueError):  # broken EXIF data
+                picture = ImageOps.exif_transpose(picture)
+            return np.array(picture)
     except UnidentifiedImageError:
         raise ImageError(
             f"format '{escaped(description, 40)}' cannot be used; valid are JPEG, PNG and WebP"

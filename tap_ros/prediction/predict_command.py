@@ -8,13 +8,14 @@ import io
 from pathlib import Path
 from typing import Annotated, TYPE_CHECKING
 
-import cv2
 import numpy as np
 from tap_ros.errors import ConfigError, ImageError
 from tap_ros.files import write_atomically
 from tap_ros.images.crop import Crop
+from tap_ros.images.encodings import decompress
 from tap_ros.images.pixels import in_picture, resize_image, resize_pixels
 from tap_ros.options import File
+from tap_ros.recording.reading_options import Part
 from tap_ros.text import escaped
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tyro import conf
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 PANEL = 2.6  # inches, side of a picture
 DPI = 100
+_LARGEST = 2 ** 29  # bytes of rgb, of a picture file; phones make larger ones than cameras stream
 FAINT = 0.5  # mass of a map, below which an object is hardly in the prediction
 
 _Pixels = conf.arg(metavar='U,V [U,V ...]', help_behavior_hint='(default: none)')
@@ -34,11 +36,13 @@ class Options:
     """
     Options of the command.
 
-    :param start: picture file; square, unless the weights were trained on a part of such.
+    :param start: picture file: JPEG, PNG or WebP.
     :param goal: likewise; left out for weights that predict from the start alone.
     :param objects: where the objects are in the start picture: column and row of each, in the
         pixels of the file.
     :param goal_objects: where the same objects are in the goal picture, in the same order.
+    :param crop: the square part of the pictures that is used: 'centre', the largest one in the
+        middle, or LEFT,TOP,SIDE in pixels of the file; by default as the weights were trained.
     :param samples: how many to draw of weights with z.
     :param recursion: subgoals in a row.
     :param seed: of z; the same one draws the same samples.
@@ -54,6 +58,7 @@ class Options:
     )] = DEFAULT_PREDICTOR
     objects: Annotated[tuple[str, ...], _Pixels] = ()
     goal_objects: Annotated[tuple[str, ...], _Pixels] = ()
+    crop: Part = ''
     samples: int = 1
     recursion: int = 1
     seed: int = 0
@@ -86,19 +91,23 @@ def run(args: Options) -> None:
             'positions; give those of the same objects in both pictures')
     scaled, places, corner = {}, {}, (0, 0)
     for name, picture in pictures.items():
-        cut = predictor.camera_crop.of(picture.shape[:2], name)
+        shape = picture.shape[:2]
+        cut = Crop(args.crop) if args.crop else predictor.camera_crop.of(shape, name)
         if cut.part:
-            place, part = cut.window(picture.shape[:2]), Crop(cut.part)
-            inside = part.pixels(pixels[name], picture.shape[:2])
-            if in_picture(pixels[name], picture.shape[:2]).all() and not in_picture(
-                    inside, place[:1:-1]).all():
+            try:
+                left, top, width, height = cut.window(shape)
+            except ImageError as error:
+                raise ImageError(f'{name}: {error}') from error
+            part = Crop(cut.part)
+            inside = part.pixels(pixels[name], shape)
+            if in_picture(pixels[name], shape).all() and not in_picture(
+                    inside, (height, width)).all():
                 raise ImageError(
-                    '{0}: an object is not in the part that the weights see, {3}x{4} pixels from '
-                    'column {1}, row {2} on; leave it out in both pictures'.format(name, *place))
-            pixels[name] = inside
-            picture = pictures[name] = part.image(picture)
-            corner = place[:2] if name == 'start' else corner
-        scaled[name], places[name] = fit(picture, pixels[name], size, name)
+                    f'{name}: an object is not in the part that the weights see, {width}x{height} '
+                    f'pixels from column {left}, row {top} on; leave it out in both pictures')
+            pixels[name], pictures[name] = inside, part.image(picture)
+            corner = (left, top) if name == 'start' else corner
+        scaled[name], places[name] = fit(pictures[name], pixels[name], size, name)
     subgoals = predictor.predict(
         scaled['start'], scaled.get('goal'), places['start'], places.get('goal'),
         num_samples=args.samples, recursion_depth=args.recursion, seed=args.seed)
@@ -115,18 +124,18 @@ def run(args: Options) -> None:
 
 def read_picture(path: str | Path) -> np.ndarray:
     """
-    Read a picture file.
+    Read a picture file just as a compressed picture of a recording or a camera is read.
 
-    :param path: of a PNG, JPEG or anything else that OpenCV reads.
+    :param path: of a JPEG, PNG or WebP file.
     :return: uint8 (H, W, 3) rgb.
-    :raises ImageError: when it is not there or is no picture.
+    :raises ImageError: when it is not there, is no picture, or is damaged.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if Path(path).is_file() else None
-    if image is None:
-        raise ImageError(f'{escaped(path)}: '
-                         + ('is no picture that can be read; give a PNG or JPEG file'
-                            if Path(path).exists() else 'is not there; give a picture file'))
-    return np.ascontiguousarray(image[..., ::-1])
+    try:
+        return decompress(Path(path).read_bytes(), Path(path).suffix[1:], _LARGEST)
+    except OSError as error:
+        raise ImageError(f'{escaped(path)}: {error.strerror}; give a picture file') from error
+    except ImageError as error:
+        raise ImageError(f'{escaped(path)}: {error}') from error
 
 
 def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
@@ -164,7 +173,8 @@ def fit(picture: np.ndarray, pixels: np.ndarray, size: Sequence[int],
     H, W = picture.shape[:2]
     if W * size[0] != H * size[1]:
         raise ImageError(f'{name}: {W}x{H} pixels (width x height); the weights take pictures of '
-                         f'the shape {size[1]}x{size[0]}, cut it to that first')
+                         f'the shape {size[1]}x{size[0]}; say which part of it is used, by --crop '
+                         'centre or --crop LEFT,TOP,SIDE')
     if not in_picture(pixels, (H, W)).all():
         raise ImageError(f'{name}: an object is outside its {W}x{H} pixels; expected column,row '
                          'in the picture as it is in the file')

@@ -3,12 +3,15 @@
 """`python -m tap_ros predict` on picture files."""
 
 import re
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
+from PIL import Image
 import pytest
 from tap_ros.cli import main
-from tap_ros.prediction.predict_command import fit
+from tap_ros.messages.images import decode_image
+from tap_ros.prediction.predict_command import fit, read_picture
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.training.weights import save_weights
@@ -66,19 +69,28 @@ def test_weights_that_predict_forward_need_no_goal(files, tmp_path):
     assert out.exists()
 
 
-@pytest.mark.parametrize('change, named', [
-    (['--objects', '1,2', '3,4'], '--goal-objects'), (['--objects', '20'], '--objects 20'),
-    (['--objects', '500,2', '--goal-objects', '1,2'], 'outside its 192x192'),
-    (['--objects', 'nan,2', '--goal-objects', '1,2'], 'outside'),
-    (['--weights', 'none.safetensors'], 'none.safetensors'),
-    (['--weights', 'grasp_forward'], 'goal'), (['--samples', '0'], 'num_samples')])
-def test_what_cannot_be_used_is_named_and_nothing_is_written(
-        files, tmp_path, capsys, change, named):
-    out = tmp_path / 'subgoal.png'
-    assert main(['predict', *files, '--out', str(out), *change]) == 1
+def refusal(capsys, *arguments):
+    """Return the one line in which a prediction is refused."""
+    assert main(['predict', *arguments]) == 1
     error = capsys.readouterr().err
-    assert error.count('\n') == 1 and named in error
-    assert not out.exists()
+    assert error.count('\n') == 1
+    return error
+
+
+def test_what_cannot_be_used_is_named_and_nothing_is_written(files, tmp_path, capsys):
+    out = tmp_path / 'subgoal.png'
+    for change, named in (
+            (['--objects', '1,2', '3,4'], '--goal-objects'),
+            (['--objects', '20'], '--objects 20'),
+            (['--objects', '500,2', '--goal-objects', '1,2'], 'outside its 192x192'),
+            (['--objects', 'nan,2', '--goal-objects', '1,2'], 'outside'),
+            (['--weights', 'none.safetensors'], 'none.safetensors'),
+            (['--weights', 'grasp_forward'], 'goal'), (['--samples', '0'], 'num_samples'),
+            (['--crop', 'middle'], 'crop: expected centre'),
+            (['--crop', '100,0,99'], 'start: crop 100,0,99 reaches beyond'),
+            (['--crop', '0,0,20', '--objects', '40,9', '--goal-objects', '1,2'], 'not in the pa')):
+        assert named in refusal(capsys, *files, '--out', str(out), *change), change
+        assert not out.exists()
 
 
 def test_the_picture_is_a_png_beside_the_others(files, tmp_path, capsys):
@@ -92,13 +104,41 @@ def test_the_picture_is_a_png_beside_the_others(files, tmp_path, capsys):
     assert 'no goal picture' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('name, named', [
-    ('absent.png', 'is not there'), ('text.png', 'is no picture'), ('wide.png', '96x64')])
-def test_a_file_that_is_no_square_picture_is_named(files, tmp_path, capsys, name, named):
+def test_a_file_that_is_no_whole_square_picture_is_named(files, tmp_path, capsys):
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
     (tmp_path / 'text.png').write_text('not a picture')
+    (tmp_path / 'empty.jpg').write_bytes(b'')
     cv2.imwrite(str(tmp_path / 'wide.png'), np.zeros((64, 96, 3), np.uint8))
-    assert main(['predict', str(tmp_path / name), files[1]]) == 1
-    assert named in capsys.readouterr().err
+    for kind in ('.jpg', '.png', '.webp'):
+        whole = cv2.imencode(kind, noise)[1].tobytes()
+        for share in (0.5, 0.95):
+            (tmp_path / f'half{share}{kind}').write_bytes(whole[:int(share * len(whole))])
+    for path in tmp_path.glob('half*'):
+        assert 'damaged' in (said := refusal(capsys, files[0], str(path))) and path.name in said
+    for name, named in (('absent.png', 'No such file'), ('text.png', 'valid are JPEG, PNG'),
+                        ('empty.jpg', 'valid are JPEG, PNG'), ('wide.png', '96x64'),
+                        ('', 'directory')):
+        assert named in refusal(capsys, str(tmp_path / name), files[1]), name
+
+
+@pytest.mark.parametrize('mode', ['RGB', 'CMYK', 'L', 'P', 'RGBA'])
+def test_files_are_read_as_recorded_pictures_are_and_upright(tmp_path, mode):
+    smooth = cv2.resize(np.random.default_rng(0).integers(0, 255, (4, 6, 3), np.uint8), (96, 64))
+    picture = Image.fromarray(smooth).convert(mode)
+    shown = np.array(picture.convert('RGB')).astype(int)
+    upright = {1: shown, 3: shown[::-1, ::-1], 6: np.rot90(shown, -1), 8: np.rot90(shown)}
+    for orientation, expected in upright.items():
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        path = tmp_path / ('p.png' if mode in ('P', 'RGBA') else 'p.jpg')
+        picture.save(path, exif=exif, quality=95)
+        found = read_picture(path)
+        assert np.abs(found - expected).mean() < 4, orientation
+        message = SimpleNamespace(data=path.read_bytes(), format='jpeg',
+                                  header=SimpleNamespace(frame_id=''))
+        assert np.array_equal(found, decode_image(message))
+    picture.convert('RGB').save(tmp_path / 'p.jpg', exif=b'Exif\0\0MM nonsense')
+    assert read_picture(tmp_path / 'p.jpg').shape == shown.shape
 
 
 def test_pictures_are_scaled_and_positions_with_them():
@@ -109,7 +149,7 @@ def test_pictures_are_scaled_and_positions_with_them():
     assert pixels == pytest.approx(np.array([[0, 0], [7.5, -0.5]]))
 
 
-def test_the_part_that_the_weights_were_trained_on_is_cut_out(episode, tmp_path, capsys):
+def test_the_part_that_is_used_is_asked_for_or_that_of_the_training(episode, tmp_path, capsys):
     network, _ = load_network('push2')
     weights = tmp_path / 'cut.safetensors'
     save_weights(weights, network, 'predictor', network.config, {
@@ -120,10 +160,12 @@ def test_the_part_that_the_weights_were_trained_on_is_cut_out(episode, tmp_path,
         wide[:, 32:224] = frame[..., ::-1].repeat(3, 0).repeat(3, 1)
         cv2.imwrite(str(path), wide)
     start, goal = ((pixels + 0.5) * 3 - 0.5 + [32, 0] for pixels in episode.object_pixels[[0, -1]])
-    assert main(['predict', *map(str, files), '--weights', str(weights), '--objects',
-                 *words(start), '--goal-objects', *words(goal),
-                 '--out', str(tmp_path / 'out.png')]) == 0
     subgoal, = SubgoalPredictor.load('push2').predict(
         episode.frames[0], episode.frames[-1], *episode.object_pixels[[0, -1]])
-    told = np.array(re.findall(r'object \d at ([\d.]+),([\d.]+)', capsys.readouterr().out), float)
-    assert told == pytest.approx((subgoal.expected_pixels + 0.5) * 3 - 0.5 + [32, 0], abs=0.2)
+    for options in (['--weights', str(weights)], ['--crop', 'centre'], ['--crop', '32,0,192']):
+        assert main(['predict', *map(str, files), *options, '--objects', *words(start),
+                     '--goal-objects', *words(goal), '--out', str(tmp_path / 'out.png')]) == 0
+        told = re.findall(r'object \d at ([\d.]+),([\d.]+)', capsys.readouterr().out)
+        assert np.array(told, float) == pytest.approx(
+            (subgoal.expected_pixels + 0.5) * 3 - 0.5 + [32, 0], abs=0.2)
+    assert '--crop centre' in refusal(capsys, *map(str, files))
