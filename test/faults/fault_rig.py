@@ -82,8 +82,8 @@ class World:
     """
 
     def __init__(self, node, rate_hz=10.0):
-        self.sent = {}
-        self.restore()
+        self.sent, self._began = {}, 0.0
+        self._reset()
         self._seen = first_pictures()[0]
         self._node, self._period = node, 1.0 / rate_hz
         self._publishers = {topic: node.create_publisher(kind, name, STREAM)
@@ -102,7 +102,22 @@ class World:
             self._node.destroy_publisher(publisher)
 
     def restore(self):
-        """Publish everything as it is again."""
+        """Publish everything as it is again; return when that has begun."""
+        self._reset()
+        return self.renewed()
+
+    def renewed(self):
+        """
+        Wait for messages that are made from now on; return the moment when their round began.
+
+        On a busy machine that takes longer than a period, and until then nobody can know.
+        """
+        begin = time.monotonic()
+        while self._began <= begin:
+            time.sleep(0.005)
+        return self._began
+
+    def _reset(self):
         self.silent, self.frozen, self.shift_s = set(), None, 0.0
         self.objects, self.gripper = (None, None), None
 
@@ -128,8 +143,10 @@ class World:
 
     def _run(self):
         while not self._stop.wait(self._period):
+            began = time.monotonic()
             now = time.time_ns() + int(self.shift_s * 1e9)
             self.publish(self.messages(to_stamp(self.frozen or now)))
+            self._began = began
 
 
 class Arm:

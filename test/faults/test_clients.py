@@ -14,6 +14,7 @@ import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectState, ObjectStates
 from tap_ros.errors import TapError
+from tap_ros.nodes.topics import SERVICE_QOS
 
 pytestmark = pytest.mark.ros
 
@@ -22,9 +23,19 @@ SOON_S = 10.0
 ANSWERED = 'each call is answered'
 
 
-def take_down(trials, load):
-    """Take down what came of many calls; a trial is a call."""
-    trials.record(times=len(load.latencies) + load.counts['busy'])
+@pytest.mark.parametrize('clients, depth', [
+    pytest.param(clients, depth, id=name, marks=fault(
+        injected, ANSWERED, seconds, 'answers a second', min))
+    for name, injected, seconds, clients, depth in (
+        *((f'clients-{count}', '12, 16 or 64 clients at once for 10 s', 10, count,
+           SERVICE_QOS.depth) for count in (12, 16, 64)),
+        ('clients-default-queue', f'16 clients with the default queue of {DEFAULT_DEPTH} for 40 s',
+         40, 16, DEFAULT_DEPTH),
+        ('clients-long', '16 clients for 10 min', 600, 16, SERVICE_QOS.depth))])
+def test_(rig, trials, clients, depth):
+    rig.need('predictor_node')
+    load = measure_load(clients, float(trials.count), depth)
+    trials.record(times=len(load.latencies) + load.counts['busy'])  # a trial is a call
     trials.measured(load.per_second)
     trials.note = f'{load.counts["busy"]} told to come later'
     if len(load.latencies) < load.counts['busy']:
@@ -32,26 +43,6 @@ def take_down(trials, load):
     for end in ('lost', 'refused'):
         if load.counts[end]:
             trials.record(f'a good request was {end}', load.counts[end])
-
-
-@pytest.mark.parametrize('clients', [12, 16, 64])
-@fault('12, 16 or 64 clients at once for 10 s', ANSWERED, 10, 'answers a second', min)
-def test_clients(rig, trials, clients):
-    rig.need('predictor_node')
-    take_down(trials, measure_load(clients, float(trials.count)))
-
-
-@fault(f'16 clients with the default queue of {DEFAULT_DEPTH} for 40 s', ANSWERED, 40,
-       'answers a second', min)
-def test_clients_default_queue(rig, trials):
-    rig.need('predictor_node')
-    take_down(trials, measure_load(16, float(trials.count), DEFAULT_DEPTH))
-
-
-@fault('16 clients for 10 min', ANSWERED, 600, 'answers a second', min)
-def test_clients_long(rig, trials):
-    rig.need('predictor_node')
-    take_down(trials, measure_load(16, float(trials.count)))
 
 
 @fault('16 clients against one', 'at least 1.5 times as many answers a second', 3,

@@ -41,7 +41,7 @@ class Injection:
     """
     What is done to a World that shows the same moment again and again, and what the goal does.
 
-    :param do: called with World, trial; returns None, or the moment when it was done.
+    :param do: called with World, trial; returns when it was done, None: now.
     :param during: while the arm moves; else before the goal begins.
     :param end: how the goal has to end, '' if it need not.
     :param within: what the reason has to say.
@@ -73,12 +73,14 @@ def repeat_stamps(world, trial):
     """Let all inputs repeat one stamp from before the goal on."""
     world.frozen = time.time_ns()
     time.sleep((0.5, 3.0)[trial % 2])
+    return world.renewed()
 
 
 def jump(*seconds):
     """Let all clocks jump."""
     def do(world, trial):
         world.shift_s = seconds[trial % len(seconds)]
+        return world.renewed()
     return do
 
 
@@ -87,6 +89,7 @@ def change_objects(world, trial):
     seen = first_pictures()[0]
     world.objects = (seen.object_pixels[:1], seen.object_names[:1]) if trial % 2 else (
         np.concatenate([seen.object_pixels, [[5.0, 5.0]]]), (*seen.object_names, 'newcomer'))
+    return world.renewed()
 
 
 # Name, what is injected, what must happen, trials of a whole run, what is measured, how.
@@ -199,8 +202,8 @@ def test_absurd_to_planner(rig, trials, spoil):
                 if during:
                     handle = rig.begin_moving()
                 name = spoil(world, trial)
+                moment = world.renewed()
                 time.sleep(0.0 if during else 0.5)
-                moment = time.monotonic()
                 if not during:
                     handle = rig.begin()
                 end = rig.expect_end(handle, 'aborted: ', timeout_s=12.0)
