@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike
 from tap_ros.planning.cost import distances_to_pixels
 from tap_ros.prediction.batches import fixed_time, uses_recorded_goal
 from tap_ros.prediction.networks import Prediction
@@ -49,17 +48,6 @@ def _least_sum(to_start: torch.Tensor, to_goal: torch.Tensor) -> torch.Tensor:
     scores = [torch.where(torch.tensor(moved, device=to_start.device), to_goal, to_start).sum(1)
               for moved in halfway]
     return torch.stack(scores).amin(0)
-
-
-def bottleneck_frequency(scores: ArrayLike, threshold: float) -> np.ndarray:
-    """
-    Compute which share of predictions is a bottleneck.
-
-    :param scores: (..., N), in pixels.
-    :param threshold: in pixels; a score of at most that counts.
-    :return: (...), from 0 to 1.
-    """
-    return (np.asarray(scores) <= threshold).mean(-1)
 
 
 def context_pixels(episode: Episode, goal_picture: str) -> np.ndarray:

@@ -27,8 +27,8 @@ class Interval(NamedTuple):
     high: float
 
 
-def bootstrap(statistic: Callable[..., Any], *arrays: ArrayLike, resamples: int = RESAMPLES,
-              seed: int = 0) -> Interval:
+def bootstrap(statistic: Callable[..., Any], *arrays: ArrayLike,
+              resamples: int = RESAMPLES) -> Interval:
     """
     Estimate a statistic of episodes: N of the N episodes are drawn again and again.
 
@@ -37,7 +37,6 @@ def bootstrap(statistic: Callable[..., Any], *arrays: ArrayLike, resamples: int 
     :param statistic: function of arrays (..., N) that gives (...); NaN where it is undefined.
     :param arrays: of the same N along the last axis, at least 1.
     :param resamples: how often to draw.
-    :param seed: of the draws.
     :return: Interval over the draws in which the statistic is defined; NaN to NaN without any.
     """
     from scipy import stats  # takes a second
@@ -52,7 +51,7 @@ def bootstrap(statistic: Callable[..., Any], *arrays: ArrayLike, resamples: int 
         draws = stats.bootstrap(
             (np.arange(N),), lambda drawn, axis: statistic(*(a[..., drawn] for a in arrays)),
             n_resamples=resamples, batch=max(1, _DRAWN // max(a.size for a in arrays)),
-            vectorized=True, method='percentile', random_state=np.random.default_rng(seed),
+            vectorized=True, method='percentile', random_state=np.random.default_rng(0),
         ).bootstrap_distribution
     if np.isnan(draws).all():
         return Interval(value, np.nan, np.nan)
@@ -60,15 +59,9 @@ def bootstrap(statistic: Callable[..., Any], *arrays: ArrayLike, resamples: int 
     return Interval(value, float(low), float(high))
 
 
-def mean_interval(values: ArrayLike, **options: int) -> Interval:
-    """
-    Estimate the mean over episodes.
-
-    :param values: (N,).
-    :param options: of bootstrap.
-    :return: Interval.
-    """
-    return bootstrap(lambda values: values.mean(-1), np.asarray(values, float), **options)
+def mean_interval(values: ArrayLike) -> Interval:
+    """Estimate the mean over episodes of values (N,)."""
+    return bootstrap(lambda values: values.mean(-1), np.asarray(values, float))
 
 
 def share_interval(successes: ArrayLike) -> Interval:
@@ -85,16 +78,3 @@ def share_interval(successes: ArrayLike) -> Interval:
     values = np.asarray(successes, float)
     found = stats.binomtest(round(values.sum()), len(values)).proportion_ci(method='wilson')
     return Interval(float(values.mean()), float(found.low), float(found.high))
-
-
-def gain_interval(errors: ArrayLike, baseline: ArrayLike, **options: int) -> Interval:
-    """
-    Estimate by which share a method's mean error is below a baseline's on the same episodes.
-
-    :param errors: (N,), of the method.
-    :param baseline: (N,), of the baseline, in the same order.
-    :param options: of bootstrap.
-    :return: Interval; 0.25 is an error a quarter lower.
-    """
-    return bootstrap(lambda errors, baseline: 1 - errors.mean(-1) / baseline.mean(-1),
-                     np.asarray(errors, float), np.asarray(baseline, float), **options)

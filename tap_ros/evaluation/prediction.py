@@ -17,14 +17,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.bottleneck import (
-    bottleneck_frequency,
     context_pixels,
     predicted_maps,
     score_bottlenecks,
     THRESHOLDS,
     VISIBLE,
 )
-from tap_ros.evaluation.intervals import bootstrap, gain_interval, Interval, mean_interval
+from tap_ros.evaluation.intervals import bootstrap, Interval, mean_interval
 from tap_ros.evaluation.samples import draw_latents, SAMPLES, SampleScores, score_samples
 from tap_ros.evaluation.shown import SHOWN, ShownScorer
 from tap_ros.files import write_atomically
@@ -90,9 +89,9 @@ class EpisodeScores:
         result = {
             'min_l1': mean_interval(self.min_l1),
             'match_step': mean_interval(self.match_step),
-            'match_step_std': bootstrap(_std, self.match_step),
+            'match_step_std': bootstrap(partial(np.std, axis=-1), self.match_step),
             'match_fraction': mean_interval(self.match_fraction),
-            'match_fraction_std': bootstrap(_std, self.match_fraction)}
+            'match_fraction_std': bootstrap(partial(np.std, axis=-1), self.match_fraction)}
         changed = self.changed_l1[np.isfinite(self.changed_l1)]
         if len(changed):
             result['changed_l1'] = mean_interval(changed)
@@ -100,12 +99,10 @@ class EpisodeScores:
         if len(scores):
             visible = np.where(self.object_mass[np.isfinite(self.bottleneck)] < VISIBLE, np.inf,
                                scores)
-            result['bottleneck_median'] = bootstrap(_median, scores)
+            result['bottleneck_median'] = bootstrap(partial(np.median, axis=-1), scores)
             for threshold in THRESHOLDS:
-                result[f'bottleneck_{threshold}px'] = bootstrap(
-                    partial(bottleneck_frequency, threshold=threshold), scores)
-                result[f'visible_bottleneck_{threshold}px'] = bootstrap(
-                    partial(bottleneck_frequency, threshold=threshold), visible)
+                result[f'bottleneck_{threshold}px'] = mean_interval(scores <= threshold)
+                result[f'visible_bottleneck_{threshold}px'] = mean_interval(visible <= threshold)
         both = np.minimum(self.hand, self.objects)
         for name, shares in (('hand', self.hand), ('objects', self.objects), ('both', both)):
             if np.isfinite(shares).any():
@@ -233,10 +230,7 @@ class Options:
     :param all: take every episode, not only those that training held out.
     :param goal_picture: the episode's last frame, or the goal's own picture where reached, with
         the arm elsewhere.
-    :param margin: frames beside the context that do not count as matches.
     :param samples: how many to draw of weights with z.
-    :param robot_mask: what is taken out of the frames that predictions are compared with, see
-        `train --help`; 'weights': what it was when they were trained.
     :param out: write scores.json and pictures.png there.
     """
 
@@ -247,9 +241,7 @@ class Options:
     image_topic: Topic = ''
     all: Flag = False
     goal_picture: Literal['last', 'recorded'] = 'recorded'
-    margin: int = 0
     samples: int = SAMPLES
-    robot_mask: Literal['weights', 'none', 'arm', 'all'] = 'weights'
     out: Folder = ''
 
 
@@ -266,8 +258,7 @@ def run(args: Options) -> None:
         raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
     settings = training.get('settings', {})
-    robot_mask = (trained_robot_mask(training)[0] if args.robot_mask == 'weights'
-                  else args.robot_mask)
+    robot_mask = trained_robot_mask(training)[0]
     kept, held_out = with_masks(store, split_episodes(
         store, settings.get('test_fraction', TEST_FRACTION),
         held_out=() if args.all else settings.get('held_out', ())), robot_mask)
@@ -276,7 +267,7 @@ def run(args: Options) -> None:
         raise ConfigError('recordings: no episode of them was held out from training; '
                           'give more of them, or --all')
     filled = fill(store, robot_mask)
-    scores = evaluate(network, store, episodes, args.margin, args.goal_picture, filled=filled)
+    scores = evaluate(network, store, episodes, goal_picture=args.goal_picture, filled=filled)
     print(f'{len(episodes)} episodes, goal picture: {args.goal_picture}; l1 on [0, 1]; object '
           'positions: ground truth; in brackets 95% intervals over the episodes')
     _print_table(scores)
@@ -285,25 +276,17 @@ def run(args: Options) -> None:
         for method, value in scores.items()}
     if network.config.latent_size:
         about['samples'] = _report_samples(score_samples(
-            network, store, episodes, args.margin, args.goal_picture, args.samples,
+            network, store, episodes, goal_picture=args.goal_picture, count=args.samples,
             filled=filled), args.samples)
     if args.out:
         folder = Path(args.out)
         about = {'weights': str(args.weights), 'data_hash': store.data_hash,
-                 'goal_picture': args.goal_picture, 'margin': args.margin, 'scores': about}
+                 'goal_picture': args.goal_picture, 'margin': 0, 'scores': about}
         if robot_mask != 'none':
             about['robot_mask'] = robot_mask
         write_atomically(folder / 'scores.json', json.dumps(about, indent=2) + '\n')
         write_pictures(folder / 'pictures.png', network, store, episodes[:12], args.goal_picture,
                        filled=filled)
-
-
-def _std(values: np.ndarray) -> np.ndarray:
-    return values.std(-1)
-
-
-def _median(values: np.ndarray) -> np.ndarray:
-    return np.median(values, -1)
 
 
 def _print_table(scores: Mapping[str, EpisodeScores]) -> None:
@@ -317,7 +300,8 @@ def _print_table(scores: Mapping[str, EpisodeScores]) -> None:
                 for column in columns.values()))
     for method in METHODS[1:]:
         if method in scores:
-            gain = gain_interval(scores['prediction'].min_l1, scores[method].min_l1)
+            gain = bootstrap(lambda errors, copied: 1 - errors.mean(-1) / copied.mean(-1),
+                             scores['prediction'].min_l1, scores[method].min_l1)
             print(f'min_l1 below {method} by {_text(gain)}')
 
 

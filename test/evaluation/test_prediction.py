@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.bottleneck import (
-    bottleneck_frequency,
     bottleneck_scores,
     bottleneck_share,
     MIN_MOTION,
     target_bottlenecks,
 )
-from tap_ros.evaluation.prediction import evaluate, Options, run, write_pictures
+from tap_ros.evaluation.prediction import evaluate, Options, run
 from tap_ros.evaluation.samples import draw_latents, score_samples
 from tap_ros.images.pixels import to_float
 from tap_ros.options import parse
@@ -78,11 +77,6 @@ def test_bottleneck_is_either_object_first_and_the_sum_over_objects():
     assert score(goal[0, 0], goal[0, 1]) == pytest.approx(4)
     halfway = (start + goal)[0] / 2
     assert score(halfway[0], halfway[1]) == pytest.approx(2 + 3)
-
-
-def test_frequency_rises_with_the_threshold():
-    frequency = [bottleneck_frequency([0.5, 1.5, 2.0, 9.0], pixels) for pixels in (0, 1, 2, 10)]
-    assert frequency == [0, 0.25, 0.75, 1]
 
 
 def test_with_three_objects_one_or_two_may_have_moved_but_not_none_or_all():
@@ -156,11 +150,6 @@ def test_copying_matches_the_frame_beside_it_and_is_no_bottleneck():
                for e in EPISODES]
     assert np.allclose(scores['copy-start'].bottleneck, shorter, atol=1e-4)
     assert np.allclose(scores['copy-goal'].bottleneck, shorter, atol=1e-4)
-
-
-def test_margin_keeps_matches_away_from_the_context():
-    scores = evaluate(Pasting(), EPISODES, range(3), margin=2)
-    assert scores['copy-start'].match_step.tolist() == [3, 3, 3]
 
 
 def test_episodes_in_which_an_object_stays_do_not_count_as_bottlenecks():
@@ -245,13 +234,6 @@ def test_each_episode_has_samples_of_its_own():
     assert draw_latents([7, 3], 4, 5)[1].equal(draw_latents([3], 9, 5)[0, :4])
     assert not draw_latents([3], 1, 5).equal(draw_latents([7], 1, 5))
     assert not draw_latents([3], 1, 5).equal(draw_latents([3], 1, 5, seed=1))
-
-
-def test_pictures_are_written(tmp_path):
-    from matplotlib.image import imread
-    write_pictures(tmp_path / 'sheet.png', Pasting(), EPISODES, range(3), scale=1)
-    sheet = imread(tmp_path / 'sheet.png')
-    assert sheet.shape[:2] == (3 * 34 - 2, 5 * 34 - 2)
 
 
 @pytest.mark.parametrize('options', [
