@@ -30,6 +30,8 @@ Run: TypeAlias = Callable[[Any], int | None]
 COMMANDS: dict[str, tuple[str, Module]] = {
     'collect': ('simulate the expert and record it', 'sim_bridge.collect'),
     'import-video': ('import video files', 'tap_ros.recording.formats.pictures'),
+    'import-arrays': ('import pictures of HDF5 files or zarr stores',
+                      'tap_ros.recording.formats.arrays'),
     'import-tfrecord': ('import TFRecord files: RLDS data sets, BAIR',
                         'tap_ros.recording.formats.tfrecord'),
     'import-lerobot': ('import a LeRobot data set', 'tap_ros.recording.formats.lerobot'),

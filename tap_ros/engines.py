@@ -15,6 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+import logging
 import multiprocessing
 from multiprocessing import connection
 import os
@@ -136,9 +137,9 @@ def _result(future: 'Future[Any]') -> Any:
 def _pool(engine: Engine) -> Iterator[Workers]:
     """Start processes; new ones where a worker was killed."""
     room = engine.workers or len(os.sched_getaffinity(0))
-
-    def start() -> ProcessPoolExecutor:
-        return ProcessPoolExecutor(room, multiprocessing.get_context('spawn'), _start_worker)
+    start = partial(
+        ProcessPoolExecutor, room, multiprocessing.get_context('spawn'), _start_worker)
+    pool = start()
 
     def begin(task: Work) -> 'Future[Any]':
         nonlocal pool
@@ -149,7 +150,6 @@ def _pool(engine: Engine) -> Iterator[Workers]:
             pool = start()
             return pool.submit(task.function, *task.args)
 
-    pool = start()
     try:
         yield begin, room, (BrokenProcessPool,)
     except BaseException:
@@ -194,7 +194,7 @@ def _ray(engine: Engine) -> Iterator[Workers]:
     try:
         if host:  # Ray itself tries for minutes
             socket.create_connection((host, int(port)), timeout=5).close()
-        ray.init(log_to_driver=False, logging_level='ERROR',
+        ray.init(log_to_driver=False, logging_level=logging.ERROR,
                  runtime_env={'env_vars': {'PYTHONPATH': modules}}, **place)
     except (OSError, RuntimeError, ValueError) as error:
         raise ConfigError(

@@ -23,7 +23,7 @@ from tap_ros.messages.joints import decode_positions, PLACE
 from tap_ros.messages.topics import BY_COLUMNS, IMAGE, JOINT_STATES, Topic, TOPICS
 from tap_ros.recording.damage import describe
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.foreign import open_file
+from tap_ros.recording.foreign import explain, open_file
 from tap_ros.recording.mcap_file import Channel
 from tap_ros.recording.messages import check_schema, decode
 from tap_ros.robots.arm import find_joints, known_arms
@@ -107,6 +107,8 @@ class _Bag:
         for rule in rules:
             if len(left) > 1:
                 left = [topic for topic in left if rule(topic)] or left
+        if not left and (why := explain(self.channels.values(), self.files)):
+            raise RecordingError(f'{self.source}: {why}; {self.known}')
         if not left:
             raise RecordingError(
                 f'{self.source}: no topic ends in {IMAGE.recorded} with type {IMAGE.type}; name '

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import cv2
@@ -18,8 +19,10 @@ import numpy as np
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer
 from tap_ros.images.crop import Crop
-from tap_ros.options import default_text, Folder
+from tap_ros.options import default_text, Folder, Topic
+from tap_ros.recording.bags import find_bags
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.foreign import video_packets, VIDEOS
 from tap_ros.recording.reading_options import Part
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 from tap_ros.text import escaped
@@ -28,7 +31,6 @@ from tyro import conf
 
 EPISODES_PER_FILE = 25
 EPISODE_SPACING_NS = 60 * 10**9  # between the end of an episode and the start of the next
-VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
 Paths = Annotated[conf.Positional[tuple[str, ...]], conf.arg(
     metavar='PATH [PATH ...]', help_behavior_hint='(required)')]
 
@@ -58,12 +60,15 @@ class Options(Target):
     """
     Options of the command: one video is one demonstration.
 
-    :param paths: video files of one camera, in the order of the demonstrations.
+    :param paths: video files of one camera, in the order of the demonstrations, or bags with
+        packets of video.
+    :param image_topic: of the packets, where a bag has several.
     :param fps: frames a second; 0: as the videos say.
     :param task: what is done in them, as text.
     """
 
     paths: Paths
+    image_topic: Topic = ''
     fps: float = 0.0
     task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
 
@@ -80,7 +85,9 @@ def run(args: Options) -> None:
     def episodes() -> Iterator[Episode]:
         for number, path in enumerate(map(Path, args.paths)):
             seconds, frames = zip(*(
-                (at, args.cut.image(frame)) for at, frame in video_frames(path)))
+                (at, args.cut.image(frame)) for at, frame in (
+                    video_frames(path) if path.suffix.lower() in VIDEOS else
+                    _bag_frames(path, args.image_topic))))
             yield make_episode(frames, np.arange(len(frames)) / args.fps if args.fps else seconds,
                                task=args.task, seed=number)
 
@@ -107,7 +114,7 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
         'goal_poses': np.full((K, 7), np.nan), 'object_source': 'imported'}
     return Episode(frames=np.stack(frames), object_names=object_names,
                    stamps=np.round(np.asarray(seconds) * 1e9).astype(np.int64),
-                   **(fields | known))  # type: ignore[arg-type]
+                   **(fields | known))
 
 
 def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = None) -> str:
@@ -139,6 +146,17 @@ def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = N
             raise RecordingError(f'{escaped(out)}: there is no episode to import')
         write_metadata(out)
     return f'{escaped(out)}: {done} episodes, {frames} frames of {size[1]}x{size[0]} pixels'
+
+
+def _bag_frames(path: Path, topic: str) -> Iterator[tuple[float, np.ndarray]]:
+    """Decode the packets of video in a bag, as video_frames; times are those of the log."""
+    with TemporaryDirectory(prefix='tap_ros_video_') as folder:
+        for bag in find_bags(path):
+            times, stream = video_packets(bag, topic)
+            file = Path(folder, 'packets.video')
+            file.write_bytes(stream)
+            for at, (_, frame) in zip(times, video_frames(file)):
+                yield at, frame
 
 
 def video_frames(path: Path) -> Iterator[tuple[float, np.ndarray]]:

@@ -31,6 +31,7 @@ from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.images.encodings import decompress
 from tap_ros.options import default_text
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.foreign import natural
 from tap_ros.recording.formats.pictures import make_episode, Paths, Target, write_bag
 from tap_ros.text import escaped, listing
 from tyro import conf
@@ -88,7 +89,7 @@ def run(args: Options) -> None:
     if not 0 < args.fps <= 1000:
         raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000')
     files = [file for path in map(Path, args.paths) for file in (
-        sorted(path.rglob('*.tfrecord*'), key=_natural) if path.is_dir() else [path])]
+        sorted(path.rglob('*.tfrecord*'), key=natural) if path.is_dir() else [path])]
     camera, blank = args.camera, Counter[bool]()
 
     def episodes() -> Iterator[Episode]:
@@ -158,11 +159,6 @@ def _picture(data: bytes) -> np.ndarray:
 
 def _is_blank(picture: np.ndarray) -> bool:
     return bool((picture == picture[0, 0]).all())
-
-
-def _natural(path: Path) -> list[int | str]:
-    """Sort traj_256_to_511 before traj_1024_to_1279."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', str(path))]
 
 
 def read_records(path: str | Path) -> Iterator[bytes]:

@@ -1,0 +1,122 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Import pictures that stand as arrays in HDF5 files (ALOHA, robomimic) or zarr stores.
+
+An array of pictures is (N, H, W, 3), (N, 3, H, W), or (N, bytes) of JPEG files. Its last name is
+the camera; arrays of one camera in several groups, such as data/demo_7/obs, are an episode each,
+and so is each file. meta/episode_ends, as of diffusion policy, cuts one array into episodes.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.images.encodings import decompress
+from tap_ros.options import default_text
+from tap_ros.recording.episode import Episode
+from tap_ros.recording.foreign import natural
+from tap_ros.recording.formats.pictures import make_episode, Paths, Target, write_bag
+from tap_ros.text import escaped, listing
+from tyro import conf
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Target):
+    """
+    Options of `python -m tap_ros import-arrays`.
+
+    :param paths: HDF5 files, folders of them, or zarr stores.
+    :param camera: NAME of the pictures; needed where there are several cameras.
+    :param fps: frames a second, which the arrays do not tell.
+    :param task: what is done in them, as text.
+    """
+
+    paths: Paths
+    camera: Annotated[str, conf.arg(metavar='NAME', help_behavior_hint=default_text)] = ''
+    fps: float = 10.0
+    task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
+
+
+def run(args: Options) -> None:
+    """
+    Import, and print what was.
+
+    :raises TapError: for what cannot be read, and a folder that holds something.
+    """
+    if not 0 < args.fps <= 1000:
+        raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000')
+    files = [file for path in map(Path, args.paths) for file in (
+        sorted((file for file in path.rglob('*') if file.suffix in ('.hdf5', '.h5')), key=natural)
+        or [path])]
+
+    def episodes() -> Iterator[Episode]:
+        number = 0
+        for file in files:
+            try:
+                for pictures in _episodes(_open(file), args.camera):
+                    frames = [args.cut.image(_picture(each)) for each in pictures]
+                    yield make_episode(frames, np.arange(len(frames)) / args.fps, task=args.task,
+                                       seed=number)
+                    number += 1
+            except (OSError, KeyError, ValueError) as error:
+                raise RecordingError(
+                    f'{escaped(file)}: cannot be read: {escaped(error, 200)}') from error
+
+    print(write_bag(args, episodes()))
+
+
+def _open(path: Path) -> Any:
+    """Open a file or store: a tree of groups, which act as dicts, and arrays."""
+    name = 'zarr' if path.is_dir() or path.suffix == '.zip' else 'h5py'
+    try:
+        if name == 'zarr':
+            import zarr  # type: ignore[import-not-found]
+            return zarr.open(str(path), mode='r')
+        import h5py  # type: ignore[import-not-found]
+        return h5py.File(path, 'r')
+    except ImportError as error:
+        raise ConfigError(f'{name} is not installed; type `pip install {name}`') from error
+
+
+def _episodes(root: Any, camera: str) -> Iterator[Any]:
+    """Yield the arrays of pictures of each episode of a camera."""
+    arrays = dict(_arrays(root))
+    found = {name: array for name, array in arrays.items() if _holds_pictures(array)}
+    cameras = sorted({name.rpartition('/')[2] for name in found}, key=str)
+    if camera not in cameras and (camera or len(cameras) != 1):
+        raise ConfigError(f'--camera: expected one of {listing(cameras) or "them, but none is"}')
+    chosen = camera or cameras[0]
+    ends = arrays.get('meta/episode_ends')
+    for name in sorted(found, key=lambda name: natural(Path(name))):
+        if name.rpartition('/')[2] == chosen:
+            cuts = [0, *(np.asarray(ends[:]).tolist() if ends is not None else [len(found[name])])]
+            for begin, end in zip(cuts, cuts[1:]):
+                yield found[name][begin:end]
+
+
+def _arrays(group: Any, above: str = '') -> Iterator[tuple[str, Any]]:
+    """Yield the arrays below a group, with their paths."""
+    for name in group:
+        if hasattr(group[name], 'dtype'):
+            yield above + name, group[name]
+        else:
+            yield from _arrays(group[name], f'{above}{name}/')
+
+
+def _holds_pictures(array: Any) -> bool:
+    """Tell whether an array is of pictures."""
+    if len(array.shape) == 2 and array.dtype == np.uint8 and len(array):
+        return bytes(array[0][:3]) == b'\xff\xd8\xff'
+    return len(array.shape) == 4 and 3 in (array.shape[1], array.shape[3])
+
+
+def _picture(values: Any) -> np.ndarray:
+    """Return a picture, uint8 (H, W, 3): of pixels 0 to 255, or of a JPEG with zeros behind it."""
+    if values.ndim == 1:
+        return decompress(bytes(values), 'jpeg')
+    pixels = np.asarray(values).clip(0, 255).astype(np.uint8)
+    return pixels if pixels.shape[-1] == 3 else np.moveaxis(pixels, 0, -1)

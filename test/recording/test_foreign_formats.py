@@ -1,0 +1,218 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Bags of other storages and messages are read as ours; for what is no bag a command is told."""
+
+import base64
+import json
+import shlex
+import sqlite3
+import struct
+import sys
+from types import SimpleNamespace
+
+import cv2
+from made_bags import camera, joints, record, SECOND
+from mcap.writer import Writer as McapWriter
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import Writer as Ros2Writer
+from tap_ros.cli import main, read
+from tap_ros.errors import RecordingError
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.messages import typestore
+from tap_ros.recording.reader import iter_episodes
+
+TOPIC = '/camera/image_raw'
+SENT = [each for t in range(1, 6) for each in (camera(t), joints(t, gripper_x=t / 8))]
+# Four packets of H.264, 16x16 pixels, grey of 39, 89, 139 and 189.
+PACKETS = [base64.b64decode(text) for text in (
+    'AAABZ0LACtp6EAAAAwAQAAADAUjxImoAAAFozgbyAAABZYiEOiYoAAkE4A==', 'AAABQZogLqJxQABJfw==',
+    'AAABQZpALqJxQABBww==', 'AAABQZpgLrxkUAAQoooAAhRRQABCiigACFFFAAEKKKAAIUUUAAQoooAAhRRQABCii'
+    'gACFFFAAEKKKAAIUUUAAQoooAAhRRQABCiigACFFg==')]
+
+
+def write_sqlite3(folder):
+    """Write a bag as ROS 2 Iron does, with a topic of a type that nobody installed."""
+    with Ros2Writer(folder, version=8) as writer:
+        topics = {topic: writer.add_connection(topic, kind, typestore=typestore())
+                  for topic, kind in dict.fromkeys((topic, kind) for topic, kind, *_ in SENT)}
+        odd = writer.add_connection('/odd', 'odd_msgs/msg/Odd', msgdef='float64 x\n',
+                                    rihs01='RIHS01_' + 64 * '0')
+        for topic, _, data, log in SENT:
+            writer.write(topics[topic], log, data)
+            writer.write(odd, log, b'\0\1\0\0' + bytes(8))
+    return folder
+
+
+def write_bare_db3(folder):
+    """Write a file without metadata and without definitions, as of Humble."""
+    write_sqlite3(folder / 'whole')
+    file = next((folder / 'whole').glob('*.db3')).rename(folder / 'bare.db3')
+    with sqlite3.connect(file) as base:
+        base.execute('DELETE FROM message_definitions')
+    return file
+
+
+def write_ros1(path):
+    store = typestore()
+    with Ros1Writer(path) as writer:
+        topics = {}
+        for topic, kind, data, log in SENT:
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(topics[topic], log, store.cdr_to_ros1(data, kind))
+    return path
+
+
+def write_mcap(path, schema_encoding, encoding, messages):
+    """Write (topic, type, data, log time) as messages of another encoding."""
+    with open(path, 'wb') as stream:
+        writer = McapWriter(stream)
+        writer.start()
+        channels = {}
+        for topic, kind, data, log in messages:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(
+                    topic, encoding, writer.register_schema(kind, schema_encoding, b''))
+            writer.add_message(channels[topic], log, bytes(data), log)
+        writer.finish()
+    return path
+
+
+def write_ros1_mcap(path):
+    return write_mcap(path, 'ros1msg', 'ros1', [
+        (topic, kind.replace('/msg/', '/'), typestore().cdr_to_ros1(data, kind), log)
+        for topic, kind, data, log in SENT])
+
+
+@pytest.mark.parametrize('write, name', [
+    (write_sqlite3, 'bag'), (write_bare_db3, ''), (write_ros1, 'a.bag'),
+    (write_ros1_mcap, 'a.mcap')])
+def test_other_bags_say_what_a_bag_of_ours_says(write, name, tmp_path):
+    expected, = iter_episodes(record(tmp_path / 'ours', SENT))
+    (tmp_path / 'theirs').mkdir()
+    path = write(tmp_path / 'theirs' / name)
+    for place in (path, tmp_path / 'theirs'):
+        for found in (list(iter_episodes(place)), [open_recordings(place)[0]]):
+            np.testing.assert_array_equal(found[0].frames, expected.frames)
+            np.testing.assert_array_equal(found[0].stamps, expected.stamps)
+            np.testing.assert_array_equal(found[0].grippers, expected.grippers)
+            assert len(found) == 1
+
+
+def length_delimited(number, data):
+    return bytes([number << 3 | 2]) + bytes([len(data) & 127 | 128, len(data) >> 7]) + data
+
+
+def foxglove_image(t, compressed):
+    """Return a picture as protobuf: (type, bytes, pixels)."""
+    pixels = np.full((8, 8, 3), 20 * t, np.uint8)
+    stamp = length_delimited(1, b'\x08' + bytes([t]))
+    if compressed:
+        data = cv2.imencode('.png', pixels)[1].tobytes()
+        return 'foxglove.CompressedImage', (
+            stamp + length_delimited(2, data) + length_delimited(3, b'png')), pixels
+    numbers = b''.join(bytes([number << 3 | 5]) + struct.pack('<I', value)
+                       for number, value in ((2, 8), (3, 8), (5, 24)))
+    return 'foxglove.RawImage', (
+        stamp + numbers + length_delimited(4, b'rgb8')
+        + length_delimited(6, pixels.tobytes())), pixels
+
+
+@pytest.mark.parametrize('compressed', [False, True])
+def test_pictures_of_foxglove_are_read_from_protobuf(compressed, tmp_path):
+    sent = [foxglove_image(t, compressed) for t in range(1, 5)]
+    path = write_mcap(tmp_path / 'a.mcap', 'protobuf', 'protobuf', [
+        ('/cam', kind, data, t * SECOND) for t, (kind, data, _) in enumerate(sent, 1)])
+    episode, = iter_episodes(path)
+    np.testing.assert_array_equal(episode.frames, [pixels for *_, pixels in sent])
+    assert episode.stamps.tolist() == [t * SECOND for t in range(1, 5)]
+
+
+def test_damage_of_other_bags_is_named(tmp_path):
+    for path in (write_ros1(tmp_path / 'a.bag'), write_bare_db3(tmp_path)):
+        data = path.read_bytes()
+        path.write_bytes(data[:len(data) // 3])
+        with pytest.raises(RecordingError, match=f'{path.name}: (cannot be read|.* lost)'):
+            list(iter_episodes(path))
+
+
+@pytest.mark.parametrize('name, content, command', [
+    ('episode_0.hdf5', b'\x89HDF\r\n\x1a\n' + bytes(99), 'import-arrays'),
+    ('pusht.zarr/.zgroup', b'{}', 'import-arrays'),
+    ('robomimic/low.h5', b'\x89HDF\r\n\x1a\n' + bytes(99), 'import-arrays'),
+    ('set/meta/info.json', b'{}', 'import-lerobot'),
+    ('bridge/1.0.0/bridge-train.tfrecord-00000-of-00002', b'', 'import-tfrecord'),
+    ('demo.mp4', b'\0\0\0\x18ftyp', 'import-video'),
+    ('demos/7/front.MOV', b'\0\0\0\x18ftyp', 'import-video')])
+def test_for_what_is_no_bag_the_command_is_told(name, content, command, tmp_path, capsys):
+    file = tmp_path / 'in' / name
+    file.parent.mkdir(parents=True)
+    file.write_bytes(content)
+    given = {'info.json': file.parents[1], '.zgroup': file.parent}.get(file.name, file)
+    for path in {given, tmp_path / 'in' / name.split('/')[0]}:
+        assert main(['inspect', str(path)]) == 1
+        said = capsys.readouterr().err
+        advice = shlex.split(said[said.index('python -m tap_ros'):])
+        assert advice[3] == command and str(tmp_path) in advice[4] and read(advice[3:])
+
+
+VIDEO = {'foxglove_msgs/msg/CompressedVideo': (
+    'cdr', lambda data: b'\0\1\0\0' + struct.pack('<iII', 1, 0, 1) + bytes(4)
+    + struct.pack('<I', len(data)) + data + bytes(-len(data) % 4) + struct.pack('<I', 5)
+    + b'h264\0'),
+    'foxglove.CompressedVideo': ('protobuf', lambda data: length_delimited(3, data))}
+
+
+@pytest.mark.parametrize('kind', VIDEO)
+def test_packets_of_video_become_a_bag_by_the_command_that_is_told(
+        kind, tmp_path, capsys, monkeypatch):
+    encoding, wrap = VIDEO[kind]
+    path = write_mcap(tmp_path / 'a.mcap', '', encoding, [
+        ('/video', kind, wrap(data), t * SECOND // 2) for t, data in enumerate(PACKETS, 1)])
+    assert main(['inspect', str(path)]) == 1
+    said = capsys.readouterr().err
+    advice = shlex.split(said[said.index('python -m tap_ros'):said.rindex(' BAG')] + ' BAG')
+    monkeypatch.chdir(tmp_path)
+    assert main(advice[3:]) == 0
+    episode, = iter_episodes(tmp_path / 'BAG')
+    assert np.abs(episode.frames.mean((1, 2, 3)) - [39, 89, 139, 189]).max() < 3
+    assert set(np.diff(episode.stamps)) == {SECOND // 2}
+
+
+def test_other_encodings_are_named_instead_of_a_topic_to_choose(tmp_path):
+    path = write_mcap(tmp_path / 'a.mcap', 'jsonschema', 'json', [
+        (TOPIC, 'foxglove.RawImage', json.dumps({}).encode(), SECOND)])
+    with pytest.raises(RecordingError, match='encoded as json; only those of ROS') as error:
+        list(iter_episodes(path))
+    assert '--image-topic' not in str(error.value)
+
+
+@pytest.mark.parametrize('name', ['h5py', 'zarr'])
+def test_arrays_of_pictures_are_imported(name, tmp_path, capsys, monkeypatch):
+    """The libraries are stood in for; both give trees of dicts and arrays."""
+    pictures = np.random.default_rng(0).integers(0, 256, (9, 8, 12, 3), np.uint8)
+    jpeg = np.frombuffer(cv2.imencode('.jpg', pictures[0])[1], np.uint8)
+    trees = {
+        'h5py': {'data': {f'demo_{i}': {'obs': {'front': pictures[i:i + 3], 'joints': np.ones(3)}}
+                          for i in (2, 0, 1)}},
+        'zarr': {'data': {'img': np.moveaxis(pictures, -1, 1).astype(np.float32)},
+                 'meta': {'episode_ends': np.array([4, 9])}}}
+    monkeypatch.setitem(sys.modules, name, SimpleNamespace(
+        File=lambda path, mode: trees[name], open=lambda path, mode: trees[name]))
+    path = tmp_path / 'in'
+    path.mkdir() if name == 'zarr' else path.touch()
+    assert main(['import-arrays', str(path), '--out', str(tmp_path / 'bag'), '--fps', '5']) == 0
+    found = [episode.frames for episode in iter_episodes(tmp_path / 'bag')]
+    cuts = [(0, 3), (1, 4), (2, 5)] if name == 'h5py' else [(0, 4), (4, 9)]
+    for frames, (begin, end) in zip(found, cuts, strict=True):
+        np.testing.assert_array_equal(frames, pictures[begin:end])
+    trees[name] = {'left': np.stack([np.pad(jpeg, (0, 40))] * 3), 'right': pictures}
+    assert main(['import-arrays', str(path), '--out', str(tmp_path / 'b')]) == 1
+    assert '--camera: expected one of left, right' in capsys.readouterr().err
+    assert main(['import-arrays', str(path), '--out', str(tmp_path / 'b'),
+                 '--camera', 'left']) == 0
+    monkeypatch.setitem(sys.modules, name, None)
+    assert main(['import-arrays', str(path), '--out', str(tmp_path / 'c')]) == 1
+    assert f'pip install {name}' in capsys.readouterr().err
