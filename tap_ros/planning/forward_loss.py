@@ -45,76 +45,42 @@ class Windows:
         return Windows(**{name: tensor.to(device) for name, tensor in vars(self).items()})
 
 
-def read_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int],
-                 starts: np.ndarray | Sequence[int], steps: int, robot_mask: RobotMask = 'none',
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def make_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int],
+                 starts: np.ndarray | Sequence[int], steps: int, homography: torch.Tensor,
+                 mirrored: np.ndarray, orders: np.ndarray | Sequence[int],
+                 robot_mask: RobotMask = 'none') -> Windows:
     """
-    Read windows from a store.
+    Read windows and change how they look: mirrored left to right, in other colours.
 
     :param episodes: (B,) episode indices; starts (B,) first frames; steps T.
+    :param homography: (3, 3) tensor, or (E, 3, 3), one for each episode of the store.
+    :param mirrored: (B,) bool; orders (B,) index to COLOUR_ORDERS.
     :param robot_mask: see robot_mask.hidden_pixels; the episodes have masks unless it is 'none'.
-    :return: images uint8 (B, T + 1, H, W, 3), grippers (B, T + 1, 4), actions (B, T, 4), and
-        where the robot hides something, bool (B, T + 1, H, W).
+    :return: Windows; the grippers and actions of mirrored ones have x negated.
     :raises RecordingError: where gripper positions are missing.
     """
     images, grippers, actions, hidden = [], [], [], []
     for i, start in zip(episodes, starts):
-        episode = store[int(i)]
-        images.append(episode.frames[start:start + steps + 1])
-        grippers.append(episode.grippers[start:start + steps + 1])
+        episode, part = store[int(i)], slice(start, start + steps + 1)
+        images.append(episode.frames[part])
+        grippers.append(episode.grippers[part])
         actions.append(episode.actions[start:start + steps])
         if robot_mask == 'none' or episode.robot_masks is None:
             hidden.append(np.zeros(images[-1].shape[:-1], bool))
         else:
-            hidden.append(hidden_pixels(
-                episode.robot_masks[start:start + steps + 1], robot_mask))
-    grippers = np.stack(grippers).astype(np.float32)
-    if not np.isfinite(grippers).all():
-        bad = int(np.asarray(episodes)[~np.isfinite(grippers).all((1, 2))][0])
+            hidden.append(hidden_pixels(episode.robot_masks[part], robot_mask))
+    hands = np.stack(grippers).astype(np.float32)
+    if not np.isfinite(hands).all():
+        bad = int(np.asarray(episodes)[~np.isfinite(hands).all((1, 2))][0])
         raise RecordingError(
             f'/joint_states: episode {bad} lacks gripper positions; the forward model needs '
             f'{", ".join(GRIPPER_JOINTS)} at every picture')
-    return np.stack(images), grippers, np.stack(actions).astype(np.float32), np.stack(hidden)
-
-
-def draw_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int], batch_size: int,
-                 steps: int, homography: torch.Tensor, rng: np.random.Generator,
-                 augment: bool = True, robot_mask: RobotMask = 'none') -> Windows:
-    """
-    Draw a batch of windows at random and augment it.
-
-    :param episodes: episode indices to draw from, each with more than `steps` frames.
-    :param homography: (3, 3) tensor, or (E, 3, 3), one for each episode of the store.
-    :param robot_mask: see read_windows.
-    :return: Windows.
-    """
-    chosen = rng.choice(episodes, batch_size)
-    lengths = np.asarray(store.lengths)[chosen]
-    starts = (rng.random(batch_size) * (lengths - steps)).astype(int)
-    images, grippers, actions, hidden = read_windows(store, chosen, starts, steps, robot_mask)
-    mirrored = rng.random(batch_size) < 0.5 * augment
-    orders = rng.integers(len(COLOUR_ORDERS), size=batch_size) * augment
-    homography = homography.expand(len(lengths), 3, 3) if homography.ndim == 2 else (
-        homography[torch.from_numpy(chosen)])
-    return augment_windows(images, grippers, actions, hidden, homography, mirrored, orders)
-
-
-def augment_windows(images: np.ndarray, grippers: np.ndarray, actions: np.ndarray,
-                    hidden: np.ndarray, homography: torch.Tensor, mirrored: np.ndarray,
-                    orders: np.ndarray) -> Windows:
-    """
-    Mirror pictures left to right and swap their colour channels, everything else to match.
-
-    :param images: uint8 (B, T + 1, H, W, 3); grippers (B, T + 1, 4); actions (B, T, 4).
-    :param hidden: bool (B, T + 1, H, W).
-    :param homography: (3, 3) or (B, 3, 3) tensor; mirrored (B,) bool; orders (B,) index to
-        COLOUR_ORDERS.
-    :return: Windows; the grippers and actions of mirrored ones have x negated.
-    """
+    tables = homography if homography.ndim == 2 else homography[
+        torch.as_tensor(np.asarray(episodes))]
     batch = Windows(
-        to_float(images), torch.from_numpy(hidden[:, :, None]),
-        torch.from_numpy(grippers.copy()), torch.from_numpy(actions.copy()),
-        homography.expand(len(images), 3, 3).clone(), torch.from_numpy(np.asarray(mirrored)),
+        to_float(np.stack(images)), torch.from_numpy(np.stack(hidden)[:, :, None]),
+        torch.from_numpy(hands), torch.from_numpy(np.stack(actions).astype(np.float32)),
+        tables.expand(len(images), 3, 3).clone(), torch.from_numpy(np.asarray(mirrored)),
         torch.tensor([COLOUR_ORDERS[i] for i in orders]))
     batch.images = recolour(batch.images, batch.colours[:, None])
     batch.images = mirror(batch.images, batch.mirrored)
@@ -122,8 +88,25 @@ def augment_windows(images: np.ndarray, grippers: np.ndarray, actions: np.ndarra
     batch.grippers[batch.mirrored, :, 0] *= -1
     batch.actions[batch.mirrored, :, 0] *= -1
     batch.homography[batch.mirrored] = mirror_table(
-        batch.homography, images.shape[3])[batch.mirrored]
+        batch.homography, batch.images.shape[-1])[batch.mirrored]
     return batch
+
+
+def draw_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int], batch_size: int,
+                 steps: int, homography: torch.Tensor, rng: np.random.Generator,
+                 augment: bool = True, robot_mask: RobotMask = 'none') -> Windows:
+    """
+    Draw a batch of windows at random, and how they are changed.
+
+    :param episodes: episode indices to draw from, each with more than `steps` frames.
+    :param homography: see make_windows; robot_mask: likewise.
+    """
+    chosen = rng.choice(episodes, batch_size)
+    lengths = np.asarray(store.lengths)[chosen]
+    starts = (rng.random(batch_size) * (lengths - steps)).astype(int)
+    mirrored = rng.random(batch_size) < 0.5 * augment
+    orders = rng.integers(len(COLOUR_ORDERS), size=batch_size) * augment
+    return make_windows(store, chosen, starts, steps, homography, mirrored, orders, robot_mask)
 
 
 def recolour(images: torch.Tensor, colours: torch.Tensor) -> torch.Tensor:

@@ -128,42 +128,33 @@ def choose_sample(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray,
                   subgoals: Iterable['Subgoal'], seed: int = 0, limits: Limits = FULL,
                   before_plan: Callable[[], object] = lambda: None) -> list['Subgoal']:
     """
-    Take the predicted subgoals of one sample, that of least chain_cost; the first of equals.
+    Take the predicted subgoals of one sample: those whose legs the planner expects to cost least.
 
+    A leg goes to the first subgoal from what is seen, then from each predicted picture to the next
+    target, the arm standing where the plan before left it.
+
+    :param scene: mpc_inputs.Scene, what is seen now.
+    :param goal_pixels: (K, 2).
     :param subgoals: of any samples, earliest first in each.
-    :return: those of the sample taken, earliest first. The other parameters are chain_cost's.
+    :param seed: of the planner; limits: of its actions.
+    :param before_plan: called before every plan; what it raises ends the choice.
+    :return: those of the sample taken, earliest first; the first of equals.
     """
+    def cost(chain: list['Subgoal']) -> float:
+        total, now = 0.0, scene
+        for subgoal in [*chain, None]:
+            before_plan()
+            target = (mpc.goal(goal_pixels) if subgoal is None
+                      else mpc.goal(maps=subgoal.object_maps))
+            plan = mpc.plan(now, target, Memory(seed), limits)
+            total += plan.cost
+            if subgoal is not None:
+                hand = gripper_after(now.gripper, plan.actions)
+                now = Scene(subgoal.image, hand, subgoal.expected_pixels)
+        return total
+
     samples: dict[int, list[Subgoal]] = {}
     for subgoal in subgoals:
         samples.setdefault(subgoal.sample, []).append(subgoal)
     chains = list(samples.values())
-    if len(chains) == 1:
-        return chains[0]
-    return min(chains, key=lambda chain: chain_cost(
-        mpc, scene, goal_pixels, chain, seed, limits, before_plan))
-
-
-def chain_cost(mpc: VisualMPC, scene: Scene, goal_pixels: np.ndarray, chain: Iterable['Subgoal'],
-               seed: int = 0, limits: Limits = FULL,
-               before_plan: Callable[[], object] = lambda: None) -> float:
-    """
-    Sum what the planner itself expects the legs of a chain of subgoals to cost.
-
-    To the first subgoal from what is seen, then from each predicted picture to the next target,
-    the arm standing where the plan before left it.
-
-    :param scene: mpc_inputs.Scene, what is seen now.
-    :param goal_pixels: (K, 2); chain: earliest first.
-    :param seed: of the planner; limits: of its actions.
-    :param before_plan: called before every plan; what it raises ends the choice.
-    """
-    total = 0.0
-    for subgoal in [*chain, None]:
-        before_plan()
-        target = mpc.goal(goal_pixels) if subgoal is None else mpc.goal(maps=subgoal.object_maps)
-        plan = mpc.plan(scene, target, Memory(seed), limits)
-        total += plan.cost
-        if subgoal is not None:
-            hand = gripper_after(scene.gripper, plan.actions)
-            scene = Scene(subgoal.image, hand, subgoal.expected_pixels)
-    return total
+    return chains[0] if len(chains) == 1 else min(chains, key=cost)

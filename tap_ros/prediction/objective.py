@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the predictor is trained to do: from a batch to its loss."""
 
-from collections.abc import Sequence
 import contextlib
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -99,7 +98,6 @@ class Outcome:
 
     loss: torch.Tensor
     match: torch.Tensor
-    prediction: Prediction
     parts: dict[str, torch.Tensor]
     judged: dict[str, Any] | None = None
     nats: torch.Tensor | None = None
@@ -165,7 +163,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
         parts['error'] = _recursive_loss(
             networks, prediction, targets, context, measured, match, parts['error'], config, z,
             autocast)
-    return Outcome(total(parts.values()), match, prediction,
+    return Outcome(total(parts.values()), match,
                    {name: value.detach() for name, value in parts.items()}, judged,
                    None if nats is None else nats.detach())
 
@@ -263,7 +261,7 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
     batch = targets.batch
     B, T = batch.times.shape
     assert networks.recognition is not None
-    divergences, errors, predictions = [], [], []
+    divergences, errors = [], []
     measured = targets.measured(context)
     for t in range(T):
         step = torch.full_like(targets.rows, t)
@@ -274,7 +272,6 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
                 context, sample_latent(mean, log_variance, draws.posterior[:, t]))
         divergences.append(kl_divergence(mean, log_variance))
         errors.append(targets.outer_l1(prediction.image, step))
-        predictions.append(prediction)
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
     whole = (kl_weight * divergences + errors).detach()
     match = match_step(selection_errors(
@@ -282,14 +279,5 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
     nats, error = (values.gather(1, match[:, None]).mean()
                    for values in (divergences, outer_error(errors, config)))
     parts = {'kl': kl_weight * nats, 'error': error}
-    return Outcome(total(parts.values()), match, _choose(predictions, match),
+    return Outcome(total(parts.values()), match,
                    {name: value.detach() for name, value in parts.items()}, nats=nats.detach())
-
-
-def _choose(predictions: Sequence[Prediction], match: torch.Tensor) -> Prediction:
-    """Put together, for each episode, the prediction of its matched target."""
-    def pick(name: str) -> Any:
-        values = [getattr(prediction, name) for prediction in predictions]
-        return None if values[0] is None else torch.stack(values, 1)[
-            torch.arange(len(match), device=match.device), match]
-    return Prediction(*(pick(name) for name in ('image', 'flow', 'masks', 'new_pixels')))

@@ -9,7 +9,7 @@ from made_episodes import cover, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
-from tap_ros.planning.forward_loss import augment_windows, forward_loss, read_windows
+from tap_ros.planning.forward_loss import forward_loss, make_windows
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training import train
@@ -38,8 +38,8 @@ def windows(bag, robot_mask, mirrored):
     """Return windows of the third frame on, first pictures filled as FreeView does."""
     store = FilledStore(open_recordings([bag], progress=False), robot_mask,
                         filling=fill_from_past)
-    raw = read_windows(store, [0, 1], [2, 3], 4, robot_mask)
-    return augment_windows(*raw, HOMOGRAPHY, np.array([mirrored] * 2), [1, 2])
+    return make_windows(store, [0, 1], [2, 3], 4, HOMOGRAPHY, np.array([mirrored] * 2), [1, 2],
+                        robot_mask)
 
 
 def learn(batch, robot_mask='all'):

@@ -10,14 +10,13 @@ import pytest
 from safetensors.torch import load_file
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.planning.forward_loss import (
-    augment_windows,
     COLOUR_ORDERS,
     draw_arm_like,
     draw_windows,
     forward_loss,
+    make_windows,
     motion_weight,
     picture_loss,
-    read_windows,
 )
 from tap_ros.planning.forward_training import draw_step, model_config, train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
@@ -32,16 +31,17 @@ HOMOGRAPHY = torch.tensor(TABLE).view(3, 3)
 
 def windows(mirrored, order=0, seed=3, steps=4):
     store = [make_episode(seed)]
-    raw = read_windows(store, [0], [2], steps)
-    return augment_windows(*raw, HOMOGRAPHY, np.array([mirrored]), [order]), store[0]
+    return make_windows(
+        store, [0], [2], steps, HOMOGRAPHY, np.array([mirrored]), [order]), store[0]
 
 
 def test_windows_without_the_gripper_are_refused_by_the_number_of_their_episode():
     store = [make_episode(seed) for seed in (1, 2, 3)]
     store[2].grippers[3, 0] = np.nan
-    assert len(read_windows(store, [0, 1, 2], [2, 2, 4], 4)[0]) == 3
+    plain = HOMOGRAPHY, np.zeros(3, bool), [0] * 3
+    assert len(make_windows(store, [0, 1, 2], [2, 2, 4], 4, *plain).images) == 3
     with pytest.raises(RecordingError, match='episode 2 lacks gripper positions'):
-        read_windows(store, [0, 1, 2], [2, 2, 0], 4)
+        make_windows(store, [0, 1, 2], [2, 2, 0], 4, *plain)
 
 
 def test_mirrored_windows_show_objects_where_the_mirrored_table_says():

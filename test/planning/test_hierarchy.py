@@ -2,14 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of hierarchical planning: which target comes when, and how subgoals are chosen."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.planning.action_sequences import FULL, gripper_after, Limits
+from tap_ros.planning.action_sequences import gripper_after, Limits
 from tap_ros.planning.hierarchy import (
-    chain_cost,
     choose_sample,
     Itinerary,
     Target,
@@ -110,38 +108,32 @@ def small_planner():
 
 
 def test_the_subgoal_on_the_way_is_chosen_and_the_first_of_equals():
-    mpc = small_planner()
     start, goal = PLACES, PLACES + [4.0, 0.0]
     between, astray = start + [2.0, 0.0], np.array([[28.0, 28.0], [3.0, 3.0]])
-    chains = [[subgoal(astray)], [subgoal(between)], [subgoal(between)]]
-    costs = [chain_cost(mpc, scene(start), goal, chain) for chain in chains]
-    assert costs[1] == costs[2] < costs[0]
-    found = [replace(chain[0], sample=i) for i, chain in enumerate(chains)]
-    assert choose_sample(mpc, scene(start), goal, found) == found[1:2]
-    assert choose_sample(mpc, scene(start), goal, found[::-1]) == found[2:]
+    found = [subgoal(place, sample=i) for i, place in enumerate((astray, between, between))]
+    assert choose_sample(small_planner(), scene(start), goal, found) == found[1:2]
+    assert choose_sample(small_planner(), scene(start), goal, found[::-1]) == found[2:]
 
 
-def test_samples_are_judged_by_plans_with_the_seed_and_the_limits_that_are_given():
-    mpc, chain = small_planner(), [subgoal(PLACES + 2.0)]
+def test_samples_are_judged_leg_by_leg_with_the_seed_and_the_limits_that_are_given():
+    mpc, slow, plans = small_planner(), Limits(0.01, 0.02), []
 
-    def cost(seed, limits):
-        goal = mpc.goal(maps=chain[0].object_maps)
-        first = mpc.plan(scene(PLACES), goal, Memory(seed), limits)
+    def plan(seen, goal, *rest):
+        plans.append((seen, goal, rest, VisualMPC.plan(mpc, seen, goal, *rest)))
+        return plans[-1][-1]
+
+    mpc.plan = plan
+    samples = [subgoal(PLACES + 2.0 * i, i) for i in range(2)]
+    chosen = choose_sample(mpc, scene(PLACES), PLACES + 4.0, samples, 7, slow)
+    assert [rest for _, _, rest, _ in plans] == 4 * [(Memory(7), slow)]
+    costs = [sum(found.cost for *_, found in plans[i:i + 2]) for i in (0, 2)]
+    assert chosen == [samples[np.argmin(costs)]]
+    for sample, (_, to, _, first), (then, last, _, _) in zip(samples, plans[::2], plans[1::2]):
+        assert torch.equal(to.distances, mpc.goal(maps=sample.object_maps).distances)
+        assert torch.equal(last.distances, mpc.goal(PLACES + 4.0).distances)
+        assert then.image is sample.image and then.object_pixels is sample.expected_pixels
         hand = gripper_after(np.zeros(4, np.float32), first.actions)
-        seen = Scene(chain[0].image, hand, PLACES + 2.0)
-        return first.cost + mpc.plan(seen, mpc.goal(PLACES + 4.0), Memory(seed), limits).cost
-
-    slow = Limits(0.01, 0.02)
-    for seed, limits in ((0, FULL), (1, FULL), (0, slow)):
-        assert cost(seed, limits) == chain_cost(
-            mpc, scene(PLACES), PLACES + 4.0, chain, seed, limits)
-    assert len({cost(0, FULL), cost(1, FULL), cost(0, slow)}) == 3
-    given = []
-    mpc.plan = lambda seen, goal, *rest: given.append(rest) or VisualMPC.plan(
-        mpc, seen, goal, *rest)
-    samples = [subgoal(PLACES, 0), subgoal(PLACES, 1)]
-    choose_sample(mpc, scene(PLACES), PLACES + 4.0, samples, 7, slow)
-    assert given == 4 * [(Memory(7), slow)]
+        np.testing.assert_array_equal(then.gripper, hand)
 
 
 def test_subgoals_are_divided_by_their_sample_and_one_sample_needs_no_plan():

@@ -8,13 +8,12 @@ from made_episodes import cover, move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import RecordingError
-from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import Augmentation, make_batch, Sampling
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import discriminators_loss, Draws, Networks, predictor_loss
 from tap_ros.prediction.selection import Targets
-from tap_ros.prediction.training import held_out_scores, train
+from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import ObjectiveSettings, TrainingConfig
 from tap_ros.prediction.training_networks import Discriminator, Recognition
 from tap_ros.recording.cache import open_recordings
@@ -106,24 +105,6 @@ def test_pixels_that_are_never_free_have_no_gradient(bags):
     assert touched[batch.seen].float().mean() > 0.99
 
 
-def test_progress_does_not_count_the_robot(bags):
-    batch, _ = batches(bags, 'all')
-    targets = Targets(batch, None, ObjectiveSettings())
-    bare = open_recordings([bags[0]], progress=False)
-    scene = [make_episode(i) for i in CHOSEN]
-    errors = targets.errors(targets.measured(to_float(batch.context)))
-    seen = batch.seen.numpy()
-    for b, episode in enumerate(scene):
-        free = np.where(seen[b][..., None], episode.frames, 0)
-        # Objects may be filled with where they were; the robot's noise would be far more.
-        expected = np.abs(free[2].astype(int) - free[0]).mean() / 255
-        assert errors[b, 0, 0].item() == pytest.approx(expected, abs=0.02)
-    plain = make_batch(bare, CHOSEN, Sampling(margin=1))
-    with_robot = Targets(plain, None, ObjectiveSettings()).errors(to_float(plain.context))
-    assert (with_robot[plain.valid[:, None].expand_as(with_robot)].min()
-            > 2 * errors[plain.valid[:, None].expand_as(errors)].min())
-
-
 @pytest.mark.parametrize('share', [0.0, 0.5, 1.0])
 def test_context_pictures_are_filled_when_asked_to(bags, share):
     store = open_recordings([bags[0]], progress=False)
@@ -137,22 +118,6 @@ def test_context_pictures_are_filled_when_asked_to(bags, share):
     for row in np.flatnonzero(~shown):
         assert (batch.context[row, 0].numpy() == store.frames(chosen[row])[0]).all()
     assert (batch.bare[:, :, -2:, -2:] == 0).all() and (batch.targets[:, :, -2:, -2:] == 0).all()
-
-
-def test_held_out_scores_do_not_count_what_is_never_free(bags):
-    batch, _ = batches(bags, 'all')
-    config = ObjectiveSettings(**method_fields('min-wo-gan'), outer_power=1.0)
-    network = networks(config).predictor.eval()
-    expected = held_out_scores(network, [batch], config)
-    hook = network.register_forward_hook(lambda module, args, output: replace_base(output))
-    assert held_out_scores(network, [batch], config) == expected
-    hook.remove()
-
-
-def replace_base(prediction):
-    """Paint over the base in a prediction."""
-    prediction.image[:, :, -2:, -2:] = 1
-    return prediction
 
 
 def test_weights_say_their_mask_and_recordings_without_masks_are_refused(bags, bag, tmp_path):

@@ -324,33 +324,6 @@ def test_the_preference_of_a_level_lies_between_its_own_inputs(monkeypatch):
     assert seen[1].argmax(1).tolist() == [2] * 4  # 3.5 of 1 to 6; the first of two
 
 
-def brightening(*shares):
-    """Return a batch of one episode whose frames show these shares of the way to the goal."""
-    start, goal, T = torch.zeros(8, 8, 3), torch.full((8, 8, 3), 200), len(shares)
-    targets = (start + torch.tensor(shares)[:, None, None, None] * (goal - start))[None].byte()
-    column = torch.ones(1, 1, dtype=torch.int64)
-    return Batch(torch.stack([start, goal])[None].byte(), targets, torch.arange(1, T + 1)[None],
-                 column, column * T, column * (T + 1), torch.ones(1, T, dtype=torch.bool))
-
-
-def test_progress_matches_the_frame_half_way_in_the_pictures():
-    """An episode that is done late: of targets that fit nearly alike, the one half way wins."""
-    batch = brightening(0.02, 0.04, 0.06, 0.08, 0.1, 0.5, 0.9)
-    frames = to_float(batch.targets)
-    image = (frames[:, 3] + frames[:, 5]) / 2  # as near to either
-    matches = {kind: predictor_loss(showing(image), batch, None, replace(
-        CONFIG, selection=kind)).match.item() for kind in ('absolute', 'progress')}
-    assert matches == {'absolute': 4, 'progress': 5}
-
-
-def test_a_prediction_that_copies_the_start_is_not_matched_to_frames_that_equal_it():
-    batch = brightening(0.0, 0.0, 0.4, 0.7, 1.0)  # it waits first
-    config = replace(CONFIG, selection='progress')
-    matches = [predictor_loss(showing(to_float(batch.targets[:, 0])), batch, None, replace(
-        config, progress_margin=margin)).match.item() for margin in (0.0, 0.5)]
-    assert matches == [0, 2]
-
-
 def test_padding_changes_no_selection_error():
     whole, copy_error = make_batch(T=6), torch.rand(4, 2, 6)
     padded = replace(whole, valid=whole.times <= 4)
@@ -361,3 +334,22 @@ def test_padding_changes_no_selection_error():
         found = selection_errors(torch.ones(4, 6), lambda: copy_error, padded, config)[:, :4]
         expected = selection_errors(torch.ones(4, 4), lambda: copy_error[..., :4], short, config)
         assert found.allclose(expected), kind
+
+
+def test_progress_prefers_half_way_in_the_pictures_and_leaves_out_what_shows_an_input():
+    def matches(shares, image, **settings):
+        start, goal, T = torch.zeros(8, 8, 3), torch.full((8, 8, 3), 200), len(shares)
+        targets = start + torch.tensor(shares)[:, None, None, None] * (goal - start)
+        column, frames = torch.ones(1, 1, dtype=torch.int64), to_float(targets.byte())
+        batch = Batch(torch.stack([start, goal])[None].byte(), targets[None].byte(),
+                      torch.arange(1, T + 1)[None], column, column * T, column * (T + 1),
+                      torch.ones(1, T, dtype=torch.bool))
+        return predictor_loss(showing(image(frames)[None]), batch, None, replace(
+            CONFIG, **settings)).match.item()
+
+    late = (0.02, 0.04, 0.06, 0.08, 0.1, 0.5, 0.9)  # of targets that fit alike the one half way
+    assert [matches(late, lambda frames: (frames[3] + frames[5]) / 2, selection=kind)
+            for kind in ('absolute', 'progress')] == [4, 5]
+    waiting = (0.0, 0.0, 0.4, 0.7, 1.0)
+    assert [matches(waiting, lambda frames: frames[0], selection='progress',
+                    progress_margin=margin) for margin in (0.0, 0.5)] == [0, 2]

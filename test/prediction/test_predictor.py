@@ -91,14 +91,6 @@ def test_going_forward_each_prediction_is_the_next_context():
     assert np.abs(chain[2].expected_pixels - chain[0].expected_pixels).max() > 0.2
 
 
-def test_what_the_weights_do_not_take_or_lack_is_refused(predictor, forward):
-    for goal in ({'goal': GOAL}, {'goal_pixels': GOAL_PIXELS}):
-        with pytest.raises(ConfigError, match='goal: these weights predict forward'):
-            forward.predict(START, start_pixels=START_PIXELS, **goal)
-    with pytest.raises(ConfigError, match='goal: these weights predict between'):
-        predictor.predict(START)
-
-
 @pytest.mark.parametrize('num_context', [1, 2])
 def test_samples_differ_by_z_repeat_by_seed_and_say_where_they_belong(num_context):
     predictor = SubgoalPredictor(lively_network(num_context=num_context, latent_size=8))

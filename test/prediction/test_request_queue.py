@@ -152,24 +152,6 @@ def test_what_is_prepared_is_prepared_in_the_thread_that_works():
         RequestQueue(fail, len, 1, 1, 1)
 
 
-def test_an_answer_that_cannot_be_given_leaves_the_others_theirs(capsys):
-    answers, done = [], threading.Event()
-
-    def fail(_):
-        raise OSError('the client has gone')
-
-    def keep(found):
-        answers.append(found)
-        done.set()
-
-    queue = RequestQueue(lambda: lambda batch: batch, lambda one: 1, 10, 8, 100)
-    queue.put(1, fail)
-    queue.put(2, keep)
-    assert done.wait(TIMEOUT) and answers == [2]
-    queue.close()
-    assert 'the client has gone' in capsys.readouterr().err
-
-
 def test_an_interrupted_start_leaves_no_thread_at_work():
     prepared, threads = threading.Event(), []
 

@@ -181,27 +181,6 @@ def test_configurations_that_cannot_be_are_refused_in_one_line(path, tmp_path):
             assert load != load_network or name.split('\n')[0] in said, name
 
 
-def test_a_description_that_is_none_is_refused(path):
-    tensors, _ = load_tensors(path)
-    for text in ('', '{', '[]', 'null', '3', '[' * 200_000, '{"a":' * 200_000, '\ud800'):
-        path.write_bytes(safetensors_of(tensors, {
-            'format': 'tap_ros 2', 'about': text, 'sha256': '0' * 64}))
-        refusal(load_network, path)
-
-
-def safetensors_of(tensors, metadata):
-    """Return a file's bytes, with a header of our own writing."""
-    entries, data = {'__metadata__': metadata}, b''
-    for name, tensor in tensors.items():
-        raw = tensor.reshape(-1).view(torch.uint8).numpy().tobytes()
-        kind = {torch.float32: 'F32', torch.int64: 'I64'}[tensor.dtype]
-        entries[name] = {'dtype': kind, 'shape': list(tensor.shape),
-                         'data_offsets': [len(data), len(data) + len(raw)]}
-        data += raw
-    header = json.dumps(entries).encode()
-    return len(header).to_bytes(8, 'little') + header + data
-
-
 def test_what_is_no_file_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / 'fifo')
     (tmp_path / 'memory').symlink_to('/proc/self/mem')  # whoever reads it, it cannot be
