@@ -22,14 +22,15 @@ $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 # Two processes share two cores best when each takes one.
 paper: export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo explore test paper faults build lint bench ros2 clean
+.PHONY: help demo explore test test-all paper faults build lint bench ros2 clean
 
 help:
 	@echo 'make demo    push objects to where a goal picture shows them, predict a stack'
 	@echo '             SCENES=20: that many of each task; ARGS=...: more options of the demo'
 	@echo 'make explore a page in the browser: move objects of the goal picture, see what is predicted'
 	@echo '             and planned, push; ARGS="--task push3"'
-	@echo 'make test    all tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'
+	@echo 'make test    the tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'
+	@echo 'make test-all also the tests that take minutes each'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
 	@echo 'make faults  inject every fault into real nodes and files, in docs/results: five hours;'
@@ -51,6 +52,9 @@ explore: build
 	@$(ENTER); $(DOMAIN); python -m tap_ros explore $(ARGS)
 
 test: build
+	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) -m 'not minutes' $(ARGS)
+
+test-all: build
 	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) $(ARGS)
 
 paper: build

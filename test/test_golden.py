@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_digests_are_as_before():
     run = subprocess.run([sys.executable, ROOT / 'scripts' / 'golden.py'], cwd=ROOT, text=True,
                          capture_output=True)

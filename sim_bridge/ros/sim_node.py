@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulator as a ROS node: camera, objects and clock out, twist commands in."""
 
+from collections.abc import Callable
 from importlib.util import find_spec
 import math
 import sys
@@ -85,11 +86,12 @@ class SimNode(Node):
         self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
         self._episode = self.create_publisher(Episode, 'episode', STREAM)
         # Subscribed before the twist, so that of two commands sent together it is taken first.
-        for kind, topic, callback, qos in (
-                (Float64, 'gripper/command', self._on_gripper, STREAM),
-                (TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM),
-                (Float64, 'arm/command_timeout', self._on_timeout, LATCHED)):
-            self.create_subscription(kind, topic, callback, qos)
+        subscriptions: list[tuple[Any, str, Callable[..., None], Any]] = [
+            (Float64, 'gripper/command', self._on_gripper, STREAM),
+            (TwistStamped, 'arm/delta_twist_cmds', self._on_twist, STREAM),
+            (Float64, 'arm/command_timeout', self._on_timeout, LATCHED)]
+        for subscription in subscriptions:
+            self.create_subscription(*subscription)
         self._reset(task, self.params['seed'], False)
         for kind, name, answer in ((ResetScene, 'sim/reset', self._on_reset),
                                    (SetGoal, 'sim/set_goal', self._on_set_goal),

@@ -9,6 +9,7 @@ episode ends when the last block is let go: frames after that would show the goa
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -77,7 +78,7 @@ class StackTask(Task):
         """Act until the last block is let go; the outcome is that after SETTLE_STEPS more."""
         mover = PickAndPlace(table, rng)
         plans = (plan for k in scene.order
-                 for plan in mover.move(k, lambda below=k - 1: table.object_poses()[below, :3]))
+                 for plan in mover.move(k, partial(_origin, table, k - 1)))
         observations, actions, _ = carry_out(
             table, self.succeeds, first, plans, how.num_frames or self.num_frames)
         for _ in range(SETTLE_STEPS):
@@ -186,3 +187,8 @@ class PickAndPlace:
 def on_table(place: np.ndarray) -> np.ndarray:
     """Return the origin (3,) of what would be below an object on the table at (2,) m."""
     return np.append(place, -HALF_HEIGHT)
+
+
+def _origin(table: Table, k: int) -> np.ndarray:
+    """Return where the origin of object k is now, (3,) m."""
+    return table.object_poses()[k, :3]

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
 from tap_ros import plugins
-from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE
+from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM
 from tap_ros.errors import ConfigError, KinematicsError
 from tap_ros.robots.arm import find_joints, get_arm, known_arms, Mount, TIP_FRAME
 from tap_ros.robots.description import robot_description
-from tap_ros.robots.silhouette import Body, draw_mask, PinholeCamera
 from tap_ros.robots.ur10e import inverse, UR10E
 from tap_ros.robots.urdf import read_urdf
 
@@ -72,34 +71,17 @@ def test_urdf_transforms_and_kinematics_agree(arm):
             np.testing.assert_allclose(pose, wanted[name], atol=1e-12, err_msg=name)
 
 
-def seen_and_drawn(name):
-    """Return the masks of the simulator, and those that the URDF and the joints tell."""
-    simulator, arm = Simulator('push2', 64, 'arm', arm=name), get_arm(name)
-    robot = read_urdf(robot_description(arm), 'own')
-    seen = [simulator.reset(seed) for seed in range(3)]
-    view = PinholeCamera(simulator.camera_matrix, (64, 64), simulator.camera_pose)
-    drawn = []
-    for one in seen:
-        poses = robot.poses(dict(zip(arm.joints, one.arm_joints)))
-        drawn.append(draw_mask([
-            Body(s.corners @ poses[s.link][:3, :3].T + poses[s.link][:3, 3], ROBOT_MASK_ARM)
-            for s in robot.shapes], view, 1))
-    simulator.close()
-    return [one.robot_mask for one in seen], drawn
-
-
 def test_another_package_adds_an_arm_in_a_few_lines(monkeypatch):
     taller = replace(UR10E, name='taller', mount=replace(UR10E.mount, position=(0.0, 0.7, 0.1)))
     monkeypatch.setattr(plugins, 'taller', taller, raising=False)
     monkeypatch.setitem(plugins.BUILT_IN['tap_ros.arms'], 'taller', 'tap_ros.plugins:taller')
-    masks = {name: seen_and_drawn(name) for name in ('panda', 'taller', 'ur10e')}
-    for name, (seen, drawn) in masks.items():
-        for true, mask in zip(seen, drawn):
-            assert (true == ROBOT_MASK_ARM).mean() > 0.02, name
-            # But for shadows, which the mask of the URDF was not asked for.
-            covered = (mask == ROBOT_MASK_ARM)[true == ROBOT_MASK_ARM].mean()
-            assert covered > 0.5 and (mask == ROBOT_MASK_FREE).mean() > 0.6, (name, covered)
-    assert (masks['taller'][0][0] != masks['ur10e'][0][0]).any()
+    masks = []
+    for name in ('panda', 'taller', 'ur10e'):
+        simulator = Simulator('push2', 64, 'arm', arm=name)
+        masks.append(simulator.reset(0).robot_mask)
+        simulator.close()
+        assert (masks[-1] == ROBOT_MASK_ARM).mean() > 0.02, name
+    assert (masks[1] != masks[2]).any()
     with pytest.raises(ConfigError, match="did you mean 'panda'"):
         Simulator(arm='pandas')
 

@@ -112,7 +112,7 @@ def test_files_depend_on_nothing_but_the_settings(whole, tmp_path):
     assert contents(folder) == contents(whole)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_files_do_not_depend_on_the_engine(whole, tmp_path, monkeypatch):
     pytest.importorskip('ray')
     monkeypatch.setenv('RAY_ADDRESS', '127.0.0.1:1')  # a cluster that was not asked for
