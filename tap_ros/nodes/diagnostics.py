@@ -131,7 +131,8 @@ class Diagnostics:
         silent = {topic for topic, source in self._inputs.items()
                   if now - max(source.newest, self._begun) > SILENT_SECONDS and (
                       source.max_age_s < math.inf or not source.count and topic in self._expected)}
-        types = {one.topic_name: one.msg_type for one in list(self._node.subscriptions)}
+        types: dict[str, Any] = {
+            one.topic_name: one.msg_type for one in list(self._node.subscriptions)}
         for topic in sorted(silent - self._told):
             why = why_silent(self._node, topic, types.get(topic))
             self._node.get_logger().warning(

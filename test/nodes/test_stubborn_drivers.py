@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""visual_mpc_node with an arm that refuses, and with drivers that repeat one stamp."""
+"""visual_mpc_node with an arm that refuses, and drivers that are late, silent or repeat."""
 
 import time
 
@@ -29,12 +29,14 @@ class Rig:
     """
     A planner, and camera, objects and arm of the test's own, which publish ten times a second.
 
-    :ivar frozen: names of topics that repeat one stamp; clock: whether one says so.
+    :ivar frozen: topics that repeat one stamp; clock: whether one says so; silent: topics.
     :ivar refuses: whether the arm refuses every command.
+    :ivar joints_at: seconds from the picture at which the two joint states beside it are stamped.
     """
 
     def __init__(self, client):
-        self.frozen, self.clock, self.refuses, self.twists = (), False, False, []
+        self.twists = []
+        self.behave()
         self._publishers = {topic: client.create_publisher(kind, f'stubborn/{topic}', STREAM)
                             for topic, kind in (
                                 ('clock', Clock), ('joint_states', JointState),
@@ -42,7 +44,6 @@ class Rig:
         self._refused = client.create_publisher(CommandRefused, 'stubborn/arm/refused', STREAM)
         client.create_subscription(
             TwistStamped, 'stubborn/arm/delta_twist_cmds', self._on_twist, STREAM)
-        self._begun = time.time_ns()
         client.create_timer(0.1, self._publish)
         self.planner = LocalNode(VisualMpcNode, '/stubborn', num_threads=4, image_timeout=1.5)
         self._action = ActionClient(client, ReachGoal, 'stubborn/reach_goal')
@@ -50,18 +51,28 @@ class Rig:
         self.goal = encode_objects(['cup'], [(40, 40)], np.zeros((1, 7)), to_stamp(1), 'world',
                                    ObjectStates.SOURCE_TRACKED)
 
+    def behave(self, frozen=(), clock=False, silent=(), refuses=False, joints_at=(-0.007, 0.003)):
+        self.frozen, self.clock, self.silent, self.refuses = frozen, clock, silent, refuses
+        self.joints_at, self._begun = joints_at, time.time_ns()
+
     def _publish(self):
         now = time.time_ns()
         if self.clock:
             self._publishers['clock'].publish(Clock(clock=to_stamp(self._begun)))
+        for offset in () if 'joint_states' in self.silent else self.joints_at:
+            stamp = (self._begun if 'joint_states' in self.frozen else now) + int(1e9 * offset)
+            for state in (encode_joints([0, 0, 0.1, 0], to_stamp(stamp), 'world'),
+                          JointState(name=['finger_joint'], position=[0.3])):  # another driver's
+                state.header.stamp = to_stamp(stamp)
+                self._publishers['joint_states'].publish(state)
         for topic, encode in (
-                ('joint_states', lambda at: encode_joints([0, 0, 0.1, 0], at, 'world')),
                 ('objects', lambda at: encode_objects(
                     ['cup'], [(20, 20)], np.zeros((1, 7)), at, 'world',
                     ObjectStates.SOURCE_TRACKED)),
                 ('camera/image_raw', lambda at: encode_image(PICTURE, at, 'eye'))):
             stamp = self._begun if topic in self.frozen else now
-            self._publishers[topic].publish(encode(to_stamp(stamp)))
+            if topic not in self.silent:
+                self._publishers[topic].publish(encode(to_stamp(stamp)))
 
     def _on_twist(self, message):
         self.twists.append(message)
@@ -71,11 +82,12 @@ class Rig:
     def moves(self):
         return sum(1 for twist in list(self.twists) if to_nanoseconds(twist.header.stamp))
 
-    def reach(self, **fields):
+    def reach(self, on_feedback=None, **fields):
         """Pursue a goal to its end; return status and result once the arm stands."""
+        time.sleep(0.3)
         self.twists.clear()
         goal = ReachGoal.Goal(mode='direct', goal_objects=self.goal, **fields)
-        found = wait_for_result(send_goal(self._action, goal, 30), 100)
+        found = wait_for_result(send_goal(self._action, goal, 30, on_feedback), 100)
         assert until(lambda: self.twists and not to_nanoseconds(self.twists[-1].header.stamp), 5)
         return found
 
@@ -90,12 +102,12 @@ def rig():
 
 
 def test_an_arm_that_refuses_everything_ends_the_goal_and_the_next_one_is_served(rig):
-    rig.refuses = True
+    rig.behave(refuses=True)
     status, result = rig.reach(step_budget=3)
-    rig.refuses = False
     assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
     assert f'{MOST_REFUSED} commands in a row' in result.message
     assert 'emergency stop' in result.message and rig.moves() == MOST_REFUSED
+    rig.behave()
     status, result = rig.reach(step_budget=2)
     assert status == GoalStatus.STATUS_SUCCEEDED and result.steps == rig.moves() == 2
 
@@ -103,13 +115,25 @@ def test_an_arm_that_refuses_everything_ends_the_goal_and_the_next_one_is_served
 def test_drivers_that_repeat_one_stamp_move_nothing_unless_a_clock_stands_still(rig):
     everything = 'joint_states', 'objects', 'camera/image_raw'
     for frozen in (everything, everything[2:], everything[:1]):
-        rig.frozen = frozen
-        time.sleep(0.5)
+        rig.behave(frozen)
         status, result = rig.reach(step_budget=2)
         assert status == GoalStatus.STATUS_ABORTED and rig.moves() == 0, result.message
-        rig._begun = time.time_ns()
-    rig.frozen, rig.clock = everything, True
-    time.sleep(0.5)
-    status, result = rig.reach(step_budget=1)
-    assert rig.moves() == 1, result.message
-    rig.frozen, rig.clock = (), False
+    rig.behave(everything, clock=True, joints_at=(0,))
+    rig.reach(step_budget=1)
+    assert rig.moves() == 1
+
+
+def test_joints_of_another_time_than_the_picture_move_nothing(rig):
+    rig.behave(joints_at=(-5.0, -4.99))
+    status, result = rig.reach(step_budget=2)
+    assert status == GoalStatus.STATUS_ABORTED and rig.moves() == 0
+    assert 'older than the picture' in result.message and '/joint_states' in result.message
+
+
+def test_an_input_that_falls_silent_stops_the_arm(rig):
+    for topic in ('joint_states', 'objects', 'camera/image_raw'):
+        rig.behave()
+        status, result = rig.reach(
+            lambda feedback, topic=topic: rig.behave(silent=(topic,)), step_budget=40)
+        assert status == GoalStatus.STATUS_ABORTED and topic in result.message, result.message
+        assert 1 <= rig.moves() == result.steps < 40

@@ -59,7 +59,8 @@ class RobotMaskNode(Node):
         self._robot: Robot | None = None
         self._diagnostics = Diagnostics(self, {
             'camera/camera_info': STALE_S, 'joint_states': STALE_S,
-            'robot_description': math.inf})
+            'robot_description': math.inf},
+            expected=[] if self.params['urdf'] else ['robot_description'])
         self._masks = self.create_publisher(Image, 'camera/robot_mask', STREAM)
         subscriptions = [
             AdaptiveSubscription(self, JointState, 'joint_states', self._on_joints, STREAM),
