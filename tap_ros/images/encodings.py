@@ -25,15 +25,17 @@ class Encoding:
     How the pixels of an encoding become rgb.
 
     :param pixel_bytes: bytes of a pixel.
-    :param to_rgb: takes uint8 (H, W, pixel_bytes), contiguous; returns uint8 (H, W, 3).
+    :param to_rgb: takes uint8 (H * planes, W, pixel_bytes), contiguous; returns uint8 (H, W, 3).
     :param block: (height, width) in pixels; a picture has whole blocks.
     :param least: pixels that a side has at least.
+    :param planes: rows of data for each row of pixels, as colours may stand behind the greys.
     """
 
     pixel_bytes: int
     to_rgb: Callable[[np.ndarray], np.ndarray]
     block: tuple[int, int] = (1, 1)
     least: int = 1
+    planes: float = 1
 
 
 def _channels(size: int, *order: int) -> Encoding:
@@ -44,11 +46,22 @@ def _channels(size: int, *order: int) -> Encoding:
 
 
 def _yuv(code: str) -> Encoding:
-    """Return an encoding of two pixels that share their colour, by its code in cv2."""
+    """Return an encoding whose pixels share their colour by two or four, by its code in cv2."""
     def to_rgb(pixels: np.ndarray) -> np.ndarray:
         import cv2  # here, as --help of training does without
         return cv2.cvtColor(pixels, getattr(cv2, f'COLOR_YUV2RGB_{code}'))
-    return Encoding(2, to_rgb, (1, 2))
+    if code in ('UYVY', 'YUY2'):
+        return Encoding(2, to_rgb, (1, 2))
+    return Encoding(1, to_rgb, (2, 2), planes=1.5)
+
+
+def _nv24() -> Encoding:
+    """Return greys with a plane of colours of the same size, of which every fourth counts."""
+    def to_rgb(pixels: np.ndarray) -> np.ndarray:
+        height, width = len(pixels) // 3, pixels.shape[1]
+        colours = pixels[height:].reshape(height, width, 2)[::2, ::2].reshape(-1, width, 1)
+        return ENCODINGS['nv12'].to_rgb(np.concatenate([pixels[:height], colours]))
+    return Encoding(1, to_rgb, (2, 2), planes=3)
 
 
 def _bayer(code: str) -> Encoding:
@@ -63,8 +76,12 @@ ENCODINGS = {
     'rgb8': _channels(3, 0, 1, 2), 'bgr8': _channels(3, 2, 1, 0),
     'rgba8': _channels(4, 0, 1, 2), 'bgra8': _channels(4, 2, 1, 0),
     'mono8': _channels(1, 0, 0, 0),
+    # What cv_bridge calls pictures of OpenCV, whose order is blue, green, red.
+    '8UC1': _channels(1, 0, 0, 0), '8UC3': _channels(3, 2, 1, 0), '8UC4': _channels(4, 2, 1, 0),
     'yuv422': _yuv('UYVY'), 'uyvy': _yuv('UYVY'),
     'yuv422_yuy2': _yuv('YUY2'), 'yuyv': _yuv('YUY2'),
+    'nv12': _yuv('NV12'), 'nv21': _yuv('NV21'), 'nv24': _nv24(),
+    'i420': _yuv('I420'),
     'bayer_rggb8': _bayer('BG'), 'bayer_bggr8': _bayer('RG'), 'bayer_gbrg8': _bayer('GR'),
     'bayer_grbg8': _bayer('GB')}
 _DEEP = re.compile(r'(mono|rgb|bgr|rgba|bgra|bayer_[rgb]{4})16|(16|32|64)[US FC]+\d*')
@@ -84,19 +101,20 @@ def find_encoding(name: str) -> Encoding:
         why = (' (it has more than 8 bits a channel, as depth cameras have; record the colour '
                'camera, or let its driver send 8 bits)')
     raise ImageError(f"encoding '{escaped(name, 40)}' cannot be used{why}; valid encodings: "
-                     f'{", ".join(ENCODINGS)}')
+                     f'{", ".join(ENCODINGS)}; let the driver send one of them')
 
 
 def to_rgb(pixels: np.ndarray, name: str) -> np.ndarray:
     """
     Turn raw pixels into a picture.
 
-    :param pixels: uint8 (H, W, pixel_bytes of the encoding).
+    :param pixels: uint8 (H * planes, W, pixel_bytes of the encoding).
     :param name: one of ENCODINGS.
     :return: uint8 (H, W, 3) rgb, contiguous.
     :raises ImageError: for a size that the encoding does not allow.
     """
-    encoding, (height, width) = ENCODINGS[name], pixels.shape[:2]
+    encoding, (rows, width) = ENCODINGS[name], pixels.shape[:2]
+    height = int(rows / encoding.planes)
     if (height % encoding.block[0] or width % encoding.block[1]
             or min(height, width) < encoding.least):
         raise ImageError(f'{width}x{height} pixels of encoding {name}; it comes in blocks of '

@@ -46,9 +46,9 @@ def decode_image(message: Any, name: str = '', size: Sequence[int] | None = None
                 raise ImageError('is empty; send a whole image')
             image = decompress(np.frombuffer(message.data, np.uint8), message.format)
         else:
-            channels = find_encoding(message.encoding).pixel_bytes
-            image = to_rgb(_rows(message, channels).reshape(
-                message.height, message.width, channels), message.encoding)
+            encoding = find_encoding(message.encoding)
+            image = to_rgb(_rows(message, encoding.pixel_bytes, encoding.planes).reshape(
+                -1, message.width, encoding.pixel_bytes), message.encoding)
     if resize and size is not None and image.shape[:2] != tuple(size):
         return resize_image(image, size)
     return check_image(image, name, size)
@@ -195,8 +195,8 @@ def _check_kind(message: Any, encoding: str, size: Sequence[int] | None, like: s
                          f'got {message.width}x{message.height}')
 
 
-def _rows(message: Any, bytes_per_pixel: int) -> np.ndarray:
-    """Check the layout; return uint8 (height, width * bytes_per_pixel) without padding."""
+def _rows(message: Any, bytes_per_pixel: int, planes: float = 1) -> np.ndarray:
+    """Check the layout; return uint8 (rows, width * bytes_per_pixel) without padding."""
     height, width, step = message.height, message.width, message.step
     _check_length(message)
     if height == 0 or width == 0:
@@ -206,11 +206,14 @@ def _rows(message: Any, bytes_per_pixel: int) -> np.ndarray:
         raise ImageError(
             f'step is {step} bytes, but {width} pixels of {message.encoding} take {row_bytes}; '
             'step must be at least that')
-    if len(message.data) != step * height:
+    rows = int(height * planes)
+    if len(message.data) == step * height and height % int(2 * planes) == 0:
+        rows = height  # some drivers count all rows of planes
+    if len(message.data) != step * rows:
         raise ImageError(
             f'data has {len(message.data)} bytes, expected step * height = '
-            f'{step} * {height} = {step * height}')
-    return np.frombuffer(message.data, np.uint8).reshape(height, step)[:, :row_bytes]
+            f'{step} * {rows} = {step * rows}')
+    return np.frombuffer(message.data, np.uint8).reshape(rows, step)[:, :row_bytes]
 
 
 def _check_length(message: Any) -> None:

@@ -15,6 +15,7 @@ import warnings
 import numpy as np
 from tap_ros.messages.joints import positions_at
 from tap_ros.messages.stamps import MAX_GAP
+from tap_ros.recording.clocks import put_right
 from tap_ros.recording.columns import Columns, join, NAMES, Track
 from tap_ros.recording.damage import FAR, seconds
 from tap_ros.recording.episode import Episode, RecordingWarning
@@ -111,14 +112,9 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     """
     tracks, names, marks = join(parts)
     gaps = _gaps(parts)
-    tracks = {name: track.take(np.argsort(track.log, kind='stable'))
-              for name, track in tracks.items()}
-    frame = tracks['frame']
-    if len(frame) > 1 and not frame.stamp.any():
-        frame.stamp = frame.log
     tracks['twist'] = _without_stops(tracks['twist'])
-    for name in ('twist', 'joint', 'arm', 'object'):
-        _stamp_unstamped(tracks[name], frame)
+    tracks = put_right(tracks, parts[0].source, parts[0].topics)
+    frame = tracks['frame']
     spans = read_spans(frame, tracks['mark'], marks, gaps, reading)
     owner = _owner(spans, frame, gaps, parts)
     order = np.lexsort((frame.stamp, owner))
@@ -248,14 +244,6 @@ def _without_stops(twist: Track) -> Track:
     """
     stops = (twist.stamp == 0) & ~twist.picked().any(1)
     return twist.take(np.flatnonzero(~stops)) if twist.stamp.any() else twist
-
-
-def _stamp_unstamped(track: Track, frame: Track) -> None:
-    """Give messages without a stamp that of the newest frame logged before."""
-    if len(frame) and (track.stamp == 0).any():
-        newest = np.searchsorted(frame.log, track.log, 'right') - 1
-        track.stamp = np.where(
-            track.stamp == 0, frame.stamp[np.maximum(newest, 0)], track.stamp)
 
 
 def _actions(tracks: dict[str, Track], clock: _Clock) -> np.ndarray:

@@ -14,7 +14,7 @@ from tap_ros.images.crop import CENTRE, check_trainable
 from tap_ros.recording.columns import Columns, first_size
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.foreign import open_file, recognise
-from tap_ros.recording.metadata import bag_files, FILE_NAME
+from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number
 from tap_ros.recording.reading import Reading, trained_reading
 from tap_ros.recording.topic_choice import find_topics, list_paths
 from tap_ros.text import escaped
@@ -136,4 +136,4 @@ def warn_of_damage(part: Columns) -> None:
 
 
 def _is_bag(path: Path) -> bool:
-    return path.is_dir() and ((path / FILE_NAME).exists() or any(path.glob('*.mcap')))
+    return path.is_dir() and bool((path / FILE_NAME).exists() or files_by_number(path))

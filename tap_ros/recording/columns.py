@@ -65,6 +65,7 @@ class Columns:
     marks: list[Mark] = field(default_factory=list)  # by row of mark
     damage: list[str] = field(default_factory=list)  # lines: what could not be used, and why
     shapes: dict[str, list[int]] = field(default_factory=dict)  # of pictures, by name
+    topics: dict[str, str] = field(default_factory=dict)  # by name
 
     def describe(self) -> str:
         """Return all that is not an array as JSON text."""
@@ -130,7 +131,8 @@ class _Decoder:
                  reading: Reading) -> None:
         self.file, self.found, self.write, self.reading = file, found, write, reading
         self.size = size  # (H, W) that pictures must have, by _alike
-        self.columns = Columns(str(file.path))
+        self.columns = Columns(
+            str(file.path), topics={name: topic for topic, name in found.items()})
         self.sizes: Counter[tuple[int, int]] = Counter()  # (H, W) -> camera images
         self.losses: list[Loss] = []
         self.order = 0  # messages so far

@@ -37,9 +37,6 @@ from tap_ros.text import escaped
 import zstandard
 
 MAX_CHUNK_BYTES = 2**28  # a chunk that claims to unpack to more is refused
-# Bounds on what a file may unpack to, far above what recordings of its size hold.
-FREE_BYTES, BYTES_PER_BYTE = 2**28, 1024
-FREE_RECORDS, BYTES_PER_RECORD = 2**17, 4
 OTHERS = 0x80  # opcodes from here on belong to others, and are skipped
 RECORD = struct.Struct('<BQ')  # opcode, length of what follows
 _MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log time, publish time
@@ -76,7 +73,7 @@ class McapFile:
 
     def __init__(self, path: str | Path) -> None:
         self.path = path
-        self._map = _map(path)
+        self._map = _bytes_of(path)
         self._data, self.size = memoryview(self._map), len(self._map)
         self.channels: dict[int, Channel] = {}
         self.losses: list[Loss] = []
@@ -84,8 +81,6 @@ class McapFile:
         self._pending: list[tuple[str, str, int]] = []  # losses before the next message
         self._newest: int | None = None  # log time so far
         self._counts: Counter[int] = Counter()  # messages read by channel
-        self._bytes_left = FREE_BYTES + BYTES_PER_BYTE * self.size
-        self._records_left = self._most_records = FREE_RECORDS + self.size // BYTES_PER_RECORD
         self._shift = 0  # bytes by which the summary is not where it should be
         self._end, self._is_without_summary = self.size, False  # of the data
         self._stopped: int | None = None  # the byte from which on records are not understood
@@ -223,11 +218,6 @@ class McapFile:
         if size > MAX_CHUNK_BYTES:
             raise RecordingError(f'it claims to unpack to {size} bytes; at most '
                                  f'{MAX_CHUNK_BYTES} are accepted')
-        if size > self._bytes_left:
-            raise RecordingError('it is not unpacked: more than '
-                                 f'{FREE_BYTES + BYTES_PER_BYTE * self.size} bytes in all, from a '
-                                 f'file of {self.size}')
-        self._bytes_left -= size
         try:
             data = _unpack(chunk.compression, chunk.data, size)
         except (zstandard.ZstdError, RuntimeError) as error:
@@ -245,10 +235,6 @@ class McapFile:
             while position < len(data):
                 kind, length = RECORD.unpack_from(data, position)
                 end = position + RECORD.size + length
-                self._records_left -= 1
-                if self._records_left < 0:
-                    raise RecordingError(f'it is left out: the file holds more than '
-                                         f'{self._most_records} records, in {self.size} bytes')
                 if kind == Opcode.MESSAGE:
                     _, _, number, _, log, publish = _MESSAGE.unpack_from(data, position)
                     if position + _MESSAGE.size > end:
@@ -339,18 +325,23 @@ def read_record(kind: type[Record], content: bytes | memoryview, whole: bool = T
     return record
 
 
-def _map(path: str | Path) -> mmap.mmap:
-    """Map a file into memory, after a look at whether it can be MCAP."""
+def _bytes_of(path: str | Path) -> mmap.mmap | bytes:
+    """Map a file into memory, or unpack one that is compressed as a whole, if it is MCAP."""
     try:
         mode = os.stat(path).st_mode  # opening a FIFO would wait for its writer
         if not stat.S_ISREG(mode):
             raise RecordingError(f'{path}: not a regular file; expected an .mcap file')
         with open(path, 'rb') as stream:
             if stream.seek(0, 2) == 0:
-                raise RecordingError(f'{path}: the file is empty')
-            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+                raise RecordingError(f'{path}: the file is empty; it holds no message')
+            data: mmap.mmap | bytes = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+            if data[:4] == zstandard.FRAME_HEADER:
+                data = zstandard.ZstdDecompressor().stream_reader(
+                    data, read_across_frames=True).read()
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
+    except zstandard.ZstdError as error:
+        raise RecordingError(f'{path}: does not unpack: {error}') from error
     if data[:len(MAGIC)] != MAGIC:
         raise RecordingError(f'{path}: not an MCAP file: it starts with {data[:8].hex(" ")}, '
                              f'not {MAGIC.hex(" ")}')

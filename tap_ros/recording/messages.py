@@ -7,6 +7,7 @@ rosbags knows the types of Jazzy; ours stand here, so that recordings are writte
 tap_msgs is not installed. Others are looked up in the ROS installation, as rosbag2 does.
 """
 
+from contextlib import suppress
 from functools import cache
 import os
 from pathlib import Path
@@ -18,6 +19,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores, TypesysError
 from rosbags.typesys.store import Typestore
 from tap_ros.errors import RecordingError
+import zstandard
 
 DEFINITIONS = {
     'tap_msgs/msg/CommandRefused': 'std_msgs/Header header\nstring message\n',
@@ -84,10 +86,15 @@ def decode(type_name: str, data: bytes | memoryview) -> Any:
     Read one message.
 
     :param type_name: for example 'sensor_msgs/msg/JointState'.
-    :param data: bytes-like, with the encapsulation header.
+    :param data: bytes-like, with the encapsulation header; rosbag2 may have compressed it.
     :return: the message, its fields as attributes; arrays of numbers are views of the data.
     :raises RecordingError: when the bytes are not such a message.
     """
+    if data[:4] == zstandard.FRAME_HEADER:
+        try:
+            data = zstandard.ZstdDecompressor().stream_reader(data).read()
+        except zstandard.ZstdError as error:
+            raise RecordingError(f'damaged message: {error}') from error
     for end in (len(data), *range(len(data) - 4, len(data) - 20, -4)):
         try:
             return typestore().deserialize_cdr(data[:end], type_name)
@@ -128,21 +135,19 @@ def check_schema(type_name: str, text: str) -> None:
     Accept the schema of a recording if its messages can be read with our definitions.
 
     :param type_name: for example 'tap_msgs/msg/Episode'.
-    :param text: ros2msg, as schema_text gives it; with comments or without.
+    :param text: ros2msg, as schema_text gives it; with comments or without. One that cannot be
+        read, as of a recorder that did not find the definition, says nothing.
     :raises RecordingError: when fields differ; it names the type and both lists of fields.
     """
-    try:
-        if len(text) > _MAX_SCHEMA:
-            raise ValueError(f'more than {_MAX_SCHEMA} characters')
-        types = get_types_from_msg(text.replace('\r\n', '\n'), type_name)
-    except _UNREADABLE as error:
-        raise RecordingError(
-            f'message type {type_name}: its recorded definition cannot be read') from error
+    types: dict[str, Any] = {}
+    with suppress(*_UNREADABLE):
+        if len(text) <= _MAX_SCHEMA:
+            types = get_types_from_msg(text.replace('\r\n', '\n'), type_name)
     known = typestore().fielddefs
     for name, (_, theirs) in types.items():
-        if name in known and list(theirs) != list(known[name][1]):
-            theirs, ours = (
-                ', '.join(field for field, _ in fields) for fields in (theirs, known[name][1]))
+        ours = list(known[name][1]) if name in known else list(theirs)
+        if list(theirs) != ours[:len(theirs)]:  # one that is cut off says nothing else
+            theirs, ours = (', '.join(field for field, _ in fields) for fields in (theirs, ours))
             raise RecordingError(
                 f'message type {name}: recorded with the fields {theirs}; expected {ours}')
 

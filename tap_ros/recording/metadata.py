@@ -24,11 +24,11 @@ from tap_ros.text import escaped, listing
 import yaml
 
 FILE_NAME, MOUNT_NAME = 'metadata.yaml', 'arm_mount.json'
-MAX_BYTES, _MAX_MOUNT_BYTES = 2**23, 2**16
-MAX_DEPTH = 32
+MAX_BYTES = 2**23  # of either
 _UNUSABLE = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _KEY = 'rosbag2_bagfile_information'
+PACKED = '.zstd'  # behind the name of a file that rosbag2 compressed as a whole
 
 
 def bag_information(files: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -80,21 +80,6 @@ def to_yaml(value: Any) -> str:
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=False)
 
 
-def _from_yaml(text: str) -> Any:
-    """Parse YAML; raise ValueError or another of _UNUSABLE when it is not, or is a bomb."""
-    if len(text) > MAX_BYTES:
-        raise ValueError(f'it has more than {MAX_BYTES} bytes')
-    depth = 0
-    for event in yaml.parse(text, Loader=_LOADER):  # the loader itself recurses, in C
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_DEPTH:
-            raise ValueError(f'it is nested more than {MAX_DEPTH} deep')
-        if isinstance(event, yaml.ScalarEvent) and event.value == '<<':
-            raise ValueError('it merges mappings (<<)')
-    return yaml.load(text, Loader=_LOADER)
-
-
 class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
     """Writes equal values in full; rosbag2 knows no anchors."""
 
@@ -114,7 +99,9 @@ def save(folder: str | Path, files: Sequence[dict[str, Any]]) -> None:
 
 def files_by_number(folder: str | Path) -> list[Path]:
     """Return the .mcap files of a folder in the order of the numbers in their names."""
-    return sorted(Path(folder).glob('*.mcap'), key=_natural)
+    found = {path.name.removesuffix(PACKED): path for kind in ('*.mcap' + PACKED, '*.mcap')
+             for path in Path(folder).glob(kind)}
+    return sorted(found.values(), key=_natural)
 
 
 def bag_files(folder: str | Path) -> list[Path]:
@@ -125,8 +112,8 @@ def bag_files(folder: str | Path) -> list[Path]:
 
     :param folder: of the bag.
     :return: list of paths; empty when there is no .mcap file.
-    :raises RecordingError: for a bag of another storage or compressed by rosbag2 as a whole, and
-        for a metadata.yaml that cannot be used.
+    :raises RecordingError: for a bag of another storage, and for a metadata.yaml that cannot be
+        used.
     """
     folder = Path(folder)
     path = folder / FILE_NAME
@@ -136,14 +123,10 @@ def bag_files(folder: str | Path) -> list[Path]:
         raise RecordingError(f'{path}: not a regular file')
     try:
         with open(path, 'rb') as stream:
-            information = _from_yaml(stream.read(MAX_BYTES + 1).decode())[_KEY]
-        storage = information['storage_identifier']
-        paths = information['relative_file_paths']
-        compression = information.get('compression_format') or ''
+            information = yaml.load(stream.read(MAX_BYTES), Loader=_LOADER)[_KEY]
+        storage, paths = information['storage_identifier'], information['relative_file_paths']
         if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
             raise ValueError('relative_file_paths is no list of names')
-        if not isinstance(storage, str) or not isinstance(compression, str):
-            raise ValueError('storage_identifier and compression_format are no texts')
         if len(set(paths)) < len(paths):
             raise ValueError('relative_file_paths names a file twice')
     except OSError as error:
@@ -153,29 +136,21 @@ def bag_files(folder: str | Path) -> list[Path]:
             f'{path}: not the metadata of a rosbag2 bag ({escaped(" ".join(str(error).split()))});'
             ' remove it to read the .mcap files without it, or make it anew (ros2 bag reindex)'
         ) from error
-    if storage != 'mcap':
+    if storage != 'mcap':  # rosbags is installed with us
+        name = shlex.quote(escaped(folder))
         raise RecordingError(
-            f'{path}: the bag is stored as {escaped(storage, 40)}; only mcap is read; '
-            f'{_convert(folder)}, or record with -s mcap')
-    if compression:
-        raise RecordingError(
-            f'{path}: the bag is compressed by rosbag2 ({escaped(compression, 40)}); only '
-            f'compression inside mcap is read; {_convert(folder)}, or record with '
-            '--storage-preset-profile zstd_fast')
+            f'{path}: the bag is stored as {escaped(storage, 40)}; only mcap is read; convert it: '
+            f'rosbags-convert --src {name} --dst {name}_mcap --dst-storage mcap, or record with '
+            '-s mcap')
     files = [folder / Path(name).name for name in paths]
+    files = [file if _is_file(file) else file.with_suffix('') if file.suffix == PACKED else file
+             for file in files]  # some were unpacked since
     missing = [file.name for file in files if not _is_file(file)]
     if missing:
         raise RecordingError(
             f'{path} names files that are not there: {listing(missing)}; bring them back, or '
             'make metadata.yaml anew (ros2 bag reindex)')
     return files
-
-
-def _convert(folder: Path) -> str:
-    """Return the command that makes a bag which can be read; rosbags is installed with tap_ros."""
-    name = shlex.quote(escaped(folder))
-    return (f'convert it: rosbags-convert --src {name} --dst {shlex.quote(escaped(folder))}_mcap '
-            '--dst-storage mcap')
 
 
 def _is_file(path: Path) -> bool:
@@ -189,7 +164,7 @@ def _is_file(path: Path) -> bool:
 def qos_from_text(text: str) -> list[Any]:
     """Return the offered QoS profiles that stand in a channel's metadata; [] when unknown."""
     try:
-        profiles = _from_yaml(text) if text else []
+        profiles = yaml.load(text, Loader=_LOADER) if text else []
     except _UNUSABLE:
         return []
     return profiles if isinstance(profiles, list) else []
@@ -238,7 +213,7 @@ def read_mount(folder: str | Path) -> ArmMount:
         return ArmMount()
     expected = {**asdict(ArmMount().mount), 'opening': 0.0, 'arm': DEFAULT_ARM}
     try:
-        if not path.is_file() or path.stat().st_size > _MAX_MOUNT_BYTES:
+        if not path.is_file() or path.stat().st_size > MAX_BYTES:
             raise ValueError('no regular file, or too long')
         values = {'arm': DEFAULT_ARM} | json.loads(path.read_bytes())  # earlier ones lack it
         if set(values) != set(expected) or len(values['position']) != 3:

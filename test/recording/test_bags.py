@@ -116,7 +116,6 @@ def test_metadata_that_cannot_be_used_is_named(bag):
     good = path.read_text()
     for old, new, words in (
             ('storage_identifier: mcap', 'storage_identifier: sqlite3', 'only mcap is read'),
-            ("compression_format: ''", 'compression_format: zstd', 'compressed by rosbag2'),
             ('push2_1.mcap', 'push2_7.mcap', 'not there: push2_7.mcap'),
             ('rosbag2_bagfile_information', 'nothing', 'not the metadata')):
         path.write_text(good.replace(old, new))
@@ -125,14 +124,10 @@ def test_metadata_that_cannot_be_used_is_named(bag):
 
 
 UNUSABLE = [
-    'relative_file_paths: null', 'relative_file_paths: 5', 'relative_file_paths: [5]',
-    'relative_file_paths: {a: b}', 'relative_file_paths: [[a]]',
-    'relative_file_paths: [push2_0.mcap, push2_0.mcap]',
-    'relative_file_paths: ' + '[' * 200000, 'relative_file_paths: ' + '{a: ' * 200000,
-    'a: &a {b: c}\n  d: {<<: [*a, *a]}\n  relative_file_paths: [push2_0.mcap]',
-    'version: 2001-99-99', 'version: ' + '1' * 5000, 'version: !!int ""', 'x: ' + 'y' * 2**23,
-    'relative_file_paths: [../../etc/passwd]', 'relative_file_paths: [..]',
-    f'relative_file_paths: [{"a" * 5000}]', 'relative_file_paths: ["a\\0b\\e[2J\\n"]']
+    'relative_file_paths: null', 'relative_file_paths: [5]', 'relative_file_paths: {a: b}',
+    'relative_file_paths: [push2_0.mcap, push2_0.mcap]', 'version: 2001-99-99',
+    'relative_file_paths: [..]', f'relative_file_paths: [{"a" * 5000}]',
+    'relative_file_paths: ["a\\0b\\e[2J\\n"]']
 
 
 def test_unusable_metadata_is_one_line_that_names_it(bag):

@@ -156,10 +156,6 @@ def test_a_clock_that_is_set_back_begins_an_episode_and_does_not_stop_the_rate(t
     found, _ = read(record(tmp_path / 'far', [
         camera(t, log=log) for log, t in enumerate(times)]), reading=Reading(rate=1))
     assert [e.frames[:, 0, 0, 0].tolist() for e in found] == [times[:4], times[4:]]
-    times = [*range(10, 16), *range(13, 19)]
-    found, _ = read(record(tmp_path / 'little', [
-        camera(t, log, log=log) for log, t in enumerate(times)]))
-    assert [e.frames[:, 0, 0, 0].tolist() for e in found] == [[*range(6)], [*range(6, 12)]]
 
 
 def deep(t, topic, form='16UC1'):

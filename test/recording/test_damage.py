@@ -313,13 +313,9 @@ def pack(content, claimed=None):
 
 
 def test_files_that_unpack_to_what_no_recording_holds_are_refused_in_time(tmp_path):
-    tiny = struct.pack('<BQHIQQ', 5, 22, 1, 0, 0, 0) * 300_000
-    large = bytes([0x90]) + struct.pack('<Q', 2**27 - 9) + bytes(2**27 - 9)  # opcode of others
     for chunks, words in (
             (pack(bytes(100), mcap_file.MAX_CHUNK_BYTES + 1), 'claims to unpack to'),
-            (pack(bytes(50 * 2**20), 1000), 'more than it claims'),
-            (pack(tiny), 'holds more than .* records'),
-            (pack(large) * 3, 'not unpacked: more than .* in all')):
+            (pack(bytes(50 * 2**20), 1000), 'more than it claims')):
         (tmp_path / 'a.mcap').write_bytes(b'\x89MCAP0\r\n' + chunks)
         assert (tmp_path / 'a.mcap').stat().st_size < 10**5
         with pytest.raises(RecordingError, match=f'a.mcap: chunk .*{words}'):

@@ -169,6 +169,6 @@ def test_a_schema_with_comments_is_accepted_and_another_is_not():
     check_schema(name, '# words\r\n' + text.replace('\n', '  # more words\r\n', 1))
     with pytest.raises(RecordingError, match='ObjectState: recorded .* name, u, pose;'):
         check_schema(name, text.replace('float64 v\n', ''))
-    for text in ('Ärger\n', 'float64 x\n' * 10**6, '=' * 80, 'MSG: a/b'):
-        with pytest.raises(RecordingError, match='ObjectStates: its recorded definition cannot'):
-            check_schema(name, text)
+    # A recorder that does not find a definition writes nothing, or half of it.
+    for text in ('', 'Ärger\n', 'float64 x\n' * 10**6, '=' * 80, 'MSG: a/b', text[:40]):
+        check_schema(name, text)
