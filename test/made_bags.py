@@ -10,14 +10,17 @@ at its stamp unless `log` says when.
 import warnings
 
 from made_episodes import assert_all_equal
+from mcap.writer import Writer
 import numpy as np
+from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.messages import encode
+from tap_ros.recording.messages import encode, schema_text
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import BagWriter
 
 IMAGE = 'sensor_msgs/msg/Image'
 OBJECTS = 'tap_msgs/msg/ObjectStates'
+JOINTS = 'sensor_msgs/msg/JointState'
 SECOND = 10**9  # ns
 
 
@@ -50,9 +53,8 @@ def gripper(log, opening):
     return '/gripper/command', kind, encode(kind, {'data': opening}), round(log * SECOND)
 
 
-def joints(t, log=None, **positions):
-    return message('/joint_states', 'sensor_msgs/msg/JointState', t, log,
-                   name=list(positions), position=list(positions.values()))
+def joints(t, log=None, topic='/joint_states', **positions):
+    return message(topic, JOINTS, t, log, name=list(positions), position=list(positions.values()))
 
 
 def objects(t, topic='/objects', **us):
@@ -82,6 +84,27 @@ def record_files(folder, *parts):
     return folder
 
 
+def write_mcap(path, messages, topics=(), schema=None, **options):
+    """
+    Write messages as another writer would.
+
+    :param topics: (topic, type) of which there need be no message.
+    :param schema: bytes of every definition; by default it is right.
+    :param options: of mcap's Writer.
+    """
+    with open(path, 'wb') as stream:
+        writer, numbers = Writer(stream, **options), {}
+        writer.start('ros2')
+        for topic, kind in dict.fromkeys((*topics, *((one[0], one[1]) for one in messages))):
+            text = schema_text(kind).encode() if schema is None else schema
+            numbers[topic] = writer.register_channel(
+                topic, 'cdr', writer.register_schema(kind, 'ros2msg', text))
+        for topic, _, data, log in messages:
+            writer.add_message(numbers[topic], log, data, log)
+        writer.finish()
+    return path
+
+
 def read(path, **options):
     """Return (episodes, warnings) of a recording, which are the same with the cache."""
     with warnings.catch_warnings(record=True) as told:
@@ -92,3 +115,14 @@ def read(path, **options):
         for _ in range(2):  # the second time from the cache
             assert_all_equal(open_recordings(path, **options), found)
     return found, [str(one.message) for one in told]
+
+
+def shown(episodes):
+    """Return the first value of each frame of each episode."""
+    return [episode.frames[:, 0, 0, 0].tolist() for episode in episodes]
+
+
+def decode_gripper(message):
+    """Return the gripper in a JointState of ours, float32 (4,)."""
+    known = dict(zip(message.name, message.position))
+    return np.array([known[joint] for joint in GRIPPER_JOINTS], np.float32)

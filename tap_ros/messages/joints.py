@@ -32,27 +32,6 @@ def decode_positions(message: Any) -> dict[str, float]:
     return dict(zip(message.name, np.asarray(message.position).tolist()))
 
 
-def decode_gripper(message: Any, name: str = 'joint_states') -> np.ndarray:
-    """
-    Find the gripper among joints.
-
-    :param message: sensor_msgs/JointState.
-    :param name: how an error calls it.
-    :return: float32 (4,) x, y, z in metres and opening from 0 to 1.
-    :raises PlanningError: when a joint of GRIPPER_JOINTS is missing or not finite.
-    """
-    positions = decode_positions(message)
-    missing = [joint for joint in GRIPPER_JOINTS if joint not in positions]
-    if missing:
-        raise PlanningError(
-            f'{name}: lacks {", ".join(missing)}; it has {listing(positions) or "no joints"}')
-    gripper = np.array([positions[joint] for joint in GRIPPER_JOINTS], np.float32)
-    for joint, position in zip(GRIPPER_JOINTS, gripper):
-        if not np.isfinite(position):
-            raise PlanningError(f'{name}: {joint} is at {position}; expected finite numbers')
-    return gripper
-
-
 def joint_fields(gripper: Iterable[float], stamp: Stamp | int, frame_id: str,
                  arm: Mapping[str, float] | None = None) -> dict[str, Any]:
     """

@@ -89,14 +89,16 @@ class EpisodeTable:
 def runs_of(parts: Iterable[Columns]) -> list[list[Columns]]:
     """Split the files of a bag where one does not go on where the one before ended."""
     runs: list[list[Columns]] = []
-    newest = -FAR
+    newest = shown = -FAR  # log times of any message, and of a frame
     for part in parts:
-        logs = [part.arrays[name][:, 0] for name in NAMES if len(part.arrays.get(name, ()))]
-        oldest = min((int(log.min()) for log in logs), default=FAR)
-        if not runs or oldest < newest - MAX_JITTER_NS:
+        logs = {name: part.arrays[name][:, 0] for name in NAMES if len(part.arrays.get(name, ()))}
+        oldest = min((int(log.min()) for log in logs.values()), default=FAR)
+        first = int(logs['frame'].min()) if 'frame' in logs else FAR
+        if not runs or oldest < newest - MAX_JITTER_NS or first < shown - MIN_MATCH_NS:
             runs.append([])
         runs[-1].append(part)
-        newest = max((int(log.max()) for log in logs), default=-FAR)
+        newest = max((int(log.max()) for log in logs.values()), default=-FAR)
+        shown = int(logs['frame'].max()) if 'frame' in logs else -FAR
     return runs
 
 

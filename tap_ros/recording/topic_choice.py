@@ -78,9 +78,10 @@ class _Bag:
             self.channels |= file.topics()
             for topic, count in file.counts().items():
                 self.counts[topic] = self.counts.get(topic, 0) + count
-            if not file.channels and file.losses:
-                damage.append(f'{file.path}: {describe(file.losses)[0]}')
-        if not self.channels:
+            losses = [loss for loss in file.losses if loss.what]  # more than that it is cut off
+            if not file.channels and losses:
+                damage.append(f'{file.path}: {describe(losses)[0]}')
+        if not self.channels or (self.counts and not any(self.counts.values())):
             raise RecordingError(damage[0] if damage else f'{self.source}: holds no message')
 
     def camera(self, wanted: str) -> str:

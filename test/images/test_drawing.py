@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from tap_ros.images.drawing import film_strip, grid, overlay
+from tap_ros.images.drawing import grid, overlay
 
 SCALE = 4
 
@@ -36,12 +36,6 @@ def test_marks_outside_the_picture_are_not_seen_however_far(far):
         assert (shown == 128).all()
     for pixel in ((-0.5, 5), (5, 15.5)):  # at the border half of a mark is
         assert (overlay(start, maps, SCALE, [pixel]) != 128).any()
-
-
-def test_a_strip_begins_and_ends_with_the_episode():
-    frames = [np.full((4, 4, 3), t, np.uint8) for t in range(17)]
-    strip = film_strip(frames, 5)
-    assert [int(frame[0, 0, 0]) for frame in strip] == [0, 4, 8, 12, 16]
 
 
 def test_panels_keep_their_pixels_and_have_white_between_them():

@@ -66,12 +66,6 @@ def test_a_bad_picture_is_refused_with_the_reason(change, words):
     assert str(error.value).isprintable() and len(str(error.value)) < 400
 
 
-def test_a_frame_id_without_end_is_refused():
-    message = ros_messages.encode_image(picture(), STAMP, 101 * 'x')
-    with pytest.raises(ImageError, match='goal: frame_id has 101 characters; at most 100'):
-        images.decode_image(message, 'goal')
-
-
 def test_what_is_just_within_the_limits_is_taken():
     message = ros_messages.encode_image(picture(), STAMP, images.MAX_FRAME_ID * 'x')
     assert np.array_equal(images.decode_image(message, 'goal'), picture())
@@ -83,33 +77,6 @@ def test_what_is_just_within_the_limits_is_taken():
     names.append(objects.MAX_NAME * 'x')
     message = some_objects(len(names) * [[1, 2]], names)
     assert objects.decode_objects(message, 'objects')[0] == tuple(names)
-
-
-@pytest.mark.parametrize('change, empty', [
-    ({}, True), ({'step': 3, 'encoding': 'rgb8'}, True), ({'width': 1}, False),
-    ({'height': 1}, False), ({'data': array.array('B', [0])}, False)])
-def test_only_a_picture_without_size_and_data_is_empty(change, empty):
-    assert images.is_empty(Image(**change)) == empty
-
-
-def test_everything_says_when_and_where_it_was_seen():
-    for message in (ros_messages.encode_image(picture(), STAMP, 'here'),
-                    ros_messages.encode_map(np.zeros((5, 7)), STAMP, 'here'),
-                    ros_messages.encode_objects(
-                        ['red'], [[1, 2]], np.zeros((1, 7)), STAMP, 'here', 1),
-                    ros_messages.encode_joints([0, 0, 0, 1], STAMP, 'here'),
-                    ros_messages.encode_camera_info(np.eye(3), (5, 7), STAMP, 'here')):
-        assert message.header.stamp == STAMP and message.header.frame_id == 'here'
-
-
-def test_the_camera_is_described_by_its_intrinsics_and_size():
-    K = [[50.0, 0, 3.5], [0, 60, 2.5], [0, 0, 1]]
-    info = ros_messages.encode_camera_info(np.array(K), (5, 7), STAMP, 'eye')
-    assert (info.height, info.width, info.distortion_model) == (5, 7, 'plumb_bob')
-    assert np.reshape(info.k, (3, 3)).tolist() == K
-    assert np.reshape(info.p, (3, 4)).tolist() == [[*row, 0] for row in K]
-    assert np.reshape(info.r, (3, 3)).tolist() == np.eye(3).tolist()
-    assert list(info.d) == 5 * [0.0]
 
 
 def test_another_size_is_refused_unless_resizing_is_allowed():

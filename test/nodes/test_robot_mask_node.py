@@ -4,6 +4,7 @@
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
+from made_bags import decode_gripper
 import numpy as np
 from processes import LocalNode, Newest, NodeProcess
 import pytest
@@ -12,7 +13,6 @@ from std_msgs.msg import String
 from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import ImageError, TapError
 from tap_ros.messages.images import decode_camera_info, decode_mask
-from tap_ros.messages.joints import decode_gripper
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.robot_mask.node import RobotMaskNode
 from tap_ros.nodes.ros_messages import encode_camera_info

@@ -7,6 +7,7 @@ from operator import attrgetter
 import re
 
 from geometry_msgs.msg import TwistStamped, Vector3
+from made_bags import decode_gripper
 import numpy as np
 from processes import Client, Newest, NodeProcess
 import pytest
@@ -16,7 +17,6 @@ from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import ResetScene, StepScene
 from tap_ros.contract import CONTROL_PERIOD
-from tap_ros.messages.joints import decode_gripper
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import call, wait_for_future
 from tap_ros.nodes.topics import STREAM

@@ -7,21 +7,21 @@ import signal
 import subprocess
 import sys
 
-from made_bags import camera, gripper, IMAGE, read, record
-from mcap.writer import Writer
+from made_bags import camera, gripper, IMAGE, JOINTS, mark, read, record, shown, write_mcap
 import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.messages import encode, schema_text
+from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import BagWriter
+import yaml
+import zstandard
 
 
 def test_what_is_no_recording_is_named(tmp_path):
     for data, words in ((b'', 'the file is empty'), (b'x', 'not an MCAP file'),
-                        (b'SQLite format 3\0' * 9, 'not an MCAP file'),
                         (bytes(100), 'not an MCAP file')):
         (tmp_path / 'a.mcap').write_bytes(data)
         for path in (tmp_path, tmp_path / 'a.mcap'):
@@ -32,27 +32,30 @@ def test_what_is_no_recording_is_named(tmp_path):
     (tmp_path / 'folder').mkdir()
     with pytest.raises(RecordingError, match='holds no recording'):
         open_recordings(tmp_path / 'folder')
+    os.mkfifo(tmp_path / 'folder' / 'a.mcap')  # nothing waits for its writer
+    with pytest.raises(RecordingError, match='a.mcap: not a regular file'):
+        open_recordings(tmp_path / 'folder')
 
 
-def test_no_image_topic_lists_the_topics_found(tmp_path):
+def test_a_recording_without_messages_says_so(tmp_path):
+    empty = write_mcap(tmp_path / 'a.mcap', [])
+    (tmp_path / 'cut.mcap').write_bytes(empty.read_bytes()[:40])  # of a recorder just killed
+    (tmp_path / 'begun.mcap').write_bytes(empty.read_bytes()[:8])
+    for path in tmp_path.glob('*.mcap'):
+        with pytest.raises(RecordingError, match='holds no message'):
+            open_recordings(path)
+    only = write_mcap(tmp_path / 'b.mcap', [], [('/camera/image_raw', IMAGE)])
+    with pytest.raises(RecordingError, match='b.mcap: holds no message'):
+        open_recordings(only)
+
+
+def test_without_a_camera_the_topics_found_are_listed(tmp_path):
     bag = record(tmp_path / 'bag', [gripper(1, 1)])
     for reading, words in (
             (Reading(), r'bag_0.mcap: .*/camera/image_raw.*found: /gripper/command \(std'),
             (Reading('/cam'), 'no topic /cam of type .*found: /gripper/command')):
         with pytest.raises(RecordingError, match=words):
             open_recordings(bag, reading=reading)
-
-
-def test_image_topic_without_any_image(tmp_path):
-    stream = open(tmp_path / 'a.mcap', 'wb')
-    writer = Writer(stream)
-    writer.start('ros2')
-    schema = writer.register_schema(IMAGE, 'ros2msg', schema_text(IMAGE).encode())
-    writer.register_channel('/camera/image_raw', 'cdr', schema)
-    writer.finish()
-    stream.close()
-    with pytest.raises(RecordingError, match='a.mcap: the image topic holds no image'):
-        open_recordings(tmp_path)
 
 
 KILLED = """
@@ -82,21 +85,17 @@ def test_a_killed_recorder_leaves_a_readable_bag(tmp_path):
     with pytest.warns(RecordingWarning, match='bag_0.mcap'):
         (episode,) = iter_episodes(tmp_path / 'bag')
     assert len(episode) >= written - 1
-    assert episode.frames[:, 0, 0, 0].tolist() == [t % 256 for t in range(len(episode))]
+    assert shown([episode])[0] == [t % 256 for t in range(len(episode))]
 
 
-def test_bag_writer_splits_files(tmp_path):
+def test_bag_writer_splits_files_and_keeps_what_is_there(tmp_path):
     writer = BagWriter(tmp_path / 'bag', flush_seconds=-1.0, split_bytes=2000, compression='none')
     for t in range(40):
         writer.write_raw(*camera(t))
     writer.close()
     assert len(list((tmp_path / 'bag').glob('*.mcap'))) > 3
-    (episode,), _ = read(tmp_path / 'bag', reading=Reading(episode_seconds=0))
-    assert episode.frames[:, 0, 0, 0].tolist() == list(range(40))
-
-
-def test_bag_writer_keeps_what_is_there(tmp_path):
-    (tmp_path / 'precious').write_text('')
+    found, _ = read(tmp_path / 'bag', reading=Reading(episode_seconds=0))
+    assert shown(found) == [[*range(40)]]
     with pytest.raises(RecordingError, match='is not empty'):
         BagWriter(tmp_path)
 
@@ -111,44 +110,56 @@ def test_bag_writer_refuses_unknown_and_changed_types(tmp_path, monkeypatch):
             writer.write_raw('/a', IMAGE, b'', 1)
 
 
-def test_metadata_that_cannot_be_used_is_named(bag):
+def test_metadata_that_cannot_be_used_is_named_in_one_line(bag):
     path = bag / 'metadata.yaml'
     good = path.read_text()
-    for old, new, words in (
-            ('storage_identifier: mcap', 'storage_identifier: sqlite3', 'only mcap is read'),
-            ('push2_1.mcap', 'push2_7.mcap', 'not there: push2_7.mcap'),
-            ('rosbag2_bagfile_information', 'nothing', 'not the metadata')):
-        path.write_text(good.replace(old, new))
-        with pytest.raises(RecordingError, match=f'metadata.yaml.*{words}'):
+    begin = 'rosbag2_bagfile_information:\n  storage_identifier: mcap\n  '
+    for text, words in (
+            (good.replace('push2_1.mcap', 'push2_7.mcap'), 'not there: push2_7.mcap'),
+            (good.replace('rosbag2_bagfile_information', 'nothing'), 'not the metadata'),
+            (begin + 'relative_file_paths: null', 'not the metadata'),
+            (begin + 'relative_file_paths: [[a]]', 'not the metadata'),
+            (begin + 'relative_file_paths: [push2_0.mcap, push2_0.mcap]', 'a file twice'),
+            (begin + 'version: 2001-99-99', 'not the metadata'),
+            (begin + 'relative_file_paths: [..]', 'not there'),
+            (begin + f'relative_file_paths: [{"a" * 5000}]', 'not there'),
+            (begin + 'relative_file_paths: ["a\\0b\\e[2J\\n"]', 'not')):
+        path.write_text(text)
+        with pytest.raises(RecordingError, match=f'metadata.yaml.*{words}') as caught:
             open_recordings(bag)
-
-
-UNUSABLE = [
-    'relative_file_paths: null', 'relative_file_paths: [5]', 'relative_file_paths: {a: b}',
-    'relative_file_paths: [push2_0.mcap, push2_0.mcap]', 'version: 2001-99-99',
-    'relative_file_paths: [..]', f'relative_file_paths: [{"a" * 5000}]',
-    'relative_file_paths: ["a\\0b\\e[2J\\n"]']
-
-
-def test_unusable_metadata_is_one_line_that_names_it(bag):
-    for text in UNUSABLE:
-        (bag / 'metadata.yaml').write_text(
-            f'rosbag2_bagfile_information:\n  storage_identifier: mcap\n  {text}\n')
-        with pytest.raises(RecordingError) as caught:
-            open_recordings(bag)
-        assert 'metadata.yaml' in str(caught.value)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
 
 
-def test_nothing_waits_for_a_fifo(tmp_path, bag):
-    os.mkfifo(tmp_path / 'a.mcap')
-    with pytest.raises(RecordingError, match='a.mcap: neither a regular file nor a folder'):
-        open_recordings(tmp_path / 'a.mcap')
-    (tmp_path / 'folder').mkdir()
-    os.mkfifo(tmp_path / 'folder' / 'a.mcap')
-    with pytest.raises(RecordingError, match='a.mcap: not a regular file'):
-        open_recordings(tmp_path / 'folder')
-    (bag / 'metadata.yaml').unlink()
-    os.mkfifo(bag / 'metadata.yaml')
-    with pytest.raises(RecordingError, match='metadata.yaml: not a regular file'):
+def test_bags_that_rosbag2_compressed_are_read_with_metadata_and_without(tmp_path):
+    messages = [mark(1, 0), *map(camera, range(1, 9)), mark(8, 1)]
+    for number, (packed, described) in enumerate(
+            (whole, described) for whole in (True, False) for described in (True, False)):
+        bag = record(tmp_path / str(number), messages)
+        file = bag / f'{number}_0.mcap'
+        if packed:
+            (bag / (file.name + '.zstd')).write_bytes(zstandard.compress(file.read_bytes()))
+            file.unlink()
+        else:
+            write_mcap(file, [(topic, kind, zstandard.compress(data), log)
+                              for topic, kind, data, log in messages])
+        about = yaml.safe_load((bag / 'metadata.yaml').read_text())
+        about['rosbag2_bagfile_information'] |= {
+            'compression_format': 'zstd', 'compression_mode': 'FILE' if packed else 'MESSAGE',
+            'relative_file_paths': [path.name for path in bag.glob('*.mcap*')]}
+        (bag / 'metadata.yaml').write_text(yaml.safe_dump(about))
+        if not described:
+            (bag / 'metadata.yaml').unlink()
+        for path in (bag, *bag.glob('*.mcap*')):
+            assert shown(read(path)[0]) == [[*range(1, 9)]]
+
+
+def test_definitions_that_say_nothing_are_those_of_everybody(tmp_path):
+    messages = [*map(camera, range(1, 5))]
+    for number, text in enumerate((b'', b'= = =\n', b'std_msgs/Header header\nuint32 hei\xff')):
+        bag = write_mcap(tmp_path / f'{number}.mcap', messages, schema=text)
+        assert shown(read(bag)[0]) == [[1, 2, 3, 4]]
+    bag = write_mcap(tmp_path / 'a.mcap', messages, schema=b'uint32 height\nuint32 size\n')
+    with pytest.raises(RecordingError, match='a.mcap: topic /camera/image_raw: .*height, size;'):
         open_recordings(bag)
+    write_mcap(tmp_path / 'b.mcap', messages, [('/joint_states', JOINTS)])
+    assert shown(read(tmp_path / 'b.mcap')[0]) == [[1, 2, 3, 4]]

@@ -16,29 +16,12 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.writer import EpisodeWriter
 
 
-def test_store_describes_its_episodes(bag, episodes):
-    store = open_recordings([bag])
-    assert len(store) == len(episodes)
-    assert store.lengths.tolist() == [len(e) for e in episodes]
-    assert store.num_frames == sum(len(e) for e in episodes)
-    assert store.image_size == (8, 12)
-    np.testing.assert_array_equal(store.frames(2), episodes[2].frames)
-    with pytest.raises(IndexError):
-        store[len(episodes)]
-
-
 def test_frames_and_masks_are_views_of_memory_maps(bag):
     episode = open_recordings(bag)[3]
     for pictures in (episode.frames, episode.robot_masks):
         while pictures.base is not None and not isinstance(pictures, np.memmap):
             pictures = pictures.base
         assert isinstance(pictures, np.memmap) and not pictures.flags.writeable
-
-
-def test_second_opening_decodes_nothing(bag, episodes, monkeypatch):
-    open_recordings(bag)
-    monkeypatch.setattr(cache_module, 'decode_file', None)
-    assert_all_equal(open_recordings(bag), episodes)
 
 
 def test_the_key_is_the_content_of_the_file(bag, episodes, cache, monkeypatch):
@@ -49,21 +32,9 @@ def test_the_key_is_the_content_of_the_file(bag, episodes, cache, monkeypatch):
     monkeypatch.setattr(cache_module, 'decode_file', None)
     again = open_recordings(moved)
     assert_all_equal(again, episodes)
+    assert again.lengths.tolist() == [len(e) for e in episodes] and again.image_size == (8, 12)
     assert again.data_hash == first.data_hash
     assert sorted(os.listdir(cache)) == before
-
-
-def test_other_content_is_another_key(tmp_path, episodes):
-    path = tmp_path / 'a.mcap'
-    hashes = set()
-    for part in (episodes[:2], episodes[1:3], episodes[:2]):
-        with EpisodeWriter(path) as writer:
-            for episode in part:
-                writer.write(episode)
-        store = open_recordings(path)
-        assert_all_equal(store, part)
-        hashes.add(store.data_hash)
-    assert len(hashes) == 2
 
 
 def test_damaged_caches_are_built_again(bag, episodes, cache):
@@ -100,7 +71,7 @@ def test_large_recordings_are_decoded_in_other_processes(tmp_path, bag, episodes
         writer.write(make_episode(size=(4, 16)))
     with EpisodeWriter(bag / 'push2_0.mcap') as writer:
         writer.write(make_episode(seed=99))
-    with pytest.raises(RecordingError, match='push2_1.mcap: .* images of different sizes'):
+    with pytest.raises(RecordingError, match='push2_1.mcap: images of different sizes'):
         open_recordings(bag)
 
 
@@ -129,12 +100,3 @@ def test_an_unusable_cache_folder_is_named(tmp_path, bag):
     (tmp_path / 'file').write_text('')
     with pytest.raises(RecordingError, match='TAP_ROS_CACHE'):
         open_recordings(bag, tmp_path / 'file' / 'cache')
-
-
-def test_images_of_one_store_share_their_size(tmp_path):
-    for name, size in (('small', (8, 8)), ('large', (16, 8))):
-        (tmp_path / name).mkdir()
-        with EpisodeWriter(tmp_path / name / f'{name}.mcap') as writer:
-            writer.write(make_episode(size=size))
-    with pytest.raises(RecordingError, match=r'large.mcap \(8x16\), .*small.mcap \(8x8\)'):
-        open_recordings([tmp_path / 'large', tmp_path / 'small'])

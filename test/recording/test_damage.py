@@ -20,7 +20,6 @@ from tap_ros.recording import writer as writer_module
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.file_writer import FileWriter
-from tap_ros.recording.messages import encode, schema_text
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import EpisodeWriter
 import zstandard
@@ -157,24 +156,6 @@ def test_flips_between_chunks_lose_nothing(chunked):
             assert_all_equal(read(path)[0], episodes)
 
 
-def test_what_is_put_in_loses_nothing_and_a_hole_only_its_chunk(chunked):
-    path, episodes = chunked
-    data = path.read_bytes()
-    chunks = [(start, end) for kind, start, end in records(data) if kind == CHUNK]
-    start, end = chunks[9]
-    for strange in (struct.pack('<BQ', 0x33, 5) + bytes(5), b'x', bytes(5000)):
-        path.write_bytes(data[:start] + strange + data[start:])
-        found, texts = read(path)
-        assert_all_equal(found, episodes)
-        assert not texts
-    path.write_bytes(data[:start + 500] + data[start + 600:])
-    assert check_damaged(path, episodes) == 'part'
-    found, texts = read(path)
-    assert_all_equal([found[0], found[-1]], [episodes[0], episodes[-1]])
-    assert sum('chunk at byte' in text for text in texts) == 1
-    assert any(f'chunk at byte {start}, log time ' in text for text in texts)
-
-
 @pytest.mark.parametrize('hole', ['cut out', 'zeros'])
 def test_a_missing_chunk_is_named_with_its_place_and_its_messages(chunked, hole):
     path, episodes = chunked
@@ -285,23 +266,6 @@ def test_damage_that_no_checksum_shows_costs_its_chunk(tmp_path, chunked):
         assert check_damaged(other, episodes) == 'part'
         assert any(re.search(f'chunk at byte .*it holds a damaged .*{words}', text)
                    for text in read(other)[1])
-
-
-def test_messages_that_nothing_describes_are_named(tmp_path):
-    with open(tmp_path / 'a.mcap', 'wb') as stream:
-        writer = Writer(stream)
-        writer.start('ros2')
-        schema = writer.register_schema(IMAGE, 'ros2msg', schema_text(IMAGE).encode())
-        number = writer.register_channel('/camera/image_raw', 'cdr', schema)
-        for t in range(1, 6):
-            data = encode(IMAGE, {
-                'header': {'stamp': {'sec': t}}, 'height': 1, 'width': 1, 'encoding': 'mono8',
-                'step': 1, 'data': b'\7'})
-            writer.add_message(99 if t == 3 else number, t * 10**9, data, t * 10**9)
-        writer.finish()
-    with pytest.warns(RecordingWarning, match='log time 3.000000000 s: messages of channel 99,'):
-        found = list(iter_episodes(tmp_path))
-    assert [len(episode) for episode in found] == [2, 2]
 
 
 def pack(content, claimed=None):

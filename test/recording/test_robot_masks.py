@@ -13,7 +13,7 @@ import pytest
 from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import inspect_files
-from tap_ros.recording.writer import EpisodeWriter, write_metadata
+from tap_ros.recording.writer import EpisodeWriter
 
 PERIOD = 0.25  # s
 
@@ -63,15 +63,6 @@ def test_a_mask_of_another_stamp_or_none_is_not_used(tmp_path):
     assert found[0].robot_masks is None and len(told) == 1
 
 
-def test_repeated_masks_and_pictures_count_once(tmp_path):
-    episode = cover(make_episode())
-    again = [stream(values) + stream(values, 1e-6)
-             for values in (episode.frames, episode.robot_masks)]
-    found, told = read(record(tmp_path / 'bag', *again))
-    np.testing.assert_array_equal(found[0].robot_masks, episode.robot_masks)
-    assert not told
-
-
 def test_a_bad_mask_is_named_and_costs_the_masks_of_its_episode(tmp_path):
     episode = cover(make_episode())
     for number, (at, wrong, words) in enumerate((at, *case) for at in (0, 3) for case in (
@@ -87,16 +78,6 @@ def test_a_bad_mask_is_named_and_costs_the_masks_of_its_episode(tmp_path):
         assert found[0].robot_masks is None
         assert '/camera/robot_mask: 1 message cannot be used' in bad
         assert re.search(words, bad) and '1 of 1 episodes' in lacking
-
-
-def test_masks_without_a_picture_in_their_file_harm_nothing(tmp_path):
-    episode = cover(make_episode())
-    bag = record(tmp_path / 'bag', stream(episode.frames), stream(episode.robot_masks))
-    record(tmp_path / 'more', [], stream(episode.robot_masks, start=10.0))
-    (tmp_path / 'more' / 'more_0.mcap').rename(bag / 'bag_1.mcap')
-    write_metadata(bag)
-    found, _ = read(bag)
-    np.testing.assert_array_equal(found[0].robot_masks, episode.robot_masks)
 
 
 def test_the_mask_of_a_goal_has_the_stamp_of_its_picture(tmp_path):

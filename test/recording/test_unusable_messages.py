@@ -15,11 +15,6 @@ from made_bags import (
     record_files,
     SECOND,
 )
-from made_episodes import make_episode
-import pytest
-from tap_ros.errors import ConfigError
-from tap_ros.evaluation import inspect_files
-from tap_ros.recording.writer import EpisodeWriter
 
 BAD = {
     'another size': {'height': 4, 'width': 4, 'step': 12, 'data': bytes(48)},
@@ -41,13 +36,6 @@ def test_a_bad_picture_costs_itself_alone(tmp_path):
             assert [e.frames[:, 0, 0, 0].tolist() for e in found] == [
                 [t for t in range(1, 7) if t != at], [8]]
             assert [e.outcome for e in found] == ['success', 'failure']
-
-
-def test_the_size_of_most_pictures_wins_though_the_first_is_another(tmp_path):
-    (episode,), (text,) = read(record(tmp_path / 'bag', [
-        camera(1, **BAD['another size']), *map(camera, range(2, 6))]))
-    assert 'a picture of 4x4 pixels among those of 3x2' in text
-    assert episode.frames[:, 0, 0, 0].tolist() == [2, 3, 4, 5]
 
 
 def test_many_bad_pictures_are_one_warning(tmp_path):
@@ -95,14 +83,3 @@ def test_a_huge_message_costs_itself(tmp_path):
     (episode,), (text,) = read(record(tmp_path / 'bag', [camera(1), many(20000), camera(2)]))
     assert len(episode) == 2
     assert re.search('topic /objects: 1 message .*more than 1048576', text)
-
-
-def test_inspect_shows_names_in_one_line(tmp_path, capsys):
-    with EpisodeWriter(tmp_path / 'a.mcap') as writer:
-        writer.write(make_episode(task='push2\n\x1b[2Jall is well'))
-    args = inspect_files.Options(str(tmp_path / 'a.mcap'), episodes=1)
-    with pytest.raises(ConfigError, match='12x8 pixels; the predictor needs square ones'):
-        inspect_files.run(args)  # as train would refuse it
-    lines = capsys.readouterr().out.splitlines()
-    assert all(line.isprintable() for line in lines)
-    assert r'task        push2\n\x1b[2Jall is well 1' in lines
