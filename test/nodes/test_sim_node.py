@@ -3,7 +3,6 @@
 """What the simulator's topics and services promise."""
 
 from geometry_msgs.msg import TwistStamped
-from made_bags import decode_gripper
 import numpy as np
 from processes import Client, LocalNode, Newest, NodeProcess, until
 import pytest
