@@ -68,7 +68,7 @@ def recognise(path: Path) -> list[list[Path]] | None:
         if any(next(path.glob(names), None) for names in ('*.mcap*', '*/*.mcap*')):
             return None
     if what := _what(path):
-        raise RecordingError(f'{escaped(path)}: is {what}')
+        raise RecordingError(f'{escaped(path)}: {what}')
     return None
 
 
@@ -299,14 +299,14 @@ def _what(path: Path) -> str:
         if '.tfrecord' in file.name:
             return _advice('TFRecord files, as of RLDS', 'import-tfrecord', path)
         if file.suffix.lower() in VIDEOS and file.is_file():
-            return _advice('video', 'import-video', file)
+            return _advice('video', 'import-video', path)
         if file.is_file() and _start(file).startswith(b'\x89HDF'):
             return _advice('HDF5, as of ALOHA and robomimic', 'import-arrays', path)
     return ''
 
 
 def _advice(what: str, command: str, place: Path) -> str:
-    return f'{what}, no recording of ROS; make one of it: {_command(command, place)}'
+    return f'no recording of ROS, but {what}; make one of it: {_command(command, place)}'
 
 
 def _command(name: str, place: Path) -> str:

@@ -7,6 +7,7 @@ Of other robots pictures and the task as text are taken; their actions would be 
 another meaning.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -22,10 +23,10 @@ from tap_ros.images.crop import Crop
 from tap_ros.options import default_text, Folder, Topic
 from tap_ros.recording.bags import find_bags
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.foreign import video_packets, VIDEOS
+from tap_ros.recording.foreign import natural, video_packets, VIDEOS
 from tap_ros.recording.reading_options import Part
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
-from tap_ros.text import escaped
+from tap_ros.text import escaped, listing
 from tqdm import tqdm
 from tyro import conf
 
@@ -60,14 +61,16 @@ class Options(Target):
     """
     Options of the command: one video is one demonstration.
 
-    :param paths: video files of one camera, in the order of the demonstrations, or bags with
-        packets of video.
+    :param paths: video files of one camera, in the order of the demonstrations, folders that hold
+        some at any depth, or bags with packets of video.
+    :param camera: name of the files, without ending, where folders hold those of several.
     :param image_topic: of the packets, where a bag has several.
     :param fps: frames a second; 0: as the videos say.
     :param task: what is done in them, as text.
     """
 
     paths: Paths
+    camera: Annotated[str, conf.arg(metavar='NAME', help_behavior_hint=default_text)] = ''
     image_topic: Topic = ''
     fps: float = 0.0
     task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
@@ -82,8 +85,10 @@ def run(args: Options) -> None:
     if not 0 <= args.fps <= 1000:
         raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000, or 0')
 
+    files = [file for path in args.paths for file in _find_videos(Path(path), args.camera)]
+
     def episodes() -> Iterator[Episode]:
-        for number, path in enumerate(map(Path, args.paths)):
+        for number, path in enumerate(files):
             seconds, frames = zip(*(
                 (at, args.cut.image(frame)) for at, frame in (
                     video_frames(path) if path.suffix.lower() in VIDEOS else
@@ -91,7 +96,20 @@ def run(args: Options) -> None:
             yield make_episode(frames, np.arange(len(frames)) / args.fps if args.fps else seconds,
                                task=args.task, seed=number)
 
-    print(write_bag(args, episodes(), len(args.paths)))
+    print(write_bag(args, episodes(), len(files)))
+
+
+def _find_videos(path: Path, camera: str) -> list[Path]:
+    """Return the videos of a camera in a folder; anything else as it is."""
+    found = sorted((file for file in path.rglob('*') if file.suffix.lower() in VIDEOS),
+                   key=natural)
+    if not found:
+        return [path]
+    names = Counter(file.stem for file in found)
+    if not camera and 1 < len(names) < len(found):
+        raise ConfigError(f'--camera: expected one of {listing(sorted(names))}, which '
+                          f'{escaped(path)} holds of several demonstrations')
+    return [file for file in found if camera in ('', file.stem)]
 
 
 def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.ndarray,
