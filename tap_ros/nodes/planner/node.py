@@ -20,7 +20,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused
-from tap_ros.errors import PlanningError, TapError
+from tap_ros.errors import ConfigError, PlanningError, TapError
 from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
@@ -199,7 +199,8 @@ class VisualMpcNode(LifecycleBase):
             else:
                 handle.abort()
         except Exception as error:
-            self._diagnostics.error(error)
+            if not isinstance(error, ConfigError):  # else who sent the goal was wrong
+                self._diagnostics.error(error)
             result.message = str(error)
             if not isinstance(error, TapError):
                 result.message = internal_error(error)
