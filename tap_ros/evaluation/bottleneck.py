@@ -6,8 +6,9 @@ Whether a prediction is a bottleneck: some objects at their goals, others in pla
 Object positions are the recordings', that is, the simulator's ground truth; they score only.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 from tap_ros.planning.cost import distances_to_pixels
@@ -22,6 +23,7 @@ THRESHOLDS = tuple(range(11))  # px
 MIN_MOTION = 4.0  # px
 # A map is normalised, so an object that a prediction leaves out is still somewhere by its map.
 VISIBLE = 0.5  # least mass, of 1, that the maps of all objects keep if these are to be seen
+MapsOf: TypeAlias = Callable[[int, np.ndarray], WarpedMaps]
 
 
 def bottleneck_scores(maps: torch.Tensor, start_pixels: torch.Tensor,
@@ -125,13 +127,14 @@ def can_be_bottleneck(pixels: np.ndarray) -> bool:
         np.linalg.norm(pixels[1] - pixels[0], axis=-1).min() >= MIN_MOTION))
 
 
-def score_bottlenecks(episodes: Sequence[Episode], prediction: Prediction,
+def score_bottlenecks(episodes: Sequence[Episode], maps_of: MapsOf,
                       goal_picture: str) -> tuple[np.ndarray, np.ndarray]:
     """
     Score the predictions of a batch, and copying the start or the goal instead.
 
     :param episodes: list of B Episodes.
-    :param prediction: networks.Prediction of them.
+    :param maps_of: gives the maps of the prediction for an episode, from its number and the
+        pixels (2, K, 2) of its objects, see predicted_maps.
     :param goal_picture: see batches.uses_recorded_goal.
     :return: float32 (B, 3), prediction, copy-start, copy-goal, in pixels, and float32 (B, 3), the
         mass that the map of that object has kept which lost most, of 1. NaN where it is
@@ -143,7 +146,7 @@ def score_bottlenecks(episodes: Sequence[Episode], prediction: Prediction,
         pixels = context_pixels(episode, goal_picture)
         if not can_be_bottleneck(pixels):
             continue
-        warped = predicted_maps(pixels, prediction, b)
+        warped = maps_of(b, pixels)
         pixels = torch.from_numpy(pixels).to(warped.maps.device)
         maps = torch.cat([  # of the prediction, the start and the goal
             warped.maps[None], one_hot_maps(pixels, warped.maps.shape[-2:])])

@@ -18,6 +18,7 @@ import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.bottleneck import (
     context_pixels,
+    MapsOf,
     predicted_maps,
     score_bottlenecks,
     THRESHOLDS,
@@ -29,11 +30,14 @@ from tap_ros.evaluation.shown import SHOWN, ShownScorer
 from tap_ros.files import write_atomically
 from tap_ros.images.drawing import grid, overlay
 from tap_ros.images.pixels import to_float, to_uint8
+from tap_ros.messages.subgoals import Subgoal
 from tap_ros.options import Bags, Flag, Folder, Topic
 from tap_ros.prediction.batches import Batch, make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
+from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files, Question
+from tap_ros.prediction.warp import WarpedMaps
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.training.inpainted import fill, Filled, with_masks
@@ -120,16 +124,16 @@ class EpisodeScores:
                 **{name: interval.value for name, interval in self.intervals().items()}}
 
 
-def evaluate(network: PredictorNetwork, store: EpisodeStore, episodes: Sequence[int] | np.ndarray,
-             margin: int = 0, goal_picture: str = 'last', seed: int = 0,
-             filled: Filled | None = None) -> dict[str, EpisodeScores]:
+def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
+             episodes: Sequence[int] | np.ndarray, margin: int = 0, goal_picture: str = 'last',
+             seed: int = 0, filled: Filled | None = None) -> dict[str, EpisodeScores]:
     """
     Measure a predictor, and copying, on episodes it was not trained on.
 
     Without a goal picture in its context the targets are all frames after the start, the last one
     included. With z one sample of each episode is measured, as the paper's genmin + vae.
 
-    :param network: PredictorNetwork in eval mode.
+    :param network: PredictorNetwork in eval mode, or any other Predictor.
     :param store: the EpisodeStore.
     :param episodes: indices of at least one episode, each of at least 3 frames.
     :param margin: frames beside the context pictures that do not count as matches.
@@ -138,25 +142,23 @@ def evaluate(network: PredictorNetwork, store: EpisodeStore, episodes: Sequence[
     :param filled: the targets without the robot, see batches.make_batch.
     :return: dict from METHODS (without copy-goal where there is no goal) to EpisodeScores.
     """
-    device = next(network.parameters()).device
-    forward, latent_size = network.config.num_context == 1, network.config.latent_size
+    forward = _is_forward(network)
     methods = METHODS[:2] if forward else METHODS
     parts: dict[str, list[list[np.ndarray]]] = {method: [] for method in methods}
     for at in range(0, len(episodes), _BATCH):
         chosen = episodes[at:at + _BATCH]
         batch = make_batch(store, chosen, Sampling(
-            margin, goal_picture=goal_picture, forward=forward), filled=filled).to(device)
-        context = to_float(batch.context)
-        z = None
-        if latent_size:
-            z = draw_latents(chosen, 1, latent_size, seed)[:, 0].to(device)
+            margin, goal_picture=goal_picture, forward=forward), filled=filled)
         with torch.inference_mode():
-            prediction = network(context, z)
+            if isinstance(network, torch.nn.Module):
+                batch = batch.to(next(network.parameters()).device)
+                image, maps_of = _ask_network(network, batch, chosen, seed)
+            else:
+                image, maps_of = _ask(network, batch)
             measured = to_float(batch.measured)
-            images = batch.visible(
-                torch.cat([prediction.image[:, None], measured], 1))         # B, 1 + C, 3, H, W
-            errors = l1_errors(images, batch.targets.movedim(-1, 2))     # B, 1 + C, T
-            placed, mass = score_bottlenecks([store[i] for i in chosen], prediction, goal_picture)
+            images = batch.visible(torch.cat([image[:, None], measured], 1))  # B, 1 + C, 3, H, W
+            errors = l1_errors(images, batch.targets.movedim(-1, 2))          # B, 1 + C, T
+            placed, mass = score_bottlenecks([store[i] for i in chosen], maps_of, goal_picture)
         scorers = [ShownScorer(store[i]) for i in chosen]
         for m, method in enumerate(methods):
             match = match_step(errors[:, m], batch.valid)[:, None]
@@ -170,6 +172,38 @@ def evaluate(network: PredictorNetwork, store: EpisodeStore, episodes: Sequence[
                                   mass[:, m], *np.array(shown).T])
     return {method: EpisodeScores(*(np.concatenate(column) for column in zip(*rows)))
             for method, rows in parts.items()}
+
+
+def _is_forward(network: PredictorNetwork | Predictor) -> bool:
+    return network.config.num_context == 1 if isinstance(network, torch.nn.Module) else (
+        network.mode == 'forward')
+
+
+def _ask_network(network: PredictorNetwork, batch: Batch, episodes: Sequence[int] | np.ndarray,
+                 seed: int) -> tuple[torch.Tensor, MapsOf]:
+    """Return the pictures (B, 3, H, W) of a network, and its maps, see score_bottlenecks."""
+    z, size = None, network.config.latent_size
+    if size:
+        z = draw_latents(episodes, 1, size, seed)[:, 0].to(batch.context.device)
+    prediction = network(to_float(batch.context), z)
+    return prediction.image, lambda b, pixels: predicted_maps(pixels, prediction, b)
+
+
+def _ask(predictor: Predictor, batch: Batch) -> tuple[torch.Tensor, MapsOf]:
+    """Return what another predictor shows, as _ask_network."""
+    def ask(b: int, pixels: np.ndarray) -> Subgoal:
+        names = ('start', 'goal')[:batch.context.shape[1]]
+        return predictor.predict_together([Question(
+            **dict(zip(names, batch.context[b].numpy())),
+            **{f'{name}_pixels': at for name, at in zip(names, pixels)})])[0][0]
+
+    def maps_of(b: int, pixels: np.ndarray) -> WarpedMaps:
+        subgoal = ask(b, pixels)
+        return WarpedMaps(torch.from_numpy(subgoal.object_maps), torch.from_numpy(subgoal.mass))
+
+    nothing = np.zeros((2, 0, 2), np.float32)
+    images = [ask(b, nothing).image for b in range(len(batch.context))]
+    return to_float(np.stack(images)), maps_of
 
 
 def _changed_l1(images: torch.Tensor, batch: Batch, match: torch.Tensor,
@@ -236,7 +270,8 @@ class Options:
 
     weights: Annotated[str, conf.arg(
         metavar='FILE',
-        help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}.')]
+        help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}; or another '
+             'predictor, such as nearest_keyframe:bags/push2, which then has seen those bags.')]
     recordings: Bags
     image_topic: Topic = ''
     all: Flag = False
@@ -251,11 +286,17 @@ def run(args: Options) -> None:
 
     :raises ConfigError: if there is nothing to score, or the pictures have another size.
     """
-    network, training = load_network(args.weights)
+    network: PredictorNetwork | Predictor
+    if predictor_files(args.weights):
+        network, training = load_network(args.weights)
+        size = network.config.image_size
+    else:
+        network, training = load_predictor(args.weights), {}
+        size = network.image_size[0]
     store = open_recordings(
         args.recordings, reading=reading_like(training, args.recordings, args.image_topic))
-    if store.image_size != (network.config.image_size,) * 2:
-        raise ConfigError(f'{args.weights}: made for {network.config.image_size} pixels a side, '
+    if store.image_size != (size, size):
+        raise ConfigError(f'{args.weights}: made for {size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
     settings = training.get('settings', {})
     robot_mask = trained_robot_mask(training)[0]
@@ -274,7 +315,7 @@ def run(args: Options) -> None:
     about: dict[str, Any] = {method: value.summary() | {'intervals': {
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
-    if network.config.latent_size:
+    if isinstance(network, PredictorNetwork) and network.config.latent_size:
         about['samples'] = _report_samples(score_samples(
             network, store, episodes, goal_picture=args.goal_picture, count=args.samples,
             filled=filled), args.samples)
@@ -285,8 +326,9 @@ def run(args: Options) -> None:
         if robot_mask != 'none':
             about['robot_mask'] = robot_mask
         write_atomically(folder / 'scores.json', json.dumps(about, indent=2) + '\n')
-        write_pictures(folder / 'pictures.png', network, store, episodes[:12], args.goal_picture,
-                       filled=filled)
+        if isinstance(network, PredictorNetwork):
+            write_pictures(folder / 'pictures.png', network, store, episodes[:12],
+                           args.goal_picture, filled=filled)
 
 
 def _print_table(scores: Mapping[str, EpisodeScores]) -> None:

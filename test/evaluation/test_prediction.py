@@ -260,6 +260,15 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     assert (tmp_path / 'out' / 'pictures.png').stat().st_size > 0
 
 
+def test_another_predictor_is_scored_by_what_it_shows_and_its_maps(tmp_path, capsys):
+    bag, out = write_bag(tmp_path / 'bag', EPISODES), tmp_path / 'out'
+    run(parse(Options, ['--weights', f'nearest_keyframe:{bag}', '--recordings', str(bag), '--all',
+                        '--goal-picture', 'last', '--out', str(out)]))
+    scores = json.loads((out / 'scores.json').read_text())['scores']
+    assert scores['prediction']['min_l1'] < 1e-6  # it has seen these episodes
+    assert scores['prediction']['bottleneck_median'] < scores['copy-goal']['bottleneck_median'] / 2
+
+
 @pytest.mark.parametrize('home', [3, 5, 8])
 def test_the_bottleneck_is_when_one_object_is_home_and_the_others_untouched(home):
     T, start, end = 11, np.array([[3.0, 3], [20, 20]]), np.array([[3.0, 12], [28, 20]])
