@@ -205,6 +205,10 @@ def test_what_cannot_be_done_is_said_moves_nothing_and_is_no_error_of_a_node(exp
         assert page.locator('#subgoal-run').bounding_box() == before, 'nothing moves'
         assert state(page)['goal']['objects'] == [first, second]
         assert page.evaluate('moved') is None
+        page.locator('#samples').fill('16')
+        page.locator('#levels').fill('4')
+        page.click('#subgoal-run')
+        page.wait_for_function('state.log.at(-1).includes("num_samples")', timeout=60_000)
         page.wait_for_timeout(1500)
         assert not [each for each in state(page)['diagnostics']
                     if each['level'] == 2 and 'service' in each['name']]

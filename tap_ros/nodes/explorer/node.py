@@ -4,6 +4,7 @@
 
 from collections import deque
 from collections.abc import Mapping
+from functools import cache
 import json
 import math
 import sys
@@ -35,8 +36,7 @@ from tap_ros.nodes.parameters import declare_transport, Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
 from tap_ros.nodes.topics import camera_image, LATCHED, STREAM
-from tap_ros.planning.mpc_config import PLANNING_TASKS
-from tap_ros.plugins import names
+from tap_ros.plugins import load_plugin, names
 from tap_ros.text import escaped
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
@@ -253,7 +253,7 @@ class ExplorerNode(Node):
         self._server.put('state', json.dumps({
             'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
             'simulator': simulator,
-            'plans': not (simulator and self._task) or self._task in PLANNING_TASKS,
+            'plans': not simulator or not _grips(self._task),
             'movable': self._calls.offered('set_goal') and bool(goals) and not running,
             'camera': {**self._size('camera'), 'objects': _listed(objects),
                        'targets': _listed({n: goals[n] for n in objects if n in goals}),
@@ -346,6 +346,15 @@ class Distances:
                 'times': [round(time, 2) for time, _ in points],
                 'values': [[round(values[k], 2) for _, values in points]
                            for k in range(len(names))]}
+
+
+@cache
+def _grips(task: str) -> bool:
+    """Tell whether a task needs a gripper, which nothing plans; False for an unknown one."""
+    try:
+        return bool(getattr(load_plugin('tap_ros.tasks', task), 'gripping', False))
+    except TapError:
+        return False
 
 
 def _listed(objects: Mapping[str, Place]) -> list[dict[str, Any]]:
