@@ -68,7 +68,8 @@ def run(args: Options) -> None:
                               f'{recording} has {store.image_size}; use matching ones')
         fraction, robot_mask = min(args.test_fraction, 1), model.config.robot_mask
         everything = np.arange(len(store))
-        parts = (everything, everything) if fraction == 1 else split_episodes(store, fraction)
+        parts = (everything, everything) if fraction == 1 else split_episodes(
+            store, fraction, held_out=training.get('settings', {}).get('held_out', ()))
         held_out = with_masks(store, parts, robot_mask)[1]
         filled = store if robot_mask == 'none' else FilledStore(
             store, robot_mask, filling=fill_from_past)

@@ -45,9 +45,28 @@ class Table:
         return project(self.homography, self.points()).view(self.cells, self.cells, 2)
 
     def seed_maps(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Put each object's map (K, n, n), which sums to 1, at its pixel (K, 2)."""
-        return splat_on_table(pixels[:, None], torch.ones_like(pixels[:, :1]), self.homography,
-                              self.cells, self.half)
+        """
+        Put a map for each object on the grid, bilinearly at its pixel, then blur it by one cell.
+
+        :param pixels: (K, 2) as (u, v). What is outside the table counts at its rim.
+        :return: (K, n, n), each summing to 1.
+        """
+        n = self.cells
+        points = project(torch.linalg.inv(self.homography), pixels[:, None])
+        at = ((points / self.half + 1) * (n - 1) / 2).clamp(0, n - 1.001)  # (K, 1, 2) x, y
+        low = at.floor()
+        share = at - low
+        low = low.long()
+        maps = pixels.new_zeros(len(pixels), n * n)
+        for dx in (0, 1):
+            for dy in (0, 1):
+                part = (share[..., 0] if dx else 1 - share[..., 0])
+                part = part * (share[..., 1] if dy else 1 - share[..., 1])
+                maps.scatter_add_(1, (low[..., 1] + dy) * n + low[..., 0] + dx, part)
+        line = pixels.new_tensor([1.0, 2.0, 1.0]) / 4
+        kernel = torch.outer(line, line)[None, None]
+        maps = F.conv2d(maps.view(-1, 1, n, n), kernel, padding=1)[:, 0]
+        return maps / maps.sum((-1, -2), keepdim=True).clamp_min(1e-12)
 
 
 def project(matrix: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
@@ -100,34 +119,6 @@ def channels_last(x: torch.Tensor) -> torch.Tensor:
 def channels_first(x: torch.Tensor) -> torch.Tensor:
     """View (N, h, w, C) as (N, C, h, w)."""
     return x.permute(0, 3, 1, 2)
-
-
-def splat_on_table(pixels: torch.Tensor, weights: torch.Tensor, homography: torch.Tensor,
-                   cells: int, half_size: float) -> torch.Tensor:
-    """
-    Spread weighted pixel positions bilinearly over the table grid, then blur by one cell.
-
-    :param pixels: (K, N, 2) as (u, v).
-    :param weights: (K, N).
-    :param homography: (3, 3), table metres to pixels.
-    :return: (K, cells, cells), each summing to 1. Weight outside the table counts at its rim.
-    """
-    points = project(torch.linalg.inv(homography), pixels)
-    at = ((points / half_size + 1) * (cells - 1) / 2).clamp(0, cells - 1.001)  # (K, N, 2) x, y
-    low = at.floor()
-    share = at - low
-    low = low.long()
-    maps = pixels.new_zeros(len(pixels), cells * cells)
-    for dx in (0, 1):
-        for dy in (0, 1):
-            part = (share[..., 0] if dx else 1 - share[..., 0])
-            part = part * (share[..., 1] if dy else 1 - share[..., 1])
-            maps.scatter_add_(
-                1, (low[..., 1] + dy) * cells + low[..., 0] + dx, part * weights)
-    line = pixels.new_tensor([1.0, 2.0, 1.0]) / 4
-    maps = F.conv2d(
-        maps.view(-1, 1, cells, cells), torch.outer(line, line)[None, None], padding=1)[:, 0]
-    return maps / maps.sum((-1, -2), keepdim=True).clamp_min(1e-12)
 
 
 def mirror_table(homography: torch.Tensor, width: int) -> torch.Tensor:

@@ -27,7 +27,6 @@ class SubgoalPredictor(Predictor):
 
     :ivar config: PredictorConfig.
     :ivar image_size: (height, width) of the pictures it takes.
-    :ivar num_context: pictures it is conditioned on: 2, start and goal, or 1, the start.
     :ivar mode: 'bidirectional' for two of them, 'forward' for one.
     :ivar training: dict saying how the weights were made.
     :ivar camera_crop: TrainedCrop: what to make of a camera's pictures before it sees them.
@@ -48,8 +47,7 @@ class SubgoalPredictor(Predictor):
             raise ConfigError('predictor: needs weights for 2 context pictures, start and goal, '
                               f'or for 1, the start; these are for {network.config.num_context}')
         self.config = network.config
-        self.num_context = network.config.num_context
-        self.mode = 'forward' if self.num_context == 1 else 'bidirectional'
+        self.mode = 'forward' if network.config.num_context == 1 else 'bidirectional'
         self.image_size = (network.config.image_size, network.config.image_size)
         self.training = training or {}
         self.camera_crop = trained_crop(self.training, self.image_size)

@@ -6,18 +6,8 @@ from collections.abc import Callable
 import math
 
 from tap_ros.images.pixels import to_float
+from tap_ros.prediction import losses
 from tap_ros.prediction.batches import Augmentation, Batch
-from tap_ros.prediction.losses import (
-    bell,
-    bell_preference,
-    beside_context,
-    l1_error,
-    l1_errors,
-    linear_preference,
-    match_step,
-    picture_progress,
-    relative_to_copying,
-)
 from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
@@ -39,16 +29,16 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
     """
     if config.loss == 'min':
         return error
-    preference = (linear_preference(batch.times, batch.end, config.beta) if config.forward
-                  else bell_preference(batch.times, batch.first, batch.last))
+    preference = (losses.linear_preference(batch.times, batch.end, config.beta) if config.forward
+                  else losses.bell_preference(batch.times, batch.first, batch.last))
     if config.selection == 'relative':
-        return relative_to_copying(error, copy_error(), preference)
+        return losses.relative_to_copying(error, copy_error(), preference)
     if config.selection == 'progress':
-        progress = picture_progress(copy_error(), batch.valid)
+        progress = losses.picture_progress(copy_error(), batch.valid)
         if config.progress_margin:
-            hidden = beside_context(progress, config.progress_margin, batch.valid)
+            hidden = losses.beside_context(progress, config.progress_margin, batch.valid)
             error = error.masked_fill(hidden, math.inf)
-        return error / bell(progress)
+        return error / losses.bell(progress)
     return error / preference
 
 
@@ -103,18 +93,18 @@ class Targets:
             return torch.zeros_like(self.rows)  # the batch begins with the fixed frame
         batch = batch or self.batch
         error = self.errors(image.detach()[:, None])[:, 0]
-        return match_step(selection_errors(
+        return losses.match_step(selection_errors(
             error, lambda: self.errors(context.detach()), batch, self.config), batch.valid)
 
     def errors(self, images: torch.Tensor) -> torch.Tensor:
         """Return the errors (B, Q, T) of augmented pictures (B, Q, 3, H, W), as recorded."""
         if self.augmentation:
             images = self.augmentation.undo(images)
-        return l1_errors(self.batch.visible(images), self.batch.targets.movedim(-1, 2))
+        return losses.l1_errors(self.batch.visible(images), self.batch.targets.movedim(-1, 2))
 
     def outer_l1(self, image: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return the l1 errors (B,) of predictions (B, 3, H, W) at targets (B,) of T."""
-        return l1_error(self.visible(image), self.frame(step))
+        return losses.l1_error(self.visible(image), self.frame(step))
 
 
 def outer_error(error: torch.Tensor, config: ObjectiveSettings) -> torch.Tensor:

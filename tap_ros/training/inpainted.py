@@ -140,7 +140,7 @@ def with_masks(store: 'EpisodeStore', parts: tuple[np.ndarray, np.ndarray],
         return parts
     training, held_out = (part[[store.has_masks(int(i)) for i in part]] for part in parts)
     before, after = sum(map(len, parts)), len(training) + len(held_out)
-    if not len(training):
+    if len(parts[0]) and not len(training):
         raise RecordingError(
             f'recordings: robot_mask {robot_mask} needs a robot mask for every picture of an '
             f'episode, and {len(training)} of {len(parts[0])} to train on have them; record '

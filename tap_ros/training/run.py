@@ -21,6 +21,7 @@ import time
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from tap_ros.errors import RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.recording.bags import check_first_picture, find_bags
 from tap_ros.recording.cache import EpisodeStore, open_recordings
@@ -133,6 +134,9 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
         with _run_folder(config.out) if processes.first else nullcontext():
             parts = with_masks(store, split_episodes(
                 store, config.test_fraction, min_frames, config.held_out), config.robot_mask)
+            if not len(parts[0]):
+                raise RecordingError('recordings: all that --held-out leaves is too short to '
+                                     'train on; name others')
             warn_if_few(parts[1])
             torch.manual_seed(config.seed)
             this = Run(config, kind, device, store, *parts, processes, progress)

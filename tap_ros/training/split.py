@@ -34,7 +34,7 @@ def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
     :param min_frames: episodes with fewer frames are left out.
     :param held_out: files or folders: what is recorded there is held out, and nothing else.
     :return: (training, held-out), int64 arrays of episode indices.
-    :raises RecordingError: if no episode is long enough to train on, or all are held out.
+    :raises RecordingError: if no episode is long enough to train on.
     """
     usable = [i for i in range(len(store)) if store.lengths[i] >= min_frames]
     if not usable:
@@ -45,12 +45,10 @@ def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
         places = {Path(path).resolve() for path in held_out}
         held = np.array([not places.isdisjoint((file, *file.parents)) for file in (
             store.source(i).resolve() for i in usable)])
-        if held.all():
-            raise RecordingError('recordings: all of them are held out; name others to train on')
         return chosen[~held], chosen[held]
-    keys: list[object] = [(store[i].task, store[i].seed) for i in usable]
-    if len(set(keys)) == 1:
-        keys = list(_demonstrations(store, usable))
+    seeds = [store[i].seed for i in usable]
+    keys = ([(store[i].task, seed) for i, seed in zip(usable, seeds)] if len(set(seeds)) > 1
+            else _demonstrations(store, usable))
     # A hash rather than a random draw: adding episodes moves none to the other side.
     hashes = np.array([zlib.crc32(repr(key).encode()) for key in keys])
     held = hashes < test_fraction * 2 ** 32

@@ -9,10 +9,9 @@ from tap_ros.planning.table import (
     fit_arm,
     fit_projection,
     fit_table,
-    grid_points,
     mirror_table,
     project,
-    splat_on_table,
+    Table,
 )
 import torch
 from toy_world import ARM, make_episode, MIDDLE, TABLE
@@ -47,13 +46,12 @@ def test_without_object_positions_the_table_is_the_grippers_plane():
     np.testing.assert_array_equal(fit_table(blind, arm), arm[:, [0, 1, 3]])
 
 
-def test_splatted_maps_sum_to_one_and_have_their_mean_at_the_pixel():
-    table = torch.tensor(TABLE).view(3, 3)
+def test_maps_sum_to_one_and_have_their_mean_at_the_pixel():
+    table = Table(torch.tensor(TABLE).view(3, 3), (32, 32), 40)
     pixels = torch.tensor([[10.3, 12.9], [20.0, 17.5]])
-    maps = splat_on_table(pixels[:, None], torch.ones(2, 1), table, 40, 0.55)
+    maps = table.seed_maps(pixels)
     torch.testing.assert_close(maps.sum((1, 2)), torch.ones(2))
-    points = (grid_points(40) * 0.55).flatten(0, 1)
-    mean = project(table, maps.flatten(1) @ points)
+    mean = maps.flatten(1) @ table.pixels().flatten(0, 1)
     torch.testing.assert_close(mean, pixels, atol=1e-3, rtol=0)
 
 

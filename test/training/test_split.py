@@ -22,12 +22,13 @@ class Store:
     def __init__(self, seeds, length=9, times=None):
         self._seeds, self.lengths = seeds, np.full(len(seeds), length)
         self._times = times or range(len(seeds))
+        self.task = ['push2'] * len(seeds)
 
     def __len__(self):
         return len(self._seeds)
 
     def __getitem__(self, i):
-        return SimpleNamespace(task='push2', seed=self._seeds[i],
+        return SimpleNamespace(task=self.task[i], seed=self._seeds[i],
                                stamps=10 * self._times[i] + np.arange(9))
 
     def source(self, i):
@@ -54,6 +55,10 @@ def test_cameras_of_one_demonstration_stay_on_one_side_without_seeds_too(times):
         training, held_out = split_episodes(Store([seed] * len(times), times=times), 0.3)
         assert 0 < len(held_out) < len(training)
         assert {int(times[i]) for i in training}.isdisjoint(int(times[i]) for i in held_out)
+    two_tasks = Store([0] * 12)
+    two_tasks.task = ['push', 'pull'] * 6
+    training, held_out = split_episodes(two_tasks, 0.3)
+    assert {i % 2 for i in training} == {0, 1} and len(held_out)
     alone = Store([0, 0], times=[1, 1])
     assert not len(split_episodes(alone, 0.3)[1])
 
@@ -97,5 +102,4 @@ def test_recordings_that_are_named_are_held_out_wherever_they_are(tmp_path, monk
     assert split(['all'], str(tmp_path / 'all/bag1/bag1_0.mcap')) == [[0, 2], [1]]
     assert split(['all/bag0', 'all/bag1'], str(other)) == [[0, 1], [7]]
     assert split(['all', 'other'], 'all') == [[7], [0, 1, 2]]
-    with pytest.raises(RecordingError, match='all of them are held out'):
-        split(['all'], 'all')
+    assert split(['other'], 'other') == [[], [7]]  # as an evaluation asks
