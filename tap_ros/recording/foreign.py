@@ -18,6 +18,7 @@ import re
 import shlex
 from typing import Any
 
+from mcap.writer import MCAP0_MAGIC as MAGIC
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
@@ -61,6 +62,8 @@ def recognise(path: Path) -> list[list[Path]] | None:
     """
     if bag := _bag(path):
         return [bag]
+    if path.suffix == '.mcap' or _start(path).startswith(MAGIC):
+        return None
     if path.is_dir():
         parts = sorted(part for part in path.iterdir() if part.is_dir())
         if any(map(_bag, parts)):
@@ -213,12 +216,14 @@ class RosbagFile(McapFile):
 @contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
     """Open a reader of rosbags; its errors, and those of sqlite, become RecordingErrors."""
+    is_ros1 = _start(Path(path)).startswith(b'#ROSBAG')
     try:
-        is_ros1 = _start(Path(path)).startswith(b'#ROSBAG')
         reader = Ros1Reader(Path(path)) if is_ros1 else Ros2Reader(Path(path))
         reader.open()
     except Exception as error:
-        raise RecordingError(f'{escaped(path)}: cannot be read: {escaped(error)}') from error
+        raise RecordingError(
+            f'{escaped(path)}: cannot be read: {escaped(error)}'
+            + '; if its recorder was killed, `rosbag reindex` mends it' * is_ros1) from error
     try:
         yield reader
     except Exception as error:
@@ -290,10 +295,11 @@ def _bag(path: Path) -> list[Path] | None:
 
 def _what(path: Path) -> str:
     """Return what something is that is no bag, and the command that makes one; '' if unknown."""
-    for folder in (path, *path.absolute().parents[:3]):
+    for folder in (path, *path.absolute().parents[:4]):
         if (folder / 'meta' / 'info.json').is_file():
             return _advice('LeRobot data', 'import-lerobot', folder)
-    if any((path / name).is_file() for name in ('.zgroup', '.zarray', '.zattrs', 'zarr.json')):
+    if path.name.endswith('.zarr.zip') or any((path / name).is_file() for name in (
+            '.zgroup', '.zarray', '.zattrs', 'zarr.json')):
         return _advice('a zarr store', 'import-arrays', path)
     for file in (path, *(islice(path.rglob('*'), _MOST_FILES) if path.is_dir() else ())):
         if '.tfrecord' in file.name:

@@ -195,7 +195,8 @@ def test_arrays_of_pictures_are_imported(name, tmp_path, capsys, monkeypatch):
     pictures = np.random.default_rng(0).integers(0, 256, (9, 8, 12, 3), np.uint8)
     jpeg = np.frombuffer(cv2.imencode('.jpg', pictures[0])[1], np.uint8)
     trees = {
-        'h5py': {'data': {f'demo_{i}': {'obs': {'front': pictures[i:i + 3], 'joints': np.ones(3)}}
+        'h5py': {'data': {f'demo_{i}': {'obs': {'front': pictures[i:i + 3], 'joints': np.ones(3)},
+                                        'next_obs': {'front': pictures[i + 1:i + 4]}}
                           for i in (2, 0, 1)}},
         'zarr': {'data': {'img': np.moveaxis(pictures, -1, 1).astype(np.float32)},
                  'meta': {'episode_ends': np.array([4, 9])}}}

@@ -86,9 +86,12 @@ def test_a_camera_is_asked_for_only_among_those_that_show_something(tmp_path, ca
     file.write_bytes(record(rlds(frames, image_1=blank)) + record(rlds(blank, image_1=blank)))
     code, said = run_import(capsys, 'import-tfrecord', file, '--out', out)
     assert code == 0 and '1 episodes' in said and 'left out: 1 episodes' in said
-    file.write_bytes(record(rlds(frames, image_1=blank, wrist=wrist)))
+    depth = rlds(frames, image_1=blank, wrist=wrist)
+    depth['steps/observation/depth'] = 6 * [cv2.imencode('.png', np.full((8, 8), 900, np.uint16))[
+        1].tobytes()]
+    file.write_bytes(record(depth))
     code, said = run_import(capsys, 'import-tfrecord', file, '--out', tmp_path / 'b')
-    assert code == 1 and '--camera: expected one of image_0, wrist' in said
+    assert code == 1 and '--camera: expected one of image_0, wrist\n' in said
     assert run_import(capsys, 'import-tfrecord', file, '--out', tmp_path / 'b', '--camera',
                       'wrist', '--size', '8', '--crop', 'centre')[0] == 0
     assert next(iter_episodes(tmp_path / 'b')).frames.shape == (6, 8, 8, 3)

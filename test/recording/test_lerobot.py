@@ -289,6 +289,17 @@ def test_frames_are_those_of_the_rows_times_and_of_one_episode_each(
     assert any('within the one before' in str(each.message) for each in recwarn) == (second < 2)
 
 
+def test_rows_of_another_rate_than_described_keep_their_times(filmed, tmp_path):
+    folder, key = filmed
+    info = json.loads((folder / 'meta' / 'info.json').read_text())
+    (folder / 'meta' / 'info.json').write_text(json.dumps(info | {'fps': 30}))
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 0
+    for number, episode in enumerate(iter_episodes(tmp_path / 'bag')):
+        assert set(np.diff(episode.stamps)) == {10**9 // 4}
+        assert np.abs(episode.frames.mean((1, 2, 3)) - 15 * np.arange(
+            8 * number, 8 * number + 8)).max() < 5
+
+
 def test_a_video_that_ends_early_is_named(filmed, tmp_path, capsys):
     folder, key = filmed
     rewrite(folder, 'data', lambda table: table.set_column(

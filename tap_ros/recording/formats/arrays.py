@@ -3,9 +3,9 @@
 """
 Import pictures that stand as arrays in HDF5 files (ALOHA, robomimic) or zarr stores.
 
-An array of pictures is (N, H, W, 3), (N, 3, H, W), or (N, bytes) of JPEG files. Its last name is
-the camera; arrays of one camera in several groups, such as data/demo_7/obs, are an episode each,
-and so is each file. meta/episode_ends, as of diffusion policy, cuts one array into episodes.
+An array of pictures is (N, H, W, 3 or 4), (N, 3, H, W), or (N, bytes) of JPEG files. Its last name
+is the camera; arrays of one camera in several groups, such as data/demo_7/obs, are an episode
+each, and so is each file. meta/episode_ends, as of diffusion policy, cuts an array into episodes.
 """
 
 from collections.abc import Iterator
@@ -100,7 +100,7 @@ def _episodes(root: Any, camera: str) -> Iterator[Any]:
 
 def _arrays(group: Any, above: str = '') -> Iterator[tuple[str, Any]]:
     """Yield the arrays below a group, with their paths."""
-    for name in group:
+    for name in set(group) - {'next_obs'}:  # robomimic's observations once more
         if hasattr(group[name], 'dtype'):
             yield above + name, group[name]
         else:
@@ -111,12 +111,14 @@ def _holds_pictures(array: Any) -> bool:
     """Tell whether an array is of pictures."""
     if len(array.shape) == 2 and array.dtype == np.uint8 and len(array):
         return bytes(array[0][:3]) == b'\xff\xd8\xff'
-    return len(array.shape) == 4 and 3 in (array.shape[1], array.shape[3])
+    return len(array.shape) == 4 and (array.shape[1] == 3 or array.shape[3] in (3, 4))
 
 
 def _picture(values: Any) -> np.ndarray:
-    """Return a picture, uint8 (H, W, 3): of pixels 0 to 255, or of a JPEG with zeros behind it."""
+    """Return a picture, uint8 (H, W, 3), of a JPEG with zeros behind it, or of pixels."""
     if values.ndim == 1:
         return decompress(bytes(values), 'jpeg')
-    pixels = np.asarray(values).clip(0, 255).astype(np.uint8)
-    return pixels if pixels.shape[-1] == 3 else np.moveaxis(pixels, 0, -1)
+    if values.dtype.kind == 'f' and values.max() <= 1:
+        values = values * 255
+    pixels = np.asarray(values).round().clip(0, 255).astype(np.uint8)
+    return pixels[..., :3] if pixels.shape[-1] in (3, 4) else np.moveaxis(pixels, 0, -1)

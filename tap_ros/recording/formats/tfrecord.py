@@ -10,6 +10,7 @@ and the instruction are taken; times are nominal, since records do not tell them
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count
 import math
@@ -118,12 +119,16 @@ def run(args: Options) -> None:
 
 def _choose(features: dict[str, Any], camera: str) -> str:
     """Return the camera whose pictures are taken, with the number of steps in a batch."""
-    found = sorted({
-        match[1] or match[2] for name, value in features.items() if isinstance(value, list)
-        and (match := re.fullmatch(r'steps/observation/(.+)|0/(.+)/encoded', name))
-        and _is_picture(value[0] if value else b'')})
-    if camera in found:
+    names = {match[1] or match[2] for name, value in features.items() if isinstance(value, list)
+             and (match := re.fullmatch(r'steps/observation/(.+)|0/(.+)/encoded', name))
+             and _is_picture(value[0] if value else b'')}
+    if camera in names:
         return camera
+    found = []
+    for name in sorted(names):
+        with suppress(ImageError):  # of depth
+            _picture(_pictures(features, name)[0])
+            found.append(name)
     if camera or not found:
         raise ConfigError(f'--camera {escaped(camera)}: expected one of '
                           f'{listing(found) or "those with pictures, but there are none"}')
