@@ -1,0 +1,183 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A time preference w(t) of Eq. 5 that is learned from a few marked demonstrations.
+
+w(t) is a softmax over the frames of a demonstration, of a linear function of seven features and
+their squares. The features are what every sequence of pictures has: where a frame is in time and
+on the way from start to goal, how fast the pictures change there, and whether that slows down.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from typing import Any, Self
+
+import numpy as np
+from tap_ros.errors import ConfigError
+
+FEATURES = ('time', 'progress', 'distance to both', 'speed', 'distance to start',
+            'distance to goal', 'change of speed')
+FLOOR = math.exp(-4)  # the least w of a frame, as a share of the largest of its demonstration
+RIDGE = 0.1  # price of the squared weights, in nats; the features have variance 1
+SPREAD = (0.25, 0.5, 0.25)  # a mark is off by a frame as often as not
+LEAST_FRAMES = 3
+WINDOW = 4  # frames, before and after, between which speed changes
+
+
+def describe(frames: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray:
+    """
+    Compute the features of each frame; brightness and contrast of the camera change none of them.
+
+    Distances are l1, speed is the distance to the frames beside. Progress is (d_0 - d_T) / (d_0 +
+    d_T), with d_0 and d_T the distances to start and goal.
+
+    :param frames: uint8 (T, H, W, 3), T at least 3: start, what lies between, goal.
+    :param hidden: bool (T, H, W), pixels that do not count, such as the robot's; None: none.
+    :return: float64 (T, 14): FEATURES, then their squares.
+    :raises ConfigError: for fewer frames.
+    """
+    T = len(frames)
+    if T < LEAST_FRAMES:
+        raise ConfigError(f'a demonstration of {T} frames; expected at least {LEAST_FRAMES}')
+    pictures = frames.astype(np.float32)
+
+    def distance(a: int, b: int) -> float:
+        gap = np.abs(pictures[a] - pictures[b]).mean(-1)
+        if hidden is not None:
+            gap = gap[~(hidden[a] | hidden[b])]
+        return float(gap.mean()) if gap.size else 0.0
+
+    start, goal = (np.array([distance(end, t) for t in range(T)]) for end in (0, T - 1))
+    moves = np.array([distance(t, t + 1) for t in range(T - 1)])
+    speed = (np.append(moves[:1], moves) + np.append(moves, moves[-1:])) / 2
+    usual, largest = max(speed.mean(), 1e-6), max(start.max(), goal.max(), 1e-6)
+    nearer = np.minimum(start, goal)
+    before = np.array([speed[max(0, t + 1 - WINDOW):t + 1].mean() for t in range(T)])
+    after = np.array([speed[t:t + WINDOW].mean() for t in range(T)])
+    log_speed = np.pad(np.log(speed / usual + 0.1), 1, 'edge')
+    found = np.stack([
+        np.arange(T) / (T - 1), (start - goal) / np.maximum(start + goal, 1e-6),
+        nearer / max(nearer.max(), 1e-6), np.convolve(log_speed, np.ones(3) / 3, 'valid'),
+        start / largest, goal / largest,
+        np.log((after + 0.1 * usual) / (before + 0.1 * usual))], 1)
+    return np.concatenate([found, found ** 2], 1)
+
+
+@dataclass(frozen=True)
+class Preference:
+    """
+    A learned w(t).
+
+    :param weights: (14,), of the features with their mean taken off, in their deviations.
+    :param mean: (14,), of the features in the demonstrations that were marked.
+    :param deviation: (14,), likewise.
+    """
+
+    weights: np.ndarray
+    mean: np.ndarray
+    deviation: np.ndarray
+
+    def __call__(self, features: np.ndarray) -> np.ndarray:
+        """Return w (T,), FLOOR to 1, of the frames of a demonstration with features (T, 14)."""
+        logits = self._logits(features)
+        return np.maximum(np.exp(logits - logits.max()), FLOOR)
+
+    def best(self, features: np.ndarray) -> int:
+        """Return the frame of largest w, of those between start and goal."""
+        return 1 + int(self._logits(features)[1:-1].argmax())
+
+    def _logits(self, features: np.ndarray) -> np.ndarray:
+        """Return log w (T,), up to a constant."""
+        return np.asarray((features - self.mean) / self.deviation @ self.weights)
+
+    def to_json(self) -> dict[str, list[float]]:
+        """Return what JSON can hold; from_json reads it."""
+        return {name: values.tolist() for name, values in vars(self).items()}
+
+    @classmethod
+    def from_json(cls, values: Any) -> Self:
+        """
+        Read what to_json has returned.
+
+        :raises ConfigError: for anything else.
+        """
+        try:
+            found = cls(**{name: np.array(each, float) for name, each in values.items()})
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ConfigError(f'preference: expected weights, mean and deviation of features '
+                              f'({error})') from error
+        size = (2 * len(FEATURES),)
+        if not all(each.shape == size and np.isfinite(each).all() for each in vars(
+                found).values()) or (found.deviation <= 0).any():
+            raise ConfigError(f'preference: expected {size[0]} finite numbers of each, and '
+                              'deviations above 0')
+        return found
+
+
+def learn_preference(features: Sequence[np.ndarray], marks: Sequence[int]) -> Preference:
+    """
+    Learn w from marked demonstrations: the most likely one, with a ridge.
+
+    Minimises sum_n (-sum_k SPREAD_k log softmax(x_n a)_{m_n + k}) + RIDGE |a|^2, which is convex,
+    by Newton's method.
+
+    :param features: of N demonstrations, (T, 14) each.
+    :param marks: N, the frame that is marked in each.
+    :return: Preference.
+    :raises ConfigError: without marks, or for one outside of its demonstration.
+    """
+    from scipy.optimize import minimize  # takes a moment to import
+    if not marks:
+        raise ConfigError('marks: no demonstration is marked; mark at least one, better ten')
+    for number, (one, mark) in enumerate(zip(features, marks, strict=True)):
+        if not 0 <= mark < len(one):
+            raise ConfigError(f'marks: frame {mark} of demonstration {number}, which has '
+                              f'{len(one)} frames')
+    everything = np.concatenate(features)
+    mean, deviation = everything.mean(0), np.maximum(everything.std(0), 1e-6)
+    inputs = [(one - mean) / deviation for one in features]
+    wanted = [np.array(SPREAD) @ x[np.clip([mark - 1, mark, mark + 1], 0, len(x) - 1)]
+              for x, mark in zip(inputs, marks)]
+
+    def loss(a: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = RIDGE * a @ a, 2 * RIDGE * a
+        for x, target in zip(inputs, wanted):
+            share, log_sum = _softmax(x @ a)
+            value, slope = value + log_sum - target @ a, slope + share @ x - target
+        return float(value), slope
+
+    def curvature(a: np.ndarray) -> np.ndarray:
+        found = 2 * RIDGE * np.eye(len(a))
+        for x in inputs:
+            share, _ = _softmax(x @ a)
+            found = found + (x.T * share) @ x - np.outer(share @ x, share @ x)
+        return found
+
+    answer = minimize(loss, np.zeros(everything.shape[1]), jac=True, hess=curvature,
+                      method='trust-exact', options={'gtol': 1e-6})
+    return Preference(answer.x, mean, deviation)
+
+
+def leave_one_out(features: Sequence[np.ndarray], marks: Sequence[int],
+                  tolerance: int = 1) -> np.ndarray:
+    """
+    Say whether the marks are enough: whether each is found by what is learned from the others.
+
+    :param features: as for learn_preference; marks: likewise, two at least.
+    :param tolerance: frames that it may be off.
+    :return: bool (N,).
+    """
+    def without(values: Sequence[Any], i: int) -> list[Any]:
+        return [*values[:i], *values[i + 1:]]
+
+    found = [learn_preference(without(features, i), without(marks, i)).best(features[i])
+             for i in range(len(marks))]
+    return np.abs(np.array(found) - marks) <= tolerance
+
+
+def _softmax(logits: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the softmax, and the logarithm of the sum of exponentials."""
+    largest = logits.max()
+    share = np.exp(logits - largest)
+    return share / share.sum(), float(largest + np.log(share.sum()))

@@ -1,0 +1,121 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of the preference that is learned from marks."""
+
+import json
+
+import numpy as np
+import pytest
+from tap_ros.errors import ConfigError
+from tap_ros.prediction.preference import (
+    describe,
+    FEATURES,
+    FLOOR,
+    learn_preference,
+    leave_one_out,
+    Preference,
+    RIDGE,
+    SPREAD,
+)
+
+CALM = FEATURES.index('speed')
+
+
+def demonstration(seed):
+    """Draw a square that crosses the picture and stands still somewhere; return where."""
+    rng = np.random.default_rng(seed)
+    pause, length = int(rng.integers(4, 17)), 24
+    steps = rng.uniform(0.8, 1.2, length)
+    steps[pause - 1:pause + 2] = 0.05
+    frames = np.full((length, 24, 48, 3), 60, np.uint8)
+    for frame, at in zip(frames, 2 + steps.cumsum()):
+        frame[8:16, round(at):round(at) + 8] = rng.integers(150, 240, 3) // 10 * 10
+    return frames, pause
+
+
+@pytest.fixture(scope='module')
+def marked():
+    drawn = [demonstration(seed) for seed in range(20)]
+    return [describe(frames) for frames, _ in drawn], [pause for _, pause in drawn]
+
+
+def test_a_handful_of_marks_finds_the_others(marked):
+    features, marks = marked
+    learned = learn_preference(features[:6], marks[:6])
+    off = [abs(learned.best(one) - mark) for one, mark in zip(features[6:], marks[6:])]
+    assert np.mean(np.array(off) <= 1) > 0.8
+    assert leave_one_out(features[:8], marks[:8]).mean() > 0.7
+    random = np.random.default_rng(0).integers(1, 23, 8).tolist()
+    assert leave_one_out(features[:8], random).mean() < 0.6
+    for one in features:
+        w = learned(one)
+        assert w.shape == (24,) and w.max() == 1 and w.min() >= FLOOR
+        assert w[1:-1].argmax() + 1 == learned.best(one)
+
+
+def test_what_is_learned_is_the_least_of_the_loss(marked):
+    features, marks = [one[:20 - i] for i, one in enumerate(marked[0][:4])], [3, 0, 17, 9]
+    learned = learn_preference(features, marks)
+    assert learned.weights.any()
+
+    def loss(a):
+        value = RIDGE * a @ a
+        for x, mark in zip(features, marks):
+            logits = (x - learned.mean) / learned.deviation @ a
+            log_share = logits - np.log(np.exp(logits).sum())
+            for share, t in zip(SPREAD, (mark - 1, mark, mark + 1)):
+                value -= share * log_share[min(max(t, 0), len(x) - 1)]
+        return value
+
+    least, rng = loss(learned.weights), np.random.default_rng(0)
+    for size in (1e-3, 0.1, 3.0):
+        for _ in range(20):
+            assert loss(learned.weights + size * rng.standard_normal(14)) > least
+
+
+def test_features_of_a_demonstration_shown_backwards_are_turned_round():
+    frames, _ = demonstration(3)
+    there, back = describe(frames)[:, :7], describe(frames[::-1])[::-1, :7]
+    np.testing.assert_allclose(back[:, 0], 1 - there[:, 0], atol=1e-9)
+    np.testing.assert_allclose(back[:, [1, 6]], -there[:, [1, 6]], atol=1e-6)
+    np.testing.assert_allclose(back[:, [2, 3]], there[:, [2, 3]], atol=1e-6)
+    np.testing.assert_allclose(back[:, [4, 5]], there[:, [5, 4]], atol=1e-6)
+
+
+def test_features_are_bounded_squared_and_the_same_for_a_darker_camera():
+    frames, pause = demonstration(5)
+    found = describe(frames)
+    assert found.shape == (24, 14) and np.isfinite(found).all()
+    np.testing.assert_array_equal(found[:, 7:], found[:, :7] ** 2)
+    assert found[:, [0, 2, 4, 5]].min() >= 0 and found[:, [0, 2, 4, 5]].max() == 1
+    assert found[[0, -1], 1].tolist() == [-1, 1]
+    assert abs(found[:, CALM].argmin() - pause) <= 1
+    np.testing.assert_allclose(describe(frames // 2 + 10), found, atol=0.05)
+    assert np.isfinite(describe(np.zeros((3, 8, 8, 3), np.uint8))).all()  # nothing ever moves
+
+
+def test_what_is_hidden_changes_nothing():
+    frames, _ = demonstration(7)
+    hidden = np.zeros(frames.shape[:3], bool)
+    hidden[:, :5] = hidden[4, 10:12] = True
+    painted = np.where(hidden[..., None], 255 - frames, frames)
+    np.testing.assert_array_equal(describe(painted, hidden), describe(frames, hidden))
+    assert not np.array_equal(describe(painted), describe(frames))
+    assert np.isfinite(describe(frames, np.ones_like(hidden))).all()
+
+
+def test_it_is_kept_as_plain_numbers_and_anything_else_is_refused(marked):
+    features, marks = marked
+    learned = learn_preference(features[:3], marks[:3])
+    values = json.loads(json.dumps(learned.to_json()))
+    np.testing.assert_array_equal(Preference.from_json(values)(features[0]), learned(features[0]))
+    for wrong in (None, [], {}, {**values, 'more': [1]}, {**values, 'mean': 'x'},
+                  {**values, 'mean': [0.0] * 13}, {**values, 'weights': [float('nan')] * 14},
+                  {**values, 'deviation': [0.0] * 14}):
+        with pytest.raises(ConfigError, match='preference: expected'):
+            Preference.from_json(wrong)
+    for call, said in ((lambda: learn_preference([], []), 'no demonstration is marked'),
+                       (lambda: learn_preference(features[:1], [24]), 'frame 24 of demonstration'),
+                       (lambda: describe(np.zeros((2, 8, 8, 3), np.uint8)), '2 frames')):
+        with pytest.raises(ConfigError, match=said):
+            call()
