@@ -2,16 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings to damage, and child processes that read them within limits of time and memory."""
 
-from dataclasses import dataclass
 import hashlib
 from io import BytesIO
 import multiprocessing
 import os
 from pathlib import Path
-import resource
 import signal
 import struct
-import subprocess
 import time
 import traceback
 import warnings
@@ -24,7 +21,6 @@ from tap_ros.recording.messages import schema_text
 from tap_ros.recording.writer import EpisodeWriter
 import zstandard
 
-ROOT = Path(__file__).parents[2]
 MAGIC = b'\x89MCAP0\r\n'
 CHUNK = 6  # opcode of an MCAP record
 IMAGE = 'sensor_msgs/msg/Image'
@@ -215,43 +211,6 @@ class Reader:
         self._pipe.close()
         code, self._process = self._process.exitcode, None
         return code
-
-
-@dataclass(frozen=True)
-class Ended:
-    """How a child process ended."""
-
-    code: int | None  # None: it was killed after its time
-    text: str  # what it printed
-    seconds: float
-
-
-def run_limited(command, timeout_s, file_bytes=None):
-    """
-    Run a command to its end.
-
-    :param command: list of words.
-    :param timeout_s: after so long all of its processes are killed.
-    :param file_bytes: most bytes of any file that it writes; beyond, a write fails as it does on a
-        full disk, though with another error number.
-    :return: Ended.
-    """
-    def limit():
-        if file_bytes is not None:
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
-    begin = time.monotonic()
-    process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        cwd=ROOT, start_new_session=True, preexec_fn=limit)
-    try:
-        text, _ = process.communicate(timeout=timeout_s)
-        code = process.returncode
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        text, _ = process.communicate()
-        code = None
-    return Ended(code, text.decode(errors='replace'), time.monotonic() - begin)
 
 
 def describe_exit(code):

@@ -127,7 +127,7 @@ def test_(rig, trials, injection):
             fields = goal_fields(step_budget=injection.budget)
             with trials.one():
                 if injection.during:
-                    handle = rig.begin_moving(min(2, injection.budget - 1), **fields)
+                    handle = rig.begin_moving(**fields)
                 moment = injection.do(world, trial) or time.monotonic()
                 if not injection.during:
                     begin = moment
@@ -290,7 +290,7 @@ def test_scene_other_simulator(rig, trials):
         rig.need('visual_mpc_node', sim='real')
         with trials.one():
             rig.reset(trial)
-            handle = rig.begin_moving(1, **any_goal(trial))
+            handle = rig.begin_moving(**any_goal(trial))
             other = NodeProcess('sim_node', rig.folder / 'other_sim.log', {'seed': 99},
                                 ['-r __node:=other_sim'])
             try:
@@ -350,7 +350,7 @@ def test_predictor_killed(rig, trials):
                 assert time.monotonic() - begin < limit, 'a call while it was dead took long'
                 rig.restart('predictor_node')
                 rig.expect_prediction(5.0)
-                rig.begin_moving(1, **goal_fields('subgoal'))
+                rig.begin_moving(**goal_fields('subgoal'))
 
 
 def moving_goal(rig, trial):

@@ -305,7 +305,13 @@ class VisualMpcNode(LifecycleBase):
             raise PlanningError(end.message)
         age = time.monotonic() - (
             seen if seen.stamp_ns == command.seen.stamp_ns else command.seen).received
-        if age > self.params['max_age'] or self._goal.changed(accepted):
+        if age > self.params['max_age']:
+            self.get_logger().warning(
+                f'a command is not sent, as what it answers came {age:.1f} s ago, and max_age is '
+                f'{self.params["max_age"]:g} s: the machine is too slow or busy',
+                throttle_duration_sec=10.0)
+            return False
+        if self._goal.changed(accepted):
             return False
         return self._arm.send(
             handle, command.plan.action, to_stamp(command.seen.stamp_ns), topics)
