@@ -70,19 +70,24 @@ def run(args: Options) -> None:
     except ConfigError as error:
         refusal = error
         bags = find_bags(args.path)
-        size = first_size(bags[0], next(iter(find_topics(bags[0], reading.image_topic))))
+        size = first_size(bags[0], next(iter(find_topics(bags[0], reading.cameras[0]))))
         with suppress(ImageError):  # whoever opens it is told
-            if size is not None and max(reading.cut.cut_size(size)) > LARGE:  # gigabytes
-                shown = replace(reading, crop=reading.crop or CENTRE, size=64)
+            if size is not None and max(reading.cut.cut_size(size)) > LARGE:
+                # All of them would be gigabytes, and take minutes.
+                rate = max(1, 2 / reading.gap if reading.gap else 0)
+                shown = replace(reading, crop=reading.crop or CENTRE, size=64,
+                                rate=min(reading.rate or rate, rate))
     store = open_recordings([args.path], reading=shown)
-    cameras = {next(iter(find_topics(bag, reading.image_topic))) for bag in find_bags(args.path)}
+    cameras = {next(iter(find_topics(bag, camera))) for bag in find_bags(args.path)
+               for camera in reading.cameras}
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})
     print(f'{escaped(args.path)}: {len(episodes)} episodes, {lengths.sum()} frames of '
           f'{store.image_size[1]}x{store.image_size[0]} pixels')
     if store.camera_size not in (store.image_size, None):
-        how = '' if shown == reading else f', here as with --crop {shown.crop} --size 64'
+        how = '' if shown == reading else (
+            f', here as with --crop {shown.crop} --size 64 --rate {shown.rate:g}')
         print('cut         from pictures of {1}x{0} pixels{2}'.format(*store.camera_size, how))
     print(f'told apart  {_told_apart(store, reading)}')
     print(f'camera      {listing(sorted(cameras))}')

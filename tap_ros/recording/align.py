@@ -26,6 +26,7 @@ from tap_ros.robots.arm import get_arm
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
 _LOOKED_AT = 4096  # messages looked at together
+_LEAST_PAUSE = 0.5  # s, between two demonstrations
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,8 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     tracks['twist'] = _without_stops(tracks['twist'])
     tracks = put_right(tracks, parts[0].source, parts[0].topics)
     frame = tracks['frame']
+    if not marks and reading.gap:
+        _propose_gap(frame.stamp, reading, parts[0].source)
     spans = read_spans(frame, tracks['mark'], marks, gaps, reading)
     owner = _owner(spans, frame, gaps, parts)
     order = np.lexsort((frame.stamp, owner))
@@ -209,6 +212,26 @@ class _Clock:
         at, found = np.concatenate(times), np.concatenate(rows)
         order = np.lexsort((found, at))
         return at[order], found[order]
+
+
+def _propose_gap(stamps: np.ndarray, reading: Reading, source: str) -> None:
+    """Say which gap tells demonstrations apart, where the pauses between them are other ones."""
+    steps = np.sort(np.diff(stamps)) / 1e9
+    steps = steps[steps > 0]
+    longer = steps[1:] >= max(_LEAST_PAUSE, 5 * np.median(steps)) if len(steps) else np.empty(0)
+    if not longer.any():
+        return
+    ratios = np.where(longer, steps[1:] / steps[:-1], 0)
+    last = int(ratios.argmax())  # the step before the widest hole in their histogram
+    pauses, count = steps[last + 1:], int((steps > reading.gap).sum())
+    if ratios[last] < 2 or len(pauses) == count or len(pauses) > len(steps) // 3:
+        return
+    how = (f'they are cut at {count} pauses of more than {reading.gap:g} s' if count else
+           f'none pauses for {reading.gap:g} s')
+    warnings.warn(
+        f'{source}: no marks tell demonstrations apart, {how} (--gap); between its pictures are '
+        f'{len(pauses)} pauses of {pauses[0]:.1f} to {pauses[-1]:.1f} s: --gap '
+        f'{np.sqrt(steps[last] * pauses[0]):.2g} cuts there', RecordingWarning, stacklevel=4)
 
 
 def _gaps(parts: Sequence[Columns]) -> np.ndarray:

@@ -5,6 +5,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+import itertools
 from pathlib import Path
 from typing import Any
 import warnings
@@ -81,9 +82,10 @@ def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
     """
     reading, settings = trained_reading(training, image_topic), training.get('settings')
     trained = settings.get('image_topic') if isinstance(settings, dict) else None
-    if not image_topic and isinstance(trained, str) and trained and all(
-            trained in {topic for topic, _, _ in list_topics(path)} for path in paths):
-        reading = replace(reading, image_topic=trained)
+    trained = {trained} if isinstance(trained, str) else set(trained or ())
+    if not image_topic and all(trained - {''} <= {topic for topic, _, _ in list_topics(path)}
+                               for path in paths):
+        reading = replace(reading, image_topic=tuple(sorted(trained)))
     return reading
 
 
@@ -99,8 +101,9 @@ def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: 
     :raises RecordingError: when a recording is missing, or lacks the image topic.
     """
     sizes = set()
-    for bag in (bag for path in paths for bag in find_bags(path)):
-        size = first_size(bag, next(iter(find_topics(bag, reading.image_topic))))
+    for bag, camera in itertools.product(
+            (bag for path in paths for bag in find_bags(path)), reading.cameras):
+        size = first_size(bag, next(iter(find_topics(bag, camera))))
         if size is not None:
             sizes.add(size)
             with suppress(ImageError):  # whoever opens it is told

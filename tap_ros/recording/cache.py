@@ -14,6 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 import hashlib
+import itertools
 import json
 import math
 import multiprocessing
@@ -106,13 +107,14 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
         or when the images differ in size; the message names the file.
     """
     paths = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
-    bags = [bag for path in paths for bag in find_bags(path)]
+    found = [bag for path in paths for bag in find_bags(path)]
+    cutting = for_bags(reading, len(found))
+    bags, cameras = zip(*itertools.product(found, reading.cameras))
     cache_dir = Path(cache_dir) if cache_dir else cache_folder()
     with tqdm(total=sum(file.stat().st_size for bag in bags for file in bag),
               desc='opening recordings', unit='B', unit_scale=True, disable=not progress,
               delay=1) as bar:
-        jobs = _jobs(bags, [find_topics(bag, reading.image_topic) for bag in bags], reading,
-                     cache_dir)
+        jobs = _jobs(bags, list(map(find_topics, bags, cameras)), reading, cache_dir)
         loaded = {job: _load(job) for bag in jobs for job in bag}
         bar.update(sum(job.size for job, part in loaded.items() if part is not None))
         missing = [job for job, part in loaded.items() if part is None]
@@ -127,12 +129,13 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     for part in (part for bag in columns for part in bag):
         warn_of_damage(part)
     arms = [read_mount(bag[0].parent) for bag in bags]
-    cutting = for_bags(reading, len(bags))
     runs = [(run, arm, bag[0]) for parts, arm, bag in zip(columns, arms, bags)
             for run in runs_of(parts)]
     tables = [assemble(run, arm, cutting) for run, arm, _ in runs]
     # What is read depends on these, too.
     apart = [repr(arm) for arm in arms if arm != ArmMount()]
+    if len(reading.cameras) > 1:
+        apart.append(repr(reading.cameras))
     if replace(reading, image_topic='') != AS_RECORDED:
         apart.append(repr(replace(reading, image_topic='')))
     store = EpisodeStore(tables, [*(job.digest for bag in jobs for job in bag), *apart],

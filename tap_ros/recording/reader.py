@@ -4,6 +4,7 @@
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,8 @@ def iter_episodes(path: str | Path, reading: Reading = AS_RECORDED) -> Iterator[
     """
     bags = find_bags(path)
     cutting = for_bags(reading, len(bags))
-    for files in bags:
-        found, arm = find_topics(files, reading.image_topic), read_mount(files[0].parent)
+    for files, camera in product(bags, reading.cameras):
+        found, arm = find_topics(files, camera), read_mount(files[0].parent)
         parts = [_decode(file, found, reading) for file in files]
         check_sizes(parts)
         for run in runs_of(parts):

@@ -19,6 +19,7 @@ class Reading:
     Which pictures of recordings are used.
 
     :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+        Of several topics each gives episodes of its own.
     :param crop: the square part of the pictures that is used: 'centre', the largest one in the
         middle, or LEFT,TOP,SIDE in pixels of the camera. Without it pictures are used whole.
     :param size: pixels a side that pictures are scaled to, such as 64; 0: not scaled.
@@ -29,7 +30,7 @@ class Reading:
         at most this length; 0: never. Of several bags each is an episode.
     """
 
-    image_topic: str = ''
+    image_topic: str | tuple[str, ...] = ''
     crop: str = ''
     size: int = 0
     rate: float = 0.0
@@ -38,11 +39,19 @@ class Reading:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be read with."""
+        if not isinstance(self.image_topic, str) and len(self.image_topic) < 2:
+            object.__setattr__(self, 'image_topic', ''.join(self.image_topic))
         if self.crop or self.size:
             self.cut  # noqa: B018  it says what is wrong
         for name in ('rate', 'gap', 'episode_seconds'):
             if not 0 <= getattr(self, name) <= 1e6:
                 raise ConfigError(f'{name}: expected 0 to 1000000, got {getattr(self, name)}')
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The topics of cameras; of one '' is found."""
+        topics = self.image_topic
+        return (topics,) if isinstance(topics, str) else tuple(topics)
 
     @cached_property
     def cut(self) -> 'Crop':
@@ -66,7 +75,8 @@ def reading_of(settings: Reading) -> Reading:
     return Reading(**{field.name: getattr(settings, field.name) for field in fields(Reading)})
 
 
-def trained_reading(training: Mapping[str, Any], image_topic: str = '') -> Reading:
+def trained_reading(training: Mapping[str, Any],
+                    image_topic: str | tuple[str, ...] = '') -> Reading:
     """
     Return how the recordings of a training were read.
 

@@ -4,9 +4,10 @@
 
 from dataclasses import replace
 import io
+import re
 
 import cv2
-from made_bags import camera, IMAGE, message, read, record, SECOND
+from made_bags import camera, IMAGE, message, read, record, SECOND, shown
 from made_episodes import make_episode
 import numpy as np
 from PIL import Image as Picture
@@ -19,6 +20,7 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import EpisodeWriter
+from tap_ros.training.split import split_episodes
 
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 TOPIC = '/camera/color/image_raw/compressed'
@@ -192,6 +194,46 @@ def test_unmarked_recordings_are_cut_by_pauses_or_by_length(tmp_path):
         found, _ = read(record(tmp_path / str(number), map(camera, times)), reading=reading)
         assert [len(e) for e in found] == lengths
         assert np.concatenate([e.stamps for e in found]).tolist() == [t * SECOND for t in times]
+
+
+def test_a_gap_is_proposed_where_other_pauses_are_between_demonstrations(tmp_path):
+    def times(pause, count=4, period=0.1):
+        return [start + t * period for start in np.arange(count) * (20 * period + pause)
+                for t in range(20)]
+    for number, (stamps, words) in enumerate((
+            (times(3), '3 pauses of 3.1 to 3.1 s: --gap 0.56'), (times(9), ''), (times(0), ''),
+            (times(1.5), '3 pauses of 1.6 to 1.6 s: --gap 0.4'), (times(2, 4, 1), ''),
+            ([*times(3), *(t + 99 for t in times(3))], 'cut at 1 pauses .* 7 pauses of 3.1 to'))):
+        found, told = read(record(tmp_path / str(number), [
+            camera(1 + t, i) for i, t in enumerate(stamps)]))
+        assert len(told) == bool(words) and re.search(words, ''.join(told))
+        if 'gap 0' in words:
+            gap = float(told[0].split('--gap ')[1].split()[0])
+            assert [len(e) for e in read(
+                tmp_path / str(number), reading=Reading(gap=gap))[0]] == [20] * 4
+
+
+def test_several_cameras_of_a_demonstration_are_on_one_side_of_the_split(tmp_path):
+    bag = record(tmp_path / 'bag', [camera(t + d * 30, d, topic=f'/{side}/rgb')
+                                    for d in range(1, 9) for t in range(4) for side in 'ab'])
+    store = open_recordings(bag, reading=Reading(('/a/rgb', '/b/rgb')))
+    assert len(store) == 16 and shown(store) == shown(iter_episodes(
+        bag, Reading(('/a/rgb', '/b/rgb'))))
+    for fraction in (0.1, 0.3, 0.6):
+        parts = split_episodes(store, fraction)
+        numbers = [{int(store[i].frames[0, 0, 0, 0]) for i in part} for part in parts]
+        assert not numbers[0] & numbers[1] and all(len(part) % 2 == 0 for part in parts)
+        assert sum(map(len, numbers)) == 8
+
+
+def test_sizes_that_come_out_alike_after_the_cut_may_change(tmp_path):
+    sizes = [(48, 64)] * 3 + [(96, 128)] * 2 + [(60, 60)]
+    bag = record(tmp_path / 'bag', [
+        compressed(t + 1, scene(t, size)) for t, size in enumerate(sizes)])
+    (episode,), told = read(bag, reading=Reading(crop='centre', size=16))
+    assert episode.frames.shape == (6, 16, 16, 3) and not told
+    with pytest.raises(RecordingError, match='3 of 64x48, 2 of 128x96, 1 of 60x60.*--crop'):
+        open_recordings(bag)
 
 
 def test_of_several_bags_each_is_an_episode(tmp_path):
