@@ -5,6 +5,9 @@
 #   . scripts/environment.bash
 # It uses the ROS 2 of that environment, and puts another one that the shell had sourced aside.
 
+# The files of colcon and of virtual environments ask for variables that there are not.
+case $- in *u*) tap_nounset=1; set +u ;; *) tap_nounset= ;; esac
+
 tap_root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 
 if [ -n "${AMENT_PREFIX_PATH:-}" ]; then
@@ -27,4 +30,5 @@ fi
 if [ -f "$tap_root/install/setup.bash" ]; then
   . "$tap_root/install/setup.bash"
 fi
-unset tap_root
+[ -z "$tap_nounset" ] || set -u
+unset tap_root tap_nounset

@@ -5,4 +5,12 @@
 import os
 
 # Off-screen rendering on a machine without a display; MuJoCo reads it once, when it is imported.
-os.environ.setdefault('MUJOCO_GL', 'egl')
+_chosen = os.environ['MUJOCO_GL'] = os.environ.get('MUJOCO_GL') or 'egl'
+GL_PROBLEM = ''  # why nothing can be drawn
+try:
+    import mujoco
+except Exception as error:  # no such value, or its library is not there; physics needs neither
+    GL_PROBLEM = str(error)
+    os.environ['MUJOCO_GL'] = 'disabled'
+    import mujoco  # noqa: F401
+    os.environ['MUJOCO_GL'] = _chosen

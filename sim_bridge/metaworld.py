@@ -14,7 +14,7 @@ import warnings
 import mujoco
 import numpy as np
 from sim_bridge.gym_world import GymWorld
-from sim_bridge.world.camera import Camera
+from sim_bridge.world.camera import Camera, drawing
 from tap_ros.contract import (
     CONTROL_PERIOD,
     ROBOT_MASK_ARM,
@@ -52,7 +52,8 @@ class MetaWorld(GymWorld):
         eye.pos[:] = np.array(CAMERA.position) * TURN + ORIGIN
         eye.quat[:], eye.fovy[:] = replace(CAMERA, turn=np.pi).quaternion, CAMERA.fovy
         model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0  # 7 ms instead of 300
-        self._renderer = mujoco.Renderer(model, image_size, image_size)
+        with drawing():
+            self._renderer = mujoco.Renderer(model, image_size, image_size)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._option = mujoco.MjvOption()

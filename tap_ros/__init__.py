@@ -14,6 +14,16 @@ import os
 if 'OMP_WAIT_POLICY' not in os.environ:
     os.environ.setdefault('GOMP_SPINCOUNT', '60000')
 
+# A container that runs with any user id has no home, or one that cannot be written.
+_home = os.path.expanduser('~')
+if not os.access(_home, os.W_OK):
+    _folder = f"{os.environ.get('TMPDIR', '/tmp')}/tap_ros-{os.getuid()}"
+    os.environ.setdefault('TAP_ROS_CACHE', f'{_folder}/cache')
+    if 'ROS_HOME' not in os.environ:
+        os.environ.setdefault('ROS_LOG_DIR', f'{_folder}/log')
+    if _home == '~':  # other libraries look for one, too
+        os.environ['HOME'] = _folder
+
 # What most users need; each is imported when it is asked for, so that nodes stay light.
 _EXPORTS = {
     'Arm': 'tap_ros.robots.arm',

@@ -14,6 +14,7 @@ import importlib
 from operator import or_
 import os
 from pathlib import Path
+import signal
 import sys
 from typing import Annotated, Any, cast, TypeAlias
 
@@ -86,17 +87,20 @@ class All:
     """Options of all benchmarks, one after the other: none."""
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None, leave: Callable[..., None] | None = None) -> int:
     """
     Run one command.
 
     :param arguments: list of strings; by default those of the process.
+    :param leave: handles SIGINT until the command is imported, and after it has ended.
     :return: exit code: 0, 1 after an error that was named, 130 when interrupted.
     :raises SystemExit: as options.parse, for words that are no command or option and for --help.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         run, options = read(arguments)
+        if leave is not None and signal.getsignal(signal.SIGINT) is leave:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         return run(options) or 0
     except TapError as error:
         print(f'error: {escaped(error, 2000)}', file=sys.stderr)

@@ -2,15 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera's geometry, and off-screen rendering."""
 
+from collections.abc import Iterator
 import contextlib
 from dataclasses import dataclass, replace
+import os
+from typing import Any
+import warnings
 import weakref
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
+from sim_bridge import GL_PROBLEM
 from sim_bridge.world.scene import CAMERA_FOVY, CAMERA_POSITION, CAMERA_TILT
 from tap_ros.errors import SceneError
+from tap_ros.text import escaped
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,21 @@ class Camera:
         return replace(self, width=width, height=height)
 
 
+@contextlib.contextmanager
+def drawing() -> Iterator[None]:
+    """Raise SceneError, with the remedy, where MuJoCo cannot draw off-screen."""
+    try:
+        with warnings.catch_warnings(action='ignore'):
+            if GL_PROBLEM:
+                raise OSError(GL_PROBLEM)
+            yield
+    except Exception as error:
+        raise SceneError(
+            f"cannot render off-screen with MUJOCO_GL={escaped(os.environ['MUJOCO_GL'])} "
+            f'({escaped(error)}); set MUJOCO_GL=egl, and on Debian and Ubuntu: apt-get install '
+            'libegl1 libgl1-mesa-dri') from error
+
+
 class OpenGL:
     """
     An off-screen OpenGL context; it belongs to the thread that built it.
@@ -112,15 +133,11 @@ class OpenGL:
         # Torch's CUDA build brings triton, whose LLVM has to be loaded before that of Mesa.
         with contextlib.suppress(ImportError):
             import triton  # noqa: F401
-        try:
+        with drawing():
             self._gl = mujoco.GLContext(width, height)
             self._gl.make_current()
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
             mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        except Exception as error:
-            raise SceneError(
-                f'cannot render off-screen ({error}); on Debian and Ubuntu: '
-                'apt-get install libegl1 libgl1-mesa-dri, and set MUJOCO_GL=egl') from error
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         # Dropped without close, MuJoCo would free another context's objects.
         self._finalizer = weakref.finalize(self, _free, self._gl, self._context)
@@ -150,8 +167,15 @@ class OpenGL:
         self._finalizer()
 
 
-def _free(gl: mujoco.GLContext, context: mujoco.MjrContext) -> None:
-    """Free a context while it is the current one."""
-    gl.make_current()
+_kept: list[tuple[Any, mujoco.MjrContext]] = []  # contexts that could not be freed
+
+
+def _free(gl: Any, context: mujoco.MjrContext) -> None:
+    """Free a context while it is the current one; keep one that another thread is drawing with."""
+    try:
+        gl.make_current()
+    except Exception:
+        _kept.append((gl, context))
+        return
     context.free()
     gl.free()
