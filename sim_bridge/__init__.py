@@ -4,6 +4,8 @@
 
 import os
 
+import tap_ros  # noqa: F401  # its handler of Ctrl-C, before what takes long to import
+
 # Off-screen rendering on a machine without a display; MuJoCo reads it once, when it is imported.
 _chosen = os.environ['MUJOCO_GL'] = os.environ.get('MUJOCO_GL') or 'egl'
 GL_PROBLEM = ''  # why nothing can be drawn

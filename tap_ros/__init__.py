@@ -8,6 +8,25 @@ The names of __all__ can be imported from here: `from tap_ros import SubgoalPred
 
 from importlib import import_module
 import os
+import signal
+import sys
+
+
+def leave_at_once(*_: object) -> None:
+    """Say so and end: the handler of SIGINT while a command or a node is imported."""
+    os.write(2, b'interrupted\n')
+    os._exit(130)
+
+
+# There an interrupt would come out as any error of what is imported. Commands and nodes handle it
+# themselves as soon as they run.
+if sys.argv[:1] == ['-m']:
+    _program = sys.orig_argv[sys.orig_argv.index('-m') + 1] if '-m' in sys.orig_argv else ''
+    _ours = _program.partition('.')[0] in ('tap_ros', 'sim_bridge')
+else:
+    _ours = os.path.basename(os.path.dirname(sys.argv[0])) == 'tap_ros'  # lib/tap_ros/sim_node
+if _ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, leave_at_once)
 
 # By default an idle thread of libgomp spins for milliseconds before it sleeps. On cores that are
 # busy with something else that makes small networks 10 times slower; a fifth of it costs nothing.

@@ -18,6 +18,7 @@ import signal
 import sys
 from typing import Annotated, Any, cast, TypeAlias
 
+from tap_ros import leave_at_once
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.options import parse
 from tap_ros.text import escaped
@@ -87,19 +88,18 @@ class All:
     """Options of all benchmarks, one after the other: none."""
 
 
-def main(arguments: Sequence[str] | None = None, leave: Callable[..., None] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """
     Run one command.
 
     :param arguments: list of strings; by default those of the process.
-    :param leave: handles SIGINT until the command is imported, and after it has ended.
     :return: exit code: 0, 1 after an error that was named, 130 when interrupted.
     :raises SystemExit: as options.parse, for words that are no command or option and for --help.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
         run, options = read(arguments)
-        if leave is not None and signal.getsignal(signal.SIGINT) is leave:
+        if signal.getsignal(signal.SIGINT) is leave_at_once:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         return run(options) or 0
     except TapError as error:

@@ -143,12 +143,13 @@ def _pool(engine: Engine) -> Iterator[Workers]:
 
     def begin(task: Work) -> 'Future[Any]':
         nonlocal pool
-        try:
-            return pool.submit(task.function, *task.args)
-        except BrokenProcessPool:
-            pool.shutdown(cancel_futures=True)
-            pool = start()
-            return pool.submit(task.function, *task.args)
+        with deaf_children():
+            try:
+                return pool.submit(task.function, *task.args)
+            except BrokenProcessPool:
+                pool.shutdown(cancel_futures=True)
+                pool = start()
+                return pool.submit(task.function, *task.args)
 
     try:
         yield begin, room, (BrokenProcessPool,)
@@ -160,19 +161,30 @@ def _pool(engine: Engine) -> Iterator[Workers]:
         pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def deaf_children() -> Iterator[None]:
+    """Let processes that begin in the block ignore Ctrl-C, which a terminal sends to them, too."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _start_worker() -> None:
     """
     Let a worker end with its parent alone.
 
-    Who holds the lock of a folder is the only one to write there, so it must not outlive it; what
-    a terminal sends to both is the parent's to handle.
+    Who holds the lock of a folder is the only one to write there, so it must not outlive it.
     """
     def end() -> None:
         parent = multiprocessing.parent_process()
         assert parent is not None, 'a worker has one'
         connection.wait([parent.sentinel])
         os._exit(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=end, daemon=True).start()
 
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the simulator: determinism, kinematics, limits."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from sim_bridge.simulator import Simulator
@@ -95,4 +97,9 @@ def test_a_dropped_simulator_leaves_the_pictures_of_others_alone(simulator):
     other.reset(4)
     simulator.observe()  # whose context is the current one when the other is dropped
     del other
+    np.testing.assert_array_equal(simulator.observe().image, before)
+    made = [Simulator('push2')]
+    made[0].reset(5)
+    with ThreadPoolExecutor(1) as pool:  # in a thread that cannot draw with that context
+        pool.submit(made.clear).result()
     np.testing.assert_array_equal(simulator.observe().image, before)

@@ -1,0 +1,95 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Shells, containers and terminals as people have them: it works, or one line says why not."""
+
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+KEPT = {name: value for name, value in os.environ.items() if name != 'MUJOCO_GL'}
+
+
+def run(code, **changes):
+    """Run Python code with other variables, None for none of that name; return what it printed."""
+    environment = {k: v for k, v in (KEPT | changes).items() if v is not None}
+    return subprocess.run([sys.executable, '-c', code], cwd=ROOT, env=environment, text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=100)
+
+
+@pytest.mark.parametrize('options', ['-u', '-eu', '-e -o pipefail', '+u'])
+def test_the_environment_can_be_entered_by_any_shell(options):
+    if not (ROOT / '.venv' / 'bin' / 'activate').is_file():
+        pytest.skip('installed without make')
+    line = f'set {options}; . scripts/environment.bash; python -c "import rclpy"; echo "left $-"'
+    done = subprocess.run(['bash', '-c', line], cwd=ROOT, text=True, capture_output=True,
+                          env={'PATH': os.environ['PATH']})
+    assert done.returncode == 0 and 'left' in done.stdout, done.stderr
+    assert ('u' in done.stdout.split('left ')[1]) == ('u' in options and '+' not in options)
+
+
+@pytest.mark.parametrize('value', ['glx-nonsense', 'osmesa', 'disabled'])
+def test_without_opengl_physics_runs_and_pictures_are_refused_in_one_line(value):
+    done = run('import sim_bridge, mujoco\n'
+               'mujoco.MjModel.from_xml_string("<mujoco/>")\n'
+               'from tap_ros.errors import SceneError\n'
+               'try: from sim_bridge.simulator import Simulator; Simulator().reset(0)\n'
+               'except SceneError as error: print("refused:", error)', MUJOCO_GL=value)
+    if done.returncode == 0 and not done.stdout:
+        pytest.skip(f'{value} works here')
+    assert done.returncode == 0 and done.stdout.startswith('refused: '), done.stdout
+    assert f'MUJOCO_GL={value}' in done.stdout and 'MUJOCO_GL=egl' in done.stdout
+    assert done.stdout.count('\n') == 1
+
+
+def test_an_empty_mujoco_gl_is_none():
+    done = run('import os, sim_bridge; print(os.environ["MUJOCO_GL"])', MUJOCO_GL='')
+    assert done.stdout == 'egl\n'
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('home', [None, '/nonexistent', '/proc'])
+def test_without_a_home_cache_and_logs_find_a_place(tmp_path, home):
+    """Whoever has no entry in passwd has no home without HOME, as with docker run --user."""
+    code = ('import os, pwd\n'
+            'def unknown(uid): raise KeyError\n'
+            'pwd.getpwuid = unknown\n'
+            'os.access = lambda path, mode, _=os.access: "tmp" in path and _(path, mode)\n'
+            'import tap_ros, rclpy\n'
+            'from tap_ros.recording.cache import cache_folder\n'
+            'rclpy.init()\n'
+            'print(cache_folder())')
+    done = run(code, HOME=home, TMPDIR=str(tmp_path), TAP_ROS_CACHE=None, ROS_LOG_DIR=None)
+    assert done.stdout == f'{tmp_path}/tap_ros-{os.getuid()}/cache\n'
+    assert list(tmp_path.glob('tap_ros-*/log/*'))
+
+
+@pytest.mark.parametrize('module', [
+    'tap_ros', pytest.param('tap_ros.nodes.predictor.node', marks=pytest.mark.ros),
+    pytest.param('sim_bridge.ros.sim_node', marks=pytest.mark.ros)])
+def test_ctrl_c_while_python_imports_is_one_line(module, tmp_path):
+    slow = tmp_path / 'numpy.py'  # imported by all, for ever
+    slow.write_text('print("importing", flush=True)\n'
+                    'import time\n'
+                    'try: time.sleep(60)\n'
+                    'except BaseException as error: raise ImportError from error\n')
+    path = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get('PYTHONPATH', '')])
+    words = ['inspect', str(tmp_path)] if module == 'tap_ros' else []
+    process = subprocess.Popen(
+        [sys.executable, '-m', module, *words], cwd=ROOT, env=os.environ | {'PYTHONPATH': path},
+        text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    assert process.stdout.readline() == 'importing\n'
+    time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    assert (process.communicate(timeout=20)[0], process.returncode) == ('interrupted\n', 130)
+
+
+def test_a_program_that_imports_the_package_keeps_its_own_handler():
+    done = run('import signal, tap_ros, sim_bridge\n'
+               'print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)')
+    assert done.stdout == 'True\n'
