@@ -64,7 +64,7 @@ def weights(tmp_path_factory):
 
 
 def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(client, weights, capfd):
-    start, goal = jpeg(START), encode_image(GOAL, STAMP, 'eye')
+    start, goal = jpeg(START), jpeg(GOAL)
     objects, goal_objects = (
         positions(('cup', 'box'), pixels) for pixels in (PIXELS, PIXELS[::-1]))
     service = Service(client, 'compressed', weights=weights, image_transport='compressed')
@@ -75,7 +75,8 @@ def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(client, weig
             for message, topic, qos in (
                 (start, 'camera/image_raw/compressed', qos_profile_sensor_data),
                 (objects, 'objects', qos_profile_sensor_data),
-                (goal, 'goal/image', volatile), (goal_objects, 'goal/objects', volatile))])
+                (goal, 'goal/image/compressed', volatile),
+                (goal_objects, 'goal/objects', volatile))])
         assert 'taken best_effort and volatile, as it is published' in capfd.readouterr().err
         picture = encode_image(START, STAMP, 'eye')
         beside = positions(('cup',), [(20.0, 200.0)])
@@ -91,7 +92,7 @@ def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(client, weig
     predictor = SubgoalPredictor.load(weights)
     cut = predictor.camera_crop.of((480, 640), 'goal')
     pixels = cut.pixels(PIXELS.astype(np.float32), (480, 640))
-    expected, = predictor.predict(cut.image(decode_image(start, 'start')), cut.image(GOAL),
+    expected, = predictor.predict(*(cut.image(decode_image(one)) for one in (start, goal)),
                                   pixels, pixels[::-1].copy())
     found = decode_image(answer.subgoals[0].image, 'subgoal').astype(int)
     assert np.abs(found - expected.image).max() <= 1
