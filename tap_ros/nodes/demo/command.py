@@ -15,8 +15,6 @@ import os
 from pathlib import Path
 import platform
 import shlex
-import shutil
-import subprocess
 import sys
 import time
 from typing import Annotated, Any, TYPE_CHECKING
@@ -38,7 +36,6 @@ from tap_ros.nodes.demo.report import (
     Run,
     SceneRuns,
     write_film,
-    write_overview,
     write_report,
 )
 from tap_ros.nodes.node_processes import NodeProcesses
@@ -170,16 +167,6 @@ def film_expert(task: str, seed: int, world: dict[str, Any]) -> list[np.ndarray]
         simulator.close()
 
 
-def start_nodes(processes: NodeProcesses, folder: Path, task: str,
-                world: dict[str, str]) -> None:
-    """Start simulator, predictor, recorder and, for tasks that push, the planner."""
-    processes.start('recorder_node', folder=folder / 'recording' / task)
-    processes.start('sim_node', lock_step=True, task=task, observer=True, **world)
-    processes.start('predictor_node', weights=task if task in PREDICTORS else DEFAULT_PREDICTOR)
-    if not get_task(task).gripping:
-        processes.start('visual_mpc_node')
-
-
 @dataclass(frozen=True)
 class Options:
     """
@@ -223,13 +210,14 @@ def run(args: Options) -> int:
     scenes = [scene for task in tasks for scene in run_task(args, task, folder)]
     seconds = time.monotonic() - begin
     pushed = [scene for scene in scenes if scene.runs]
-    write_overview(folder / 'subgoals.png', scenes)
     write_report(
         folder / 'report.html', scenes,
         f'Tasks {", ".join(tasks)}, seeds {args.seed} to {args.seed + args.scenes - 1} of each, '
         f'at most {_budget(args, tasks[0])} steps of a push, {seconds:.0f} s in all. Object '
-        'pixels at every step, and the distances, are ground truth of the simulator.',
-        _facts())
+        'pixels at every step, and the distances, are ground truth of the simulator.', {
+            'date': time.strftime('%Y-%m-%d %H:%M'),
+            'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
+            'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'})
     if pushed:
         write_film(folder / 'demo.webp', pushed)
         print(f'\n{results_table(pushed)}\n')
@@ -238,17 +226,6 @@ def run(args: Options) -> int:
         print(f'recording  {folder / "recording"}')
     print(f'page       {folder / "report.html"}')
     return 0
-
-
-def _facts() -> dict[str, str]:
-    """Say what makes a page: when, of which commit, by which command, on what machine."""
-    found = subprocess.run(  # outside of a checkout git says nothing
-        ['git', '-C', str(Path(__file__).parent), 'log', '-1', '--format=%h'],
-        capture_output=True, text=True, check=False) if shutil.which('git') else None
-    commit = found.stdout.strip() if found is not None else ''
-    return {'date': time.strftime('%Y-%m-%d %H:%M'), 'commit': commit or 'unknown',
-            'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
-            'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'}
 
 
 def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
@@ -262,7 +239,12 @@ def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
         else:
             print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
                   flush=True)
-            start_nodes(processes, folder, task, world)
+            processes.start('recorder_node', folder=folder / 'recording' / task)
+            processes.start('sim_node', lock_step=True, task=task, observer=True, **world)
+            processes.start(
+                'predictor_node', weights=task if task in PREDICTORS else DEFAULT_PREDICTOR)
+            if not get_task(task).gripping:
+                processes.start('visual_mpc_node')
             processes.wait_until_ready()
         scenes = []
         for i in range(args.scenes):

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the demo leaves of its scenes: a table, a self-contained HTML page, a film, a picture."""
+"""What the demo leaves of its scenes: a table, a self-contained HTML page, a film."""
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
@@ -107,12 +107,6 @@ def write_report(path: str | Path, scenes: Sequence[SceneRuns], note: str = '',
         modes=[MODE_NAMES[mode] for mode in pushed[0].runs] if pushed else (),
         note=note, facts=facts, scenes=[
             (f'{scene.task} {scene.seed}', list(_figures(scene))) for scene in scenes]))
-
-
-def write_overview(path: str | Path, scenes: Sequence[SceneRuns]) -> None:
-    """Write a PNG: a row for each scene with start, goal, subgoal and its object maps."""
-    write_atomically(path, png_bytes(grid(
-        [[picture for _, picture in _prediction(scene)] for scene in scenes])))
 
 
 def write_film(path: str | Path, scenes: Sequence[SceneRuns]) -> None:
