@@ -202,6 +202,7 @@ def _rows(message: Any, bytes_per_pixel: int, planes: float = 1) -> np.ndarray:
     if height == 0 or width == 0:
         raise ImageError(f'is empty ({width}x{height} pixels); send a whole image')
     row_bytes = width * bytes_per_pixel
+    step = step or row_bytes  # of drivers that leave it out
     if step < row_bytes:
         raise ImageError(
             f'step is {step} bytes, but {width} pixels of {message.encoding} take {row_bytes}; '

@@ -21,6 +21,8 @@ from tap_ros.text import escaped
 APART_NS = 5 * 10**9  # topics farther apart than this have clocks of their own
 SMALLEST_NS = 20 * 10**6  # a clock that is set back by less is not told from jitter
 NOMINAL_NS = 10**8  # between frames of which neither stamps nor log times tell anything
+_OFTEN_NS = 10 * 10**9  # no clock is set back so often
+AHEAD_NS = 3600 * 10**9  # a clock that jumps by more was set, and did not wait
 _AROUND = 9  # messages before and after a place that are compared
 _STREAMS = ('frame', 'twist', 'joint', 'arm', 'object')
 
@@ -36,7 +38,7 @@ def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str]) -> 
     said: list[str] = []
     called = {name: f'topic {escaped(topics.get(name, name))}' for name in tracks}
     called['arm'] = called['joint']
-    tracks = _one_log(tracks, said)
+    tracks = _one_log(_moving_log(tracks, said), said)
     tracks = {name: track.take(np.argsort(track.log, kind='stable'))
               for name, track in tracks.items()}
     before = tracks['frame']
@@ -58,6 +60,19 @@ def _set_back(times: np.ndarray, least: int) -> np.ndarray:
     return np.array([i for i in back.tolist() if len(times) >= i + PROOF
                      and (times[i:i + PROOF] < newest[i - 1]).all()
                      and (np.diff(times[i:i + PROOF]) >= 0).all()], np.int64)
+
+
+def _moving_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
+    """Let log times that stand still go on as stamps do, or as pictures were written."""
+    frame = tracks['frame']
+    if len(frame) <= PROOF or (np.diff(frame.log) == 0).mean() <= 0.5:
+        return tracks
+    moves = (np.diff(frame.stamp) > 0).all()
+    times = frame.stamp if moves else np.arange(len(frame)) * NOMINAL_NS
+    said.append(f'log times stand still; {"stamps" if moves else "the order of writing"} counts')
+    return {name: replace(track, log=np.interp(
+        track.order, frame.order, times - times[0]).astype(np.int64) + times[0])
+        for name, track in tracks.items()}
 
 
 def _one_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
@@ -110,13 +125,12 @@ def _frames(tracks: dict[str, Track], called: str, said: list[str]) -> Track:
     # A clock that begins at zero agrees with the next stamp.
     jumps = np.abs(np.diff(written.stamp - written.log, append=written.stamp[-1])) > APART_NS
     repeated, unstamped = int((same & ~again).sum()), int((jumps & (written.stamp == 0)).sum())
-    if repeated or unstamped:
-        times = frame.log
-        if (np.diff(times) == 0).mean() > 0.5:
-            frame, times = written, np.arange(len(frame)) * NOMINAL_NS
-        said.append(f'{called}: of {len(frame)} stamps {repeated} are repeated and {unstamped} '
-                    'are zero; its pictures are put in order by log time')
-        return replace(frame, stamp=_increasing(times))
+    back = 0 if len(tracks['mark']) else int((np.diff(written.stamp) < -MAX_JITTER_NS).sum())
+    often = back >= PROOF and back * _OFTEN_NS > np.ptp(frame.log)
+    if repeated or unstamped or often:
+        said.append(f'{called}: of {len(frame)} stamps {repeated} are repeated, {unstamped} are '
+                    f'zero and {back} go back; its pictures are put in order by log time')
+        return replace(frame, stamp=_increasing(frame.log))
     kept = written.take(np.flatnonzero(~np.append(False, again)))
     kept = replace(kept, stamp=_going_on(kept, tracks['mark'], called, said))
     if kept.stamp is written.stamp and not again.any():
@@ -157,21 +171,23 @@ def _going_on(track: Track, mark: Track, called: str, said: list[str]) -> np.nda
     :param track: in the order of writing.
     """
     stamp, begin, offsets = track.stamp, 0, []
-    for i in (np.flatnonzero(np.diff(stamp) < -SMALLEST_NS) + 1).tolist():
+    steps = np.diff(stamp)
+    for i in (np.flatnonzero((steps < -SMALLEST_NS) | (
+            steps - np.diff(track.log) > AHEAD_NS)) + 1).tolist():
         back = int(stamp[i - 1] - stamp[i])
         behind, before = (np.median((stamp - track.log)[part]) for part in (
             slice(i, i + _AROUND), slice(max(i - _AROUND, begin), i)))
         marked = ((mark.order > track.order[i - 1]) & (mark.order < track.order[i])).any()
-        if marked or (stamp[i] <= stamp[begin:i].min() and back > MAX_JITTER_NS):
+        if back > 0 and marked or (stamp[i] <= stamp[begin:i].min() and back > MAX_JITTER_NS):
             begin = i
-        elif behind - before < -back / 2:
+        elif back < 0 or behind - before < -back / 2:
             step = max(int(track.log[i] - track.log[i - 1]), 1)
             offsets.append((i, back + step))
     if offsets:
         stamp = stamp.copy()
         for i, offset in offsets:
             stamp[i:] += offset
-        said.append(f'{called}: its clock was set back {len(offsets)} times, by up to '
+        said.append(f'{called}: its clock was set {len(offsets)} times, back by up to '
                     f'{max(offset for _, offset in offsets) / 1e9:.2f} s; its messages stay in '
                     'the order in which they were written')
     return stamp

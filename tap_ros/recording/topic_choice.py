@@ -89,6 +89,8 @@ class _Bag:
         pictures = [topic for topic, channel in self.channels.items()
                     if channel.type_name in IMAGE.types]
         if wanted:
+            if wanted not in pictures and f'{wanted}/compressed' in pictures:
+                return f'{wanted}/compressed'
             if wanted not in pictures:
                 raise RecordingError(f'{self.source}: no topic {escaped(wanted)} of type '
                                      f'{" or ".join(IMAGE.types)}; {self.known}')
