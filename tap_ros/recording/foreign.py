@@ -79,12 +79,22 @@ def explain(channels: Iterable[Channel], files: Sequence[Path]) -> str:
     """Return why a bag has no camera that can be read, and a command that helps; '' if unknown."""
     for channel in channels:
         if channel.type_name in _VIDEO:
-            place = files[0] if len(files) == 1 else files[0].parent
-            return (f'topic {escaped(channel.topic)} holds packets of a video; make a bag of its '
-                    f'pictures: {_command("import-video", place)}')
+            return explain_video(channel.topic, files)
     other = sorted({channel.encoding for channel in channels} - {'cdr'})
     return f'its messages are encoded as {listing(other)}; only those of ROS are read, and ' \
         f'{listing(_FOXGLOVE)} as protobuf' if other else ''
+
+
+def explain_video(topic: str, files: Sequence[Path]) -> str:
+    """Return the command that makes pictures of a topic with packets of video."""
+    place = files[0] if len(files) == 1 else files[0].parent
+    return (f'topic {escaped(topic)} holds packets of a video; make a bag of its pictures: '
+            f'{_command("import-video", place)} --image-topic {shlex.quote(escaped(topic))}')
+
+
+def is_video(description: str) -> bool:
+    """Tell whether the field `format` of a CompressedImage is a codec of videos."""
+    return bool(re.search('h[.]?26[45]|hevc|av1|vp[89]', description.lower()))
 
 
 def video_packets(files: Iterable[Path], topic: str = '') -> tuple[list[float], bytes]:
@@ -98,7 +108,8 @@ def video_packets(files: Iterable[Path], topic: str = '') -> tuple[list[float], 
     """
     times, stream, found = list[float](), bytearray(), set[str]()
     for file in map(open_file, files):
-        found |= {name for name, channel in file.topics().items() if channel.type_name in _VIDEO}
+        found |= {name for name, channel in file.topics().items() if channel.type_name in _VIDEO
+                  or (name, channel.type_name) == (topic, COMPRESSED_TYPE)}
         wanted = found & {topic or name for name in found}
         if len(wanted) != 1:
             raise RecordingError(f'{escaped(file.path)}: --image-topic: expected one of '
