@@ -166,21 +166,15 @@ def _line(injected, promise, rows):
 
 def describe_machine():
     """Return what every row says of the machine and the code."""
-    try:
-        lines = Path('/proc/cpuinfo').read_text().splitlines()
-        cpu = next(line.split(':', 1)[1].strip() for line in lines if 'model name' in line)
-    except (OSError, StopIteration):
-        cpu = platform.machine()
-    return {'machine': f'{cpu}, {os.cpu_count()} cores', 'date': time.strftime('%Y-%m-%d'),
+    cpu = re.search(r'model name\s*: (.*)', Path('/proc/cpuinfo').read_text())
+    return {'machine': f'{cpu[1] if cpu else platform.machine()}, {os.cpu_count()} cores',
+            'date': time.strftime('%Y-%m-%d'),
             'commit': _git('rev-parse', '--short', 'HEAD') + (
                 '+' if _git('status', '--porcelain', '-uno', '--', '*.py') else '')}
 
 
 def _git(*words):
-    """Return what git says of this checkout; empty without git."""
-    try:
-        run = subprocess.run(['git', *words], cwd=ROOT, text=True, stdout=subprocess.PIPE,
-                             stderr=subprocess.DEVNULL)
-    except OSError:
-        return ''
-    return run.stdout.strip() if run.returncode == 0 else ''
+    """Return what git says of this checkout."""
+    run = subprocess.run(['git', *words], cwd=ROOT, text=True, stdout=subprocess.PIPE,
+                         stderr=subprocess.DEVNULL)
+    return run.stdout.strip()

@@ -5,14 +5,13 @@
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 import signal
-import socket
 import time
 
 from fault_files import describe_exit
 from fault_report import fault
 from fault_rig import first_pictures, goal_fields, objects_message, predict_fields
 import numpy as np
-from processes import Client, Newest, NodeProcess, page_address
+from processes import Client, http_status, Newest, NodeProcess, page_address
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates, Subgoal
@@ -125,14 +124,6 @@ def test_explorer_requests(trials, tmp_path):
         url = page_address(process)
         port = int(url.split(':')[2].strip('/'))
 
-        def status(target, host, origin=b''):
-            lines = [b'GET ' + target + b' HTTP/1.1', b'Host: ' + host]
-            lines += [b'Origin: ' + origin] if origin else []
-            with socket.create_connection(('127.0.0.1', port), 10.0) as connection:
-                connection.sendall(b'\r\n'.join([*lines, b'', b'']))
-                answer = b''.join(iter(lambda: connection.recv(4096), b''))
-            return int(answer.split(None, 2)[1]) if answer else None
-
         with connect(url.replace('http', 'ws') + 'socket', max_size=2**24) as browser:
             for trial in trials:
                 with trials.one():
@@ -141,13 +132,14 @@ def test_explorer_requests(trials, tmp_path):
                             b'', b'http://[', b'null', b'http://[::1', b'\xed\xa0\x80')))
                     if trial % 2:
                         target += random.bytes(4).translate(None, b' \r\n\t')
-                    found = status(target, host, origin)
+                    found = http_status(port, target, b'Host: ' + host, *(
+                        [b'Origin: ' + origin] if origin else []))
                     assert found is None or found == 200 or 400 <= found < 500, (
                         f'{target} of {host}, {origin}: {found}')
                     browser.send(texts[trial % len(texts)])
                     while '"kind": "error"' not in str(browser.recv(10.0)):
                         pass
-                    assert status(b'/', b'localhost') == 200, 'the page is gone'
+                    assert http_status(port, b'/', b'Host: localhost') == 200, 'the page is gone'
     finally:
         process.end()
 

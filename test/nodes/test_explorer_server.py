@@ -7,10 +7,10 @@ import http.client
 import json
 import socket
 import threading
-import time
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import http_status, until
 import pytest
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.explorer.calls import parse_command
@@ -44,13 +44,6 @@ def get(server, path='/', **headers):
 def browse(server, query='', **headers):
     return connect(f'ws://127.0.0.1:{server.port}/socket{query}', additional_headers=headers,
                    open_timeout=10, close_timeout=2, compression=None)
-
-
-def wait_until(condition, seconds=10):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def test_the_page_its_script_and_its_style_are_served():
@@ -91,7 +84,7 @@ def test_a_slow_browser_holds_up_nobody_and_gets_the_newest():
             server.put('camera', bytes([i]) * 200_000)
             if i % 10 == 9:
                 last = quick.recv(5)
-        wait_until(lambda: quick.recv(5)[7] == 199 if last[7] != 199 else True)
+        assert until(lambda: quick.recv(5)[7] == 199 if last[7] != 199 else True)
         seen = [slow.recv(5)[7]]
         while seen[-1] != 199:
             seen.append(slow.recv(5)[7])
@@ -105,22 +98,13 @@ def test_browsers_that_leave_vanish_or_say_too_much_leave_nothing_behind():
             with browse(server):
                 pass
         with browse(server) as browser:
-            wait_until(lambda: server.browsers == 1)
+            assert until(lambda: server.browsers == 1)
             browser.socket.shutdown(socket.SHUT_RDWR)
-            wait_until(lambda: server.browsers == 0)
+            assert until(lambda: server.browsers == 0)
         with browse(server) as browser, pytest.raises(ConnectionClosed):
             browser.send('x' * (MAX_COMMAND + 1))
             browser.recv(5)
-        wait_until(lambda: server.browsers == 0 and threading.active_count() <= threads)
-
-
-def status_of(server, target, *headers):
-    """Return the status of the answer to raw bytes; None when the connection is just closed."""
-    lines = [b'GET ' + target + b' HTTP/1.1', *headers, b'', b'']
-    with socket.create_connection(('127.0.0.1', server.port), 10) as connection:
-        connection.sendall(b'\r\n'.join(lines))
-        answer = b''.join(iter(lambda: connection.recv(4096), b''))
-    return int(answer.split(None, 2)[1]) if answer else None
+        assert until(lambda: server.browsers == 0 and threading.active_count() <= threads)
 
 
 def test_addresses_and_headers_that_cannot_be_read_are_refused_and_nothing_else():
@@ -129,16 +113,16 @@ def test_addresses_and_headers_that_cannot_be_read_are_refused_and_nothing_else(
         for target, *headers in (
                 (b'//[', host), (b'http://[::1', host), (b'/socket//[', host),
                 (b'/', b'Host: ['), (b'/', b'Host: [::1'), (b'/', host, b'Origin: http://[')):
-            assert status_of(server, target, *headers) in (400, 403, 404), (target, headers)
-        assert status_of(locked, b'/?token=\xff\xfe', host) in (None, 400, 401)
-        assert status_of(locked, b'/?token=%ED%A0%80', host) == 401
+            assert http_status(server.port, target, *headers) in (400, 403, 404), (target, headers)
+        assert http_status(locked.port, b'/?token=\xff\xfe', host) in (None, 400, 401)
+        assert http_status(locked.port, b'/?token=%ED%A0%80', host) == 401
 
         @settings(max_examples=60)
         @given(st.binary(max_size=12), st.binary(max_size=12), st.binary(max_size=12))
         def refused(path, name, origin):
             for each in (server, locked):
                 clean = [part.translate(None, b'\r\n\0 \t') for part in (path, name, origin)]
-                found = status_of(each, b'/' + clean[0], b'Host: ' + clean[1] + b'[',
+                found = http_status(each.port, b'/' + clean[0], b'Host: ' + clean[1] + b'[',
                                   b'Origin: //[' + clean[2])
                 assert found in (None, 400, 403), found
         refused()
@@ -178,27 +162,23 @@ def test_so_many_browsers_and_no_more():
                 browsers.enter_context(browse(server))
             with pytest.raises(InvalidStatus, match='503'), browse(server):
                 pass
-        wait_until(lambda: server.browsers == 0)
+        assert until(lambda: server.browsers == 0)
         with browse(server):
             pass
 
 
-def test_ports_and_addresses_that_cannot_be_had_are_named():
+def test_addresses_that_cannot_be_had_are_named_and_what_ends_frees_its_port():
     with serving() as server, pytest.raises(ConfigError, match=f'port.*{server.port}'):
         ExplorerServer(print, port=server.port)
     for host in ('', 'a' * 70, 'a\0b', '256.0.0.1', 'no.such.host.invalid'):
         with pytest.raises(ConfigError, match='host'):
             ExplorerServer(print, host=host, port=0)
-
-
-def test_what_ends_frees_its_port():
     with ExitStack() as stack:
         with serving() as server:
             browser = stack.enter_context(browse(server))
         with pytest.raises(ConnectionClosed):
             browser.recv(5)
-    again = ExplorerServer(print, port=server.port)
-    again.close()
+    ExplorerServer(print, port=server.port).close()
 
 
 def test_what_leads_to_this_machine_alone():
