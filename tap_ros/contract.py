@@ -45,10 +45,10 @@ ROBOT_MASKS = ('none', 'arm', 'all')  # what is taken for hidden: nothing, arm, 
 # The module with the main of each node, by the name of the node and of its executable.
 NODE_MODULES = {
     'sim_node': 'sim_bridge.ros.sim_node',
-    'predictor_node': 'tap_ros.nodes.predictor.node',
-    'visual_mpc_node': 'tap_ros.nodes.planner.node',
-    'recorder_node': 'tap_ros.nodes.recorder.node',
-    'robot_mask_node': 'tap_ros.nodes.robot_mask.node',
+    'predictor_node': 'tap_ros.nodes.predictor_node',
+    'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
+    'recorder_node': 'tap_ros.nodes.recorder_node',
+    'robot_mask_node': 'tap_ros.nodes.robot_mask_node',
     'explorer_node': 'tap_ros.nodes.explorer.node',
 }
 

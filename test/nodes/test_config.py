@@ -4,6 +4,7 @@
 
 from importlib import import_module
 from pathlib import Path
+import sys
 
 from rclpy.context import Context
 from rclpy.node import Node
@@ -22,7 +23,7 @@ def declared(name, *arguments):
     node = Node(name, context=context)
     try:
         before = set(node._parameters)
-        import_module(NODE_MODULES[name]).declare_parameters(node)
+        sys.modules[import_module(NODE_MODULES[name]).main.__module__].declare_parameters(node)
         return {key: node.get_parameter(key).value for key in set(node._parameters) - before}
     finally:
         node.destroy_node()

@@ -70,7 +70,7 @@ def test_without_a_home_cache_and_logs_find_a_place(tmp_path, home):
 
 
 @pytest.mark.parametrize('module', [
-    'tap_ros', pytest.param('tap_ros.nodes.predictor.node', marks=pytest.mark.ros),
+    'tap_ros', pytest.param('tap_ros.nodes.predictor_node', marks=pytest.mark.ros),
     pytest.param('sim_bridge.ros.sim_node', marks=pytest.mark.ros)])
 def test_ctrl_c_while_python_imports_is_one_line(module, tmp_path):
     slow = tmp_path / 'numpy.py'  # imported by all, for ever

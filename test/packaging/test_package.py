@@ -74,7 +74,7 @@ def distributions_of(package):
 def test_executables_launch_files_and_parameters_are_installed():
     for node, module in NODE_MODULES.items():
         assert Path(get_package_prefix('tap_ros'), 'lib', 'tap_ros', node).exists(), 'make build'
-        assert 'def main(' in (ROOT / (module.replace('.', '/') + '.py')).read_text()
+        assert ' main' in (ROOT / (module.replace('.', '/') + '.py')).read_text()
     share = Path(get_package_share_directory('tap_ros'))
     for pattern in ('config/*.yaml', 'config/layouts/*', 'launch/*.launch.py'):
         here = {path.name for path in ROOT.glob(pattern)}

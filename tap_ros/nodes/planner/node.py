@@ -8,7 +8,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 import math
 from pathlib import Path
-import sys
 import threading
 import time
 from typing import Any, cast
@@ -358,7 +357,3 @@ def stage_name(index: int, num_subgoals: int) -> str:
 def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
     return run_node(VisualMpcNode, 'visual_mpc_node', args, num_threads=4)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import partial
 import math
 from pathlib import Path
-import sys
 import time
 from typing import Any
 
@@ -205,7 +204,3 @@ def predict(predictor: Predictor, tasks: list[PendingRequest]) -> list[Found]:
 def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
     return run_node(PredictorNode, 'predictor_node', args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -4,7 +4,6 @@
 
 from functools import partial
 import math
-import sys
 import time
 from typing import Any
 
@@ -179,7 +178,3 @@ def declare_parameters(node: Node) -> Parameters:
 def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
     return run_node(RecorderNode, 'recorder_node', args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -4,7 +4,6 @@
 
 from collections import deque
 import math
-import sys
 import time
 from typing import Any
 
@@ -177,7 +176,3 @@ class RobotMaskNode(Node):
 def main(args: list[str] | None = None) -> int:
     """Run the node; the answer is the exit code of the process."""
     return run_node(RobotMaskNode, 'robot_mask_node', args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())
