@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos and TFRecord files, whose records are written here byte by byte, arrive as recordings."""
 
+import os
+from pathlib import Path
 import struct
 
 import cv2
@@ -151,3 +153,17 @@ def test_a_folder_of_several_cameras_asks_for_one(tmp_path, capsys):
     assert run_import(capsys, *words, '--camera', 'front')[0] == 0
     found = [episode.frames.mean() for episode in iter_episodes(tmp_path / 'bag')]
     assert np.abs(np.array(found) - [20, 100]).max() < 5
+
+
+@pytest.mark.skipif('TAP_ROS_REAL' not in os.environ, reason='TAP_ROS_REAL names no folder')
+@pytest.mark.parametrize('words', [
+    ('import-video', 'droid_new_setup', '--camera', '0'),
+    ('import-tfrecord', 'bridge-train.tfrecord', '--camera', 'image_0')])
+def test_real_recordings_can_be_trained_on(words, tmp_path, capsys):
+    """Videos of a DROID set-up (MIT) and clips of Bridge V2, in a folder that the user names."""
+    command, name, *rest = words
+    bag = tmp_path / 'bag'
+    assert run_import(capsys, command, Path(os.environ['TAP_ROS_REAL'], name), *rest, '--out', bag,
+                      '--crop', 'centre', '--size', 64)[0] == 0
+    code, said = run_import(capsys, 'inspect', bag)
+    assert code == 0 and 'episodes to learn from' in said
