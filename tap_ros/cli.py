@@ -17,6 +17,7 @@ from pathlib import Path
 import signal
 import sys
 from typing import Annotated, Any, cast, TypeAlias
+import warnings
 
 from tap_ros import leave_at_once
 from tap_ros.errors import ConfigError, TapError
@@ -97,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :raises SystemExit: as options.parse, for words that are no command or option and for --help.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
+    warnings.formatwarning = lambda message, *_, **__: f'warning: {message}\n'
     try:
         run, options = read(arguments)
         if signal.getsignal(signal.SIGINT) is leave_at_once:

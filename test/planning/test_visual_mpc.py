@@ -86,9 +86,8 @@ def test_batch_size_and_threads_change_nothing(model, trained):
     expected = plans(model)
     for changes in ({'batch_size': 5}, {'batch_size': 50}, {'threads': 2}):
         assert same(expected, plans(model, replace(SMALL, **changes)))
-    first, *others = (plans(trained, with_preset('default', batch_size=size), steps=1, scale=2)
-                      for size in (64, 32, 50))
-    assert all(same(first, other) for other in others)
+    assert same(*(plans(trained, with_preset('default', batch_size=size), steps=1, scale=2)
+                  for size in (64, 50)))
 
 
 def test_sequences_are_predicted_in_even_batches(model, monkeypatch):

@@ -123,7 +123,8 @@ def test_context_pictures_are_filled_when_asked_to(bags, share):
 def test_weights_say_their_mask_and_recordings_without_masks_are_refused(bags, bag, tmp_path):
     config = TrainingConfig(
         recordings=(str(bags[0]),), out=str(tmp_path), base_width=4, batch_size=2, steps=1,
-        margin=1, test_fraction=0.3, threads=1, robot_mask='all', fill_context=0.5)
+        margin=1, test_fraction=0.3, threads=1, precision='float32', robot_mask='all',
+        fill_context=0.5)
     about = load_weights(train(config, progress=False), 'predictor')[2]
     assert about['settings']['robot_mask'] == 'all' and about['settings']['fill_context'] == 0.5
     with pytest.raises(RecordingError, match='robot_mask all .* /camera/robot_mask'):

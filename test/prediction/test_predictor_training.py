@@ -49,7 +49,7 @@ def curve(folder, name):
 
 
 @pytest.mark.parametrize('values', [
-    {'precision': 'bfloat16', 'num_targets': 3, 'min_crop': 0.6},
+    {'num_targets': 3, 'min_crop': 0.6},
     {**method_fields('genmin-vae-gan'), 'kl_warmup': 0.5, 'posterior_std': 0.1},
     {**method_fields('genmin4'), 'mode': 'forward', 'recursion': 2, 'decoder': 'separate',
      'skips': False},

@@ -89,6 +89,8 @@ def test_ctrl_c_saves_what_a_training_has(tmp_path):
     assert 0 < about['step'] == run['steps'] < 100000
     assert f'{about["step"]} of 100000 steps are saved' in told
     assert (tmp_path / 'predictor.safetensors').exists()
+    assert 'warning: recordings: only 2 episodes are held out' in told
+    assert 'run.run(' not in told
 
 
 @pytest.mark.parametrize('change', [
