@@ -4,6 +4,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+import re
 import signal
 import time
 
@@ -11,7 +12,7 @@ from fault_files import describe_exit
 from fault_report import fault
 from fault_rig import first_pictures, goal_fields, objects_message, predict_fields
 import numpy as np
-from processes import Client, http_status, Newest, NodeProcess, page_address
+from processes import Client, http_status, Newest, NodeProcess, page_address, until
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates, Subgoal
@@ -101,11 +102,11 @@ def test_parameters(trials, tmp_path, given):
             while process.alive and 'ready' not in process.text:
                 assert time.monotonic() < deadline, 'neither ready nor ended'
                 time.sleep(0.1)
-            time.sleep(0.5)
+            named = re.compile(f'(?:WARN|ERROR|FATAL).*{parameter}')
+            assert (name, parameter) == ('predictor_node', 'weights') and process.alive or until(
+                lambda process=process, named=named: named.search(process.text), 10.0), (
+                f'{name}: {parameter} is not named')
             assert 'Traceback' not in process.text, f'{name}: a traceback'
-            assert (name, parameter) in WEIGHTS and process.alive or any(
-                parameter in line and ('WARN' in line or 'FATAL' in line or 'ERROR' in line)
-                for line in process.text.splitlines()), f'{name}: {parameter} is not named'
         process.end(signal.SIGINT)
 
 
