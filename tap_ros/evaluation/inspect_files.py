@@ -74,7 +74,7 @@ def run(args: Options) -> None:
         with suppress(ImageError):  # whoever opens it is told
             if size is not None and max(reading.cut.cut_size(size)) > LARGE:
                 # All of them would be gigabytes, and take minutes.
-                rate = max(1, 2 / reading.gap if reading.gap else 0)
+                rate = max(0.5, 2 / reading.gap if reading.gap else 0)
                 shown = replace(reading, crop=reading.crop or CENTRE, size=64,
                                 rate=min(reading.rate or rate, rate))
     store = open_recordings([args.path], reading=shown)

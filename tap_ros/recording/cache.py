@@ -262,7 +262,7 @@ def _load(job: _Job) -> Columns | None:
         with safe_open(job.folder / 'columns.safetensors', 'numpy') as file:
             about = json.loads(file.metadata()['columns'])
             arrays = {key: file.get_tensor(key) for key in file.keys()}
-        pictures = {}
+        pictures: dict[str, np.ndarray] = {}
         for name, shape in about['shapes'].items():
             if (job.folder / name).stat().st_size != math.prod(shape):
                 return None

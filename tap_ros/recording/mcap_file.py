@@ -336,8 +336,9 @@ def _bytes_of(path: str | Path) -> mmap.mmap | bytes:
                 raise RecordingError(f'{path}: the file is empty; it holds no message')
             data: mmap.mmap | bytes = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
             if data[:4] == zstandard.FRAME_HEADER:
+                stream.seek(0)
                 data = zstandard.ZstdDecompressor().stream_reader(
-                    data, read_across_frames=True).read()
+                    stream, read_across_frames=True).read()
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     except zstandard.ZstdError as error:
