@@ -57,9 +57,9 @@ def _set_back(times: np.ndarray, least: int) -> np.ndarray:
     """Return where times (N,) in the order of writing go back by more than `least`, for good."""
     newest = np.maximum.accumulate(times)
     back = np.flatnonzero(times[1:] < times[:-1] - least) + 1
-    return np.array([i for i in back.tolist() if len(times) >= i + PROOF
-                     and (times[i:i + PROOF] < newest[i - 1]).all()
-                     and (np.diff(times[i:i + PROOF]) >= 0).all()], np.int64)
+    proofs = ((i, times[i:i + PROOF]) for i in back.tolist() if len(times) >= i + PROOF)
+    return np.array([i for i, proof in proofs if (proof < newest[i - 1] - MAX_JITTER_NS).all() or (
+        (proof < newest[i - 1]).all() and (np.diff(proof) >= 0).all())], np.int64)
 
 
 def _moving_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
@@ -120,8 +120,10 @@ def _frames(tracks: dict[str, Track], called: str, said: list[str]) -> Track:
     written = frame.take(np.argsort(frame.order))
     same = np.diff(written.stamp) == 0
     again = same & (np.diff(written.picked()[:, 0]) == 0) & (written.stamp[1:] != 0)
+    by_log = replace(written, stamp=_increasing(written.log)).take(
+        np.argsort(written.log, kind='stable'))
     if not frame.stamp.any():  # it has none
-        return replace(frame, stamp=_increasing(frame.log))
+        return by_log
     # A clock that begins at zero agrees with the next stamp.
     jumps = np.abs(np.diff(written.stamp - written.log, append=written.stamp[-1])) > APART_NS
     repeated, unstamped = int((same & ~again).sum()), int((jumps & (written.stamp == 0)).sum())
@@ -130,7 +132,7 @@ def _frames(tracks: dict[str, Track], called: str, said: list[str]) -> Track:
     if repeated or unstamped or often:
         said.append(f'{called}: of {len(frame)} stamps {repeated} are repeated, {unstamped} are '
                     f'zero and {back} go back; its pictures are put in order by log time')
-        return replace(frame, stamp=_increasing(frame.log))
+        return by_log
     kept = written.take(np.flatnonzero(~np.append(False, again)))
     kept = replace(kept, stamp=_going_on(kept, tracks['mark'], called, said))
     if kept.stamp is written.stamp and not again.any():
