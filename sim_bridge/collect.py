@@ -9,7 +9,7 @@ collection goes on with the files that are not there yet.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 import json
 from pathlib import Path
 import time
@@ -17,9 +17,9 @@ from typing import Annotated, Any
 
 import numpy as np
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.tasks import get_task, run_episode, task_names, TIMINGS
+from sim_bridge.tasks.tasks import get_task, run_episode, TIMINGS
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
-from sim_bridge.world_protocol import Observation
+from sim_bridge.world_protocol import ability, make_world, Observation, World
 from tap_ros.engines import Engine, LOCAL, run_tasks, Work
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
@@ -33,6 +33,7 @@ from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
+TABLE = 'mujoco_table'
 MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 
 
@@ -41,7 +42,9 @@ class CollectConfig:
     """
     What to collect: all that a recording follows from.
 
-    :param task: name of a task, see tasks.task_names.
+    :param world: mujoco_table, or another whose expert demonstrates: metaworld, where scripts
+        act as unsteadily as a person and the camera alone is recorded.
+    :param task: one that the world has, such as push2; of metaworld door-open-v3.
     :param episodes: how many in all; a larger number later adds to the same folder.
     :param seed: of the first episode; the others count on from it.
     :param image_size: width and height in pixels.
@@ -58,7 +61,8 @@ class CollectConfig:
     :param arm: name of an arm, see robots.arm.get_arm.
     """
 
-    task: Annotated[str, one_of(task_names())] = 'push2'
+    world: Annotated[str, one_of(names('tap_ros.worlds'))] = TABLE
+    task: str = 'push2'
     episodes: int = 1000
     seed: int = 0
     image_size: int = 64
@@ -127,8 +131,7 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
 
 
 def _check(config: CollectConfig) -> None:
-    """Raise ConfigError for what cannot be collected."""
-    task = get_task(config.task)
+    """Raise ConfigError, or SceneError, for what cannot be collected."""
     if not 0 <= config.misses <= 1:
         raise ConfigError(f'misses is {config.misses:g}; expected a share from 0 to 1')
     if min(config.episodes, config.episodes_per_file) < 1:
@@ -139,8 +142,22 @@ def _check(config: CollectConfig) -> None:
     if config.timing not in TIMINGS:
         raise ConfigError(
             f'timing {config.timing!r} is unknown; valid timings: {", ".join(TIMINGS)}')
-    if task.kind != 'push' and (config.misses or config.timing != 'natural'):
-        raise ConfigError(f'misses and timing are of tasks of pushing, not of {task.name}')
+    if config.world != TABLE:
+        usual = CollectConfig()
+        said = [name for name in ('timing', 'misses', 'look', 'appearance', 'arm')
+                if getattr(config, name) != getattr(usual, name)]
+        if said:
+            raise ConfigError(f'{", ".join(said)}: of world {TABLE}, not of {config.world}')
+        _make(config).close()  # it says what it lacks
+    elif get_task(config.task).kind != 'push' and (config.misses or config.timing != 'natural'):
+        raise ConfigError(f'misses and timing are of tasks of pushing, not of {config.task}')
+
+
+def _make(config: CollectConfig) -> World:
+    """Make the world."""
+    options = {name: getattr(config, name) for name in ('look', 'appearance', 'arm')}
+    return make_world(config.world, config.task, config.image_size,
+                      **options if config.world == TABLE else {})
 
 
 def _collect_missing(folder: Path, config: CollectConfig, engine: Engine, progress: bool,
@@ -220,25 +237,32 @@ def _episodes(config: CollectConfig, shard: int) -> range:
 
 def _collect_shard(folder: str | Path, config: CollectConfig, shard: int) -> dict[str, list[Any]]:
     """Collect one file; runs in a worker process. Return what is told of its episodes."""
-    simulator = Simulator(
-        config.task, config.image_size, config.look, config.appearance, config.arm)
+    world = _make(config)
     stats: dict[str, list[Any]] = {
         key: [] for key in ('frames', 'outcomes', 'distances', 'act', 'write')}
-    with EpisodeWriter(_shard_path(folder, shard), camera_matrix=simulator.camera.K) as writer:
+    with EpisodeWriter(_shard_path(folder, shard), camera_matrix=world.camera_matrix) as writer:
         for i in _episodes(config, shard):
             begin = time.perf_counter()
-            observations, actions, outcome = run_episode(
-                simulator, config.seed + i, config.frames, config.timing, config.misses)
+            episode = _demonstrated(world, config, i)
             acted = time.perf_counter()
-            writer.write(make_episode(
-                simulator, observations, actions, outcome, (i + 1) * EPISODE_SPACING_NS))
+            writer.write(episode)
             stats['write'].append(time.perf_counter() - acted)
             stats['act'].append(acted - begin)
-            stats['frames'].append(len(observations))
-            stats['outcomes'].append(outcome)
-            stats['distances'] += simulator.distances().tolist()
-    simulator.close()
+            stats['frames'].append(len(episode))
+            stats['outcomes'].append(episode.outcome)
+            stats['distances'] += world.distances().tolist()
+    world.close()
     return stats
+
+
+def _demonstrated(world: World, config: CollectConfig, i: int) -> Episode:
+    """Let the expert of a world act; return episode i."""
+    seed, start_ns = config.seed + i, (i + 1) * EPISODE_SPACING_NS
+    if isinstance(world, Simulator):
+        return make_episode(world, *run_episode(
+            world, seed, config.frames, config.timing, config.misses), start_ns)
+    episode: Episode = ability(world, 'demonstrate')(seed, config.frames)
+    return replace(episode, stamps=episode.stamps + start_ns)
 
 
 def make_episode(simulator: Simulator, observations: Sequence[Observation], actions: np.ndarray,

@@ -22,13 +22,24 @@ from tap_ros.contract import (
     ROBOT_MASK_HAND,
 )
 from tap_ros.errors import ConfigError, SceneError
+from tap_ros.recording.episode import Episode
 
 ORIGIN = np.array([0.0, 0.65, 0.01])  # m, of our frame in Meta-World's
 TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about the vertical
 CAMERA = Camera(64, 64, tilt=0.6, fovy=42.0, position=(0.0, -0.78, 1.2))  # in our frame
+# From the robot's side: what it works at hides little.
+SIDE = replace(CAMERA, tilt=0.87, position=(0.85, 0.5, 0.85), turn=2.1)
 GAIN = 8.0  # of the command over the gap to where the fingertips shall be, 1/m
 SOLVING_STEPS = 400  # environment steps that the scripted policy has at most
 SETTLING_STEPS = 5  # after the success
+# Demonstrations, in environment steps of 12.5 ms:
+EVERY = 4  # from picture to picture
+MOST_FRAMES, LEAST_FRAMES = 70, 12
+TRIES = 20  # a demonstration that fails is made anew
+SPEED, NOISE = (0.45, 1.0), (0.0, 0.15)  # shares of the script's own command
+DETOUR_SHARE, DETOUR_STEPS = 0.8, 60  # of demonstrations; at most
+DETOUR_LOW, DETOUR_HIGH = np.array([[-0.35, 0.45, 0.12], [0.35, 0.8, 0.4]])  # m, their frame
+PAUSES, PAUSE_STEPS, PAUSE_RANGE = (1, 3), (4, 15), (5, 160)
 
 
 class MetaWorld(GymWorld):
@@ -48,9 +59,10 @@ class MetaWorld(GymWorld):
         self.env, self.policy = make_env(task)
         self.camera = replace(CAMERA, width=image_size, height=image_size)
         model = self.env.model
-        eye = model.cam('corner')
-        eye.pos[:] = np.array(CAMERA.position) * TURN + ORIGIN
-        eye.quat[:], eye.fovy[:] = replace(CAMERA, turn=np.pi).quaternion, CAMERA.fovy
+        for name, camera in (('corner', CAMERA), ('corner3', SIDE)):
+            eye = model.cam(name)
+            eye.pos[:], eye.fovy[:] = np.array(camera.position) * TURN + ORIGIN, camera.fovy
+            eye.quat[:] = replace(camera, turn=camera.turn + np.pi).quaternion
         model.vis.quality.offsamples, model.vis.quality.shadowsize = 0, 0  # 7 ms instead of 300
         with drawing():
             self._renderer = mujoco.Renderer(model, image_size, image_size)
@@ -96,9 +108,7 @@ class MetaWorld(GymWorld):
 
     def draw(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the picture, without the marker of the goal, and the robot mask."""
-        renderer = self._renderer
-        renderer.update_scene(self.env.data, 'corner', self._option)
-        image = renderer.render()
+        image, renderer = self._picture(), self._renderer
         renderer.enable_segmentation_rendering()
         try:
             ids = renderer.render()
@@ -107,6 +117,10 @@ class MetaWorld(GymWorld):
         geom = ids[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
         return image, np.where(geom, self._labels[ids[..., 0]], ROBOT_MASK_FREE).astype(np.uint8)
 
+    def _picture(self, camera: str = 'corner') -> np.ndarray:
+        self._renderer.update_scene(self.env.data, camera, self._option)
+        return self._renderer.render()
+
     def solve(self) -> None:
         """
         Let Meta-World's scripted policy act until the environment says that it is solved.
@@ -114,9 +128,7 @@ class MetaWorld(GymWorld):
         :raises SceneError: if it does not come to that.
         """
         for _ in range(SOLVING_STEPS):
-            with warnings.catch_warnings(action='ignore'):  # it commands more than is allowed
-                action = self.policy.get_action(self._seen)
-            self.act(np.asarray(action, np.float64))
+            self.act(self._command())
             if self.succeeds():
                 break
         else:
@@ -124,6 +136,74 @@ class MetaWorld(GymWorld):
                              'scene; take another seed')
         for _ in range(SETTLING_STEPS):
             self.act(np.array([0, 0, 0, 1 - 2 * self.gripper()[3]]))
+
+    def demonstrate(self, seed: int, num_frames: int = 0) -> Episode:
+        """
+        Let the scripted policy act as unsteadily as a person, and record a camera beside it alone.
+
+        Its speed, a detour before it begins, pauses and noise are drawn from the seed, as the
+        scene is. What does not succeed is drawn anew, TRIES times at most.
+
+        :param num_frames: at most; 0: MOST_FRAMES.
+        :return: Episode without objects, gripper and commands.
+        """
+        for attempt in range(TRIES):
+            rng = np.random.default_rng([seed, attempt])
+            self.begin(int(rng.integers(2 ** 31)))
+            frames, done = self._act_unsteadily(rng, num_frames or MOST_FRAMES)
+            if done and len(frames) >= LEAST_FRAMES:
+                break
+        count = len(frames)
+        actions = np.full((count, 4), np.nan, np.float32)
+        actions[-1] = 0
+        return Episode(
+            frames=np.stack(frames),
+            stamps=np.arange(count) * round(1e9 * EVERY * self.env.dt), actions=actions,
+            grippers=np.full((count, 4), np.nan, np.float32), object_names=(),
+            object_pixels=np.zeros((count, 0, 2), np.float32),
+            object_poses=np.zeros((count, 0, 7)), goal_frame=None,
+            goal_pixels=np.zeros((0, 2), np.float32), goal_poses=np.zeros((0, 7)),
+            task=self.task_name, seed=seed, outcome='success' if done else 'failure')
+
+    def _act_unsteadily(self, rng: np.random.Generator,
+                        num_frames: int) -> tuple[list[np.ndarray], bool]:
+        """Return the frames of one try, and whether it succeeded."""
+        speed, noise = rng.uniform(*SPEED), rng.uniform(*NOISE)
+        pauses = {int(rng.integers(*PAUSE_RANGE)): int(rng.integers(*PAUSE_STEPS, endpoint=True))
+                  for _ in range(rng.integers(*PAUSES, endpoint=True))}
+        pauses[0] = int(rng.integers(10))  # before the first motion
+        goes_on = int(rng.integers(2, 14))  # after the success
+        by = np.clip(self._seen[:3] + rng.uniform((-0.2, -0.1, -0.05), 0.2),
+                     DETOUR_LOW, DETOUR_HIGH)
+        detour = DETOUR_STEPS if rng.random() < DETOUR_SHARE else 0
+        frames, resting, done, action = [], 0, False, np.array([0, 0, 0, -1.0])
+        for step in range(num_frames * EVERY):
+            if step % EVERY == 0:
+                frames.append(self._picture('corner3'))
+            resting = pauses.get(step, resting)
+            if resting:
+                resting -= 1
+                action = np.array([0, 0, 0, action[3]])
+            elif detour:
+                gap = by - self._seen[:3]
+                action = np.append(speed * np.clip(10 * gap, -1, 1), -1)
+                detour = detour - 1 if np.linalg.norm(gap) > 0.04 else 0
+            else:
+                action = self._command()
+                unsteady = rng.normal(0, noise, 3) * np.linalg.norm(action[:3]).clip(max=1)
+                action[:3] = speed * action[:3] + unsteady
+            self.act(action)
+            done = done or self.succeeds()
+            goes_on -= done
+            if not goes_on:
+                return frames, True
+        return frames, False
+
+    def _command(self) -> np.ndarray:
+        """Return what the scripted policy commands now, (4,) in [-1, 1]."""
+        with warnings.catch_warnings(action='ignore'):  # it commands more than is allowed
+            action = self.policy.get_action(self._seen)
+        return np.clip(np.asarray(action, np.float64), -1, 1)
 
     def close(self) -> None:
         """Free the renderer and the environment."""

@@ -48,7 +48,9 @@ class World(Protocol):
     Some worlds can do more; who needs that asks by `ability`, which raises SceneError if the
     world lacks the method. The MuJoCo table, simulator.Simulator, has all of them:
     `observer_picture()`, `move_goal(names, pixels)`, `put_object(name, pose, velocity)`,
-    `object_motions()`. Keyword arguments look=, appearance= and arm= are the table's, too.
+    `object_motions()`. Others may have `demonstrate(seed, num_frames)`, which lets an expert act
+    and returns an Episode, for `collect`; num_frames is the most, 0 as is usual. Keyword
+    arguments look=, appearance= and arm= are the table's, too.
 
     :ivar task_name: of the present task.
     :ivar arm: the Arm that is seen, None where it is not known.

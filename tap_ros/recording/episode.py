@@ -26,7 +26,8 @@ class Episode:
 
     frames: np.ndarray  # (T, H, W, 3) uint8, rgb
     stamps: np.ndarray  # (T,) int64, nanoseconds, increasing
-    actions: np.ndarray  # (T, 4) float32; row t leads from frame t to t + 1; the last row is zeros
+    # (T, 4) float32; row t leads from frame t to t + 1; the last row is zeros; NaN is not written
+    actions: np.ndarray
     grippers: np.ndarray  # (T, 4) float32 x, y, z (m, world), opening; NaN where unknown
     object_names: tuple[str, ...]  # K
     object_pixels: np.ndarray  # (T, K, 2) float32 (u, v); NaN where unknown

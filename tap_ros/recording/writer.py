@@ -190,7 +190,7 @@ class EpisodeWriter:
         if not np.isnan(episode.grippers[t]).all():
             self._put(topics.JOINT_STATES, stamp, joint_fields(
                 episode.grippers[t], stamp, WORLD_FRAME))
-        if t < len(episode.stamps) - 1:
+        if t < len(episode.stamps) - 1 and not np.isnan(episode.actions[t]).all():
             x, y, z, opening = episode.actions[t].tolist()
             self._put(topics.TWIST, stamp, {
                 'header': header_fields(stamp, WORLD_FRAME),

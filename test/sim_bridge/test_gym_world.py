@@ -2,13 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A Gymnasium environment is a World: a dummy of a few lines, and Meta-World."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from sim_bridge.world_protocol import make_world
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
-from tap_ros.errors import SceneError
+from tap_ros.engines import Engine
+from tap_ros.errors import SceneError, TapError
+from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.topic_choice import find_topics
 
 
 class Dot(GymWorld):
@@ -103,3 +109,27 @@ def test_an_unknown_task_is_named():
     pytest.importorskip('metaworld')
     with pytest.raises(SceneError, match="'push-v4' is unknown"):
         make_world('metaworld', 'push-v4')
+
+
+def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
+    pytest.importorskip('metaworld')
+    folder = tmp_path / 'bag'
+    config = CollectConfig(
+        world='metaworld', task='plate-slide-v3', episodes=2, episodes_per_file=1, seed=3)
+    assert collect(folder, config, Engine(workers=1), progress=False)['success_rate'] == 1
+    first, second = iter_episodes(folder)
+    assert (first.task, first.seed, first.outcome) == ('plate-slide-v3', 3, 'success')
+    assert len({12, len(first), len(second)}) == 3, 'each goes its own way at its own speed'
+    topics = find_topics(sorted(folder.glob('*.mcap')))
+    assert set(topics) <= {'/camera/image_raw', '/camera/camera_info', '/clock', '/episode'}
+    assert (first.frames[0] != second.frames[0]).any(), 'each has a scene of its own'
+    # An interrupted collection goes on to the same files.
+    whole = (folder / 'bag_1.mcap').read_bytes()
+    (folder / 'bag_1.mcap').unlink()
+    assert collect(folder, config, Engine(workers=1), progress=False)['episodes'] == 1
+    assert (folder / 'bag_1.mcap').read_bytes() == whole
+    for bad, words in (({'look': 'arm', 'misses': 0.5}, 'misses, look: of world mujoco_table'),
+                       ({'task': 'door-opn-v3'}, "'door-opn-v3' is unknown")):
+        with pytest.raises(TapError, match=words):
+            collect(tmp_path / 'bad', replace(config, **bad), progress=False)
+    assert not (tmp_path / 'bad').exists()
