@@ -87,8 +87,10 @@ def _episodes(root: Any, camera: str) -> Iterator[Any]:
     arrays = dict(_arrays(root))
     found = {name: array for name, array in arrays.items() if _holds_pictures(array)}
     cameras = sorted({name.rpartition('/')[2] for name in found}, key=str)
-    if camera not in cameras and (camera or len(cameras) != 1):
-        raise ConfigError(f'--camera: expected one of {listing(cameras) or "them, but none is"}')
+    if not cameras:
+        raise ValueError('it holds no array of pictures')
+    if camera not in cameras and (camera or len(cameras) > 1):
+        raise ConfigError(f'--camera: expected one of {listing(cameras)}')
     chosen = camera or cameras[0]
     ends = arrays.get('meta/episode_ends')
     for name in sorted(found, key=lambda name: natural(Path(name))):

@@ -9,16 +9,17 @@ another meaning.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
+import shutil
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from tap_ros.errors import ConfigError, RecordingError
-from tap_ros.files import only_writer
+from tap_ros.files import only_writer, storage_errors
 from tap_ros.images.crop import Crop
 from tap_ros.options import default_text, Folder, Topic
 from tap_ros.recording.bags import find_bags
@@ -137,7 +138,7 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
 
 def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = None) -> str:
     """
-    Write episodes one after the other, in files of EPISODES_PER_FILE.
+    Write episodes one after the other, in files of EPISODES_PER_FILE: all of them, or nothing.
 
     :param target: Target.
     :param episodes: iterable of Episode, whose stamps count from anywhere.
@@ -149,20 +150,28 @@ def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = N
     out, begin, frames, done = Path(target.out), 10**9, 0, 0
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f'--out {escaped(out)}: is not empty; name a new folder')
-    size = (0, 0)
-    with only_writer(out):
-        left = iter(tqdm(episodes, 'importing', count, unit='episode', delay=1))
-        while part := list(islice(left, EPISODES_PER_FILE)):
-            number = done // EPISODES_PER_FILE
-            with EpisodeWriter(out / f'{out.resolve().name}_{number}.mcap') as writer:
-                for episode in part:
+    size, part = (0, 0), out.resolve().with_name(out.resolve().name + '.part')
+    with only_writer(part):
+        try:
+            for old in part.iterdir():
+                old.unlink()  # of an import that was killed
+            with ExitStack() as stack:
+                for episode in tqdm(episodes, 'importing', count, unit='episode', delay=1):
+                    if done % EPISODES_PER_FILE == 0:
+                        stack.close()
+                        writer = stack.enter_context(EpisodeWriter(
+                            part / f'{out.resolve().name}_{done // EPISODES_PER_FILE}.mcap'))
                     stamps = episode.stamps - episode.stamps[0] + begin
                     writer.write(replace(episode, stamps=stamps))
                     begin, size = int(stamps[-1]) + EPISODE_SPACING_NS, episode.frames.shape[1:3]
                     frames, done = frames + len(episode), done + 1
-        if not done:
-            raise RecordingError(f'{escaped(out)}: there is no episode to import')
-        write_metadata(out)
+            if not done:
+                raise RecordingError(f'{escaped(out)}: there is no episode to import')
+            write_metadata(part)
+            with storage_errors(out):
+                part.rename(out)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
     return f'{escaped(out)}: {done} episodes, {frames} frames of {size[1]}x{size[0]} pixels'
 
 
