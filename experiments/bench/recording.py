@@ -20,25 +20,22 @@ import time
 from mcap.reader import make_reader
 import numpy as np
 from tap_ros.messages.topics import IMAGE, TOPICS
-from tap_ros.options import Folder
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.messages import typestore
-from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import EpisodeWriter
 
 DECODED = frozenset(topic.recorded for topic in TOPICS if topic.becomes)
 
 
-def measure(recording='', episodes=400, files=4, repeats=3, image_size=64):
+def measure(episodes=400, files=4, repeats=3, image_size=64):
     """
-    Measure frames per second of all contenders on a raw and on a compressed copy of a recording.
+    Measure frames per second of all contenders on a raw and on a compressed recording.
 
-    :param recording: path whose first episodes are used; empty: made up ones of 41 frames.
-    :param episodes: how many.
+    :param episodes: how many, of 41 frames.
     :param files: number of files that they are spread over.
     :param repeats: the best time of so many counts; contenders take turns.
-    :param image_size: of made up frames.
+    :param image_size: of the frames.
     :return: dict compression -> dict contender -> (frames per second by the clock, and of
         processor time).
     """
@@ -47,7 +44,7 @@ def measure(recording='', episodes=400, files=4, repeats=3, image_size=64):
     with tempfile.TemporaryDirectory() as folder:
         folder = Path(folder)
         for compression in ('none', 'zstd'):
-            paths, frames = _write(folder, compression, recording, episodes, files, image_size)
+            paths, frames = _write(folder, compression, episodes, files, image_size)
             best = {name: np.full(2, np.inf) for name in contenders}
             for _ in range(repeats):
                 for name, contender in contenders.items():
@@ -76,24 +73,16 @@ def _contenders():
     }
 
 
-def _write(folder, compression, recording, count, files, image_size):
+def _write(folder, compression, episodes, files, image_size):
     """Write the files to be read; return their paths and the number of frames."""
-    if not recording:
-        source = (_make_episode(seed, image_size) for seed in range(count))
-    else:
-        source = (episode for episode, _ in zip(iter_episodes(recording), range(count)))
     paths, frames = [], 0
-    per_file = -(-count // files)
-    episode = next(source, None)
-    while episode is not None:
-        paths.append(folder / f'{compression}_{len(paths)}.mcap')
+    for number in range(files):
+        paths.append(folder / f'{compression}_{number}.mcap')
         with EpisodeWriter(paths[-1], compression) as writer:
-            for _ in range(per_file):
-                if episode is None:
-                    break
+            for seed in range(number, episodes, files):
+                episode = _make_episode(seed, image_size)
                 writer.write(episode)
                 frames += len(episode)
-                episode = next(source, None)
     return paths, frames
 
 
@@ -144,13 +133,11 @@ class Options:
     """
     Options of this benchmark.
 
-    :param recording: use these episodes instead of made up ones.
     :param episodes: how many.
     :param files: that they are spread over.
     :param repeats: the best of so many counts.
     """
 
-    recording: Folder = ''
     episodes: int = 400
     files: int = 4
     repeats: int = 3
@@ -158,7 +145,7 @@ class Options:
 
 def run(args):
     """Print a table of frames per second, and how much faster ours is."""
-    results = measure(args.recording, args.episodes, args.files, args.repeats)
+    results = measure(args.episodes, args.files, args.repeats)
     print(f'{"frames per second":44}{"by the clock":^24}{"of processor time":^24}')
     print(f'{"":44}{"raw":>12}{"zstd":>12}{"raw":>12}{"zstd":>12}')
     for name in results['none']:

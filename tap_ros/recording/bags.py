@@ -4,7 +4,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import fields
 import itertools
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from tap_ros.recording.columns import Columns, first_size
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.foreign import open_file, recognise
 from tap_ros.recording.metadata import bag_files, FILE_NAME, files_by_number
-from tap_ros.recording.reading import Reading, trained_reading
+from tap_ros.recording.reading import Reading
 from tap_ros.recording.topic_choice import find_topics, list_paths
 from tap_ros.text import escaped
 
@@ -74,19 +74,29 @@ def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],
     """
     Return how recordings are read as those of a training were.
 
-    :param training: the training dict of a weights file.
+    :param training: the training dict of a weights file, of any version; what it does not tell is
+        as by default.
     :param paths: of the recordings.
     :param image_topic: the camera's topic; by default that of the training where all of them have
-        it, else as topics.resolve finds it.
+        it, else as topic_choice finds it.
     :raises RecordingError: when a recording is missing, or nothing of it can be read.
     """
-    reading, settings = trained_reading(training, image_topic), training.get('settings')
-    trained = settings.get('image_topic') if isinstance(settings, dict) else None
-    trained = {trained} if isinstance(trained, str) else set(trained or ())
-    if not image_topic and all(trained - {''} <= {topic for topic, _, _ in list_topics(path)}
+    settings = training.get('settings')
+    settings = settings if isinstance(settings, dict) else {}
+    known = {
+        field.name: settings[field.name] for field in fields(Reading)
+        if field.name != 'image_topic'
+        and isinstance(settings.get(field.name), (str,) if field.type is str else (int, float))}
+    trained = settings.get('image_topic') or ()
+    trained = (trained,) if isinstance(trained, str) else tuple(trained)
+    topics: str | tuple[str, ...] = image_topic
+    if not image_topic and all(set(trained) <= {topic for topic, _, _ in list_topics(path)}
                                for path in paths):
-        reading = replace(reading, image_topic=tuple(sorted(trained)))
-    return reading
+        topics = trained
+    try:
+        return Reading(topics, **known)
+    except ConfigError:
+        return Reading(topics)
 
 
 def check_first_picture(paths: Iterable[str | Path], reading: Reading, network: str) -> None:

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """How recordings are read: which pictures of which camera, and where episodes are cut."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from tap_ros.errors import ConfigError
 
@@ -73,23 +72,3 @@ def for_bags(reading: Reading, count: int) -> Reading:
 def reading_of(settings: Reading) -> Reading:
     """Return the part of larger settings, a subclass, that says how recordings are read."""
     return Reading(**{field.name: getattr(settings, field.name) for field in fields(Reading)})
-
-
-def trained_reading(training: Mapping[str, Any],
-                    image_topic: str | tuple[str, ...] = '') -> Reading:
-    """
-    Return how the recordings of a training were read.
-
-    :param training: the training dict of a weights file, of any version.
-    :param image_topic: the camera's topic in other recordings, if it is called otherwise.
-    :return: Reading; what the file does not tell is as by default.
-    """
-    settings = training.get('settings')
-    known = {} if not isinstance(settings, dict) else {
-        field.name: settings[field.name] for field in fields(Reading)
-        if field.name != 'image_topic'
-        and isinstance(settings.get(field.name), (str,) if field.type is str else (int, float))}
-    try:
-        return replace(Reading(**known), image_topic=image_topic)
-    except ConfigError:
-        return Reading(image_topic)

@@ -3,7 +3,7 @@
 """Resized pictures, and positions in them."""
 
 import numpy as np
-from tap_ros.images.pixels import resize_image, resize_pixels
+from tap_ros.images.pixels import resize_image
 
 
 def test_an_even_picture_stays_even_and_no_column_is_passed_over_when_resizing():
@@ -19,14 +19,3 @@ def test_an_even_picture_stays_even_and_no_column_is_passed_over_when_resizing()
     step = np.zeros((1, 4, 3), np.uint8)
     step[:, 2:] = 255
     assert (np.diff(resize_image(step, (1, 16))[0, :, 0].astype(int)) >= 0).all()
-
-
-def test_pixels_move_with_the_resized_picture():
-    image = np.zeros((32, 64, 3), np.uint8)
-    image[20:24, 40:48] = 255  # centre at u 43.5, v 21.5
-    resized = resize_image(image, (16, 16))
-    weight = resized[..., 0] / resized[..., 0].sum()
-    v, u = np.mgrid[:16, :16]
-    centre = [(weight * u).sum(), (weight * v).sum()]
-    moved = resize_pixels([[43.5, 21.5]], (32, 64), (16, 16))
-    assert np.allclose(moved, [centre], atol=0.05)

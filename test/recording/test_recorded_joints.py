@@ -52,13 +52,6 @@ def test_the_gripper_follows_from_the_arms_joints_where_it_stood(tmp_path):
     assert open_recordings(path).data_hash != told  # what is trained on is another thing
 
 
-def test_without_a_word_the_arm_stood_as_the_simulators(tmp_path):
-    path = bag(tmp_path / 'bag', UR10E.mount, ['gripper_opening'], prefix='')
-    grippers = episode_of(path).grippers
-    np.testing.assert_allclose(grippers[:, :3], places(), atol=0.16 * FAST)
-    np.testing.assert_array_equal(grippers[:, 3], np.float32(0.9))
-
-
 def test_a_gripper_that_is_told_counts(tmp_path):
     path = bag(tmp_path / 'bag', UR10E.mount, ['gripper_x', 'gripper_y', 'gripper_z'])
     np.testing.assert_allclose(
