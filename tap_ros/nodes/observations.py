@@ -30,7 +30,7 @@ REMEMBERED = 100  # messages of a latched topic by which repetitions are recogni
 PROOF = 3  # messages in a row that prove that the clock of a topic has jumped
 POLL_LIMIT = 100  # messages of a topic taken by one poll; the rest comes with the next
 POLL_PERIOD = 0.005  # s between two polls while waiting
-CLOCK_S = 1.0  # s after which nothing is known of a clock that is silent
+CLOCK_S = 1.0  # s after which nothing is known of a clock or driver that is silent
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ class Observations:
         self._newest: dict[str, int] = {}  # topic -> stamp in ns
         self._previous: dict[str, int] = {}  # topic -> the stamp before that
         self._received: dict[str, float] = {}  # topic -> monotonic time of its last message
+        self._repeated: dict[str, float] = {}  # topic -> when a stamp came again
         # topic -> stamps in a row that are not believed
         self._suspects: dict[str, list[int]] = {topic: [] for topic in topics}
         self._sent: dict[str, deque[int]] = {topic: deque(maxlen=REMEMBERED) for topic in topics}
@@ -140,6 +141,8 @@ class Observations:
         for topic in topics:
             subscription = self._subscriptions[topic]
             why = subscription.why_silent() if explained else ''
+            if explained and time.monotonic() - self._repeated.get(topic, -math.inf) < CLOCK_S:
+                why = 'its messages repeat one stamp'
             words.append(f'{subscription.topic} ({why})' if why else subscription.topic)
         return ', '.join(words)
 
@@ -164,7 +167,7 @@ class Observations:
             if stamp != self._newest.get(topic):
                 self._previous[topic] = self._newest.get(topic, stamp)
             elif not self._latched and not self.time_stands:
-                received = self._received[topic]
+                received, self._repeated[topic] = self._received[topic], received
             self._newest[topic], self._received[topic] = stamp, received
             self._by_stamp.setdefault(stamp, {})[topic] = message, received
             self._by_stamp.move_to_end(stamp)

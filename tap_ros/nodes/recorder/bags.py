@@ -99,16 +99,12 @@ class Bags:
         try:
             writer.close()
         except Exception as error:
-            self.failure = (
+            return self._fail(
                 f'{escaped(writer.folder)}: the bag could not be finished: {escaped(error)}; what '
                 'was flushed before stays readable')
-            self._report(self.failure)
-            return self.failure
         if not self.count:
-            self.failure = (f'{escaped(writer.folder)}: nothing was recorded, as nothing has come '
-                            'on any topic')
-            self._report(self.failure)
-            return self.failure
+            return self._fail(f'{escaped(writer.folder)}: nothing was recorded, as nothing has '
+                              'come on any topic')
         return f'{self.count} messages in {escaped(writer.folder)}'
 
     def _write(self, topic: str, type_name: str, data: bytes, qos: Qos, received_ns: int,
@@ -131,11 +127,16 @@ class Bags:
             return
         writer, self._writer = self._writer, None
         writer.abandon()
-        self.failure = (
+        self._fail(
             f'{escaped(writer.folder)}: cannot be written ({escaped(error)}); recording has '
             f'stopped after {self.count} messages, those flushed before stay readable. Make '
             'room, then call recorder/record with data true: it starts a new folder')
-        self._report(self.failure)
+
+    def _fail(self, failure: str) -> str:
+        """Report a failure, and return it."""
+        self.failure = failure
+        self._report(failure)
+        return failure
 
 
 def free_folder(wanted: str | Path) -> Path:
