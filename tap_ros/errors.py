@@ -6,6 +6,13 @@ The errors of this package.
 Every message names what was wrong and what would be right. Catch TapError to catch them all.
 """
 
+from collections.abc import Mapping
+from dataclasses import fields
+import math
+from typing import Any, get_args, get_origin, Literal
+
+from tap_ros.text import escaped
+
 
 class TapError(Exception):
     """Base of all errors raised on purpose by this package."""
@@ -49,3 +56,21 @@ class EngineError(TapError):
 
 class PlanningError(TapError):
     """The planner was given states, maps or goals that cannot be planned with."""
+
+
+def check_fields(config: Any, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """
+    Raise ConfigError for fields of a dataclass that are none of the choices, or out of range.
+
+    :param ranges: least and largest value of numbers, by the name of the field.
+    """
+    for field in fields(config):
+        value, wanted = getattr(config, field.name), ''
+        if get_origin(field.type) is Literal and value not in get_args(field.type):
+            wanted = 'one of ' + ', '.join(get_args(field.type))
+        low, high = ranges.get(field.name, (-math.inf, math.inf))
+        if field.name in ranges and not low <= value <= high:
+            wanted = f'{low}..{high}' if high < math.inf else f'at least {low}'
+        if wanted:
+            raise ConfigError(
+                f'{field.name}: expected {wanted}, got {escaped(repr(value), 60)}')

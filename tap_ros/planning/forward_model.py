@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Self
 
 from tap_ros.contract import ACTION_LIMIT, CLEAR, WORKSPACE_HIGH, WORKSPACE_LOW
-from tap_ros.errors import ConfigError
+from tap_ros.errors import check_fields, ConfigError
 from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
 from tap_ros.planning.table import (
@@ -41,7 +41,6 @@ from tap_ros.planning.table import (
 )
 from tap_ros.training.devices import has_bfloat16, placed
 from tap_ros.training.robot_mask import RobotMask
-from tap_ros.training.settings import check_fields
 from tap_ros.training.weights import LATER, load_weights, make_network
 import torch
 from torch import nn

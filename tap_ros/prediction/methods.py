@@ -13,6 +13,7 @@ MODES = get_args(Mode)
 Loss = Literal['fix', 'min', 'genmin']
 Selection = Literal['absolute', 'relative', 'progress']
 Latent = Literal['none', 'vae']
+Decoder = Literal['separate', 'shared']
 
 _NAME = re.compile(r'(?P<loss>fix|min|genmin)(?P<number>\d+(\.\d+)?)?'
                    r'(?P<model>-wo-gan|-vae-gan|-vae)?(\+(?P<selection>relative|progress))?')

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
 
-from tap_ros.errors import ConfigError
-from tap_ros.prediction.training_config import Decoder
+from tap_ros.errors import check_fields, ConfigError
+from tap_ros.prediction.methods import Decoder
 from tap_ros.prediction.warp import combine, warp
-from tap_ros.training.settings import check_fields
 from tap_ros.training.weights import LATER
 import torch
 from torch import nn

@@ -13,7 +13,7 @@ import math
 from typing import Literal
 
 from tap_ros.errors import ConfigError
-from tap_ros.prediction.methods import Latent, Loss, method_name, Mode, Selection
+from tap_ros.prediction.methods import Decoder, Latent, Loss, method_name, Mode, Selection
 from tap_ros.recording.reading import Reading
 from tap_ros.training.robot_mask import RobotMask
 from tap_ros.training.settings import (
@@ -24,7 +24,6 @@ from tap_ros.training.settings import (
 )
 from tap_ros.training.train import run_training, with_recipe
 
-Decoder = Literal['separate', 'shared']
 GoalPicture = Literal['last', 'recorded', 'mixed']
 Posterior = Literal['video', 'frame']
 Precision = Literal['auto', 'float32', 'bfloat16']

@@ -3,14 +3,13 @@
 """Settings that every training has, and how the commands `train ...` name them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 import math
-from typing import Annotated, Any, get_args, get_origin, Literal
+from typing import Annotated, Any
 
-from tap_ros.errors import ConfigError
+from tap_ros.errors import check_fields, ConfigError
 from tap_ros.options import default_text, Folder
 from tap_ros.recording.reading_options import ReadingOptions
-from tap_ros.text import escaped
 from tap_ros.training.split import TEST_FRACTION
 from tyro import conf
 
@@ -82,24 +81,6 @@ def check_settings(config: Any, ranges: Mapping[str, tuple[float, float]]) -> No
     if not config.recordings:
         raise ConfigError('recordings: expected at least one .mcap file or bag folder')
     check_fields(config, {**_RANGES, **ranges})
-
-
-def check_fields(config: Any, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """
-    Raise ConfigError for fields of a dataclass that are none of the choices, or out of range.
-
-    :param ranges: least and largest value of numbers, by the name of the field.
-    """
-    for field in fields(config):
-        value, wanted = getattr(config, field.name), ''
-        if get_origin(field.type) is Literal and value not in get_args(field.type):
-            wanted = 'one of ' + ', '.join(get_args(field.type))
-        low, high = ranges.get(field.name, (-math.inf, math.inf))
-        if field.name in ranges and not low <= value <= high:
-            wanted = f'{low}..{high}' if high < math.inf else f'at least {low}'
-        if wanted:
-            raise ConfigError(
-                f'{field.name}: expected {wanted}, got {escaped(repr(value), 60)}')
 
 
 @dataclass(frozen=True)
