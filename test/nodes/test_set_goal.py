@@ -74,7 +74,8 @@ def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
     drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
     loop.reach(mode='direct', step_budget=1)  # by then the recorder knows of the new episode
     assert call(recorder, SetBool.Request(data=False), 30).success
-    episode, following = [e for e in iter_episodes(folder) if e.task]
+    # On a busy machine the recorder may hear of the first scene's beginning, too.
+    episode, following = [e for e in iter_episodes(folder) if e.task][-2:]
     assert (episode.seed, len(episode), episode.outcome) == (7, 3, 'failure')
     np.testing.assert_array_equal(episode.goal_pixels, pixels)
     np.testing.assert_allclose(episode.goal_pixels[1], MOVED['object_1'], atol=1e-4)

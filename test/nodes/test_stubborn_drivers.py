@@ -46,7 +46,7 @@ class Rig:
         client.create_subscription(
             TwistStamped, 'stubborn/arm/delta_twist_cmds', self._on_twist, STREAM)
         client.create_timer(0.1, self._publish)
-        self.planner = LocalNode(VisualMpcNode, '/stubborn', num_threads=4, image_timeout=3.0,
+        self.planner = LocalNode(VisualMpcNode, '/stubborn', num_threads=4, image_timeout=2.0,
                                  max_silence=1.0)
         self.threads, plans, mpc = set(), [], self.planner.node._mpc
         plan = mpc.plan
