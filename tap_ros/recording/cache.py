@@ -31,6 +31,7 @@ from tap_ros.recording.align import assemble, EpisodeTable, runs_of
 from tap_ros.recording.bags import check_sizes, find_bags, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.foreign import sqlite_logs
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tap_ros.recording.topic_choice import find_topics, list_paths
@@ -167,12 +168,14 @@ def _jobs(bags: Sequence[Sequence[Path]], found: Sequence[Mapping[str, str]], re
     """Return a list of _Job for each bag."""
     def job(path: Path, names: Mapping[str, str]) -> _Job:
         with open(path, 'rb') as stream:
-            digest = hashlib.file_digest(stream, 'sha256').hexdigest()
+            digest = hashlib.file_digest(stream, 'sha256')
+        for log in sqlite_logs(path):
+            digest.update(log.read_bytes())
         key = hashlib.sha256(json.dumps([
             FORMAT, sorted(names.items()), reading.crop, reading.size, reading.rate,
         ]).encode()).hexdigest()[:8]
-        return _Job(path, path.stat().st_size, digest, tuple(names.items()), reading,
-                    cache_dir / f'{digest}-{key}')
+        return _Job(path, path.stat().st_size, digest.hexdigest(), tuple(names.items()), reading,
+                    cache_dir / f'{digest.hexdigest()}-{key}')
     with ThreadPoolExecutor(_workers()) as pool:
         waiting = [[pool.submit(job, path, names) for path in bag]
                    for bag, names in zip(bags, found, strict=True)]

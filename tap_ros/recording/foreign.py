@@ -9,13 +9,16 @@ that Foxglove's programs write as protobuf are read here. All of them arrive as 
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, ExitStack
 from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
 import re
 import shlex
+import shutil
+import sqlite3
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from mcap.writer import MCAP0_MAGIC as MAGIC
@@ -29,8 +32,9 @@ from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE
 from tap_ros.recording.damage import FAR, Loss
 from tap_ros.recording.mcap_file import Channel, McapFile
 from tap_ros.recording.messages import decode, encode, typestore
-from tap_ros.recording.metadata import bag_files
+from tap_ros.recording.metadata import bag_files, FILE_NAME, PACKED
 from tap_ros.text import escaped, listing
+import zstandard
 
 VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
 _BAGS = {b'SQLite format 3\0': '.db3', b'#ROSBAG V2.0': '.bag'}  # by how a file begins
@@ -228,19 +232,60 @@ class RosbagFile(McapFile):
 def _opened(path: str | Path) -> Iterator[Any]:
     """Open a reader of rosbags; its errors, and those of sqlite, become RecordingErrors."""
     is_ros1 = _start(Path(path)).startswith(b'#ROSBAG')
+    with ExitStack() as stack:
+        try:
+            whole = _whole(Path(path), stack)
+            reader = Ros1Reader(whole) if is_ros1 else Ros2Reader(whole)
+            reader.open()
+        except Exception as error:
+            raise RecordingError(
+                f'{escaped(path)}: cannot be read: {escaped(error)}'
+                + '; if its recorder was killed, `rosbag reindex` mends it' * is_ros1) from error
+        try:
+            yield reader
+        except Exception as error:
+            raise RecordingError(escaped(error)) from error
+        finally:
+            reader.close()
+
+
+def _whole(path: Path, stack: ExitStack) -> Path:
+    """
+    Return a file that rosbags reads whole; what is beside it stays as it is.
+
+    rosbags takes neither what sqlite3 wrote beside a file whose recorder was killed, nor a file
+    without metadata that is packed. Both are made whole in a copy.
+
+    :param path: of the file.
+    :param stack: removes the copy in the end.
+    :raises RecordingError: without room for it.
+    """
+    beside, is_packed = sqlite_logs(path), path.suffix == PACKED
+    if not beside and not is_packed:
+        return path
     try:
-        reader = Ros1Reader(Path(path)) if is_ros1 else Ros2Reader(Path(path))
-        reader.open()
-    except Exception as error:
-        raise RecordingError(
-            f'{escaped(path)}: cannot be read: {escaped(error)}'
-            + '; if its recorder was killed, `rosbag reindex` mends it' * is_ros1) from error
-    try:
-        yield reader
-    except Exception as error:
-        raise RecordingError(escaped(error)) from error
-    finally:
-        reader.close()
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix='tap_ros_')))
+        copy = folder / path.name.removesuffix(PACKED)
+        for file in (*beside, *(() if is_packed else (path,))):
+            shutil.copyfile(file, folder / file.name)
+        if is_packed:
+            with open(path, 'rb') as stream, open(copy, 'wb') as out:
+                shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(
+                    stream, read_across_frames=True), out)
+    except OSError as error:
+        raise RecordingError(f'a copy is needed and cannot be made ({error.strerror}); let TMPDIR '
+                             'name a folder with space for it') from error
+    if beside:
+        with closing(sqlite3.connect(copy)) as base:
+            base.execute('SELECT count(*) FROM sqlite_master').fetchall()  # rolls back
+            base.execute('PRAGMA journal_mode=DELETE').fetchall()  # takes over what -wal holds
+    return copy
+
+
+def sqlite_logs(path: Path) -> list[Path]:
+    """Return the files beside one of sqlite3 that hold a part of what was written to it."""
+    logs = [path.with_name(path.name + end) for end in ('-wal', '-journal')]
+    return [log for log in logs if log.is_file() and log.stat().st_size]
 
 
 def _from_ros1(kind: str, data: memoryview, _: int) -> memoryview:
@@ -298,10 +343,18 @@ def _bag(path: Path) -> list[Path] | None:
     """Return the files of a bag that rosbags reads, in playing order; None for anything else."""
     if path.is_file():
         return [path] if _start(path).startswith(tuple(_BAGS)) else None
-    if any(path.glob('*.mcap*')):
-        return None
-    found = sorted((file for end in _BAGS.values() for file in path.glob(f'*{end}')), key=natural)
-    return [file for file in found if _start(file).startswith(tuple(_BAGS))] or None
+    named = {file.name.removesuffix(PACKED): file for end in _BAGS.values()
+             for kind in (end + PACKED, end) for file in path.glob(f'*{kind}')}
+    found = [file for file in sorted(named.values(), key=natural)
+             if _start(file).startswith(tuple(_BAGS))]
+    if not any(path.glob('*.mcap*')):
+        return found or None
+    if found and not (path / FILE_NAME).exists():  # which says what belongs to the bag
+        raise RecordingError(
+            f'{escaped(path)}: holds .mcap files and {listing([file.name for file in found])}, '
+            'which are no parts of one bag; give the files one by one, or move those of a bag '
+            'into a folder of its own')
+    return None
 
 
 def _what(path: Path) -> str:
@@ -331,11 +384,15 @@ def _command(name: str, place: Path) -> str:
 
 
 def _start(path: Path) -> bytes:
-    """Return how a file begins; nothing of what is no file."""
+    """Return how a file begins, unpacked; nothing of what is no file."""
     try:
         if path.is_file():  # opening a FIFO would wait for its writer
             with open(path, 'rb') as stream:
-                return stream.read(16)
-    except OSError:
+                start = stream.read(16)
+                if not start.startswith(zstandard.FRAME_HEADER):
+                    return start
+                stream.seek(0)
+                return zstandard.ZstdDecompressor().stream_reader(stream).read(16)
+    except (OSError, zstandard.ZstdError):
         pass  # who reads it says why
     return b''

@@ -343,6 +343,8 @@ def _bytes_of(path: str | Path) -> mmap.mmap | bytes:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     except zstandard.ZstdError as error:
         raise RecordingError(f'{path}: does not unpack: {error}') from error
+    if not data:
+        raise RecordingError(f'{path}: does not unpack: it is cut short')
     if data[:len(MAGIC)] != MAGIC:
         raise RecordingError(f'{path}: not an MCAP file: it starts with {data[:8].hex(" ")}, '
                              f'not {MAGIC.hex(" ")}')

@@ -13,7 +13,6 @@ import json
 from math import isfinite
 from pathlib import Path
 import re
-import shlex
 from typing import Any
 
 from tap_ros.errors import RecordingError
@@ -136,12 +135,10 @@ def bag_files(folder: str | Path) -> list[Path]:
             f'{path}: not the metadata of a rosbag2 bag ({escaped(" ".join(str(error).split()))});'
             ' remove it to read the .mcap files without it, or make it anew (ros2 bag reindex)'
         ) from error
-    if storage != 'mcap':  # rosbags is installed with us
-        name = shlex.quote(escaped(folder))
+    if storage not in ('mcap', 'sqlite3'):
         raise RecordingError(
-            f'{path}: the bag is stored as {escaped(storage, 40)}; only mcap is read; convert it: '
-            f'rosbags-convert --src {name} --dst {name}_mcap --dst-storage mcap, or record with '
-            '-s mcap')
+            f'{path}: the bag is stored as {escaped(storage, 40)}; mcap and sqlite3 are read; '
+            'make one of these with ros2 bag convert where its storage is installed')
     files = [folder / Path(name).name for name in paths]
     files = [file if _is_file(file) else file.with_suffix('') if file.suffix == PACKED else file
              for file in files]  # some were unpacked since

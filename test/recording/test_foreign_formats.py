@@ -3,8 +3,11 @@
 """Bags of other storages and messages are read as ours; for what is no bag a command is told."""
 
 import base64
+from contextlib import closing
 import json
+from pathlib import Path
 import shlex
+import shutil
 import sqlite3
 import struct
 import sys
@@ -22,6 +25,7 @@ from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.messages import encode, typestore
 from tap_ros.recording.reader import iter_episodes
+import zstandard
 
 TOPIC = '/camera/image_raw'
 SENT = [each for t in range(1, 6) for each in (camera(t), joints(t, gripper_x=t / 8))]
@@ -52,6 +56,32 @@ def write_bare_db3(folder):
     with sqlite3.connect(file) as base:
         base.execute('DELETE FROM message_definitions')
     return file
+
+
+def write_unmerged(folder):
+    """Write a file whose recorder was killed: the second half stands beside it, in -wal."""
+    whole, file = write_bare_db3(folder), folder / 'killed.db3'
+    with closing(sqlite3.connect(whole)) as base:
+        base.execute('PRAGMA journal_mode=WAL')
+        rows = base.execute('SELECT * FROM messages ORDER BY id').fetchall()
+        base.execute('DELETE FROM messages WHERE id > ?', (len(rows) // 2,))
+        base.commit()
+        base.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+        base.executemany('INSERT INTO messages VALUES (?, ?, ?, ?)', rows[len(rows) // 2:])
+        base.commit()
+        for end in ('', '-wal'):
+            shutil.copyfile(f'{whole}{end}', f'{file}{end}')
+    whole.unlink()
+    return file
+
+
+def write_packed(folder):
+    """Write a bag as of `ros2 bag record --compression-mode file`."""
+    write_sqlite3(folder)
+    file = next(folder.glob('*.db3'))
+    Path(f'{file}.zstd').write_bytes(zstandard.compress(file.read_bytes()))
+    file.unlink()
+    return folder
 
 
 def write_ros1(path):
@@ -88,6 +118,7 @@ def write_ros1_mcap(path):
 
 @pytest.mark.parametrize('write, name', [
     (write_sqlite3, 'bag'), (write_bare_db3, ''), (write_ros1, 'a.bag'),
+    (write_unmerged, ''), (write_packed, 'bag'),
     (write_ros1_mcap, 'a.mcap')])
 def test_other_bags_say_what_a_bag_of_ours_says(write, name, tmp_path):
     expected, = iter_episodes(record(tmp_path / 'ours', SENT))
@@ -99,6 +130,24 @@ def test_other_bags_say_what_a_bag_of_ours_says(write, name, tmp_path):
             np.testing.assert_array_equal(found[0].stamps, expected.stamps)
             np.testing.assert_array_equal(found[0].grippers, expected.grippers)
             assert len(found) == 1
+
+
+def test_what_is_beside_a_file_is_read_and_stays_as_it_is(tmp_path):
+    file = write_unmerged(tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.glob('killed*')}
+    whole = open_recordings(file)
+    assert {path: path.read_bytes() for path in tmp_path.glob('killed*')} == before
+    file.with_name('killed.db3-wal').unlink()
+    half = open_recordings(file)  # not what the cache keeps of the whole
+    assert len(half[0]) < len(whole[0]) == 5
+
+
+def test_mcap_beside_other_bags_is_refused_by_name(tmp_path):
+    path = write_ros1(tmp_path / 'one.bag')
+    write_ros1_mcap(tmp_path / 'two.mcap')
+    with pytest.raises(RecordingError, match='one.bag'):
+        open_recordings(tmp_path)
+    assert len(open_recordings(path)) == len(open_recordings(tmp_path / 'two.mcap')) == 1
 
 
 def length_delimited(number, data):
@@ -131,10 +180,11 @@ def test_pictures_of_foxglove_are_read_from_protobuf(compressed, tmp_path):
 
 
 def test_damage_of_other_bags_is_named(tmp_path):
-    for path in (write_ros1(tmp_path / 'a.bag'), write_bare_db3(tmp_path)):
+    packed = next(write_packed(tmp_path / 'packed').glob('*.zstd'))
+    for path in (write_ros1(tmp_path / 'a.bag'), write_bare_db3(tmp_path), packed):
         data = path.read_bytes()
         path.write_bytes(data[:len(data) // 3])
-        with pytest.raises(RecordingError, match=f'{path.name}: (cannot be read|.* lost)'):
+        with pytest.raises(RecordingError, match=path.name + ': (cannot be r|does not u|.* lost)'):
             list(iter_episodes(path))
 
 
