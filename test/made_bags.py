@@ -97,10 +97,10 @@ def write_mcap(path, messages, topics=(), schema=None, **options):
         writer.start('ros2')
         for topic, kind in dict.fromkeys((*topics, *((one[0], one[1]) for one in messages))):
             text = schema_text(kind).encode() if schema is None else schema
-            numbers[topic] = writer.register_channel(
+            numbers[topic, kind] = writer.register_channel(
                 topic, 'cdr', writer.register_schema(kind, 'ros2msg', text))
-        for topic, _, data, log in messages:
-            writer.add_message(numbers[topic], log, data, log)
+        for topic, kind, data, log in messages:
+            writer.add_message(numbers[topic, kind], log, data, log)
         writer.finish()
     return path
 

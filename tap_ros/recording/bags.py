@@ -58,15 +58,14 @@ def list_topics(path: str | Path) -> list[tuple[str, str, int | None]]:
     :return: (topic, type, number of messages, None where unknown), by name.
     :raises RecordingError: when there is no recording, or nothing of a file can be read.
     """
-    found: dict[str, tuple[str, int | None]] = {}
+    found: dict[tuple[str, str], int | None] = {}
     for file in (open_file(file) for bag in find_bags(path) for file in bag):
-        channels, counts = file.topics(), file.counts()
-        for topic, channel in channels.items():
-            before = found.get(topic, ('', 0))[1]
-            count = counts.get(topic)
-            found[topic] = channel.type_name, (
-                None if before is None or count is None else before + count)
-    return [(topic, kind, count) for topic, (kind, count) in sorted(found.items())]
+        file.topics()
+        counts = file.counts()
+        for one in {(channel.topic, channel.type_name) for channel in file.channels.values()}:
+            before, count = found.get(one, 0), counts.get(one)
+            found[one] = None if before is None or count is None else before + count
+    return [(topic, kind, count) for (topic, kind), count in sorted(found.items())]
 
 
 def reading_like(training: Mapping[str, Any], paths: Sequence[str | Path],

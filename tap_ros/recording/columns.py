@@ -24,6 +24,7 @@ from tap_ros.images.crop import CENTRE
 from tap_ros.messages.images import decode_image, decode_mask, is_empty
 from tap_ros.messages.joints import decode_positions, PLACE
 from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.topics import BY_COLUMNS, IMAGE
 from tap_ros.recording.damage import describe, FAR, gaps, Loss
 from tap_ros.recording.foreign import open_file
 from tap_ros.recording.mcap_file import McapFile
@@ -98,7 +99,8 @@ def decode_file(path: str | Path, found: Mapping[str, str],
         decoder = _Decoder(open_file(path), found, write, size, reading)
         try:
             for channel, log, _, data in decoder.file.messages(found):
-                decoder.take(channel.topic, channel.type_name, log, data)
+                if channel.type_name in BY_COLUMNS[found[channel.topic]].types:
+                    decoder.take(channel.topic, channel.type_name, log, data)
             size = decoder.most_frequent_size()
         except RecordingError as error:
             raise RecordingError(f'{path}: {error}') from error
@@ -117,9 +119,10 @@ def first_size(paths: Iterable[str | Path], topic: str) -> tuple[int, int] | Non
     """
     for file in map(open_file, paths):
         for channel, *_, data in file.messages({topic}):
-            with suppress(RecordingError, ImageError):
-                height, width, _ = decode_image(decode(channel.type_name, data)).shape
-                return height, width
+            if channel.type_name in IMAGE.types:
+                with suppress(RecordingError, ImageError):
+                    height, width, _ = decode_image(decode(channel.type_name, data)).shape
+                    return height, width
     return None
 
 

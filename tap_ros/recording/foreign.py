@@ -190,7 +190,7 @@ class RosbagFile(McapFile):
         self.path, self.size = path, Path(path).stat().st_size
         self.losses: list[Loss] = []
         self.channels: dict[int, Channel] = {}
-        self._count: Counter[str] = Counter()  # messages by topic
+        self._count = Counter[tuple[str, str]]()  # messages by topic and type
         self._converters: dict[int, Convert] = {}
         with _opened(path) as reader:
             for connection in reader.connections:
@@ -202,11 +202,11 @@ class RosbagFile(McapFile):
                     text = ''
                 self.channels[connection.id] = Channel(
                     connection.topic, connection.msgtype, 'cdr', 'ros2msg' if text else '', text)
-                self._count[connection.topic] += connection.msgcount
+                self._count[connection.topic, connection.msgtype] += connection.msgcount
 
-    def counts(self) -> dict[str, int]:
-        """Return the number of messages by topic."""
-        return dict(self._count)
+    def counts(self) -> Counter[tuple[str, str]]:
+        """Return the number of messages by topic and type."""
+        return self._count
 
     def messages(self, wanted: Collection[str]) -> Iterator[tuple[Channel, int, int, memoryview]]:
         """Yield messages as McapFile does."""

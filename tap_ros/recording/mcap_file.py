@@ -103,11 +103,13 @@ class McapFile:
                 pass
         return {channel.topic: channel for channel in self.channels.values()}
 
-    def counts(self) -> dict[str, int]:
-        """Return the number of messages by topic, as the summary says; empty where it does not."""
-        statistics = self._summary.statistics
-        return {channel.topic: statistics.channel_message_counts.get(number, 0)
-                for number, channel in self.channels.items()} if statistics else {}
+    def counts(self) -> Counter[tuple[str, str]]:
+        """Return the number of messages by topic and type; empty where no summary tells it."""
+        found, statistics = Counter[tuple[str, str]](), self._summary.statistics
+        for number, channel in self.channels.items() if statistics else ():
+            found[channel.topic, channel.type_name] += (
+                statistics.channel_message_counts.get(number, 0))
+        return found
 
     def messages(self, wanted: Collection[str]) -> Iterator[tuple[Channel, int, int, memoryview]]:
         """

@@ -7,6 +7,7 @@ By what is needed: by type, name and namespace, by the number of messages and, w
 do, by what is in them. Only where two cameras are left is somebody asked.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -50,13 +51,15 @@ def find_topics(files: Sequence[Path], image_topic: str = '') -> dict[str, str]:
     """
     bag = _Bag(files)
     camera = bag.camera(image_topic)
-    if bag.channels[camera].type_name == COMPRESSED_TYPE and bag.is_video(camera):
+    if (camera, COMPRESSED_TYPE) in bag.every and bag.is_video(camera):
         raise RecordingError(f'{bag.source}: {explain_video(camera, files)}')
     found = {camera: IMAGE.becomes} | {
         topic: name for name, one in BY_COLUMNS.items() if one is not IMAGE
         for topic in bag.beside(one, camera)}
-    for topic in found:
-        channel, source = bag.channels[topic], f'{bag.source}: topic {escaped(topic)}'
+    for channel in bag.every.values():
+        if channel.topic not in found or channel.type_name not in bag.types(channel.topic):
+            continue
+        source = f'{bag.source}: topic {escaped(channel.topic)}'
         if channel.encoding != 'cdr':
             raise RecordingError(
                 f'{source}: encoded as {channel.encoding[:40]!r}; only cdr can be read')
@@ -73,17 +76,26 @@ class _Bag:
 
     def __init__(self, files: Sequence[Path]) -> None:
         self.files, self.source = files, list_paths(files)
-        self.channels: dict[str, Channel] = {}
-        self.counts: dict[str, int] = {}  # as far as they are known
+        self.channels: dict[str, Channel] = {}  # of several types, the one that fits the name
+        self.every: dict[tuple[str, str], Channel] = {}  # by topic and type
+        self.counts = Counter[str]()  # of messages with the types, as far as they are known
+        counts = Counter[tuple[str, str]]()
         damage = []
         for file in map(open_file, files):
-            self.channels |= file.topics()
-            for topic, count in file.counts().items():
-                self.counts[topic] = self.counts.get(topic, 0) + count
+            file.topics()
+            self.every |= {(one.topic, one.type_name): one for one in file.channels.values()}
+            for one, count in file.counts().items():
+                counts[one] += count
             losses = [loss for loss in file.losses if loss.what]  # more than that it is cut off
             if not file.channels and losses:
                 damage.append(f'{file.path}: {describe(losses)[0]}')
-        if not self.channels or (self.counts and not any(self.counts.values())):
+        for (topic, kind), channel in self.every.items():
+            if topic not in self.channels or kind in (_named_best(topic) or IMAGE).types:
+                self.channels[topic] = channel
+        for (topic, kind), count in counts.items():
+            if kind in self.types(topic):
+                self.counts[topic] += count
+        if not self.channels or (counts and not any(counts.values())):
             raise RecordingError(damage[0] if damage else f'{self.source}: holds no message')
 
     def camera(self, wanted: str) -> str:
@@ -102,7 +114,9 @@ class _Bag:
                 topic for topic in pictures if _named_best(topic) is IMAGE]
         most = max((self.counts.get(topic, 0) for topic in left), default=0)
         rules: tuple[Callable[[str], object], ...] = (
-            lambda topic: _named_best(topic) is IMAGE,
+            self.is_main_one,
+            lambda topic: (_named_best(topic.removesuffix('/compressed')) is IMAGE
+                           and self.picture(topic) is not None),
             lambda topic: self.counts.get(topic, most) * _FEW > most,
             lambda topic: self.picture(topic) is not None,
             # Of a camera that is there raw, too, nothing more is learned from compressed pictures.
@@ -123,6 +137,19 @@ class _Bag:
                 f'{self.source}: several topics could be {IMAGE.recorded}: {self.listing(left)}; '
                 'name the camera topic (--image-topic)')
         return left[0]
+
+    def types(self, topic: str) -> tuple[str, ...]:
+        """Return the types of a topic's messages that are read."""
+        kind = self.channels[topic].type_name
+        return IMAGE.types if kind in IMAGE.types else (kind,)
+
+    def is_main_one(self, topic: str) -> bool:
+        """Tell whether its other topic, raw or compressed, has less than twice its pictures."""
+        raw = topic.removesuffix('/compressed')
+        other = raw if raw != topic else f'{topic}/compressed'
+        return not (0 < 2 * self.counts[topic] <= self.counts[other]
+                    and self.channels[other].type_name in IMAGE.types
+                    and self.picture(other) is not None)
 
     def beside(self, one: Topic, camera: str) -> list[str]:
         """Return the topics that are read as one of ours, beside a camera."""
@@ -159,7 +186,7 @@ class _Bag:
 
     def is_video(self, topic: str) -> bool:
         """Tell whether a topic of compressed pictures holds packets of a video."""
-        return any(is_video(message.format) for message in self._first(topic)[:1])
+        return any(is_video(getattr(message, 'format', '')) for message in self._first(topic)[:1])
 
     def joints(self, topic: str) -> Mapping[str, float]:
         """Return the joints in the first message of a topic."""
@@ -179,9 +206,10 @@ class _Bag:
 
     def _first(self, topic: str) -> list[Any]:
         """Return the first messages of a topic that can be decoded."""
-        found = []
+        found, types = [], self.types(topic)
         for file in map(open_file, self.files):
-            for channel, *_, data in islice(file.messages({topic}), _LOOKED_AT):
+            fitting = (one for one in file.messages({topic}) if one[0].type_name in types)
+            for channel, *_, data in islice(fitting, _LOOKED_AT):
                 with suppress(RecordingError):
                     found.append(decode(channel.type_name, data))
             if found:

@@ -7,7 +7,7 @@ import io
 import re
 
 import cv2
-from made_bags import camera, IMAGE, message, read, record, SECOND, shown
+from made_bags import camera, IMAGE, message, read, record, SECOND, shown, write_mcap
 from made_episodes import make_episode
 import numpy as np
 from PIL import Image as Picture
@@ -15,8 +15,9 @@ import pytest
 from tap_ros.cli import main
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.crop import Crop
-from tap_ros.recording.bags import check_first_picture, reading_like
+from tap_ros.recording.bags import check_first_picture, list_topics, reading_like
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.messages import encode
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import EpisodeWriter
@@ -158,6 +159,48 @@ def test_of_several_topics_of_pictures_the_colour_camera_is_taken(tmp_path):
     with pytest.raises(RecordingError, match=r'several .*image_raw/compressed \(40 messages\), '
                        r'/side/image_rect \(30 messages\); name the camera .*--image-topic'):
         open_recordings(bag)
+
+
+def test_of_raw_and_compressed_pictures_those_with_clearly_more_are_read(tmp_path):
+    name = '/camera/image_raw'
+    for number, (raw, packed_too, taken) in enumerate((
+            (1, 30, True), (5, 30, True), (15, 30, True), (20, 30, False), (30, 30, False))):
+        messages = [camera(t, scene(t), topic=name) for t in range(1, raw + 1)] + [
+            (f'{name}/compressed', *compressed(t, scene(t))[1:])
+            for t in range(1, packed_too + 1)]
+        messages += [deep(t, '/depth') for t in range(1, 31)]
+        found, told = read(record(tmp_path / str(number), messages))
+        assert sum(map(len, found)) == (packed_too if taken else raw) and not told
+    found, _ = read(tmp_path / '0', reading=Reading(name))  # who names it gets it
+    assert sum(map(len, found)) == 1
+    bag = record(tmp_path / 'video', [camera(t, scene(t), topic=name) for t in (1, 2, 3)] + [
+        (f'{name}/compressed', *compressed(t, b'no picture')[1:]) for t in range(1, 31)])
+    assert sum(map(len, read(bag)[0])) == 3
+
+
+def test_what_can_be_decoded_precedes_the_name(tmp_path):
+    for form in ('16UC1', '32FC1'):
+        messages = [one for t in range(1, 6) for one in (
+            deep(t, '/camera/image_raw', form), camera(t, scene(t), topic='/camera/color'))]
+        (episode,), told = read(record(tmp_path / form, messages))
+        assert len(episode) == 5 and not told
+    record(tmp_path / 'alone', [deep(t, '/camera/image_raw') for t in range(1, 6)])
+    with pytest.raises(RecordingError, match="encoding '16UC1' cannot be used"):
+        open_recordings(tmp_path / 'alone')
+
+
+def test_a_topic_of_several_types_is_read_by_the_type_of_each_message(tmp_path):
+    name, string = '/camera/image_raw', 'std_msgs/msg/String'
+    raw = [camera(t, scene(t), topic=name) for t in range(1, 16)]
+    small = [(name, *compressed(t + 0.5, scene(t))[1:]) for t in range(1, 16)]
+    mixed = [one for pair in zip(raw, small) for one in pair]
+    words = [(name, string, encode(string, {'data': 'x'}), t * SECOND) for t in range(1, 16)]
+    for number, (messages, expected) in enumerate((
+            (mixed, 30), (small[:1] + mixed[2:], 29), (words + raw, 15), (raw + words, 15))):
+        write_mcap(tmp_path / f'{number}.mcap', messages)
+        found, told = read(tmp_path / f'{number}.mcap')
+        assert sum(map(len, found)) == expected and not told
+    assert list_topics(tmp_path / '3.mcap') == [(name, IMAGE, 15), (name, string, 15)]
 
 
 def test_one_part_of_two_cameras_is_refused_before_training(tmp_path):
