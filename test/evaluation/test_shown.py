@@ -42,12 +42,6 @@ def test_an_object_that_is_painted_over_is_not_shown(episode):
     assert hand > 0.9 and objects < 0.3
 
 
-def test_half_faded_is_half_shown(episode):
-    bare = fill_in_time(episode.frames, episode.robot_masks, 'all')[0]
-    faded = (episode.frames[CARRYING] / 255 + bare[CARRYING] / 255) / 2
-    assert ShownScorer(episode).score(faded, CARRYING)[0] == pytest.approx(0.5, abs=0.01)
-
-
 def test_nothing_is_known_without_masks_or_positions(episode):
     frame = episode.frames[CARRYING] / 255
     bare = replace(episode, robot_masks=None, goal_mask=None)

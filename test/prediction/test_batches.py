@@ -133,15 +133,6 @@ def test_augmentation_can_be_undone_and_is_the_same_for_all_pictures_of_an_episo
     assert changed[:, 0].equal(changed[:, 2])
 
 
-def test_augmentation_of_black_stays_black_and_off_means_off():
-    augmentation = Augmentation.draw(4, True, True, 0.3, np.random.default_rng(0))
-    black = -torch.ones(4, 1, 3, 8, 8)
-    assert augmentation.apply(black).allclose(black)
-    images = torch.rand(4, 2, 3, 8, 8)
-    nothing = Augmentation.draw(4, False, False, 0.0, np.random.default_rng(0))
-    assert nothing.apply(images).allclose(images, atol=1e-6)
-
-
 def test_resident_frames_are_the_mapped_ones(store):
     resident = ResidentFrames(store, 'cpu')
     for forward in (False, True):

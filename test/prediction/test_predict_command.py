@@ -11,7 +11,7 @@ from PIL import Image
 import pytest
 from tap_ros.cli import main
 from tap_ros.messages.images import decode_image
-from tap_ros.prediction.predict_command import fit, read_picture
+from tap_ros.prediction.predict_command import read_picture
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.training.weights import save_weights
@@ -53,20 +53,13 @@ def test_it_predicts_what_the_predictor_does_in_the_pixels_of_the_start_picture(
 def test_without_objects_pictures_alone_are_predicted_and_samples_are_rows(
         files, tmp_path, capsys):
     sizes = []
-    for samples in '13':
-        out = tmp_path / f'{samples}.png'
-        assert main(['predict', *files, '--weights', 'pick_place_vae', '--samples', samples,
-                     '--out', str(out)]) == 0
+    for options in (files[:1] + ['--weights', 'grasp_forward'],
+                    files + ['--weights', 'pick_place_vae', '--samples', '3']):
+        out = tmp_path / 'out.png'
+        assert main(['predict', *options, '--out', str(out)]) == 0
         sizes.append(cv2.imread(str(out)).shape)
     assert 'object 1' not in capsys.readouterr().out
-    assert sizes[1][0] == 3 * sizes[0][0] and sizes[1][1] == sizes[0][1]
-
-
-def test_weights_that_predict_forward_need_no_goal(files, tmp_path):
-    out = tmp_path / 'later.png'
-    assert main(['predict', files[0], '--weights', 'grasp_forward', '--objects', '30,40',
-                 '--out', str(out)]) == 0
-    assert out.exists()
+    assert sizes[1][0] == 3 * sizes[0][0] and 2 * sizes[1][1] == 3 * sizes[0][1]
 
 
 def refusal(capsys, *arguments):
@@ -86,6 +79,8 @@ def test_what_cannot_be_used_is_named_and_nothing_is_written(files, tmp_path, ca
             (['--objects', 'nan,2', '--goal-objects', '1,2'], 'outside'),
             (['--weights', 'none.safetensors'], 'none.safetensors'),
             (['--weights', 'grasp_forward'], 'goal'), (['--samples', '0'], 'num_samples'),
+            (['--out', files[1]], f'--out {files[1]}: is a picture to predict'),
+            (['--out', 'subgoal.jpg'], '--out subgoal.jpg: expected a .png'),
             (['--crop', 'middle'], 'crop: expected centre'),
             (['--crop', '100,0,99'], 'start: crop 100,0,99 reaches beyond'),
             (['--crop', '0,0,20', '--objects', '40,9', '--goal-objects', '1,2'], 'not in the pa')):
@@ -93,35 +88,21 @@ def test_what_cannot_be_used_is_named_and_nothing_is_written(files, tmp_path, ca
         assert not out.exists()
 
 
-def test_the_picture_is_a_png_beside_the_others(files, tmp_path, capsys):
-    before = [open(file, 'rb').read() for file in files]
-    for out in (*files, str(tmp_path / 'subgoal.jpg')):
-        assert main(['predict', *files, '--out', out]) == 1
-        assert f'--out {out}' in capsys.readouterr().err
-    assert [open(file, 'rb').read() for file in files] == before
-    assert main(['predict', files[0], '--weights', 'grasp_forward', '--goal-objects', '1,2',
-                 '--out', str(tmp_path / 'a.png')]) == 1
-    assert 'no goal picture' in capsys.readouterr().err
-
-
 def test_a_file_that_is_no_whole_square_picture_is_named(files, tmp_path, capsys):
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
     (tmp_path / 'text.png').write_text('not a picture')
-    (tmp_path / 'empty.jpg').write_bytes(b'')
     cv2.imwrite(str(tmp_path / 'wide.png'), np.zeros((64, 96, 3), np.uint8))
     for kind in ('.jpg', '.png', '.webp'):
         whole = cv2.imencode(kind, noise)[1].tobytes()
-        for share in (0.5, 0.95):
-            (tmp_path / f'half{share}{kind}').write_bytes(whole[:int(share * len(whole))])
-    for path in tmp_path.glob('half*'):
+        path = tmp_path / f'half{kind}'
+        path.write_bytes(whole[:int(0.95 * len(whole))])
         assert 'damaged' in (said := refusal(capsys, files[0], str(path))) and path.name in said
     for name, named in (('absent.png', 'No such file'), ('text.png', 'valid are JPEG, PNG'),
-                        ('empty.jpg', 'valid are JPEG, PNG'), ('wide.png', '96x64'),
-                        ('', 'directory')):
+                        ('wide.png', '96x64'), ('', 'directory')):
         assert named in refusal(capsys, str(tmp_path / name), files[1]), name
 
 
-@pytest.mark.parametrize('mode', ['RGB', 'CMYK', 'L', 'P', 'RGBA'])
+@pytest.mark.parametrize('mode', ['CMYK', 'P', 'RGBA'])
 def test_files_are_read_as_recorded_pictures_are_and_upright(tmp_path, mode):
     smooth = cv2.resize(np.random.default_rng(0).integers(0, 255, (4, 6, 3), np.uint8), (96, 64))
     picture = Image.fromarray(smooth).convert(mode)
@@ -139,14 +120,6 @@ def test_files_are_read_as_recorded_pictures_are_and_upright(tmp_path, mode):
         assert np.array_equal(found, decode_image(message))
     picture.convert('RGB').save(tmp_path / 'p.jpg', exif=b'Exif\0\0MM nonsense')
     assert read_picture(tmp_path / 'p.jpg').shape == shown.shape
-
-
-def test_pictures_are_scaled_and_positions_with_them():
-    ramp = np.zeros((32, 32, 3), np.uint8)
-    ramp[..., 0] = 4 * np.arange(32)
-    picture, pixels = fit(ramp, np.array([[1.5, 1.5], [31.5, -0.5]]), (8, 8), 'start')
-    assert picture[3, 1:-1, 0].tolist() == [16 * i + 6 for i in range(1, 7)]
-    assert pixels == pytest.approx(np.array([[0, 0], [7.5, -0.5]]))
 
 
 def test_the_part_that_is_used_is_asked_for_or_that_of_the_training(episode, tmp_path, capsys):

@@ -14,7 +14,7 @@ from tap_ros.prediction import training
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
-from tap_ros.prediction.training import kl_share, network_config, train
+from tap_ros.prediction.training import kl_share, train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.devices import pick_precision, Processes
@@ -49,8 +49,8 @@ def curve(folder, name):
 
 
 @pytest.mark.parametrize('values', [
-    {'num_targets': 3, 'min_crop': 0.6},
-    {**method_fields('genmin-vae-gan'), 'kl_warmup': 0.5, 'posterior_std': 0.1},
+    {**method_fields('genmin-vae-gan'), 'kl_warmup': 0.5, 'posterior_std': 0.1,
+     'num_targets': 3, 'min_crop': 0.6},
     {**method_fields('genmin4'), 'mode': 'forward', 'recursion': 2, 'decoder': 'separate',
      'skips': False},
     {**method_fields('genmin-vae'), 'posterior': 'frame', 'num_targets': 2}])
@@ -68,13 +68,12 @@ def test_two_steps_and_two_more_equal_four(config, tmp_path, values):
 
 
 @pytest.mark.parametrize('values', [
-    {'selection': 'progress'}, method_fields('genmin-vae-gan'),
-    {**method_fields('fix1.00'), 'mode': 'forward'}])
+    {'selection': 'progress'}, {**method_fields('fix1.00-vae-gan'), 'mode': 'forward'}])
 def test_every_kind_of_method_learns(config, values):
-    config = replace(config, **values, steps=30, learning_rate=2e-3, new_pixels=True,
-                     average_decay=0.0, save_every=30)
+    config = replace(config, **values, steps=20, learning_rate=2e-3, new_pixels=True,
+                     average_decay=0.0, save_every=20, log_every=20)
     losses = []
-    for stop in (1, 30):
+    for stop in (1, 20):
         train(config, stop_at=stop, progress=False)
         losses.append(json.loads(Path(config.out, 'scores.json').read_text())['loss'])
     assert losses[1] < losses[0]
@@ -116,25 +115,6 @@ def test_a_run_leaves_what_is_needed_to_repeat_it(config):
         2, 4}
 
 
-def test_compiled_networks_are_trained(config, monkeypatch):
-    class Compiled(torch.nn.Module):
-        def __init__(self, module):
-            super().__init__()
-            self.module = module
-
-        def __len__(self):
-            raise TypeError('a compiled network has no truth value')
-
-        def forward(self, *inputs):
-            return self.module(*inputs)
-
-    made = []
-    monkeypatch.setattr(torch, 'compile', lambda module: made.append(module) or Compiled(module))
-    path = train(replace(config, compile=True, steps=1, **method_fields('genmin-vae-gan')),
-                 progress=False)
-    assert load_network(path)[1]['steps'] == 1 and len(made) == 4
-
-
 def test_several_processes_need_a_gpu_each_and_an_equal_part_of_the_batch(config, monkeypatch):
     monkeypatch.setenv('WORLD_SIZE', '2')
     with pytest.raises(ConfigError, match='device: 2 processes train on a GPU each, not on cpu'):
@@ -153,15 +133,11 @@ def test_the_price_of_z_rises():
 
 def test_settings_that_make_no_sense_or_do_nothing_are_refused_by_name(config):
     for values in (
-            {'recordings': ()}, {'loss': 'max'}, {'outer_power': 2.0}, {'mode': 'sideways'},
-            {'goal_picture': 'none'}, {'steps': 0}, {'margin': -1}, {'test_fraction': 1.5},
-            {'fraction': 1.5}, {'beta': 0.0}, {'selection': 'progress', 'mode': 'forward'},
+            {'recordings': ()}, {'loss': 'max'}, {'outer_power': 2.0}, {'goal_picture': 'none'},
+            {'steps': 0}, {'fraction': 1.5}, {'selection': 'progress', 'mode': 'forward'},
             {'recursion': 2, 'loss': 'fix'}, {'posterior': 'frame', 'latent': 'vae', 'gan': True},
-            {'posterior': 'frame'}, {'gan_weight': -1.0}, {'free_nats': -1.0}, {'kl_warmup': 0.6},
-            {'posterior_std': 0.0}, {'posterior': 'frame', 'free_nats': 1.0, 'latent': 'vae'},
-            # Without z
-            {'free_nats': 1.0}, {'kl_warmup': 0.5}, {'posterior_std': 0.1},
-            {'robot_mask': 'hand'}, {'fill_context': 0.5}):
+            {'posterior': 'frame'}, {'posterior': 'frame', 'free_nats': 1.0, 'latent': 'vae'},
+            {'free_nats': 1.0}, {'robot_mask': 'hand'}, {'fill_context': 0.5}):
         with pytest.raises(ConfigError, match=next(iter(values))):
             TrainingConfig(**{'recordings': ('bag',), 'out': 'out', **values})
     with pytest.raises(ConfigError, match="device: 'nonsense'"):
@@ -180,22 +156,6 @@ def test_the_command_line_sets_every_field_and_one_needs_no_held_out_episodes(co
     assert torch.isfinite(weights(config)[HEAD]).all()
 
 
-def test_the_networks_are_those_asked_for(config, store):
-    shape = network_config(replace(config, base_width=8, new_pixels=False), (32, 32))
-    assert (shape.base_width, shape.new_pixels, shape.num_context) == (8, False, 2)
-    assert (shape.latent_size, shape.decoder, shape.skips) == (0, 'shared', True)
-    assert network_config(replace(config, mode='forward'), (32, 32)).num_context == 1
-    for posterior, images in (('video', 5), ('frame', 3)):
-        vae = replace(config, latent='vae', latent_size=6, posterior=posterior, video_frames=5)
-        shape = network_config(vae, (32, 32))
-        helpers = training._helpers(vae, shape, store)
-        assert shape.latent_size == 6 and list(helpers) == ['recognition']
-        assert helpers['recognition'].encoder[0].in_channels == 3 * images
-    helpers = training._helpers(replace(config, gan=True, latent='vae'), shape, store)
-    assert set(helpers) == {'recognition', 'discriminator', 'posterior_discriminator'}
-    assert helpers['discriminator'].head[-1].out_channels == store.lengths.max() - 1
-
-
 def test_each_setting_reaches_the_loss_or_the_step(config):
     def first(**options):
         run = replace(config, steps=1, warmup=0, log_every=1, **options)
@@ -209,11 +169,10 @@ def test_each_setting_reaches_the_loss_or_the_step(config):
     plain, weight = first()
     again, same = first()
     assert again == plain and same.equal(weight)
-    for options in ({'outer_power': 0.5}, {'recursion': 2}, {'loss': 'min'}, {'loss': 'fix'},
+    for options in ({'outer_power': 0.5}, {'recursion': 2}, {'loss': 'min'},
                     {'loss': 'fix', 'fraction': 0.2}, {'selection': 'absolute'}, {'seed': 1}):
         assert first(**options)[0]['loss'] != pytest.approx(plain['loss'], rel=1e-6), options
-    for options in ({'gradient_clip': 1e-12}, {'learning_rate': 1e-4}, {'average_decay': 0.0},
-                    {'precision': 'bfloat16'}):
+    for options in ({'gradient_clip': 1e-12}, {'learning_rate': 1e-4}, {'average_decay': 0.0}):
         assert not first(**options)[1].equal(weight), options
 
 
@@ -241,15 +200,7 @@ def test_what_is_taken_from_episodes_is_what_the_settings_say(config, store, mon
     assert used[-1] == Sampling(**same, forward=True, video_frames=7, fraction=0.3, num_others=1)
     drawn(latent='vae', posterior='frame')
     assert used[-1].video_frames == 0
-
-    def looks(**options):
-        changes = [augmentation for _, augmentation in drawn(20, **options)]
-        return (torch.cat([a.flip for a in changes]).float().mean().item(),
-                len(torch.cat([a.order for a in changes]).unique(dim=0)),
-                (torch.cat([a.gain for a in changes]) - 1).abs().max().item())
-
-    off = {'flip': False, 'colour': False, 'brightness': 0.0}
-    assert looks(**off) == (0.0, 1, 0.0)
-    assert 0.3 < looks(**off | {'flip': True})[0] < 0.7
-    assert looks(**off | {'colour': True})[1] == 6
-    assert 0.25 < looks(**off | {'brightness': 0.3})[2] <= 0.3
+    off = drawn(flip=False, colour=False, brightness=0.0)[0][1]
+    assert not off.flip.any() and len(off.order.unique(dim=0)) == 1 and off.gain.eq(1).all()
+    on = drawn(flip=True, colour=True, brightness=0.3, batch_size=24)[0][1]
+    assert on.flip.any() and len(on.order.unique(dim=0)) == 6 and 0.2 < (on.gain - 1).max() <= 0.3

@@ -73,15 +73,6 @@ def test_what_is_learned_is_the_least_of_the_loss(marked):
             assert loss(learned.weights + size * rng.standard_normal(14)) > least
 
 
-def test_features_of_a_demonstration_shown_backwards_are_turned_round():
-    frames, _ = demonstration(3)
-    there, back = describe(frames)[:, :7], describe(frames[::-1])[::-1, :7]
-    np.testing.assert_allclose(back[:, 0], 1 - there[:, 0], atol=1e-9)
-    np.testing.assert_allclose(back[:, [1, 6]], -there[:, [1, 6]], atol=1e-6)
-    np.testing.assert_allclose(back[:, [2, 3]], there[:, [2, 3]], atol=1e-6)
-    np.testing.assert_allclose(back[:, [4, 5]], there[:, [5, 4]], atol=1e-6)
-
-
 def test_features_are_bounded_squared_and_the_same_for_a_darker_camera():
     frames, pause = demonstration(5)
     found = describe(frames)

@@ -2,11 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the queue of requests: each is answered once, whatever happens to the others."""
 
-import _thread
 from collections import Counter
-import signal
 import threading
-import time
 
 import pytest
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
@@ -129,44 +126,3 @@ def test_at_the_end_all_that_wait_are_told_and_the_batch_is_finished(made):
     ending.join(TIMEOUT)
     assert not ending.is_alive()
     assert rig.wait(4)[0] == 0 and len(rig.answers) == 4
-
-
-def test_what_is_prepared_is_prepared_in_the_thread_that_works():
-    threads = []
-
-    def prepare():
-        threads.append(threading.current_thread())
-        return lambda batch: threads.append(threading.current_thread()) or batch
-
-    queue, answered = RequestQueue(prepare, len, 1, 1, 1), threading.Event()
-    assert len(threads) == 1
-    queue.put('one', lambda found: answered.set())
-    assert answered.wait(TIMEOUT)
-    queue.close()
-    assert threads[0] is threads[1] is not threading.current_thread()
-
-    def fail():
-        raise OSError('no such file')
-
-    with pytest.raises(OSError, match='no such file'):
-        RequestQueue(fail, len, 1, 1, 1)
-
-
-def test_an_interrupted_start_leaves_no_thread_at_work():
-    prepared, threads = threading.Event(), []
-
-    def prepare():
-        threads.append(threading.current_thread())
-        time.sleep(0.1)  # until it is waited for
-        _thread.interrupt_main()
-        time.sleep(0.3)
-        prepared.set()
-        return lambda batch: batch
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            RequestQueue(prepare, len, 1, 1, 1)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert prepared.is_set() and not threads[0].is_alive()

@@ -12,7 +12,6 @@ from tap_ros.prediction.training_networks import (
     kl_divergence,
     Recognition,
     sample_latent,
-    smoothed_labels,
 )
 import torch
 from torch.distributions import Normal
@@ -23,12 +22,6 @@ STEP, OTHER = torch.tensor([2, 0, 5]), torch.tensor([3, 5, 5])  # 1, 5 and 0 ste
 
 def draw(*shape, seed=0):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
-
-
-def test_labels_fall_by_a_quarter_a_step_on_both_sides():
-    times, expected = torch.arange(12), [0, 0, .25, .5, .75, 1, .75, .5, .25, 0, 0, 0]
-    assert smoothed_labels(times, torch.tensor(5)).tolist() == expected
-    assert smoothed_labels(torch.tensor(5), times).tolist() == expected
 
 
 def test_eq_11_is_written_out():

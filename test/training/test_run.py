@@ -3,23 +3,18 @@
 """Laws of every training run: whatever ends it, it goes on to the same result."""
 
 from dataclasses import replace
-import json
 from pathlib import Path
 import resource
 import shutil
 import signal
-import subprocess
-import sys
-import time
 
 import pytest
+from tap_ros.cli import main
 from tap_ros.errors import ConfigError, StorageError, WeightsError
 from tap_ros.files import only_writer
-from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
-from tap_ros.training.checkpoints import start
-from tap_ros.training.settings import check_settings
+from tap_ros.training.checkpoints import start, TrainingState
 from tap_ros.training.weights import load_tensors, save_tensors
 import torch
 
@@ -68,29 +63,25 @@ def test_a_run_that_is_killed_while_it_saves_ends_as_it_would_have(
     assert same(half, runs)
 
 
-def test_ctrl_c_saves_what_a_training_has(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'tap_ros', 'train', 'predictor', str(SAMPLE), '--out', tmp_path,
-         '--steps', '100000', '--base-width', '4', '--batch-size', '2', '--threads', '1',
-         '--save-every', '100000', '--log-every', '1', '--precision', 'float32'],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        deadline = time.monotonic() + 300
-        while time.monotonic() < deadline and process.poll() is None and not any(
-                file.stat().st_size > 500 for file in tmp_path.glob('events*')):
-            time.sleep(0.2)
-        process.send_signal(signal.SIGINT)
-        out, told = process.communicate(timeout=120)
-    finally:
-        process.kill()
-    about = load_tensors(tmp_path / 'checkpoint.safetensors')[1]
-    run = json.loads((tmp_path / 'run.json').read_text())
-    assert process.returncode == 130 and out == '' and 'Traceback' not in told
-    assert 0 < about['step'] == run['steps'] < 100000
-    assert f'{about["step"]} of 100000 steps are saved' in told
-    assert (tmp_path / 'predictor.safetensors').exists()
-    assert 'warning: recordings: only 2 episodes are held out' in told
-    assert 'run.run(' not in told
+def test_ctrl_c_saves_what_a_training_has(half, runs, monkeypatch, capsys):
+    def interrupted(state, *rates):
+        signal.raise_signal(signal.SIGINT)
+        set_rates(state, *rates)
+
+    set_rates = TrainingState.set_rates
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainingState, 'set_rates', interrupted)
+        assert main([
+            'train', 'predictor', str(SAMPLE), '--out', half.out, '--base-width', '4',
+            '--batch-size', '2', '--steps', '4', '--threads', '1', '--test-fraction', '0.3',
+            '--save-every', '2', '--precision', 'float32', '--margin', '1']) == 130
+    out, told = capsys.readouterr()
+    assert out == '' and '3 of 4 steps are saved' in told
+    for name, found in (('checkpoint', 'step'), ('predictor', 'training')):
+        about = load_tensors(Path(half.out, f'{name}.safetensors'))[1][found]
+        assert (about if name == 'checkpoint' else about['steps']) == 3
+    train(half, progress=False)
+    assert same(half, runs)
 
 
 @pytest.mark.parametrize('change', [
@@ -145,26 +136,3 @@ def test_learning_rate_rises_and_falls_and_the_average_moves_fast_at_first():
             state.network.weight.copy_(before + 1)
         state.update_average(decay)
         assert torch.allclose(state.average.weight, before + (1 - stays), atol=1e-6)
-
-
-def test_discriminators_have_an_adam_of_their_own():
-    def betas(**helpers):
-        state = start(torch.nn.Linear(1, 1), 1e-3, torch.device('cpu'), helpers)
-        return [optimizer.param_groups[0]['betas'] for optimizer in state.optimizers]
-    assert betas() == betas(recognition=torch.nn.Linear(1, 1)) == [(0.9, 0.999)]
-    assert betas(discriminator=torch.nn.Linear(1, 1)) == [(0.5, 0.999)] * 2
-
-
-def test_the_bounds_of_settings_are_inside():
-    for name, good, bad in (
-            *((name, [1, 2], [0, -1]) for name in (
-                'steps', 'batch_size', 'horizon', 'pictures', 'width', 'features', 'log_every',
-                'save_every')),
-            ('grow', [0, 1], [-0.01, 1.01]), ('test_fraction', [0, 0.9], [-0.01, 0.91]),
-            ('average_decay', [0, 0.99999], [-0.01, 1]),
-            ('learning_rate', [0, 1], [-0.01, 1.01])):
-        for value in good:
-            check_settings(ForwardTrainingConfig(('x',), 'x', **{name: value}), {})
-        for value in bad:
-            with pytest.raises(ConfigError, match=f'^{name}: expected'):
-                ForwardTrainingConfig(('x',), 'x', **{name: value})

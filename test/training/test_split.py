@@ -11,9 +11,8 @@ import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import RecordingWarning
 from tap_ros.training.run import _paths
-from tap_ros.training.split import split_episodes, warn_if_few
+from tap_ros.training.split import split_episodes
 
 
 class Store:
@@ -40,11 +39,8 @@ def test_split_is_complete_and_does_not_depend_on_what_else_there_is():
     assert sorted([*training, *held_out]) == list(range(24))
     assert 0 < len(held_out) < len(training)
     assert split_episodes(Store(range(12)), 0.3)[1].tolist() == [i for i in held_out if i < 12]
-
-
-def test_episodes_of_the_same_scene_land_on_the_same_side():
-    training, held_out = split_episodes(Store([*range(24), *range(24)]), 0.3)
-    assert {i % 24 for i in training}.isdisjoint(i % 24 for i in held_out)
+    twice = split_episodes(Store([*range(24), *range(24)]), 0.3)
+    assert {i % 24 for i in twice[0]}.isdisjoint(i % 24 for i in twice[1])
 
 
 @pytest.mark.parametrize('times', [
@@ -74,15 +70,6 @@ def test_something_is_left_to_train_on_and_one_of_several_scenes_is_always_held_
     assert not len(split_episodes(Store(range(20)), 0.0)[1])
     with pytest.raises(RecordingError, match='no episode has at least 100 frames'):
         split_episodes(Store(range(24)), 0.1, min_frames=100)
-
-
-def test_few_held_out_episodes_are_warned_of(recwarn):
-    for count, said in ((0, 'no episode is held out'), (1, '1 episode is'), (4, '4 episodes are')):
-        with pytest.warns(RecordingWarning, match=said):
-            warn_if_few(np.arange(count))
-    recwarn.clear()
-    warn_if_few(np.arange(5))
-    assert not recwarn.list
 
 
 def test_recordings_that_are_named_are_held_out_wherever_they_are(tmp_path, monkeypatch):
