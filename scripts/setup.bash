@@ -143,6 +143,14 @@ make_wheels() {
 build_packages() {
   . scripts/environment.bash
   step 'packages tap_msgs and tap_ros' colcon build --symlink-install --base-paths . tap_msgs
+  # Where an environment forbids writing bytecode, each process would compile torch anew.
+  step 'bytecode' env -u PYTHONDONTWRITEBYTECODE python -c '
+import contextlib, importlib, pkgutil, pytest, hypothesis, xdist
+for package in map(importlib.import_module, ("tap_ros", "sim_bridge")):
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        if not module.name.endswith("__main__"):
+            with contextlib.suppress(ImportError):  # of an extra
+                importlib.import_module(module.name)'
 }
 
 check_place() {

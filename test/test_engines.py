@@ -96,7 +96,7 @@ def test_bad_engines_are_refused(engine, named):
         Engine(*engine)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_ray_gives_what_the_pool_gives_also_when_a_node_dies(tmp_path, monkeypatch):
     ray = pytest.importorskip('ray')
     from ray.cluster_utils import Cluster
