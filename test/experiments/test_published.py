@@ -36,10 +36,6 @@ def test_the_gains_of_the_text_are_those_of_table_1():
     for task, rows in published.TABLE_1.items():
         assert published.GAINS[task] == pytest.approx(
             1 - rows['genmin'][0] / rows['fix'][0], abs=1e-3)
-        # Section 4: best of 100 samples is below every method without samples in two tasks.
-        best = rows['genmin-vae-best-of-100'][0]
-        others = min(row[0] for name, row in rows.items() if 'best' not in name)
-        assert (best < others) == (task != 'grasp')
 
 
 @pytest.mark.parametrize('page', ['prediction', 'planning', 'stacking'])

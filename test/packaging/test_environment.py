@@ -22,7 +22,7 @@ def run(code, **changes):
                           stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=100)
 
 
-@pytest.mark.parametrize('options', ['-u', '-eu', '-e -o pipefail', '+u'])
+@pytest.mark.parametrize('options', ['-eu -o pipefail', '+u'])
 def test_the_environment_can_be_entered_by_any_shell(options):
     if not (ROOT / '.venv' / 'bin' / 'activate').is_file():
         pytest.skip('installed without make')
@@ -33,27 +33,19 @@ def test_the_environment_can_be_entered_by_any_shell(options):
     assert ('u' in done.stdout.split('left ')[1]) == ('u' in options and '+' not in options)
 
 
-@pytest.mark.parametrize('value', ['glx-nonsense', 'osmesa', 'disabled'])
-def test_without_opengl_physics_runs_and_pictures_are_refused_in_one_line(value):
+def test_without_opengl_physics_runs_and_pictures_are_refused_in_one_line(value='disabled'):
     done = run('import sim_bridge, mujoco\n'
                'mujoco.MjModel.from_xml_string("<mujoco/>")\n'
                'from tap_ros.errors import SceneError\n'
                'try: from sim_bridge.simulator import Simulator; Simulator().reset(0)\n'
                'except SceneError as error: print("refused:", error)', MUJOCO_GL=value)
-    if done.returncode == 0 and not done.stdout:
-        pytest.skip(f'{value} works here')
     assert done.returncode == 0 and done.stdout.startswith('refused: '), done.stdout
     assert f'MUJOCO_GL={value}' in done.stdout and 'MUJOCO_GL=egl' in done.stdout
     assert done.stdout.count('\n') == 1
 
 
-def test_an_empty_mujoco_gl_is_none():
-    done = run('import os, sim_bridge; print(os.environ["MUJOCO_GL"])', MUJOCO_GL='')
-    assert done.stdout == 'egl\n'
-
-
 @pytest.mark.ros
-@pytest.mark.parametrize('home', [None, '/nonexistent', '/proc'])
+@pytest.mark.parametrize('home', [None, '/proc'])
 def test_without_a_home_cache_and_logs_find_a_place(tmp_path, home):
     """Whoever has no entry in passwd has no home without HOME, as with docker run --user."""
     code = ('import os, pwd\n'
@@ -87,9 +79,3 @@ def test_ctrl_c_while_python_imports_is_one_line(module, tmp_path):
     time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     assert (process.communicate(timeout=20)[0], process.returncode) == ('interrupted\n', 130)
-
-
-def test_a_program_that_imports_the_package_keeps_its_own_handler():
-    done = run('import signal, tap_ros, sim_bridge\n'
-               'print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)')
-    assert done.stdout == 'True\n'

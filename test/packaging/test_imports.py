@@ -118,14 +118,11 @@ def test_nodes_load_nothing_slow_that_they_do_not_need(nodes):
     assert not set(DONE_WITHOUT[nodes]) & set(loaded)
 
 
-def test_type_checkers_are_told_of_what_is_exported():
+def test_what_is_exported_is_there_and_told_and_loaded_only_when_asked_for():
     stub = ast.parse((ROOT / 'tap_ros' / '__init__.pyi').read_text())
     told = {alias.asname: node.module for node in stub.body if isinstance(node, ast.ImportFrom)
             for alias in node.names}
     assert told == tap_ros._EXPORTS
-
-
-def test_what_is_exported_is_there_and_is_loaded_only_when_asked_for():
     script = ('import sys, tap_ros; assert not {"torch", "mujoco", "mcap"} & set(sys.modules)\n'
               'assert set(tap_ros.__all__) <= set(dir(tap_ros))\n'
               'for name in tap_ros.__all__: assert getattr(tap_ros, name).__name__ == name\n'

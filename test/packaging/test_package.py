@@ -65,10 +65,12 @@ def requirements(name):
     return {normalized(distribution): version for distribution, version in pairs}
 
 
+OWNERS = metadata.packages_distributions()
+
+
 def distributions_of(package):
     """Return the names of the distributions that a top-level package may come from."""
-    owners = metadata.packages_distributions().get(package, [package])
-    return {normalized(owner) for owner in owners}
+    return {normalized(owner) for owner in OWNERS.get(package, [package])}
 
 
 def test_executables_launch_files_and_parameters_are_installed():
@@ -100,22 +102,18 @@ def undeclared(folders, *files):
             and not distributions_of(name) & required]
 
 
-def test_everything_imported_is_declared_with_ros_or_with_pip():
+def test_what_is_imported_is_declared_and_what_is_required_is_imported():
     # scripts/setup.bash installs metaworld, without its dependencies.
     assert undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
                       'requirements-extras.txt') in ([], ['metaworld'])
     assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt',
                           'requirements-dev.txt')
-
-
-def test_nothing_is_required_that_nobody_imports():
     # By way of torch.utils.tensorboard, and of Meta-World.
     used = {'tensorboard', 'gymnasium', 'imageio'}
     for name in imported_packages('tap_ros', 'sim_bridge', 'experiments', 'test'):
         used |= distributions_of(name)
-    assert set(requirements('requirements.txt')) <= used
-    assert set(requirements('requirements-experiments.txt')) <= used
-    assert set(requirements('requirements-extras.txt')) <= used
+    for name in ('requirements', 'requirements-experiments', 'requirements-extras'):
+        assert set(requirements(f'{name}.txt')) <= used
 
 
 def test_requirements_and_constraints_agree():
@@ -132,9 +130,3 @@ def test_extras_are_those_of_the_commands(monkeypatch):
     assert extras.pop('test') == ['pytest']
     assert {normalized(each) for extra in extras.values() for each in extra} == set(
         requirements('requirements-extras.txt'))
-
-
-def test_every_interface_is_built():
-    listed = (ROOT / 'tap_msgs' / 'CMakeLists.txt').read_text()
-    for path in sorted((ROOT / 'tap_msgs').glob('*/*.*')):
-        assert f'{path.parent.name}/{path.name}' in listed

@@ -99,21 +99,6 @@ def test_nodes_run_and_answer_as_the_page_says(tmp_path, domain):
     assert list((tmp_path / 'bags' / 'mine').glob('*.mcap'))
 
 
-def test_kinds_of_prediction_as_the_page_says(tmp_path, domain):
-    sim = Started('ros2 run tap_ros sim_node', tmp_path, 'sim', domain)
-    nodes = [Started(next(line for line in RUNS if weights in line), tmp_path, weights, domain)
-             for weights in ('pick_place_vae', 'grasp_forward')]
-    try:
-        for one in (sim, *nodes):
-            one.wait_for('ready')
-        for line in (line for line in CALLS if '/predict_' in line):
-            answer = call(line, tmp_path, domain)
-            assert 'success=True' in answer, f'{line}\n{answer[-2000:]}'
-    finally:
-        for one in (sim, *nodes):
-            one.end()
-
-
 def test_launch_files_start_what_they_say(tmp_path, domain):
     launch = Started('ros2 launch tap_ros nodes.launch.py', tmp_path, 'launch', domain)
     try:

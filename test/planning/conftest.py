@@ -11,8 +11,8 @@ from toy_world import ARM, make_episode, SIZE, TABLE
 
 @pytest.fixture(scope='session')
 def bag(tmp_path_factory):
-    """Write 60 episodes of the toy world into a bag folder."""
-    return write_bag(tmp_path_factory.mktemp('bags') / 'toy', map(make_episode, range(60)))
+    """Write 30 episodes of the toy world into a bag folder."""
+    return write_bag(tmp_path_factory.mktemp('bags') / 'toy', map(make_episode, range(30)))
 
 
 @pytest.fixture

@@ -3,10 +3,6 @@
 """Laws of the forward model that hold whatever its weights are."""
 
 import pytest
-from tap_ros.errors import ConfigError
-from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
-from tap_ros.training.devices import has_bfloat16
-from tap_ros.training.weights import save_weights
 import torch
 from toy_world import ARM, TABLE
 
@@ -61,19 +57,6 @@ def test_high_above_the_table_nothing_is_pushed(model, image):
     assert (low[-1] - PIXELS).abs().max() > 1
 
 
-@pytest.mark.parametrize('step', [(0.06, 0.0), (0.0, -0.06), (-0.03, 0.04)])
-def test_what_is_pushed_moves_as_the_gripper_does(model, image, step):
-    pushing(model)
-    table = torch.tensor(TABLE).view(3, 3)
-    ahead = GRIPPER[0, :2] + 2 * torch.tensor(step)
-    pixels = (table @ torch.cat([ahead, torch.ones(1)]))[:2]
-    actions = torch.tensor([*step, 0.0, 0.0]).expand(1, 3, 4)
-    expected = rollout(model, image, GRIPPER, pixels[None], actions)[0, :, 0]
-    moved = table[:2, :2] @ torch.tensor(step)
-    torch.testing.assert_close(
-        expected, pixels + torch.arange(1, 4)[:, None] * moved, atol=0.25, rtol=0)
-
-
 @pytest.mark.parametrize('step', [(0.06, 0.0), (0.0, -0.06), (-0.036, 0.048)])
 def test_the_crop_reaches_as_far_as_it_should_and_turns_with_the_motion(model, image, step):
     pushing(model)
@@ -98,38 +81,6 @@ def test_gripper_moves_by_the_action_within_limits_and_workspace(model):
     gripper = torch.tensor([[0.42, 0.0, 0.02, 0.0]])
     moved = model.move_gripper(gripper, torch.tensor([[0.06, 0.3, -0.1, 2.0]]))
     torch.testing.assert_close(moved, torch.tensor([[0.45, 0.08, 0.0, 1.0]]))
-
-
-def test_only_the_push_net_loses_precision_and_only_where_it_is_wanted(model, tmp_path):
-    path = tmp_path / 'forward.safetensors'
-    save_weights(path, model, 'forward_model', model.config, {})
-    auto = 'bfloat16' if has_bfloat16('cpu') else 'float32'
-    for precision, used in (('float32', 'float32'), ('bfloat16', 'bfloat16'), ('auto', auto)):
-        loaded = LearnedForwardModel.load(path, precision=precision)
-        kinds = {name.split('.')[0]: value.dtype for name, value in loaded.named_parameters()}
-        assert kinds['push'] == getattr(torch, used)
-        assert kinds['encoder'] == kinds['sprite'] == loaded.push.fields.dtype == torch.float32
-        assert not loaded.training and not any(p.requires_grad for p in loaded.parameters())
-
-
-def test_impossible_settings_are_named():
-    for named, good, bad in (
-            ('9 numbers', [{}], [{'table': TABLE[:6]}, {'arm': ARM[:9]}]),
-            ('multiple of 4', [{'image_size': 32}], [{'image_size': 30}, {'image_size': 34}]),
-            ('even', [{'crop_cells': (2, 4)}], [{'crop_cells': (3, 4)}, {'crop_cells': (4, 3)}]),
-            ('crop_cells', [{'crop_cells': (1024, 2)}], [
-                {'crop_cells': (0, 2)}, {'crop_cells': (2, 1026)}, {'crop_cells': (2, 2, 2)},
-                {'crop_cells': (2.0, 2)}, {'crop_cells': (2,)}]),
-            ('window_cells', [{'window_cells': 2}, {'window_cells': 44}], [
-                {'window_cells': 1}, {'window_cells': 45}]),
-            ('image_size: ', [{'image_size': 1024}], [{'image_size': 1028}, {'image_size': 0}]),
-            *((f'{name}: expected', [{name: 1}, {name: 1024}], [{name: 0}, {name: 1025}])
-              for name in ('features', 'width', 'blocks', 'encoder_width', 'sprite_size'))):
-        for changes in good:
-            ForwardModelConfig(**{'table': TABLE, 'arm': ARM, **changes})
-        for changes in bad:
-            with pytest.raises(ConfigError, match=named):
-                ForwardModelConfig(**{'table': TABLE, 'arm': ARM, **changes})
 
 
 def test_objects_lose_themselves_only_with_nearly_all_of_their_mass(model):

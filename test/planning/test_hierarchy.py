@@ -37,18 +37,11 @@ def stages(itinerary, path):
     return found
 
 
-def test_half_gives_every_target_its_share_of_the_budget():
-    far = np.full((12, 2, 2), 60.0)
-    assert stages(Itinerary(targets(2), 12, 'half'), far) == [0] * 6 + [1] * 6
+def test_half_gives_every_target_its_share_and_reached_goes_on_at_once_but_no_later():
+    far, on_the_spot = np.full((12, 2, 2), 60.0), np.repeat(PLACES[None], 12, 0)
     assert stages(Itinerary(targets(3), 12, 'half'), far) == [0] * 4 + [1] * 4 + [2] * 4
-    on_the_spot = np.repeat(PLACES[None], 12, 0)
     assert stages(Itinerary(targets(2), 12, 'half'), on_the_spot) == [0] * 6 + [1] * 6
-
-
-def test_reached_goes_on_at_once_but_not_later_than_half():
-    on_the_spot = np.repeat(PLACES[None], 12, 0)
     assert stages(Itinerary(targets(3), 12), on_the_spot) == [1] * 8 + [2] * 4
-    far = np.full((12, 2, 2), 60.0)
     assert stages(Itinerary(targets(2), 12), far) == [0] * 6 + [1] * 6
     assert stages(Itinerary(targets(2), 12, reached=0.0), on_the_spot + 1e-3)[5] == 0
 
@@ -66,14 +59,11 @@ def test_a_map_is_reached_where_its_expected_distance_is_least():
     target = Target(places, maps)
     assert target.distance(places) == pytest.approx(0, abs=0.05)
     assert target.distance(places + [[3.0, 4.0], [0.0, 1.0]]) == pytest.approx(3, abs=0.05)
-    assert target.distance(places - [[5.0, 0.0], [0.0, 25.0]]) == pytest.approx(15, abs=0.05)
-    # beyond the right and the lower end of the picture
-    assert target.distance(places + [[30.0, 0.0], [0.0, 25.0]]) == pytest.approx(27.5, abs=0.05)
+    beyond = places + [[30.0, 0.0], [0.0, 25.0]]  # the right and the lower end of the picture
+    assert target.distance(beyond) == pytest.approx(27.5, abs=0.05)
     held = Target(places, maps, free=np.array([False, True]))
     assert held.distance(places + [[3.0, 4.0], [9.0, 9.0]]) == pytest.approx(5, abs=0.05)
     assert np.isnan(target.distance(places * np.nan))
-    with pytest.raises(ValueError):
-        target.distance(places[:1])
 
 
 def test_an_undecided_map_is_reached_in_either_place_an_uneven_one_in_the_likelier():
@@ -85,9 +75,6 @@ def test_an_undecided_map_is_reached_in_either_place_an_uneven_one_in_the_likeli
     uneven = Target(places[:1], 0.6 * maps[:1] + 0.4 * maps[1:])
     assert uneven.distance(places[:1]) == pytest.approx(0, abs=0.05)
     assert uneven.distance(places[1:]) == pytest.approx(0.2 * 15, abs=0.05)
-    away = np.array([[15.0, 20.0]])
-    expected = np.linalg.norm(places - away, axis=1).mean() - 7.5
-    assert evenly.distance(away) == pytest.approx(expected, abs=0.05)
     assert Itinerary([evenly, Target(places[:1])], 12).stage(0, places[1:]) == 1
 
 
@@ -105,14 +92,6 @@ def scene(pixels):
 def small_planner():
     return VisualMPC(Telekinesis(), VisualMPCConfig(
         search=SearchConfig(16, 1, 4), proposals=4, batch_size=16, threads=1))
-
-
-def test_the_subgoal_on_the_way_is_chosen_and_the_first_of_equals():
-    start, goal = PLACES, PLACES + [4.0, 0.0]
-    between, astray = start + [2.0, 0.0], np.array([[28.0, 28.0], [3.0, 3.0]])
-    found = [subgoal(place, sample=i) for i, place in enumerate((astray, between, between))]
-    assert choose_sample(small_planner(), scene(start), goal, found) == found[1:2]
-    assert choose_sample(small_planner(), scene(start), goal, found[::-1]) == found[2:]
 
 
 def test_samples_are_judged_leg_by_leg_with_the_seed_and_the_limits_that_are_given():

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.contract import LIFTED, LOW
-from tap_ros.planning.action_sequences import FULL, HORIZON, Limits, SequenceShape
+from tap_ros.planning.action_sequences import FULL, HORIZON
 from tap_ros.planning.cost import (
     distances_to_all_pixels,
     distances_to_pixels,
     distances_to_places,
-    PlanCost,
 )
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
@@ -97,8 +96,6 @@ def test_the_planner_goes_where_the_objects_come_nearer_to_their_goals(model):
 def test_one_object_is_brought_home_before_both_come_nearer(model):
     home, even = away(0, 10), away(4.5, 4.5)
     assert goes_right(model, home, even, unfinished=4.0) and goes_right(model, even, home)
-    far, even = away(4, 14), away(8.5, 8.5)  # where none is brought home it changes nothing
-    assert goes_right(model, even, far, unfinished=4.0) and goes_right(model, even, far)
 
 
 def test_the_end_counts_ten_times_as_much_as_a_step_on_the_way(model):
@@ -107,27 +104,13 @@ def test_the_end_counts_ten_times_as_much_as_a_step_on_the_way(model):
 
     assert goes_right(model, mid_end(7, 4), mid_end(5, 8))
     assert goes_right(model, mid_end(4, 8), mid_end(8, 5))  # 14 times 4 px against 10 times 3
-    assert goes_right(model, mid_end(3, 6), mid_end(4, 6))
     seen = plan(steady(model, away(6, 2)))
     assert seen.cost == pytest.approx((14 + 10) * (6 + 2), rel=0.05)
-
-
-def test_steps_that_the_cost_does_not_look_at_change_nothing(model):
-    seen = (np.arange(HORIZON) + 1) % 3 == 0
-    dodging = away(np.where(seen, 2.0, 12.0), 0)
-    assert goes_right(model, dodging, away(6, 0), cost_every=3)
-    assert not goes_right(model, dodging, away(6, 0), cost_every=1)
-    costs = [plan(steady(model, away(6, 2)), replace(PLAIN, cost_every=n)).cost for n in (1, 3, 5)]
-    assert costs == pytest.approx(costs[:1] * 3, abs=0.05)
 
 
 def test_an_object_that_is_lost_is_as_far_as_can_be(model):
     assert not goes_right(model, away(np.nan, 0), away(12, 0))
     assert goes_right(model, away(9, np.nan), away(12, np.nan))
-    lost = plan(steady(model, away(np.nan, np.nan)))
-    farthest = np.linalg.norm(
-        GOALS[:, None] - model.table.pixels().flatten(0, 1).numpy(), axis=2).max(1).mean()
-    assert lost.expected_distance == pytest.approx(farthest, abs=0.01)
 
 
 def dives(actions, _):
@@ -166,9 +149,6 @@ def test_proposals_find_an_object_that_chance_does_not(model):
     blind, aimed = (plan(Puppets(model, sticks), config, gripper, seen)
                     for config in (PLAIN, proposing))
     assert aimed.expected_distance < 0.6 * aimed.current_distance < blind.expected_distance
-    at_home = [plan(Puppets(model, sticks), config, gripper, GOALS)
-               for config in (PLAIN, proposing)]
-    assert np.array_equal(at_home[0].actions, at_home[1].actions)
 
 
 def test_the_last_plan_carried_on_is_among_the_first_candidates(model):
@@ -183,26 +163,6 @@ def test_the_last_plan_carried_on_is_among_the_first_candidates(model):
                        memory=first.memory) for start in (True, False))
     assert np.allclose(warm.actions[:-1], first.actions[1:], atol=1e-6)
     assert warm.expected_distance < 1 and cold.expected_distance > 4
-
-
-def test_a_search_after_a_plan_looks_near_it_half_as_widely(model):
-    def chosen(actions, _):  # a push to the right and away
-        miss = np.linalg.norm(actions[:, :, :2].mean(1) - [0.03, 0.03], axis=1)
-        return GOALS + 200 * miss[:, None, None, None] * np.ones((1, HORIZON, 2, 1))
-
-    wide = replace(PLAIN, search=SearchConfig(200, 2, 5), batch_size=200, cost_every=HORIZON)
-    first, middles, spreads = plan(Puppets(model, chosen), wide), {}, {}
-    for warm in (True, False):
-        puppets = Puppets(model, chosen)
-        plan(puppets, replace(wide, warm_start=warm), memory=first.memory)
-        moves = puppets.judged[0][:, 6, :2]
-        middles[warm], spreads[warm] = moves.mean(0), moves.std(0)
-    assert np.abs(middles[True] - first.actions[7, :2]).max() < 0.007
-    assert np.abs(middles[False]).max() < 0.007 < 0.02 < np.abs(first.actions[7, :2]).max()
-    np.testing.assert_allclose(spreads[True], 0.5 * spreads[False], rtol=0.2)
-    begins = [plan(Puppets(model, chosen), replace(wide, warm_start=warm))
-              for warm in (True, False)]
-    assert np.array_equal(begins[0].actions, begins[1].actions)  # nothing was planned before
 
 
 def slips(actions, grippers):
@@ -221,52 +181,12 @@ def test_a_push_that_succeeds_from_one_place_only_is_not_taken(model):
     right = {n: found.actions[:, 0].sum() > 0 for n, found in plans.items()}
     assert right == {0: True, 1: True, 6: False}  # judged again from the same place: no change
 
-    def robust(actions, grippers):
-        return slips(actions, np.tile(GRIPPER, (len(grippers), 1)))
-
-    sure = [plan(Puppets(model, robust), replace(PLAIN, search=search, recheck=n)) for n in (0, 6)]
-    assert np.array_equal(sure[0].actions, sure[1].actions) and sure[0].cost == sure[1].cost
-
-
-def candidates(model, height=LOW, limits=FULL, **changes):
-    """Return the actions (N, T, 4) that are judged, and the heights (N, T) at their ends."""
-    puppets = steady(model, away(5, 5))
-    gripper = np.array([0, 0, height, 0], np.float32)
-    plan(puppets, replace(PLAIN, **changes), gripper, limits=limits)
-    actions = puppets.judged[0]
-    return actions, height + actions[..., 2].cumsum(1)
-
-
-def test_candidates_keep_to_the_limits_and_use_them(model):
-    for move, climb in ((0.03, 0.04), (0.06, 0.1)):
-        actions, _ = candidates(model, limits=Limits(move, climb))
-        extent = np.abs(actions).max((0, 1))
-        np.testing.assert_allclose(extent, [move, move, climb, 0], atol=1e-6)
-    assert vars(SequenceShape(Limits(1.0, 1.0))) == vars(SequenceShape())  # the contract's hold
-
 
 def test_a_gripper_that_stands_upon_something_goes_up_before_it_pushes(model):
     for height, first in ((0.06, True), (LOW, False), (LIFTED, False)):
-        _, heights = candidates(model, height)
-        assert (heights[:, 0] > 0.1).all() == first
-
-
-def test_what_stands_costs_the_same_however_often_it_is_looked_at():
-    maps = torch.full((1, 2, 1, 2), 0.5)  # two objects, each half in either cell
-    for seen in (2, 3, 5, HORIZON):
-        cost, last = PlanCost().of_maps([maps] * seen, torch.tensor([[1.0, 3.0], [4.0, 8.0]]))
-        assert cost.item() == pytest.approx((14 + 10) * (2 + 6)) and last.item() == 4
-
-
-def test_landing_too_near_costs_100_px_and_10_for_each_missing_centimetre():
-    landings = np.array([[0.0, 0.0], [0.125, 0.0], [0.25, 0.0], [0.9, 1.0], [np.nan, np.nan]])
-    cost = PlanCost(clearance=0.25).of_landings(landings, np.array([[0.0, 0.0], [1.0, 1.0]]))
-    np.testing.assert_allclose(cost, [350, 225, 0, 250, 0])
-
-
-def test_distance_is_expected_over_the_map_not_from_its_mean():
-    maps = one_hot_maps(torch.tensor([[0.0, 5.0], [10.0, 5.0]]), PICTURE).mean(0)
-    assert distances_to_pixels(maps, torch.tensor([5.0, 5.0])) == 5
+        puppets = steady(model, away(5, 5))
+        plan(puppets, gripper=np.array([0, 0, height, 0], np.float32))
+        assert (height + puppets.judged[0][:, 0, 2] > 0.1).all() == first
 
 
 def test_all_three_ways_give_the_same():
@@ -281,6 +201,3 @@ def test_all_three_ways_give_the_same():
     torch.testing.assert_close(distances_to_places(maps, places), exact, **close)
     everywhere = torch.from_numpy(distances_to_all_pixels(maps.numpy()))
     torch.testing.assert_close(everywhere.flatten(1), exact, **close)
-    between = places[:50] + 0.4
-    exact = torch.stack([distances_to_pixels(m.expand(50, *PICTURE), between) for m in sure])
-    torch.testing.assert_close(distances_to_places(maps, between), exact, **close)

@@ -17,7 +17,6 @@ from tap_ros.planning.reach import (
     MOST_REFUSED,
     Reach,
     ReachConfig,
-    scene_change,
     Seen,
     Wait,
 )
@@ -176,11 +175,6 @@ def test_another_scene_ends_the_goal_even_if_nothing_else_is_new(mpc, changes, w
     assert isinstance(reach.step(look(1)), Command)
 
 
-def test_objects_that_are_not_looked_at_do_not_vanish():
-    assert scene_change(look(0), look(1, pixels=None, names=())) == ''
-    assert scene_change(look(0), look(1, names=())) == 'a, b vanished'
-
-
 @pytest.mark.parametrize('seed', [0, 3])
 def test_each_command_is_planned_from_what_the_one_before_left(mpc, seed):
     reach, goal, memory = begun(mpc, seed=seed), mpc.goal(GOAL.pixels), Memory(seed)
@@ -190,29 +184,6 @@ def test_each_command_is_planned_from_what_the_one_before_left(mpc, seed):
         memory = plan.memory
         np.testing.assert_array_equal(reach.step(seen).plan.actions, plan.actions)
         reach.sent()
-
-
-def test_a_goal_is_tabulated_once_unless_objects_are_free(mpc, monkeypatch):
-    asked, goal = [], mpc.goal
-    monkeypatch.setattr(mpc, 'goal', lambda **given: asked.append(given) or goal(**given))
-    reach = Reach(mpc, ReachConfig(10), 3)
-    reach.step(look(0))
-    reach.head_for([Target(START + 2), GOAL])  # the subgoal is reached at step 2
-    for t in range(4):
-        reach.step(look(t, START + t))
-        reach.sent()
-    assert [given['pixels'].tolist() for given in asked] == [
-        (START + 2).tolist(), GOAL.pixels.tolist()]
-    asked.clear()
-    free = Target(GOAL.pixels, free=np.array([True, False]))
-    reach = Reach(mpc, ReachConfig(10), 3)
-    reach.step(look(0))
-    reach.head_for([free, GOAL])
-    for t in range(3):
-        reach.step(look(t, START + t))
-        reach.sent()
-    assert [given['pixels'][0].tolist() for given in asked] == (START[0] + [
-        [0, 0], [1, 1], [2, 2]]).tolist()  # it shall stay wherever it is
 
 
 def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
@@ -245,61 +216,3 @@ def test_between_two_rounds_a_command_is_sent(mpc):
             assert isinstance(answer, Command)
             reach.sent()
         assert len(asked) == len(set(asked)) > 1
-
-
-def test_the_rounds_share_the_budget(mpc):
-    reach = Reach(mpc, ReachConfig(8, switch='half', rounds=2), 3)
-    reach.step(look(0))
-    asked = []
-    for t in range(9):
-        answer = reach.step(look(t))
-        if isinstance(answer, Aim):
-            asked.append(t)
-            reach.head_for([Target(START + 2), GOAL])
-            answer = reach.step(look(t))
-        if t < 8:
-            reach.sent()
-    assert asked == [0, 4] and reach.switches == [4, 6]
-    assert isinstance(answer, End) and answer.outcome == 'spent'
-
-
-def test_a_command_refused_before_a_round_leads_to_that_round_again(mpc):
-    reach = Reach(mpc, ReachConfig(10, rounds=2), 3)
-    reach.step(look(0))
-    reach.head_for([Target(START + 2), GOAL])
-    act(reach, 0)
-    act(reach, 1)
-    assert isinstance(reach.step(look(2, START + 2)), Aim)
-    reach.head_for([Target(START + 4), GOAL])
-    assert reach.refused(2 * SECOND, 'it answers an old image') and reach.steps == 1
-    # Without its effect the first subgoal is yet to be reached.
-    assert reach.step(look(3)).stage == 0 and len(reach.targets) == 2
-    assert isinstance(reach.step(look(4, START + 2)), Aim)
-
-
-def test_a_followed_object_is_followed_once_a_picture_in_every_round(mpc, model):
-    def followed(rounds):
-        reach = Reach(mpc, ReachConfig(10, switch='half', follower=model, rounds=rounds), 3)
-        reach.step(look(0))
-        found = []
-        for t in range(8):
-            answer = reach.step(look(t, None if t else START))
-            if isinstance(answer, Aim):
-                assert answer.seen.names == ('a', 'b')
-                assert t == 0 or answer.seen.pixels is reach.pixels
-                reach.head_for([Target(START + 2), GOAL])
-                answer = reach.step(look(t, None if t else START))
-            found.append(reach.pixels)
-            reach.sent()
-        return found
-    np.testing.assert_array_equal(followed(1)[:6], followed(2)[:6])
-
-
-def test_what_is_too_old_says_what_else_is_lacking(mpc):
-    reach = begun(mpc)
-    old = look(1, received=-9.0)
-    assert reach.step(old, now=1.0).reason == 'what was seen is 10.0 s old'
-    assert reach.step(old, now=1.0, lacking='no joints').reason == (
-        'what was seen is 10.0 s old: no joints')
-    just = begun(mpc).step(look(1, received=-4.0), now=1.0)  # as old as it may be
-    assert isinstance(just, Command)

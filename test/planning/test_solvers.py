@@ -86,43 +86,6 @@ def test_the_elites_are_judged_once_more(solver):
     assert found.cost == quadratic(found.best[None])[0]
 
 
-def test_proposals_are_the_last_samples_of_the_first_iteration_only():
-    judged, proposals = [], np.stack([TARGET + 1, TARGET + 2])
-
-    def cost(samples):
-        judged.append(samples)
-        return quadratic(samples)
-
-    config = SearchConfig(num_samples=6, num_iterations=2, num_elites=3)
-    search(config, cost=cost, proposals=proposals)
-    search(config, cost=cost)
-    np.testing.assert_array_equal(judged[0][-2:], proposals)
-    np.testing.assert_array_equal(judged[0][:-2], judged[2][:-2])  # the others are drawn as ever
-    assert not np.isin(proposals, judged[1]).any()
-    search(replace(config, num_samples=3), cost=cost, proposals=np.arange(12.0).reshape(4, 3))
-    np.testing.assert_array_equal(judged[4], np.arange(3.0, 12.0).reshape(3, 3))  # the last count
-
-
-def test_the_next_gaussian_has_mean_and_deviation_of_the_elites():
-    judged, config = [], SearchConfig(num_samples=12, num_iterations=2, num_elites=3)
-    search(config, cost=lambda samples: judged.append(samples) or quadratic(samples))
-    elites = judged[0][np.argsort(quadratic(judged[0]))[:3]]
-    noise = np.random.default_rng(0).standard_normal((2, 12, 3))[1]
-    spread = np.sqrt(((elites - elites.mean(0)) ** 2).mean(0))
-    np.testing.assert_allclose(judged[1], elites.mean(0) + spread * noise)
-
-
-def test_icem_keeps_what_was_good_draws_fewer_and_judges_the_mean_at_last():
-    judged, kept = [], np.tile(TARGET, (10, 1))
-    found = search(SearchConfig(100, 3, 10), solver=icem, kept=kept,
-                   cost=lambda s: judged.append(s) or quadratic(s))
-    assert found.cost == 0 and [len(samples) for samples in judged] == [103, 83, 64 + 3 + 1]
-    np.testing.assert_array_equal(judged[0][100:], kept[:3])
-    for before, after in zip(judged, judged[1:]):
-        best = before[np.argsort(quadratic(before), kind='stable')[:3]]
-        assert all((after == one).all(1).any() for one in best)
-
-
 def test_icem_moves_on_in_one_direction():
     moves, judged = 6, []
     search(SearchConfig(4000, 1, 10), solver=icem, moves=moves, mean=np.zeros(2 * moves + 1),

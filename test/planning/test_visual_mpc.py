@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tap_ros.errors import ConfigError, PlanningError
-from tap_ros.images.pixels import to_float
+from tap_ros.errors import PlanningError
 from tap_ros.planning.action_sequences import FULL, HORIZON
-from tap_ros.planning.cost import LAST_WEIGHT, PlanCost
+from tap_ros.planning.cost import LAST_WEIGHT
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
-from tap_ros.planning.visual_mpc import Memory, Rollouts, VisualMPC
+from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.prediction.warp import one_hot_maps
 from tap_ros.weights import FORWARD_MODEL
 import torch
@@ -43,16 +42,6 @@ def plans(model, config=SMALL, seed=0, steps=3, limits=FULL, scale=1, **goal):
     return found
 
 
-def judge(model, actions, batch_size):
-    """Judge sequences that begin at the middle of the table."""
-    start = model.begin(to_float(IMAGE)[None], torch.zeros(1, 4))
-    maps = model.table.seed_maps(torch.tensor(PIXELS).float())
-    prices = torch.from_numpy(DISTANCE).float()
-    grippers = np.zeros((len(actions), 4), np.float32)
-    rollouts = Rollouts(model, PlanCost(), batch_size)
-    return rollouts.judge(start, maps, prices, actions, grippers, every=1)
-
-
 def same(first, second):
     return all(np.array_equal(a.actions, b.actions) for a, b in zip(first, second))
 
@@ -61,7 +50,7 @@ def test_plans_are_within_limits_and_finite(model):
     for preset in PRESETS.values():
         config = replace(preset, search=SMALL.search, batch_size=24, threads=1,
                          proposals=min(8, preset.proposals))
-        for plan in plans(model, config, steps=4):
+        for plan in plans(model, config, steps=2):
             assert plan.action.shape == (4,) and plan.action.dtype == np.float32
             assert plan.actions.shape == (15, 4)
             assert np.abs(plan.action[:2]).max() <= 0.08 + 1e-6 and plan.action[3] == 0
@@ -86,32 +75,10 @@ def test_batch_size_and_threads_change_nothing(model, trained):
     expected = plans(model)
     for changes in ({'batch_size': 5}, {'batch_size': 50}, {'threads': 2}):
         assert same(expected, plans(model, replace(SMALL, **changes)))
-    assert same(*(plans(trained, with_preset('default', batch_size=size), steps=1, scale=2)
-                  for size in (64, 50)))
-
-
-def test_sequences_are_predicted_in_even_batches(model, monkeypatch):
-    seen, carried_maps = [], model.carried_maps
-
-    def spy(features, begin, maps, actions, *rest):
-        seen.append(len(actions))
-        return carried_maps(features, begin, maps, actions, *rest)
-
-    monkeypatch.setattr(model, 'carried_maps', spy)
-    for count, length in ((48, 24), (64, 32), (33, 17), (1, 1)):
-        seen.clear()
-        costs, _ = judge(model, np.zeros((count, 15, 4), np.float32), 32)
-        assert len(costs) == count and set(seen) == {length}
-
-
-def test_equal_sequences_cost_the_same_in_any_batch(model):
-    costs, actions = {}, np.zeros((40, 15, 4), np.float32)
-    actions[..., :2] = np.random.default_rng(0).normal(0, 0.05, (5, 15, 2)).repeat(8, 0)
-    for size in (1, 3, 7, 40):
-        costs[size], _ = judge(model, actions, size)
-        assert (costs[size].reshape(5, 8) == costs[size][::8, None]).all()
-    assert len({values.tobytes() for values in costs.values()}) == 1
-    assert len(set(costs[40])) == 5
+    small = replace(SMALL.search, num_samples=40), 16
+    assert same(*(plans(trained, with_preset('default', search=small[0], proposals=small[1],
+                                             batch_size=size), steps=1, scale=2)
+                  for size in (40, 30)))
 
 
 def test_a_goal_map_at_one_pixel_is_that_goal_pixel(model):
@@ -130,13 +97,9 @@ def nan(values):
 def test_a_bad_scene_is_named(model):
     mpc, scene = VisualMPC(model, SMALL), Scene(IMAGE, GRIPPER, PIXELS)
     for wrong, name in (
-            ({'image': IMAGE[:16]}, 'image'), ({'image': IMAGE.astype(np.float32)}, 'image'),
-            ({'gripper': GRIPPER[:3]}, 'gripper'), ({'gripper': nan(GRIPPER)}, 'gripper'),
+            ({'image': IMAGE[:16]}, 'image'), ({'gripper': nan(GRIPPER)}, 'gripper'),
             ({'gripper': 1000 * GRIPPER}, 'expected -1 to 1'),
-            ({'gripper': GRIPPER - np.float32([0, 0, 5, 0])}, 'z is -4.* expected -0.1 to 1'),
-            ({'gripper': GRIPPER + np.float32([0, 0, 0, 1e9])}, 'opening is 1e.09'),
             ({'object_pixels': nan(PIXELS)}, r'object_pixels.*\[0\]'),
-            ({'object_pixels': PIXELS[0]}, 'object_pixels'),
             ({'object_pixels': PIXELS[:0]}, 'object_pixels'),
             ({'object_pixels': PIXELS[:1]}, '2 goals for 1 objects')):
         with pytest.raises(PlanningError, match=name):
@@ -148,25 +111,16 @@ def test_a_bad_goal_is_named(model):
     for wrong, name in (
             ({'pixels': GOALS + 30}, 'outside the 32x32 picture'),
             ({'pixels': nan(GOALS)}, r'goal_pixels.*\[0\]'), ({}, 'one of pixels and maps'),
-            ({'pixels': GOALS, 'maps': np.ones((2, 32, 32))}, 'one of pixels and maps'),
-            ({'maps': np.ones((32, 32))}, r'goal_maps.*\(K, 32, 32\)'),
             ({'maps': np.ones((2, 16, 32))}, r'goal_maps.*\(K, 32, 32\)'),
-            ({'maps': np.zeros((2, 32, 32))}, 'goal_maps'),
-            ({'maps': nan(np.ones((2, 32, 32)))}, 'goal_maps')):
+            ({'maps': np.zeros((2, 32, 32))}, 'goal_maps')):
         with pytest.raises(PlanningError, match=name):
             mpc.goal(**wrong)
 
 
-def test_changes_of_a_preset_change_that_alone_and_paper_has_the_papers_numbers():
-    for preset, config in PRESETS.items():
-        changed = with_preset(preset, clearance=0.125, arm_hidden=True)
-        assert (changed.clearance, changed.arm_hidden) == (0.125, True)
-        assert replace(changed, clearance=config.clearance, arm_hidden=False) == config
+def test_the_preset_paper_has_the_papers_numbers():
     paper = with_preset('paper')
     assert (paper.search.num_samples, paper.search.num_iterations, paper.search.num_elites) == (
         200, 3, 10)
     assert HORIZON == 15 and LAST_WEIGHT == 10
     assert not paper.warm_start and not paper.proposals
     assert not paper.recheck and not paper.unfinished and not paper.clearance
-    with pytest.raises(ConfigError, match='default, large, paper'):
-        with_preset('fast')

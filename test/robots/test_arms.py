@@ -12,9 +12,9 @@ from sim_bridge.simulator import Simulator
 from tap_ros import plugins
 from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_ARM
 from tap_ros.errors import ConfigError, KinematicsError
-from tap_ros.robots.arm import find_joints, get_arm, known_arms, Mount, TIP_FRAME
+from tap_ros.robots.arm import find_joints, get_arm, known_arms, TIP_FRAME
 from tap_ros.robots.description import robot_description
-from tap_ros.robots.ur10e import inverse, UR10E
+from tap_ros.robots.ur10e import UR10E
 from tap_ros.robots.urdf import read_urdf
 
 ARMS = [get_arm(name) for name in plugins.names('tap_ros.arms')]
@@ -100,27 +100,6 @@ def test_an_arm_limits_what_the_gripper_does_and_which_scenes_are_drawn():
     simulator.close()
 
 
-def test_the_solution_of_any_pose_leads_there():
-    solved = 0
-    for joints in np.random.default_rng(1).uniform(-np.pi, np.pi, (100, 6)):
-        pose = UR10E.forward(joints)
-        try:
-            found = inverse(pose)
-        except KinematicsError:
-            continue
-        solved += 1
-        assert np.allclose(UR10E.forward(found), pose, atol=1e-9)
-    assert solved > 50
-
-
-@each_arm
-def test_the_mount_moves_the_gripper_with_it(arm):
-    joints, (x, y, z) = arm.joints_at((0.1, -0.1, 0.05)), arm.mount.position
-    moved = Mount((x + 1, y - 2, z + 0.5), arm.mount.yaw, arm.mount.tool + 0.1)
-    assert np.allclose(arm.gripper_at(joints, moved), [1.1, -2.1, 0.45])
-    assert np.allclose(arm.joints_at((1.1, -2.1, 0.45), moved), joints)
-
-
 @each_arm
 def test_out_of_reach_and_too_fast_is_refused_with_the_reason(arm):
     for place in ((0, -0.9, 0.1), (0, 0.6, -0.5), (0, 0, 1.5)):
@@ -132,8 +111,6 @@ def test_out_of_reach_and_too_fast_is_refused_with_the_reason(arm):
         arm.check_motion(np.zeros(len(moved)), 0.99 * moved, CONTROL_PERIOD)
         with pytest.raises(KinematicsError, match=name):
             arm.check_motion(np.zeros(len(moved)), 1.01 * moved, CONTROL_PERIOD)
-    across = np.pi - 0.04
-    arm.check_motion(np.full(len(moved), across), np.full(len(moved), -across), CONTROL_PERIOD)
 
 
 @each_arm

@@ -56,19 +56,6 @@ def test_the_arm_is_covered_and_the_rest_is_free(monkeypatch):
         assert np.mean(overlaps) > overlap and np.mean(left) > free
 
 
-def test_dilation_enlarges_by_so_many_pixels_on_all_sides():
-    masks = [draw_mask([Body(cube(0, 0, 0.5, 0.1), ARM)], camera_at(2), px) for px in (0, 5)]
-    sizes = [[np.ptp(axis) + 1 for axis in np.nonzero(mask)] for mask in masks]
-    np.testing.assert_array_equal(np.subtract(*sizes[::-1]), [10, 10])
-
-
-def test_what_is_nearer_hides_what_is_behind():
-    near, far = Body(cube(0, 0, 0.5, 0.1), HAND), Body(cube(0, 0, 0.0, 0.2), ARM)
-    for bodies in ([near, far], [far, near]):
-        mask = draw_mask(bodies, camera_at(2), 0)
-        assert mask[32, 32] == HAND and set(np.unique(mask)) == {0, HAND, ARM}
-
-
 def test_what_is_beside_or_behind_the_camera_is_cut_off():
     assert not draw_mask([Body(cube(0, 0, 3, 0.1), ARM)], camera_at(2), 3).any()
     mask = draw_mask([Body(cube(1.2, 0, 2, 1.0), ARM)], camera_at(2), 0)

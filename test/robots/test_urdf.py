@@ -6,9 +6,6 @@ import mujoco
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
-from tap_ros.robots.arm import Mount, TIP_FRAME
-from tap_ros.robots.description import robot_description
-from tap_ros.robots.ur10e import UR10E
 from tap_ros.robots.urdf import read_urdf
 
 ARM = """<robot name="r">
@@ -52,17 +49,6 @@ def test_links_are_where_mujoco_has_them():
         np.testing.assert_allclose(found[link], wanted[link], atol=1e-6)
 
 
-def test_the_own_arm_stands_where_it_is_mounted():
-    mount = Mount((0.3, -0.2, 0.1), 0.8, 0.25)
-    robot = read_urdf(robot_description(UR10E, mount, 0.05), 'own')
-    joints = np.random.default_rng(0).uniform(-3, 3, 6)
-    tip = robot.poses(dict(zip(UR10E.joints, joints)))[TIP_FRAME]
-    np.testing.assert_allclose(tip[:3, 3], UR10E.gripper_at(joints, mount))
-    hand, = [shape for shape in robot.shapes if shape.link == TIP_FRAME]
-    assert np.allclose([hand.corners[:, 2].min(), hand.corners[:, 2].max()], [-0.25, 0])
-    assert robot.held_by('wrist_3_link') == {'wrist_3_link', TIP_FRAME}
-
-
 def test_corners_contain_the_shapes_and_little_more():
     box, capsule = (shape.corners for shape in read_urdf(ARM, 'arm').shapes)
     assert np.isclose(np.linalg.norm(box - [0, 0, 1], axis=1), np.sqrt(14) / 2).all()
@@ -76,14 +62,9 @@ def test_corners_contain_the_shapes_and_little_more():
 @pytest.mark.parametrize('old, new, words', [
     ('<box size="1 2 3"/>', '<mesh filename="a.stl"/>', 'link a has a mesh; expected box'),
     ('size="1 2 3"', 'size="1 nan 3"', 'size="1 nan 3"; expected numbers: 3'),
-    ('size="1 2 3"', 'size="1 2"', 'expected numbers: 3'),
-    ('xyz="1 2 3"', 'xyz="0 0 0"', 'turn has an axis without direction'),
     ('child link="b"', 'child link="x"', 'joint turn holds a link that is not there'),
     ('child link="c"', 'child link="b"', 'no tree'),
-    ('parent link="a"', 'parent link="c"', 'no tree'),
     ('joint="slide"', 'joint="other"', 'follow mimics other'),
-    ('type="revolute"', 'type="floating"', "type 'floating'; expected one of revolute"),
-    ('</robot>', '', 'is no URDF'),
     ('<collision>', '<visual>', 'is no URDF'),
     ('<parent link="a"/>', '', 'joint turn lacks its parent')])
 def test_what_cannot_be_used_is_refused_in_one_line(old, new, words):
@@ -91,12 +72,3 @@ def test_what_cannot_be_used_is_refused_in_one_line(old, new, words):
     with pytest.raises(ConfigError, match='arm: .*' + words) as told:
         read_urdf(ARM.replace(old, new, 1), 'arm')
     assert '\n' not in str(told.value)
-
-
-def test_a_robot_without_shapes_is_refused():
-    with pytest.raises(ConfigError, match='no collision geometry'):
-        read_urdf('<robot><link name="a"/></robot>', 'x')
-    with pytest.raises(ConfigError, match='at most 2097152'):
-        read_urdf(' ' * (2**21 + 1), 'x')
-    with pytest.raises(ConfigError, match='no link z; it has a, b, c, d'):
-        read_urdf(ARM, 'arm').held_by('z')

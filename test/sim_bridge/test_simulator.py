@@ -1,18 +1,22 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of the simulator: determinism, kinematics, limits."""
+"""Laws of the simulator: determinism, limits, goals and objects that are put elsewhere."""
 
 from concurrent.futures import ThreadPoolExecutor
 
+import mujoco
 import numpy as np
 import pytest
-from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.tasks import sample_scene
-from sim_bridge.world.scene import FINGER_TRAVEL
-from sim_bridge.world.table import ramp_controls
-from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, WORKSPACE_HIGH
+from sim_bridge.simulator import PoseError, Simulator
+from sim_bridge.tasks.tasks import get_task, sample_scene
+from sim_bridge.world.scene import FINGER_TRAVEL, HALF_HEIGHT
+from sim_bridge.world.table import GRIPPER_MARGIN, ramp_controls
+from tap_ros.contract import ACTION_LIMIT, CONTROL_PERIOD, ROBOT_MASK_FREE, WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 from tap_ros.planning.mpc_inputs import GRIPPER_HIGH, GRIPPER_LOW
+
+PLACES = np.array([[0.2, 0.1], [-0.15, -0.2]])
+FREE = (-0.3, 0.3, HALF_HEIGHT, 0, 0, 0, 1)
 
 
 @pytest.fixture(scope='module')
@@ -61,27 +65,6 @@ def test_an_impossible_action_is_refused_and_nothing_moves(simulator):
     np.testing.assert_array_equal(simulator.state(), before)
 
 
-def test_the_arm_can_be_left_out_of_the_picture(simulator):
-    simulator.reset(2)
-    with_arm, without = simulator.observe(), simulator.observe(hide_arm=True)
-    u, v = simulator.camera.project(with_arm.gripper[:3].astype(float)).round().astype(int)
-    fingers, table = (seen.image[v - 2, u].astype(int) for seen in (with_arm, without))
-    assert np.ptp(fingers) < 20 and np.ptp(table) > 40, 'grey on brown'
-
-
-def test_a_disc_on_its_rim_comes_to_rest(simulator):
-    seed = next(s for s in range(100) if sample_scene(
-        simulator.task, s).shapes[0].kind == 'disc')
-    simulator.reset(seed)
-    disc = simulator.data.joint('object_0')
-    radius = simulator.model.geom('object_0_part_0').size[0]
-    disc.qpos[2:] = [radius, np.sqrt(0.5), np.sqrt(0.5), 0, 0]
-    disc.qvel[:] = [0.3, 0, 0, 0, 0, -0.3 / radius]
-    for _ in range(8):
-        before, after = simulator.object_poses()[0, :2], simulator.step(np.zeros(4))
-    assert np.linalg.norm(after.object_poses[0, :2] - before) < 0.005
-
-
 def test_fingers_pressed_beyond_their_ends_are_told_as_a_planner_accepts_them(simulator):
     simulator.reset(2)
     for pressed, end in ((-0.3, 0), (1.3, 1)):
@@ -103,3 +86,128 @@ def test_a_dropped_simulator_leaves_the_pictures_of_others_alone(simulator):
     with ThreadPoolExecutor(1) as pool:  # in a thread that cannot draw with that context
         pool.submit(made.clear).result()
     np.testing.assert_array_equal(simulator.observe().image, before)
+
+
+def test_distances_outcome_and_pictures_follow_the_goal(simulator):
+    start = simulator.reset(3)
+    before, drawn = simulator.goal(), simulator.scene
+    simulator.set_goal(PLACES)
+    goal, bare = simulator.goal(), simulator.goal(hide_arm=True)
+    assert simulator.scene is drawn
+    for seen in (goal, bare):
+        np.testing.assert_allclose(seen.object_poses[:, :2], PLACES)
+        np.testing.assert_allclose(  # heights and yaws
+            seen.object_poses[:, 2:], before.object_poses[:, 2:], atol=1e-12)
+        np.testing.assert_allclose(
+            seen.object_pixels, simulator.camera.project(goal.object_poses[:, :3]), atol=1e-4)
+        assert (seen.image != before.image).any()
+    assert (goal.robot_mask != ROBOT_MASK_FREE).any() and (goal.image != bare.image).any()
+    assert (bare.robot_mask == ROBOT_MASK_FREE).all()
+    assert np.linalg.norm(PLACES - goal.gripper[:2], axis=1).min() > GRIPPER_MARGIN
+    np.testing.assert_allclose(simulator.distances(), np.linalg.norm(
+        PLACES - start.object_poses[:, :2], axis=1), atol=1e-6)
+    assert simulator.outcome() == 'failure'
+    simulator.set_goal(start.object_poses[:, :2])
+    np.testing.assert_allclose(simulator.distances(), 0, atol=1e-6)
+    assert simulator.outcome() == 'success'
+    simulator.reset(3)
+    np.testing.assert_array_equal(simulator.goal().image, before.image)
+
+
+def pushing(simulator):
+    """Return actions that go behind the first object of scene 3 and push it."""
+    place, hand = simulator.reset(3).object_poses[0, :2], simulator.target[:3].copy()
+    actions = []
+    for goal in ([*hand[:2], 0.14], [place[0] - 0.13, place[1], 0.14],
+                 [place[0] - 0.13, place[1], 0.01], [*place, 0.01]):
+        while np.abs(gap := goal - hand).max() > 1e-6:
+            move = np.clip(gap, [-0.08, -0.08, -0.15], [0.08, 0.08, 0.15])
+            actions.append([*move, 0])
+            hand = hand + move
+    return np.array(actions)
+
+
+def test_nothing_moves_to_the_bit_also_while_the_arm_pushes(simulator):
+    actions, runs = pushing(simulator), []
+    for moved in (False, True):
+        simulator.reset(3)
+        run = []
+        for action in actions:
+            run.append(simulator.step(action))
+            if moved:
+                simulator.set_goal(PLACES)
+                simulator.photograph(simulator.goal_poses)
+                for unfit in (lambda: simulator.set_goal(np.zeros((2, 2))),
+                              lambda: simulator.put_object('object_0', np.zeros(7))):
+                    with pytest.raises(SceneError):
+                        unfit()
+                np.testing.assert_array_equal(simulator.observe().image, run[-1].image)
+        runs.append(run)
+    assert np.linalg.norm(runs[0][-1].object_poses[0] - runs[0][0].object_poses[0]) > 0.03
+    for a, b in zip(*runs):
+        for field in ('image', 'object_poses', 'gripper'):
+            np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+        assert a.stamp_ns == b.stamp_ns
+
+
+def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(simulator):
+    simulator.reset(3)
+    simulator.set_goal(PLACES)
+    before, state = simulator.goal(), simulator.state()
+    for places, words in (
+            (PLACES[:1], r'shape \(2, 2\), got \(1, 2\)'),
+            ([[0.2, 0.1], [0.1, -0.351]], 'object_1.*-0.351.*0.35 m'),
+            ([[np.nan, 0.1], [0.1, 0.1]], 'object_0.*nan.*0.35 m'),
+            ([[0.1, 0.1], [0.1, 0.1]], 'object_0 and object_1 would overlap')):
+        with pytest.raises(SceneError, match=words):
+            simulator.set_goal(places)
+    for unfit, words in (((), 'empty.*object_0'), (('cup',), 'cup.*object_0, object_1')):
+        with pytest.raises(SceneError, match=words):
+            simulator.move_goal(unfit, np.zeros((len(unfit), 2)))
+    assert simulator.goal() is before
+    np.testing.assert_array_equal(simulator.state(), state)
+
+
+def test_objects_overlap_wherever_one_reaches_into_the_other(simulator):
+    seed = next(seed for seed in range(2000) if all(
+        shape.kind == 'disc' for shape in sample_scene(get_task('push2'), seed).shapes))
+    simulator.reset(seed)
+    reach = sum(shape.half_sizes[0][0] for shape in simulator.scene.shapes)
+    simulator.set_goal([[0, 0], [reach + 1e-3, 0]])
+    with pytest.raises(SceneError, match='object_0 and object_1 would overlap'):
+        simulator.set_goal([[0, 0], [reach - 1e-3, 0]])
+
+
+def test_an_object_is_put_and_nothing_else_moves(simulator):
+    before, goal = simulator.reset(3), simulator.goal()
+    simulator.put_object('object_1', FREE)
+    after = simulator.observe()
+    np.testing.assert_array_equal(after.object_poses[1], FREE)
+    np.testing.assert_array_equal(after.object_poses[0], before.object_poses[0])
+    np.testing.assert_array_equal(after.gripper, before.gripper)
+    assert after.stamp_ns == before.stamp_ns and (after.image != before.image).any()
+    assert simulator.goal() is goal
+    later = simulator.step(np.zeros(4))  # it rests there
+    np.testing.assert_allclose(later.object_poses[1], FREE, atol=1e-3)
+
+
+def test_an_object_is_not_put_where_it_cannot_be(simulator):
+    simulator.reset(3)
+    other = simulator.object_poses()[1]
+    simulator.data.qpos[2] = 0.01  # the gripper comes down
+    mujoco.mj_forward(simulator.model, simulator.data)
+    hand = np.array([*simulator.data.qpos[:2], HALF_HEIGHT, *FREE[3:]])
+    before = simulator.state()
+    for pose, words in (
+            *((np.where(np.arange(7) == i, number, FREE), words) for i, number, words in (
+                (5, np.inf, 'finite'), (6, 2.0, 'quaternion'), (1, -1e308, 'out of reach'),
+                (2, 0.01, 'the table'))),
+            (other, 'object_1'), (hand, 'finger'), (FREE[:6], '7')):
+        with pytest.raises(PoseError, match=words):
+            simulator.put_object('object_0', pose)
+    for velocity in ((0, 0, 0), (np.nan, 0, 0, 0, 0, 0), (0, 0, 0, 0, 0, -21)):
+        with pytest.raises(SceneError, match='velocity'):
+            simulator.put_object('object_0', FREE, velocity)
+    with pytest.raises(SceneError, match='not in the scene'):
+        simulator.put_object('gripper_x', FREE)
+    np.testing.assert_array_equal(simulator.state(), before)

