@@ -6,9 +6,9 @@ import re
 import statistics
 import time
 
+from driven import predict_fields
 from experiments.bench.nodes.service import compare_latency, measure_load, streaming
 from fault_report import fault
-from fault_rig import predict_fields
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image

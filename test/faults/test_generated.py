@@ -9,8 +9,8 @@ from importlib.util import find_spec
 import re
 import time
 
+from driven import first_pictures
 from fault_report import fault
-from fault_rig import first_pictures
 import hypothesis
 from hypothesis import strategies as st
 import pytest

@@ -8,9 +8,9 @@ import re
 import signal
 import time
 
+from driven import first_pictures, goal_fields, objects_message, predict_fields
 from fault_files import describe_exit
 from fault_report import fault
-from fault_rig import first_pictures, goal_fields, objects_message, predict_fields
 import numpy as np
 from processes import Client, http_status, Newest, NodeProcess, page_address, until
 import pytest

@@ -4,7 +4,6 @@
 
 import json
 
-import fault_report
 from fault_report import fault, page, ROOT, save, Trials
 import pytest
 
@@ -36,8 +35,3 @@ def test_a_trial_holds_unless_something_is_raised(tmp_path):
     with trials.one(), pytest.raises(ValueError):
         raise ValueError('what was expected')
     assert trials.held == 4
-
-
-def test_what_json_has_no_number_for_is_text():
-    assert fault_report.round_figure(float('inf')) == 'inf'
-    assert fault_report.round_figure(0.123456) == 0.1235

@@ -2,32 +2,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """All nodes as processes, over DDS, and how they are compared with one process."""
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import threading
 
 from action_msgs.msg import GoalStatus
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
-from lifecycle import Lifecycle
 import numpy as np
 from processes import Client, LocalNode, Newest, NodeProcess, until
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from sensor_msgs.msg import Image, JointState
 from sim_bridge.simulator import Simulator
 from std_msgs.msg import Float64
-from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
-from tap_msgs.srv import PredictSubgoal, ResetScene
+import tap_ros
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import call, send_goal, wait_for_result
+from tap_ros.nodes.calls import CallError, send_goal, wait_for_future, wait_for_result
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.planning.mpc_config import with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import FORWARD_MODEL
@@ -41,9 +40,7 @@ class Loop:
 
     def __init__(self, node, folder):
         self.node, self.folder, self.processes = node, folder, {}
-        self.reset_client = node.create_client(ResetScene, 'sim/reset')
-        self.pause_client = node.create_client(SetBool, 'sim/pause')
-        self.predict_client = node.create_client(PredictSubgoal, 'predict_subgoal')
+        self.client = tap_ros.Client(node=node, timeout_s=60.0)
         self.reach_client = ActionClient(node, ReachGoal, 'reach_goal')
         self.predictor_alive = Liveness(node, 'predictor_node')
         self.image = Newest(node, Image, 'camera/image_raw', STREAM)
@@ -53,50 +50,48 @@ class Loop:
         self.goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
         self.subgoal = Newest(node, Subgoal, 'subgoal', LATCHED)
         self.overlay = Newest(node, Image, 'subgoal/overlay', LATCHED)
-        self.twists = []
+        self.twists, self.distances = [], []
         node.create_subscription(
             TwistStamped, 'arm/delta_twist_cmds', self.twists.append, STREAM)
-        self.distances = []
         node.create_subscription(
             Float64, 'plan/distance', lambda m: self.distances.append(m.data), STREAM)
 
-    def start(self, name, remaps=(), **parameters):
-        self.processes[name] = NodeProcess(
-            name, self.folder / f'{name}.log', parameters, remaps)
+    def start(self, name, **parameters):
+        self.processes[name] = NodeProcess(name, self.folder / f'{name}.log', parameters)
 
-    def reset(self, seed=SEED, patience=30.0):
-        """Start a scene, and wait so many seconds for what is published at its start."""
+    def reset(self, seed=SEED):
+        """Start a scene, and wait for what is published at its start."""
         self.image.wait(30)  # in lock-step one always comes
         before = max(to_nanoseconds(topic.wait(30).header.stamp)
                      for topic in (self.image, self.goal_image))
-        response = call(self.reset_client, ResetScene.Request(task='push2', seed=seed), 30)
-        assert response.success, response.message
+        self.client.call('reset', task='push2', seed=seed)
         # A picture may still come that answers a command; a goal comes with a scene alone.
-        goal = self.goal_image.wait(patience, lambda m: to_nanoseconds(m.header.stamp) > before)
+        goal = self.goal_image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > before)
         for topic in (self.image, self.objects, self.joints, self.goal_objects):
-            topic.wait(patience, lambda m: m.header.stamp == goal.header.stamp)
+            topic.wait(30, lambda m: m.header.stamp == goal.header.stamp)
         self.twists.clear()
         self.distances.clear()
 
     @contextmanager
     def set(self, name, **parameters):
         """Change parameters of a node for a while."""
-        client = self.node.create_client(SetParameters, f'{name}/set_parameters')
-        getter = self.node.create_client(GetParameters, f'{name}/get_parameters')
-        before = call(getter, GetParameters.Request(names=list(parameters)), 30).values
+        client = AsyncParameterClient(self.node, name)
+
+        def answer(future):
+            assert wait_for_future(future, 30)
+            return future.result()
 
         def change(values):
-            results = call(client, SetParameters.Request(parameters=[
-                ParameterMessage(name=name, value=value)
-                for name, value in zip(parameters, values)]), 30).results
+            results = answer(client.set_parameters(values)).results
             assert all(result.successful for result in results), results
 
-        change([Parameter(name, value=value).get_parameter_value()
-                for name, value in parameters.items()])
+        before = answer(client.get_parameters(list(parameters))).values
+        change([Parameter(name, value=value) for name, value in parameters.items()])
         try:
             yield
         finally:
-            change(before)
+            change([ParameterMessage(name=name, value=value)
+                    for name, value in zip(parameters, before)])
 
     def wait_until_seen(self):
         """
@@ -105,16 +100,10 @@ class Loop:
         No new image is sent meanwhile; the newest one comes once it is discovered.
         """
         def seen():
-            response = self.predict()
-            words = response.message
-            assert response.success or '/camera/image_raw' in words or '/goal/image' in words
-            return response.success and response.subgoals[0].object_maps
+            with suppress(CallError):
+                return self.client.call('predict').subgoals[0].object_maps
 
         assert until(seen, pause=0.1)
-
-    def predict(self, timeout_s=60.0, **fields):
-        return call(self.predict_client, PredictSubgoal.Request(**fields), timeout_s,
-                    server=self.predictor_alive)
 
     def reach(self, on_feedback=None, **fields):
         """Send a goal and wait for its end."""
@@ -143,13 +132,6 @@ class Loop:
         assert moving.wait(120)
         return handle
 
-    def use_weights(self, name, weights):
-        """Have a node go on with other weights."""
-        states = Lifecycle(self.node, name)
-        assert states.to('deactivate') and states.to('cleanup')
-        assert states.set('weights', weights) == ''
-        assert states.to('configure') and states.to('activate')
-
     @contextmanager
     def other_planner(self, **parameters):
         """Send goals to another planner, other_node, whose robot masks are those of own_mask."""
@@ -158,7 +140,7 @@ class Loop:
         planner = LocalNode(VisualMpcNode, num_threads=4, remaps={
             '__node': 'other_node', 'camera/robot_mask': 'own_mask',
             **{name.format('reach_goal'): name.format('other_goal') for name in action}},
-            **parameters)
+            solver='quick', **parameters)
         before = self.reach_client
         try:
             self.reach_client = ActionClient(self.node, ReachGoal, 'other_goal')
@@ -192,10 +174,9 @@ def running_loop(folder):
             loop.start('recorder_node', folder=folder / 'bag')
             loop.start('sim_node', lock_step='true', observer='true')
             loop.start('predictor_node')
-            loop.start('visual_mpc_node', image_timeout=10.0)
+            loop.start('visual_mpc_node', image_timeout=10.0, solver='quick')
             for process in loop.processes.values():
                 process.wait_for('ready', 120)
-            assert loop.predict_client.wait_for_service(30)
             assert loop.reach_client.wait_for_server(30)
             loop.reset()
             loop.wait_until_seen()
@@ -211,12 +192,13 @@ def acts_like(loop, method, weights, **fields):
 
     Where a plan is expected to end shows what it was for, as first actions often do not.
 
-    :return: the PlannedEpisode and the stages that feedback told.
+    :return: the PlannedEpisode, what feedback told, and the result.
     """
     feedback = []
     loop.reset()
-    loop.reached(feedback.append, seed=SEED, **fields)
-    sim, mpc = Simulator('push2'), VisualMPC.load(FORWARD_MODEL)
+    result = loop.reached(feedback.append, seed=SEED, **fields)
+    sim = Simulator('push2')
+    mpc = VisualMPC.load(FORWARD_MODEL, with_preset('default', solver='quick'))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     plans, plan = [], mpc.plan
@@ -230,4 +212,4 @@ def acts_like(loop, method, weights, **fields):
     assert np.array_equal(loop.moves().astype(np.float32), run.actions[:, :3])
     made = plans[-len(run.actions):]  # before these come plans to choose by
     assert [f.expected_distance for f in feedback] == [p.expected_distance for p in made]
-    return run, [f.stage for f in feedback]
+    return run, feedback, result

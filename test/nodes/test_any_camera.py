@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cameras as people have them: 640x480, compressed, best effort; heard by real nodes over DDS."""
 
-import io
 import time
 
+import cv2
 from lively import lively_network
 import numpy as np
-from PIL import Image as Picture
 from processes import Client, until
 import pytest
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
@@ -20,38 +19,25 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import declare_parameters
-from tap_ros.nodes.ros_messages import encode_image, encode_objects
+from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, to_stamp
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.training.weights import save_weights
-from test_predictor_node import Service
+from test_predictor_node import objects, Service, STAMP
 
 pytestmark = pytest.mark.slow
-STAMP = to_stamp(2_500_000_000)
 PIXELS = np.array([(200.0, 100.0), (320.0, 240.0)])  # in pictures of 640x480
 TRAINING = {'settings': {'crop': 'centre', 'size': 32}, 'camera_size': [480, 640]}
 
 
-def positions(names, pixels, stamp=STAMP):
-    return encode_objects(names, pixels, [[0, 0, 0, 0, 0, 0, 1]] * len(names), stamp, 'world',
-                          ObjectStates.SOURCE_TRACKED)
-
-
-def photograph(seed):
-    """Return a picture of 640x480 pixels with much in it."""
-    coarse = np.random.default_rng(seed).integers(0, 256, (12, 16, 3), np.uint8)
-    return np.array(Picture.fromarray(coarse).resize((640, 480), Picture.Resampling.BICUBIC))
-
-
-START, GOAL = photograph(0), photograph(1)
+START, GOAL = (cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC) for coarse in
+               np.random.default_rng(0).integers(0, 256, (2, 12, 16, 3), np.uint8))
 
 
 def jpeg(picture):
-    buffer = io.BytesIO()
-    Picture.fromarray(picture).save(buffer, 'JPEG', quality=90)
-    message = CompressedImage(format='rgb8; jpeg compressed bgr8')
+    data = cv2.imencode('.jpg', picture[..., ::-1])[1].tobytes()
+    message = CompressedImage(format='rgb8; jpeg compressed bgr8', data=data)
     message.header.stamp, message.header.frame_id = STAMP, 'eye'
-    message.data = buffer.getvalue()
     return message
 
 
@@ -65,8 +51,7 @@ def weights(tmp_path_factory):
 
 def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(client, weights, capfd):
     start, goal = jpeg(START), jpeg(GOAL)
-    objects, goal_objects = (
-        positions(('cup', 'box'), pixels) for pixels in (PIXELS, PIXELS[::-1]))
+    places, goal_places = objects(PIXELS), objects(PIXELS[::-1])
     service = Service(client, 'compressed', weights=weights, image_transport='compressed')
     try:
         volatile = QoSProfile(depth=1)  # of a goal, as `ros2 topic pub` has it
@@ -74,12 +59,12 @@ def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(client, weig
             (service.publisher(type(message), topic, qos), message)
             for message, topic, qos in (
                 (start, 'camera/image_raw/compressed', qos_profile_sensor_data),
-                (objects, 'objects', qos_profile_sensor_data),
+                (places, 'objects', qos_profile_sensor_data),
                 (goal, 'goal/image/compressed', volatile),
-                (goal_objects, 'goal/objects', volatile))])
+                (goal_places, 'goal/objects', volatile))])
         assert 'taken best_effort and volatile, as it is published' in capfd.readouterr().err
         picture = encode_image(START, STAMP, 'eye')
-        beside = positions(('cup',), [(20.0, 200.0)])
+        beside = objects([(20.0, 200.0)], ('cup',))
         message = service.refusal(
             start=picture, goal=picture, start_objects=beside, goal_objects=beside)
         assert ('start_objects: cup not in the part of the picture that the weights see, 480x480 '
@@ -101,7 +86,7 @@ def test_a_large_best_effort_camera_is_heard_and_cut_as_in_training(client, weig
 
 def test_what_was_latched_before_does_not_come_back(client):
     """A goal by hand, volatile, is not undone when its publisher has left."""
-    old, new = (positions(('cup',), [(u, 8.0)], to_stamp(u * 10**9)) for u in (3, 5))
+    old, new = (objects([(u, 8.0)], ('cup',), to_stamp(u * 10**9)) for u in (3, 5))
     kept = client.create_publisher(ObjectStates, 'goal/objects', LATCHED)
     kept.publish(old)
     asked, observed = (Observations('objects', latched=True) for _ in range(2))
@@ -130,14 +115,14 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on():
         for picture, pixels in ((START, PIXELS), (cut, (PIXELS - [80, 0] + 0.5) * 64 / 480 - 0.5)):
             np.testing.assert_array_equal(inputs.cut(picture, 'goal'), cut)
             names, found = inputs.decode_positions(
-                positions(('cup', 'box'), pixels), 'goal_objects', picture.shape[:2])
+                objects(pixels), 'goal_objects', picture.shape[:2])
             assert names == ('cup', 'box')
             np.testing.assert_allclose(found, (PIXELS - [80, 0] + 0.5) * 64 / 480 - 0.5, atol=1e-5)
         # Another camera shows the table elsewhere.
         other = to_stamp(9 * 10**9)
         inputs.sensors.put('image', encode_image(
             np.ascontiguousarray(START[:240, :320]), other, 'eye'))
-        inputs.sensors.put('objects', positions(names, PIXELS, other))
+        inputs.sensors.put('objects', objects(PIXELS, names, other))
         inputs.sensors.attach('joints', 9 * 10**9, np.zeros(4, np.float32), time.monotonic())
         with pytest.raises(ImageError, match='320x240 pixels; the forward model was trained on '
                                              'those of 640x480'):

@@ -1,15 +1,19 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The public client with real nodes: what it does, and who it says is silent."""
+"""The public client and the command `call` with real nodes: what they do, and who is silent."""
 
 from pathlib import Path
 import re
 import threading
 
+import cv2
 import numpy as np
 import pytest
 import tap_ros
+from tap_ros.cli import main
+from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
+from tap_ros.nodes.predictor.node import OVERLAY_SCALE
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.weights import DEFAULT_PREDICTOR
 
@@ -29,6 +33,9 @@ def test_it_does_with_the_nodes_what_the_classes_do(loop):
         assert answer.expected_pixels == pytest.approx(wanted.expected_pixels, abs=0.01)
         by_topics, = client.predict()
         assert by_topics.expected_pixels == pytest.approx(answer.expected_pixels, abs=0.01)
+        for topic, side in ((loop.subgoal, 0), (loop.overlay, 64 * OVERLAY_SCALE)):
+            shown = topic.wait(10, lambda m: to_nanoseconds(m.header.stamp) == start.stamp_ns)
+            assert not side or shown.width == shown.height == side
 
         reaching = client.reach(mode='direct', step_budget=3)
         steps = [feedback.step for feedback in reaching]
@@ -51,8 +58,33 @@ def test_it_does_with_the_nodes_what_the_classes_do(loop):
         client.record()
 
 
+def test_the_command_prints_places_and_draws_what_the_node_answers(loop, tmp_path, capsys):
+    with tap_ros.Client() as client:
+        start, goal = client.reset('push2', 3)
+    words, out = [], tmp_path / 'answer.png'
+    for name, view, option in (('start', start, '--objects'), ('goal', goal, '--goal-objects')):
+        cv2.imwrite(str(tmp_path / f'{name}.png'), view.image[..., ::-1])
+        words += [f'--{name}', str(tmp_path / f'{name}.png'), option,
+                  *(f'{u},{v}' for u, v in view.pixels)]
+    assert main(['call', *words, '--out', str(out)]) == 0
+    said = capsys.readouterr().out
+    wanted, = SubgoalPredictor.load(DEFAULT_PREDICTOR).predict(
+        start.image, goal.image, start.pixels, goal.pixels)
+    found = np.array(re.findall(r'object \d at ([\d.-]+),([\d.-]+)', said), float)
+    assert found == pytest.approx(wanted.expected_pixels, abs=0.06)
+    picture = cv2.imread(str(out))
+    assert picture.shape[1] > 1.5 * picture.shape[0] and picture.std() > 20
+    for bad, reason in (
+            (['--namespace', '/nobody', '--timeout', '0.2'], '/nobody/predict_subgoal'),
+            (['--objects', '3,4'], '--objects'), (['--samples', '101'], 'num_samples'),
+            (['--out', 'a.txt'], '.png'), (['--start', 'nowhere.png'], 'nowhere.png')):
+        assert main(['call', *bad]) == 1
+        error = capsys.readouterr().err
+        assert reason in error and error.count('\n') == 1
+
+
 def test_it_names_who_is_silent():
-    with tap_ros.Client('/nobody', timeout_s=0.5) as client:
+    with tap_ros.Client('/nobody', timeout_s=0.2) as client:
         for ask, silent in (
                 (client.predict, '/nobody/predict_subgoal: nobody offers it'),
                 (client.reach, 'visual_mpc_node'), (client.record, 'recorder_node'),

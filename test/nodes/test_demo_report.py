@@ -13,7 +13,6 @@ import pytest
 from tap_ros.nodes.demo.report import (
     FRAME_MS,
     GAP,
-    HEAD,
     HEIGHT,
     HOLD_MS,
     results_table,
@@ -42,19 +41,13 @@ def scenes():
         maps, {'direct': run(0.11), 'subgoal': run(0.05)}) for seed in (7, 8)]
 
 
-def test_the_table_shows_centimetres_and_their_mean(scenes):
-    other = replace(scenes[0], task='order2')
-    lines = results_table([*scenes, other]).splitlines()
-    assert lines[2].split() == ['push2', '7', '20.0', '11.0', '5.0']
-    assert lines[4].split() == ['push2,', 'mean', 'of', '2', '20.0', '11.0', '5.0']
-    assert lines[-1].split()[:4] == ['order2,', 'mean', 'of', '1']
-
-
 def test_the_page_is_one_file_with_everything_inside(scenes, tmp_path):
     side = [np.full((24, 32, 3), grey, np.uint8) for grey in (0, 80, 160, 240)]
     scenes[1].runs['direct'] = replace(scenes[1].runs['direct'], side=side)
     scenes.append(replace(scenes[0], task='grasp', runs={}, expert=side))  # nothing was planned
     path = tmp_path / 'report.html'
+    assert results_table(scenes[:2]).splitlines()[2].split() == [
+        'push2', '7', '20.0', '11.0', '5.0']
     write_report(path, scenes, 'made by a test', {'command': 'a <b>', 'date': 'today'})
     page = path.read_text()
     assert '<dt>command</dt><dd>a &lt;b&gt;</dd><dt>date</dt><dd>today</dd>' in page
@@ -92,19 +85,3 @@ def test_the_film_shows_each_run_to_its_end_and_stops_there(scenes, tmp_path):
     assert np.abs(np.subtract(shown, expected)).max() <= 6
     assert milliseconds == len(scenes) * (3 * FRAME_MS + HOLD_MS)
     assert film.info['loop'] == 0  # for ever
-
-
-def test_the_film_marks_the_goals_in_the_view_that_it_shows(scenes, tmp_path):
-    path, black = tmp_path / 'demo.webp', np.zeros((30, 40, 3), np.uint8)
-    scene = replace(scenes[0], side_goal_pixels=np.array([[10.0, 7.0], [30.0, 22.0]]))
-    for mode, run in scene.runs.items():
-        scene.runs[mode] = replace(run, side=[black])
-    write_film(path, [scene])
-    film = np.array(Image.open(path).convert('RGB'), int)
-    left, top = SMALL + GAP, HEAD
-    panel = film[top:top + HEIGHT, left:left + HEIGHT * 4 // 3]
-    v, u = (panel.max(-1) > 128).nonzero()
-    marks = np.stack([u, v], -1) * 30 / HEIGHT - 0.5
-    for place in scene.side_goal_pixels:
-        assert np.abs(marks - place).max(1).min() < 0.5
-    assert np.abs(marks[:, None] - scene.side_goal_pixels).max(-1).min(1).max() < 1.5

@@ -1,18 +1,101 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What /diagnostics says of a node's inputs and work."""
+"""What log and /diagnostics say: of inputs and work, of silence, of parameters nobody knows."""
 
 import math
 from threading import Thread
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
-from processes import LocalNode, Newest
+from processes import Client, LocalNode, Newest, until
 import pytest
-from sensor_msgs.msg import JointState
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CompressedImage, Image, JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+from tap_ros.nodes import diagnostics
+from tap_ros.nodes.calls import call
 from tap_ros.nodes.diagnostics import Diagnostics, Record
 from tap_ros.nodes.recorder.node import RecorderNode
+from tap_ros.nodes.run import warn_of_unknown_parameters
+from tap_ros.nodes.subscriptions import why_silent
 from tap_ros.nodes.topics import STREAM
+
+
+def test_what_is_published_instead_and_the_remedy_are_named():
+    eye = '/eye/image_raw'
+    for kind, topic, published, words in (
+            (Image, eye, {f'{eye}/compressed': CompressedImage},
+             [f'{eye}/compressed is', '-p image_transport:=compressed']),
+            (CompressedImage, f'{eye}/compressed', {eye: Image}, [f'{eye} is', 'transport:=raw']),
+            (Image, eye, {eye: CompressedImage},
+             ['published there is sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Image']),
+            (Image, eye, {'/front/color': Image, '/goal/image': Image},
+             ['published are /front/color:', f'-r {eye}:=/front/color']),
+            (JointState, '/joint_states', {f'/{side}/joint_states': JointState
+                                           for side in ('left', 'right')},
+             ['/left/joint_states, /right/joint_states', ':=/left/joint_states']),
+            (None, eye, {'/eye/image_ra': String}, ['no node publishes it', '/eye/image_ra'])):
+        with Client('camera') as camera, Client('looking') as node:
+            for name, other in published.items():
+                camera.create_publisher(other, name, STREAM)
+
+            def fits(topic=topic, kind=kind, words=words, node=node):
+                return all(word in why_silent(node, topic, kind) for word in words)
+
+            assert until(fits, 10), (published, why_silent(node, topic, kind))
+            assert '/goal/image' not in why_silent(node, topic, kind)
+            assert why_silent(node, next(iter(published)), next(iter(published.values()))) == ''
+
+
+@pytest.fixture
+def hurried(monkeypatch):
+    """Call inputs silent sooner."""
+    monkeypatch.setattr(diagnostics, 'SILENT_SECONDS', 1.0)
+
+
+def test_a_recorder_that_hears_nothing_says_so_and_does_not_succeed(
+        client, hurried, tmp_path, capfd):
+    pictures = client.create_publisher(CompressedImage, 'camera/image_raw/compressed', STREAM)
+    node = LocalNode(RecorderNode, folder=tmp_path / 'bag',
+                     topics=['camera/image_raw', 'wrist/joints'])
+    said = []
+
+    def warned(*words):
+        said.append(capfd.readouterr().err)
+        return any(all(word in line for word in ('WARN', *words))
+                   for line in ''.join(said).splitlines())
+
+    assert until(lambda: warned('/camera/image_raw', 'image_transport:=compressed'))
+    assert warned('/wrist/joints', 'no node publishes it')
+    service = client.create_client(SetBool, 'recorder/record')
+    assert service.wait_for_service(20)
+    answer = call(service, SetBool.Request(data=False), 20)
+    assert not answer.success and 'nothing was recorded' in answer.message
+    assert node.end() == 1
+
+    node = LocalNode(RecorderNode, folder=tmp_path / 'bag', topics=['camera/image_raw'],
+                     image_transport='compressed')
+    try:
+        assert until(pictures.get_subscription_count)
+        timer = client.create_timer(0.1, lambda: pictures.publish(CompressedImage()))
+        assert until(lambda: node.node._bags.count > 10)
+        said.clear()
+        timer.cancel()
+        assert until(lambda: warned('/camera/image_raw/compressed', 'though it is published'))
+    finally:
+        assert node.end() == 0
+
+
+def test_parameters_that_a_node_does_not_have_are_named(client, capfd):
+    with Client('careful', parameter_overrides=[
+            Parameter('max_step_yx', value=0.01), Parameter('max_step_xy', value=0.02),
+            Parameter('nonsense', value='x')]) as node:
+        node.declare_parameter('max_step_xy', 0.08)
+        warn_of_unknown_parameters(node)
+    text = capfd.readouterr().err
+    assert 'max_step_yx is unknown' in text and 'did you mean max_step_xy?' in text
+    assert 'nonsense is unknown' in text and 'parameter max_step_xy is' not in text
 
 
 def statuses(message):
@@ -21,70 +104,44 @@ def statuses(message):
             for status in message.status}
 
 
-def wait_for(newest, name, accept):
-    """Return level, message and values of the status `name` once they are acceptable."""
-    message = newest.wait(
-        20.0, lambda message: name in statuses(message) and accept(*statuses(message)[name]))
-    return statuses(message)[name]
-
-
-def test_an_input_is_not_received_then_ok_then_stale(client, tmp_path):
+def test_work_and_inputs_of_many_threads_are_counted_and_silence_is_told(client, monkeypatch):
+    monkeypatch.setattr(diagnostics, 'PERIOD', 0.2)
     newest = Newest(client, DiagnosticArray, '/diagnostics', 10)
-    joints = client.create_publisher(JointState, 'joint_states', STREAM)
-    node = LocalNode(RecorderNode, folder=tmp_path / 'bag')
-    topic, service = 'recorder_node: /joint_states', 'recorder_node: service'
-    try:
-        level, _, values = wait_for(newest, topic, lambda *_: True)
-        assert (level, values['status']) == (DiagnosticStatus.WARN, 'NotReceived')
-        assert (values['count'], values['age_s']) == ('0', 'nan')
-        assert wait_for(newest, service, lambda *_: True)[0] == DiagnosticStatus.OK
-
-        stream = client.create_timer(0.05, lambda: joints.publish(JointState()))
-        level, word, values = wait_for(
-            newest, topic, lambda level, word, values: int(values['count']) > 1)
-        assert (level, word) == (DiagnosticStatus.OK, 'OK')
-        assert float(values['rate_hz']) > 1.0 and 0 <= float(values['age_s']) <= 2.0
-
-        stream.cancel()
-        level, word, values = wait_for(newest, topic, lambda level, word, values: word != 'OK')
-        assert (level, word) == (DiagnosticStatus.STALE, 'Stale')
-        assert float(values['age_s']) >= 2.0  # it is rounded
-    finally:
-        node.end()
-
-
-def test_work_and_inputs_of_many_threads_are_counted(client):
     waiting = ['a', 'b', 'c']
-    diagnostics = Diagnostics(
+    told = Diagnostics(
         client, {'camera/image_raw': 1.0, '/goal/image': math.inf}, queue=lambda: len(waiting))
 
     def work():
         for index in range(100):
-            diagnostics.received('camera/image_raw')
-            diagnostics.received('/camera/image_raw')
-            diagnostics.took(index % 100, 'predict_subgoal')
+            told.received('camera/image_raw')
+            told.received('/camera/image_raw')
+            told.took(index % 100, 'predict_subgoal')
     threads = [Thread(target=work) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    diagnostics.error('bad\nname \x1b[31m')
-    newest = Newest(client, DiagnosticArray, '/diagnostics', 10)
-    message = newest.wait(10.0)
+    told.error('bad\nname \x1b[31m')
+    message = newest.wait(
+        10.0, lambda message: statuses(message)['test_client: service'][2]['errors'] == '1')
     found = statuses(message)
     assert set(found) == {
         'test_client: service', 'test_client: /camera/image_raw', 'test_client: /goal/image'}
     assert {status.hardware_id for status in message.status} == {'/test_client'}
-    assert found['test_client: /camera/image_raw'][2]['count'] == '1600'
+    level, word, values = found['test_client: /camera/image_raw']
+    assert (level, word, values['count']) == (DiagnosticStatus.OK, 'OK', '1600')
+    level, word, values = found['test_client: /goal/image']
+    assert (level, word) == (DiagnosticStatus.WARN, 'NotReceived')
+    assert (values['count'], values['age_s']) == ('0', 'nan')
     level, text, values = found['test_client: service']
     assert (level, text) == (DiagnosticStatus.ERROR, r'bad\nname \x1b[31m')
     assert values.pop('last_error_age_s')
     assert values == {
         'queue': '3', 'errors': '1', 'last_error': text, 'predict_subgoal calls': '800',
         'predict_subgoal p50_ms': '49.50', 'predict_subgoal p99_ms': '98.01'}
-    stamp = message.header.stamp
-    now = client.get_clock().now().nanoseconds * 1e-9
-    assert 0 <= now - (stamp.sec + stamp.nanosec * 1e-9) < 60
+    level, word, values = statuses(newest.wait(10.0, lambda message: 'Stale' in (
+        status.message for status in message.status)))['test_client: /camera/image_raw']
+    assert level == DiagnosticStatus.STALE and float(values['age_s']) >= 1.0
 
 
 def test_a_rate_is_the_frequency_and_percentiles_are_of_recent_values_alone():

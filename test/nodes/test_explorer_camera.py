@@ -8,10 +8,11 @@ import json
 import time
 
 import numpy as np
-from processes import Client, Newest, NodeProcess, page_address, until
+from processes import Client, LocalNode, Newest, until
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
+from tap_ros.nodes.explorer.node import ExplorerNode
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from websockets.sync.client import connect
@@ -33,18 +34,17 @@ def problem_of(browser):
     return problem['text']
 
 
-def test_a_photograph_of_a_real_camera_becomes_the_goal_with_its_own_objects_alone(tmp_path):
+def test_a_photograph_of_a_real_camera_becomes_the_goal_with_its_own_objects_alone():
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    explorer = NodeProcess('explorer_node', tmp_path / 'explorer.log',
-                           {'port': 0, 'token': 'secret'})
     with ExitStack() as stack:
-        stack.callback(explorer.kill)
+        explorer = LocalNode(ExplorerNode, port=0, token='secret')
+        stack.callback(explorer.end)
         node = stack.enter_context(Client('camera'))
         pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
         objects = node.create_publisher(ObjectStates, 'objects', STREAM)
         goal_image = Newest(node, Image, 'goal/image', LATCHED)
         goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
-        url = page_address(explorer).replace('http', 'ws').replace('/?', '/socket?')
+        url = explorer.node.url.replace('http', 'ws').replace('/?', '/socket?')
         assert url.endswith('?token=secret')
         browser = stack.enter_context(connect(url, open_timeout=10))
         stamps = count(10**9, 10**9)
@@ -72,4 +72,3 @@ def test_a_photograph_of_a_real_camera_becomes_the_goal_with_its_own_objects_alo
         assert bytes(goal_image.wait(5).data)[3:] == image.tobytes()[3:]
         place, = goal_objects.wait(5).objects
         assert (place.name, place.u, place.v) == ('cup', 3.0, 4.0)
-        assert explorer.end() == 0

@@ -10,21 +10,15 @@ from diagnostic_msgs.msg import DiagnosticArray
 from loop import SEED
 from mcap.reader import make_reader
 import numpy as np
-from processes import LocalNode, Newest, until
+from processes import LocalNode, until
 import pytest
-from sensor_msgs.msg import Image
-from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
-from tap_ros.images.drawing import OBJECT_COLOURS
-from tap_ros.messages.images import decode_image, decode_map
-from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import call, send_goal
+from tap_ros.nodes.calls import send_goal
 from tap_ros.nodes.planner.node import VisualMpcNode
-from tap_ros.nodes.planner.plan_view import CHOSEN
-from tap_ros.nodes.predictor.node import OVERLAY_SCALE, PredictorNode
+from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.nodes.topics import STREAM
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
@@ -32,75 +26,9 @@ from tap_ros.weights import FORWARD_MODEL
 pytestmark = pytest.mark.slow
 
 
-def positions(message):
-    return np.array([(o.pose.position.x, o.pose.position.y) for o in message.objects])
-
-
-def test_an_empty_request_predicts_from_what_was_seen_last(loop):
-    loop.reset()
-    response = loop.predict()
-    assert response.success and response.model_time_ms > 0, response.message
-    subgoal, = response.subgoals
-    assert subgoal.header.stamp == loop.image.wait(1).header.stamp
-    assert decode_image(subgoal.image, 'subgoal', (64, 64)).std() > 5
-    assert list(subgoal.object_names) == [o.name for o in loop.objects.wait(1).objects]
-    v, u = np.mgrid[:64, :64]
-    for message, point in zip(subgoal.object_maps, subgoal.expected_pixels, strict=True):
-        values = decode_map(message, 'map')
-        assert values.shape == (64, 64) and values.min() >= 0
-        assert values.sum() == pytest.approx(1, abs=1e-3)
-        assert (values * u).sum() == pytest.approx(point.x, abs=0.01)
-        assert (values * v).sum() == pytest.approx(point.y, abs=0.01)
-    published = loop.subgoal.wait(10, lambda m: m.header.stamp == subgoal.header.stamp)
-    assert published.image.data == subgoal.image.data
-    overlay = loop.overlay.wait(10, lambda m: m.header.stamp == subgoal.header.stamp)
-    assert (overlay.width, overlay.height) == (64 * OVERLAY_SCALE, 64 * OVERLAY_SCALE)
-
-
-def test_reaching_by_the_subgoal_moves_the_arm_and_an_object(loop):
-    loop.reset()
-    arm, objects = loop.joints.wait(1), positions(loop.objects.wait(1))
-    feedback = []
-    budget = 10
-    result = loop.reached(feedback.append, step_budget=budget, seed=1)
-    assert result.steps == budget and len(loop.moves()) == budget
-    assert [f.step for f in feedback] == list(range(1, budget + 1))
-    stages = [f.stage for f in feedback]
-    assert stages == sorted(stages, reverse=True) and set(stages) == {'subgoal', 'goal'}
-    assert all(f.planning_ms > 0 and np.isfinite(f.expected_distance) for f in feedback)
-    assert (np.abs(loop.moves()) <= np.array([0.08, 0.08, 0.15]) + 1e-6).all()
-    last = loop.image.wait(10)
-    joints = loop.joints.wait(10, lambda m: m.header.stamp == last.header.stamp)
-    assert np.abs(np.array(joints.position[:2]) - arm.position[:2]).max() > 0.02
-    moved = positions(loop.objects.wait(10, lambda m: m.header.stamp == last.header.stamp))
-    assert np.linalg.norm(moved - objects, axis=1).max() > 0.02
-    _, pixels = decode_objects(loop.objects.wait(1), 'objects')
-    _, goals = decode_objects(loop.goal_objects.wait(1), 'goal_objects')
-    assert result.expected_distance == pytest.approx(
-        np.linalg.norm(pixels - goals, axis=1).mean(), abs=1e-3)
-    assert loop.stopped()
-    assert until(lambda: len(loop.distances) > budget)  # the last may come after the result
-    assert len(loop.distances) == budget + 1 and loop.distances[-1] == result.expected_distance
-    assert loop.distances[0] > loop.distances[-1]
-
-
-def test_plans_are_drawn_for_whoever_listens(loop):
-    loop.reset()
-    overlay = Newest(loop.node, Image, 'plan/overlay', STREAM)
-    while not overlay.count:  # until the planner knows of the listener
-        loop.reached(mode='direct', step_budget=2)
-    picture = overlay.wait(10)
-    assert picture.header.frame_id == loop.image.wait(1).header.frame_id
-    shown = decode_image(picture, 'plan/overlay', (384, 384))
-    assert (shown == CHOSEN).all(-1).sum() > 30
-    _, goals = decode_objects(loop.goal_objects.wait(1), 'goal_objects')
-    for (u, v), colour in zip((6 * (goals + 0.5)).astype(int), OBJECT_COLOURS):
-        assert tuple(shown[v, u]) == colour
-
-
 def test_every_node_tells_how_it_is(loop):
     loop.reset()
-    assert loop.predict().success
+    loop.client.call('predict')
     told = {}
     loop.node.create_subscription(
         DiagnosticArray, '/diagnostics',
@@ -118,12 +46,10 @@ def test_every_node_tells_how_it_is(loop):
 
 
 def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
-    recorder = loop.node.create_client(SetBool, 'recorder/record')
-    call(recorder, SetBool.Request(data=False), 30)
-    bag = Path(call(recorder, SetBool.Request(data=True), 30).message.removeprefix(
-        'recording to '))
+    loop.client.record(False)
+    bag = Path(loop.client.record().removeprefix('recording to '))
     loop.reset()
-    assert loop.predict().success
+    loop.client.call('predict')
     loop.reset(seed=7)
     loop.reached(mode='direct', step_budget=2, seed=3)
     moves = loop.moves()

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of visual_mpc_node without the node: checks of a goal, and plans drawn over pictures."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -44,12 +43,7 @@ def test_modes_budgets_and_samples_are_bounded():
             ({'num_samples': 33}, '33 x 2 = 66; at most 64 plans')):
         with pytest.raises(ConfigError, match=words):
             check_request(ReachGoal.Goal(**fields))
-
-
-def test_weights_are_found_by_name_and_those_of_predictors_are_refused():
-    for name in ('push', 'push2', 'order3'):
-        assert weights_file(name) == FORWARD_MODEL
-    assert weights_file('runs/a.safetensors') == Path('runs/a.safetensors')
+    assert weights_file('push2') == FORWARD_MODEL
     with pytest.raises(ConfigError, match='grasp is a subgoal predictor.*push, push2'):
         weights_file('grasp')
 
@@ -67,13 +61,6 @@ def shown(canvas, pixel):
     """Return the colour at a pixel (u, v) of the picture before it was enlarged."""
     u, v = ((np.asarray(pixel) + 0.5) * len(canvas) / 64).astype(int)
     return tuple(canvas[v, u].tolist())
-
-
-def test_a_way_is_the_sum_of_its_moves_within_the_workspace():
-    moves = np.array([[0.05, 0.02, 0.01, 1], [0.03, -0.02, 0, 1], [9, 0, 9, 0]])
-    np.testing.assert_allclose(way(moves, HAND), [
-        [0.1, -0.2, 0.05], [0.15, -0.18, 0.06], [0.18, -0.2, 0.06],
-        [WORKSPACE_HIGH[0], -0.2, WORKSPACE_HIGH[2]]], atol=1e-6)
 
 
 def test_fingertips_are_drawn_where_the_camera_sees_them():
@@ -101,17 +88,8 @@ def test_all_ways_the_targets_and_the_gripper_are_where_they_belong():
         assert shown(canvas, target) == OBJECT_COLOURS[k]
     touched = (canvas != 90).any(-1).mean()
     assert 0.01 < touched < 0.1, 'most of the picture stays as it is'
-    alone = draw_plan(GREY, ABOVE, SimpleNamespace(
-        actions=ways[0], elites=np.empty((0, 15, 4))), HAND, TARGETS)
-    assert (alone == CHOSEN).all(-1).sum() > 200 and not (alone == ELITES).all(-1).any()
-
-
-def test_pictures_are_enlarged_as_far_as_a_page_has_room():
-    for width, times in ((16, 6), (106, 6), (107, 5), (320, 2), (321, 1), (640, 1), (1000, 1)):
-        picture = np.zeros((width // 2, width, 3), np.uint8)
-        canvas = draw_plan(picture, ABOVE, plan_of(straight(0, 0.3)), HAND, TARGETS)
-        assert canvas.shape == (width // 2 * times, width * times, 3)
-        assert canvas.shape[1] <= max(LARGEST, width)
+    wide = draw_plan(np.zeros((160, 320, 3), np.uint8), ABOVE, plan_of(*ways), HAND, TARGETS)
+    assert wide.shape[1] == LARGEST
 
 
 def test_what_cannot_be_seen_is_not_drawn_and_does_no_harm():

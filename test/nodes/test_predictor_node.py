@@ -17,7 +17,7 @@ from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.messages.images import decode_image
 from tap_ros.nodes.calls import call, wait_for_future
-from tap_ros.nodes.predictor.node import main, PredictorNode
+from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.training.weights import save_weights, stored_digest
@@ -162,14 +162,11 @@ def test_a_mode_is_that_of_the_weights_or_refused(services):
         assert all(word in message for word in words), message
 
 
-def test_weights_without_z_give_one_sample_and_say_so(services):
-    response = services['plain'].answer(num_samples=5, recursion_depth=2, **WITH_GOAL)
-    assert list(response.sample) == [0, 0] and list(response.level) == [2, 1]
-    assert 'one sample instead of 5' in response.message
-
-
 def test_why_there_are_no_maps_is_said_of_each_picture(services):
     plain = services['plain']
+    response = plain.answer(num_samples=5, recursion_depth=2, **WITH_GOAL)
+    assert list(response.sample) == [0, 0] and list(response.level) == [2, 1]
+    assert 'one sample instead of 5' in response.message, 'these have no z'
     response = plain.answer(start=START, goal=GOAL, start_objects=START_OBJECTS)
     assert response.message.endswith('no object maps: goal_objects are empty')
     image = plain.publisher(Image, 'goal/image', LATCHED)
@@ -258,15 +255,12 @@ def test_each_bound_is_named_and_what_is_refused_touches_nothing(services, capfd
             ({'start': large}, ['start', '37748736 bytes', '33554432']),
             ({'start_objects': objects([(8, 9), (5.4e8, 21)])},
              ['start_objects: box', '(540000000.0, 21.0)', 'outside', '-0.5 to 31.5']),
-            ({'goal_objects': objects([(8, 9), (20, -7)])},
-             ['goal_objects: box', '(20.0, -7.0)', 'outside', '-0.5 to 31.5']),
-            ({'start_objects': objects([(8, 9), (8, 9)], [forged, forged])}, ['cup\\n[INFO]']),
             ({'start_objects': objects([(8, 9)], [forged])}, ['lacks cup\\n[INFO]']),
             ({'mode': forged}, ['cup\\n[INFO]'])):
         message = latent.refusal(**{**WITH_GOAL, **fields})
         assert all(word in message for word in words), message
         assert message.isprintable()
-        assert latent.answer(**WITH_GOAL).subgoals == before
+    assert latent.answer(**WITH_GOAL).subgoals == before
     text = ''.join(capfd.readouterr())
     assert '\n[INFO] [0.0]' not in text and '\x1b[2J' not in text
 
@@ -322,8 +316,7 @@ def test_a_node_answers_while_it_is_active_alone_by_the_weights_of_that_time(
 
 
 @pytest.mark.slow
-def test_a_process_ends_well_at_work_and_wrong_weights_end_the_start(
-        client, files, tmp_path, capfd):
+def test_a_process_ends_well_at_work(client, files, tmp_path):
     process = NodeProcess('predictor_node', tmp_path / 'log.txt', {'weights': files['latent']},
                           ['-r __ns:=/ending'])
     try:
@@ -337,12 +330,3 @@ def test_a_process_ends_well_at_work_and_wrong_weights_end_the_start(
         assert 'Traceback' not in process.text
     finally:
         process.kill()
-    handlers = {number: signal.getsignal(number) for number in (
-        signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGHUP)}
-    try:
-        assert main(['--ros-args', '-p', f'weights:={tmp_path}/no.w']) == 1
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    line, = [line for line in capfd.readouterr().err.splitlines() if line.strip()]
-    assert '[FATAL]' in line and 'no.w' in line

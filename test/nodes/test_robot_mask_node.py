@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""robot_mask_node beside the simulator: masks with the stamps of the pictures, or the reason."""
+"""robot_mask_node: masks with the stamps of the pictures, or the reason; and what fills them."""
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
@@ -15,13 +15,15 @@ from tap_ros.errors import ImageError, TapError
 from tap_ros.messages.images import decode_camera_info, decode_mask
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.robot_mask.node import RobotMaskNode
-from tap_ros.nodes.ros_messages import encode_camera_info
+from tap_ros.nodes.robot_view import RobotView
+from tap_ros.nodes.ros_messages import encode_camera_info, encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.robots.ur10e import UR10E
 
 CAMERA = {  # of the simulator with its arm: 0.84 rad from straight down
     'camera_y': -1.36, 'camera_z': 1.33,
     'camera_qx': np.cos(0.42), 'camera_qy': 0.0, 'camera_qz': 0.0, 'camera_qw': -np.sin(0.42)}
+SCENE = np.random.default_rng(0).integers(0, 256, (6, 9, 3), np.uint8)
 
 
 @pytest.fixture(scope='module')
@@ -121,16 +123,68 @@ def test_intrinsics_are_those_of_the_pictures_that_are_sent():
     found, size = decode_camera_info(message, True)  # p is the same
     np.testing.assert_array_equal(found, [[125, 0, 60], [0, 127.5, 60], [0, 0, 1]])
     assert size == (120, 120)
-
-
-def test_cameras_that_cannot_be_used_are_refused():
-    for changes, words in (
-            ({'d': [0.1, 0.0]}, 'bends straight lines'),
-            ({'k': [0.0] * 9}, 'k is not that of a camera'),
-            ({'k': [np.nan] * 9}, 'k is not that of a camera'), ({'height': 0}, '64x0 pixels'),
-            ({'height': 2**31, 'width': 2**31}, 'pixels')):
+    for name, value, words in (
+            ('d', [0.1, 0.0], 'bends straight lines'), ('k', [np.nan] * 9, 'k is not that of'),
+            ('height', 0, '64x0 pixels')):
         message = encode_camera_info(np.eye(3), (64, 64), to_stamp(1), 'eye')
-        for name, value in changes.items():
-            setattr(message, name, value)
+        setattr(message, name, value)
         with pytest.raises(ImageError, match=words):
             decode_camera_info(message, False)
+
+
+# Pictures without the robot
+
+
+def covered(columns, seed=1):
+    """Return the scene with a robot before some columns, and its mask: hand, then arm."""
+    mask = np.zeros((6, 9), np.uint8)
+    mask[:3, columns], mask[3:, columns] = ROBOT_MASK_HAND, ROBOT_MASK_ARM
+    noise = np.random.default_rng(seed).integers(0, 256, SCENE.shape, np.uint8)
+    return np.where(mask[..., None] > 0, noise, SCENE), mask
+
+
+def mask_message(mask, stamp=1, padding=2, **changes):
+    """Make a message whose rows are padded."""
+    rows = np.pad(mask, ((0, 0), (0, padding)), constant_values=7)
+    message = Image(height=mask.shape[0], width=mask.shape[1], encoding='mono8',
+                    step=rows.shape[1], data=rows.tobytes())
+    message.header.stamp = to_stamp(stamp)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def see(view, columns, stamp, jumps=0):
+    picture, mask = covered(columns, stamp)
+    return view.see(encode_image(picture, to_stamp(stamp), 'eye'), mask_message(mask, stamp),
+                    jumps)
+
+
+def test_what_was_seen_last_takes_the_place_of_the_robot_until_another_scene_begins():
+    goal, mask = covered([7], 5)
+    for jumps in (0, 1):
+        view = RobotView('all')
+        np.testing.assert_array_equal(see(view, [0, 1], 10), covered([0, 1], 10)[0])
+        np.testing.assert_array_equal(view.fill_goal(goal, mask_message(mask)), SCENE)
+        np.testing.assert_array_equal(see(view, [4, 5], 20), SCENE)
+        older = see(view, [8], 15)  # filled, and not remembered
+        np.testing.assert_array_equal(older, SCENE)
+        np.testing.assert_array_equal(see(view, [0, 1], 30), SCENE)
+        if not jumps:
+            view.clear()
+        # The same stamps may come again.
+        np.testing.assert_array_equal(see(view, [3], 20, jumps), covered([3], 20)[0])
+        np.testing.assert_array_equal(see(view, [5], 30, jumps), SCENE)
+
+
+def test_masks_are_read_padded_or_refused_with_the_reason():
+    mask = covered([2])[1]
+    np.testing.assert_array_equal(decode_mask(mask_message(mask), 'mask', (6, 9)), mask)
+    free = np.zeros((6, 9), np.uint8)
+    for message, words in (
+            (mask_message(free + 1), 'mask: a robot mask with the value 1; expected 0'),
+            (mask_message(free.T), '9x6 pixels .* got 6x9'),
+            (mask_message(free, encoding='rgb8'), "'rgb8' .* valid .*: mono8"),
+            (mask_message(free, step=3), 'step is 3 bytes')):
+        with pytest.raises(ImageError, match=words):
+            decode_mask(message, 'mask', (6, 9))

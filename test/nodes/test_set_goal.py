@@ -5,12 +5,8 @@
 from action_msgs.msg import GoalStatus
 import numpy as np
 import pytest
-from std_srvs.srv import SetBool
-from tap_msgs.msg import ObjectState, ObjectStates
-from tap_msgs.srv import SetGoal
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import call
 from tap_ros.recording.reader import iter_episodes
 
 pytestmark = pytest.mark.slow
@@ -20,33 +16,21 @@ MOVED = {'object_1': (14.5, 44.25)}
 def set_goal(loop, pixels):
     """Move objects of the goal, {name: (u, v)}; return all its pixels (K, 2) once they came."""
     before = to_nanoseconds(loop.goal_objects.wait(10).header.stamp)
-    client = loop.node.create_client(SetGoal, 'sim/set_goal')
-    answer = call(client, SetGoal.Request(objects=ObjectStates(objects=[
-        ObjectState(name=name, u=float(u), v=float(v)) for name, (u, v) in pixels.items()])), 30)
-    assert answer.success, answer.message
+    loop.client.set_goal(pixels)
     for topic in (loop.goal_image, loop.goal_objects):
         topic.wait(10, lambda m: to_nanoseconds(m.header.stamp) > before)
     return decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
 
 
-def test_a_subgoal_is_predicted_for_the_goal_that_was_moved(loop):
-    loop.reset()
-    drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
-    before = loop.predict()
-    np.testing.assert_allclose(
-        set_goal(loop, MOVED), [drawn[0], MOVED['object_1']], atol=1e-4)
-    after = loop.predict()
-    assert before.success and after.success, after.message
-    assert len(after.subgoals[0].object_maps) == 2, 'objects and picture of the goal go together'
-    assert before.subgoals[0].image.data != after.subgoals[0].image.data
-
-
 def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_it(loop):
-    for mode in ('direct', 'subgoal'):
-        handle = loop.begin_moving(mode=mode, step_budget=1000)
-        set_goal(loop, MOVED)
-        result = loop.ended(handle, GoalStatus.STATUS_ABORTED, 'a new goal has come on')
-        assert result.steps >= 1 and '/goal/objects' in result.message
+    handle = loop.begin_moving(mode='subgoal', step_budget=1000)
+    before = loop.client.call('predict').subgoals[0]
+    set_goal(loop, MOVED)
+    result = loop.ended(handle, GoalStatus.STATUS_ABORTED, 'a new goal has come on')
+    assert result.steps >= 1 and '/goal/objects' in result.message
+    after = loop.client.call('predict').subgoals[0]
+    assert len(after.object_maps) == 2, 'objects and picture of the goal go together'
+    assert before.image.data != after.image.data
     count = len(loop.moves())
     # The goal is where the objects are now: nothing is left to do.
     last = loop.image.wait(10)
@@ -59,10 +43,8 @@ def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_
 
 
 def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
-    recorder = loop.node.create_client(SetBool, 'recorder/record')
-    loop.reset()
-    assert call(recorder, SetBool.Request(data=False), 30).success
-    folder = call(recorder, SetBool.Request(data=True), 30).message.removeprefix('recording to ')
+    loop.client.record(False)
+    folder = loop.client.record().removeprefix('recording to ')
     loop.reset(seed=7)
     set_goal(loop, {'object_1': (31.5, 44.25)})
     loop.reached(mode='direct', step_budget=2)
@@ -70,13 +52,14 @@ def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
     set_goal(loop, {'object_1': (30.0, 44.25)})
     pixels = set_goal(loop, MOVED)
     picture = loop.goal_image.wait(1)
-    loop.reset()
+    loop.reset(seed=8)
     drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
     loop.reach(mode='direct', step_budget=1)  # by then the recorder knows of the new episode
-    assert call(recorder, SetBool.Request(data=False), 30).success
-    # On a busy machine the recorder may hear of the first scene's beginning, too.
-    episode, following = [e for e in iter_episodes(folder) if e.task][-2:]
-    assert (episode.seed, len(episode), episode.outcome) == (7, 3, 'failure')
+    loop.client.record(False)
+    # What the scene before sent last may reach the recorder after the bag was begun.
+    episode, = (e for e in iter_episodes(folder) if e.seed == 7)
+    following, = (e for e in iter_episodes(folder) if e.seed == 8)
+    assert (len(episode), episode.outcome) == (3, 'failure')
     np.testing.assert_array_equal(episode.goal_pixels, pixels)
     np.testing.assert_allclose(episode.goal_pixels[1], MOVED['object_1'], atol=1e-4)
     assert episode.goal_frame.tobytes() == bytes(picture.data)

@@ -127,10 +127,6 @@ def test_who_comes_late_gets_the_goal_and_in_lock_step_the_newest_moment(rig):
         image = Newest(node, Image, 'goal/image', LATCHED).wait(10)
         objects = Newest(node, ObjectStates, 'goal/objects', LATCHED).wait(10)
     assert image.header.stamp == objects.header.stamp
-    for start, goal in zip(rig.objects.wait(10).objects, objects.objects):
-        move = [start.pose.position.x - goal.pose.position.x,
-                start.pose.position.y - goal.pose.position.y]
-        assert np.hypot(*move) == pytest.approx(0.2, abs=0.01)
 
 
 def test_a_goal_that_is_moved_is_published_as_that_of_a_reset(rig):
@@ -166,22 +162,14 @@ def test_a_goal_that_is_moved_is_published_as_that_of_a_reset(rig):
 def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(rig):
     rig.reset(seed=5)
     *_, goal = rig.goal(rig.image.wait(10).header.stamp)
-    first, second = goal.objects
+    _, second = goal.objects
     count = rig.goal_image.count
     for pixels, words in (
             ({}, ['objects', 'empty', 'object_0, object_1']),
-            ({'cup': (30, 30)}, ['cup', 'object_0, object_1']),
             ({'object_1': (64, 30)}, ['object_1', '64', '63.5']),
-            ({'object_1': (float('nan'), 30)}, ['object_1', 'nan', 'finite']),
-            ({'object_1': (63, 10)}, ['object_1', 'out of reach', '0.35 m']),
-            ({'object_1': (first.u + 1, first.v)}, ['object_0', 'object_1', 'overlap'])):
+            ({'object_1': (63, 10)}, ['object_1', 'out of reach', '0.35 m'])):
         answer = rig.set_goal(**pixels)
-        assert not answer.success
-        for word in words:
-            assert word in answer.message, answer.message
-    twice = SetGoal.Request(objects=ObjectStates(objects=[second, second]))
-    answer = call(rig.goal_client, twice, 20)
-    assert not answer.success and 'object_1' in answer.message and 'own' in answer.message
+        assert not answer.success and all(word in answer.message for word in words)
     # Poses do not count: it stays where its pixel is.
     second.pose.position.x = float('nan')
     assert call(rig.goal_client, SetGoal.Request(objects=ObjectStates(objects=[second])),
@@ -191,17 +179,9 @@ def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(rig):
     assert rig.reset(task='grasp', seed=1).success
     answer = rig.set_goal(object_0=(30, 30))
     assert not answer.success and 'grasp' in answer.message and 'push2' in answer.message
-    rig.reset(seed=5)
-
-
-def test_pictures_repeat_from_seed_and_commands(rig):
-    def run():
-        rig.reset(seed=8)
-        moves = np.random.default_rng(0).uniform(-0.08, 0.08, (5, 3))
-        return [bytes(rig.act(x=x, y=y, z=z).data) for x, y, z in moves.tolist()]
-
-    first = run()
-    assert run() == first and len(set(first)) == len(first)
+    for task in ('push3', 'push2'):
+        assert rig.reset(task=task, seed=1).success
+        rig.objects.wait(10, lambda m, count=int(task[-1]): len(m.objects) == count)
 
 
 def test_what_answers_no_picture_lets_no_time_pass(rig):
@@ -216,22 +196,10 @@ def test_what_answers_no_picture_lets_no_time_pass(rig):
     for ns in (first, first - PERIOD_NS):
         rig.process.wait_for(f'{ns} ns was answered before')
     rig.process.wait_for('newer than the newest image')
+    for answer, words in ((rig.reset(task='juggle', seed=1), ['juggle', 'push2']),
+                          (rig.step(101), ['100'])):
+        assert not answer.success and all(word in answer.message for word in words)
     assert to_nanoseconds(rig.step(1).stamp) == to_nanoseconds(second) + PERIOD_NS
-
-
-def test_bad_requests_are_refused_and_leave_the_scene_as_it_was(rig):
-    rig.reset(seed=5)
-    stamp = rig.image.wait(10).header.stamp
-    response = rig.reset(task='juggle', seed=1)
-    assert not response.success
-    assert 'juggle' in response.message and 'push2' in response.message
-    response = rig.step(101)
-    assert not response.success and '100' in response.message and response.stamp == stamp
-    assert rig.step(2).success
-    assert rig.reset(task='push3', seed=1).success
-    assert len(rig.objects.wait(10, lambda m: len(m.objects) == 3).objects) == 3
-    assert rig.reset(seed=1).success
-    assert len(rig.objects.wait(10, lambda m: len(m.objects) == 2).objects) == 2
 
 
 def test_a_paused_simulation_takes_no_commands_but_steps(rig):

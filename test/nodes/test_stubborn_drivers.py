@@ -5,149 +5,105 @@
 import threading
 import time
 
-from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import TwistStamped
-import numpy as np
-from processes import LocalNode, until
+from driven import Arm, first_pictures, goal_fields, TOPICS, World
+from processes import Client, LocalNode, until
 import pytest
-from rclpy.action import ActionClient
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Image, JointState
-from tap_msgs.action import ReachGoal
-from tap_msgs.msg import CommandRefused, ObjectStates
-from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import send_goal, wait_for_result
+from rclpy.parameter import Parameter
+import tap_ros
 from tap_ros.nodes.planner.node import VisualMpcNode
-from tap_ros.nodes.ros_messages import encode_image, encode_joints, encode_objects
-from tap_ros.nodes.topics import STREAM, to_stamp
+from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import MOST_REFUSED
 
 pytestmark = pytest.mark.slow
-PICTURE = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
 
 
 class Rig:
     """
-    A planner, and camera, objects and arm of the test's own, which publish ten times a second.
+    A planner of this process, and a World and an Arm for it.
 
-    :ivar frozen: topics that repeat one stamp; clock: whether one says so; silent: topics.
-    :ivar refuses: whether the arm refuses every command.
-    :ivar joints_at: seconds from the picture at which the two joint states beside it are stamped.
+    :ivar threads: that have planned.
     """
 
-    def __init__(self, client):
-        self.twists = []
-        self.behave()
-        self._publishers = {topic: client.create_publisher(kind, f'stubborn/{topic}', STREAM)
-                            for topic, kind in (
-                                ('clock', Clock), ('joint_states', JointState),
-                                ('objects', ObjectStates), ('camera/image_raw', Image))}
-        self._refused = client.create_publisher(CommandRefused, 'stubborn/arm/refused', STREAM)
-        client.create_subscription(
-            TwistStamped, 'stubborn/arm/delta_twist_cmds', self._on_twist, STREAM)
-        client.create_timer(0.1, self._publish)
-        self.planner = LocalNode(VisualMpcNode, '/stubborn', num_threads=4, image_timeout=2.0,
-                                 max_silence=1.0)
-        self.threads, plans, mpc = set(), [], self.planner.node._mpc
-        plan = mpc.plan
+    def __init__(self, node, world):
+        self.world, self.arm, self.threads = world, Arm(node), set()
+        self.client = tap_ros.Client(node=node)
+        self.planner = LocalNode(VisualMpcNode, num_threads=4)
+        mpc, (seen, goal) = self.planner.node._mpc, first_pictures()
+        plan = mpc.plan(Scene(seen.image, seen.gripper, seen.object_pixels),
+                        mpc.goal(goal.object_pixels))
 
-        def plan_once(*args):  # the same from then on, so that a busy machine is fast enough
+        def planned(*_):  # at once, so that a busy machine is fast enough
             self.threads.add(threading.get_ident())
-            plans.extend([] if plans else [plan(*args)])
-            return plans[0]
+            return plan
 
-        mpc.plan = plan_once
-        self._action = ActionClient(client, ReachGoal, 'stubborn/reach_goal')
-        assert self._action.wait_for_server(30)
-        self.goal = encode_objects(['cup'], [(40, 40)], np.zeros((1, 7)), to_stamp(1), 'world',
-                                   ObjectStates.SOURCE_TRACKED)
+        mpc.plan = planned
+        self.client.wait_until_ready('visual_mpc_node')
 
-    def behave(self, frozen=(), clock=False, silent=(), refuses=False, joints_at=(-0.007, 0.003)):
-        self.frozen, self.clock, self.silent, self.refuses = frozen, clock, silent, refuses
-        self.joints_at, self._begun = joints_at, time.time_ns()
+    def reach(self, step_budget, on_feedback=None, image_timeout=5.0):
+        """Pursue a goal to its end; return end and reason, and the moves, once the arm stands."""
+        self.planner.node.set_parameters([Parameter('image_timeout', value=image_timeout)])
+        begin = time.monotonic()
+        result = self.client.reach(**goal_fields(step_budget=step_budget),
+                                   on_feedback=on_feedback or (lambda feedback: None)).result()
+        assert until(lambda: self.arm.seconds_to_stop(begin) < float('inf'), 5)
+        return result, len(self.arm.moves(begin))
 
-    def _publish(self):
-        now = time.time_ns()
-        if self.clock:
-            self._publishers['clock'].publish(Clock(clock=to_stamp(self._begun)))
-        for offset in () if 'joint_states' in self.silent else self.joints_at:
-            stamp = (self._begun if 'joint_states' in self.frozen else now) + int(1e9 * offset)
-            for state in (encode_joints([0, 0, 0.1, 0], to_stamp(stamp), 'world'),
-                          JointState(name=['finger_joint'], position=[0.3])):  # another driver's
-                state.header.stamp = to_stamp(stamp)
-                self._publishers['joint_states'].publish(state)
-        for topic, encode in (
-                ('objects', lambda at: encode_objects(
-                    ['cup'], [(20, 20)], np.zeros((1, 7)), at, 'world',
-                    ObjectStates.SOURCE_TRACKED)),
-                ('camera/image_raw', lambda at: encode_image(PICTURE, at, 'eye'))):
-            stamp = self._begun if topic in self.frozen else now
-            if topic not in self.silent:
-                self._publishers[topic].publish(encode(to_stamp(stamp)))
-
-    def _on_twist(self, message):
-        self.twists.append(message)
-        if self.refuses and to_nanoseconds(message.header.stamp):
-            self._refused.publish(CommandRefused(header=message.header, message='emergency stop'))
-
-    def moves(self):
-        return sum(1 for twist in list(self.twists) if to_nanoseconds(twist.header.stamp))
-
-    def reach(self, on_feedback=None, **fields):
-        """Pursue a goal to its end; return status and result once the arm stands."""
-        time.sleep(0.3)
-        self.twists.clear()
-        goal = ReachGoal.Goal(mode='direct', goal_objects=self.goal, **fields)
-        found = wait_for_result(send_goal(self._action, goal, 30, on_feedback), 100)
-        assert until(lambda: self.twists and not to_nanoseconds(self.twists[-1].header.stamp), 5)
-        return found
+    def aborted(self, words, **fields):
+        """Check that a goal is aborted for this reason, and nothing moves."""
+        time.sleep(0.5)  # what was published before is old by now
+        result, moves = self.reach(2, image_timeout=1.0, **fields)
+        assert result.end == 'aborted' and words in result.message and not moves, result.message
 
 
 @pytest.fixture(scope='module')
 def rig():
-    from processes import Client
-    with Client() as client:
-        rig = Rig(client)
+    with Client() as node, World(node) as world:
+        rig = Rig(node, world)
         yield rig
         assert rig.planner.end() == 0
 
 
+@pytest.fixture(autouse=True)
+def restored(rig):
+    rig.arm.refusing = False
+    rig.world.restore()
+
+
 def test_an_arm_that_refuses_everything_ends_the_goal_and_the_next_one_is_served(rig):
-    rig.behave(refuses=True)
-    status, result = rig.reach(step_budget=3)
-    assert status == GoalStatus.STATUS_ABORTED and result.steps == 0
+    rig.arm.refusing = True
+    result, moves = rig.reach(3)
+    assert result.end == 'aborted' and result.steps == 0 and moves == MOST_REFUSED
     assert f'{MOST_REFUSED} commands in a row' in result.message
-    assert 'emergency stop' in result.message and rig.moves() == MOST_REFUSED
-    rig.behave()
+    assert 'protective stop' in result.message
+    rig.arm.refusing = False
     for _ in range(3):
-        status, result = rig.reach(step_budget=2)
-        assert status == GoalStatus.STATUS_SUCCEEDED and result.steps == rig.moves() == 2
+        result, moves = rig.reach(2)
+        assert result.end == 'succeeded' and result.steps == moves == 2, result.message
     assert len(rig.threads) == 1, 'each one that has planned keeps memory of its own'
 
 
 def test_drivers_that_repeat_one_stamp_move_nothing_unless_a_clock_stands_still(rig):
-    everything = 'joint_states', 'objects', 'camera/image_raw'
-    for frozen in (everything, everything[2:], everything[:1]):
-        rig.behave(frozen)
-        status, result = rig.reach(step_budget=2)
-        assert status == GoalStatus.STATUS_ABORTED and rig.moves() == 0, result.message
-        assert 'repeat one stamp' in result.message or frozen == everything[:1]
-    rig.behave(everything, clock=True, joints_at=(0,))
-    rig.reach(step_budget=1)
-    assert rig.moves() == 1
+    for topics, words in ((TOPICS, 'repeat one stamp'), (['image'], 'repeat one stamp'),
+                          (['joints'], '/joint_states')):
+        rig.world.restore()
+        rig.world.frozen = dict.fromkeys(topics, time.time_ns())
+        rig.aborted(words)
+    rig.world.restore()
+    now = time.time_ns()
+    rig.world.frozen, rig.world.clock_ns = dict.fromkeys(TOPICS, now), now
+    _, moves = rig.reach(1)
+    assert moves == 1
 
 
 def test_joints_of_another_time_than_the_picture_move_nothing(rig):
-    rig.behave(joints_at=(-5.0, -4.99))
-    status, result = rig.reach(step_budget=2)
-    assert status == GoalStatus.STATUS_ABORTED and rig.moves() == 0
-    assert 'older than the picture' in result.message and '/joint_states' in result.message
+    rig.world.late_s = 5.0
+    rig.aborted('older than the picture')
 
 
-def test_an_input_that_falls_silent_stops_the_arm(rig):
-    for topic in ('joint_states', 'objects', 'camera/image_raw'):
-        rig.behave()
-        status, result = rig.reach(
-            lambda feedback, topic=topic: rig.behave(silent=(topic,)), step_budget=40)
-        assert status == GoalStatus.STATUS_ABORTED and topic in result.message, result.message
-        assert 1 <= rig.moves() == result.steps < 40
+def test_an_input_that_falls_silent_stops_the_arm_and_no_goal_begins(rig):
+    for topic, (_, name) in TOPICS.items():
+        rig.world.restore()
+        result, moves = rig.reach(40, lambda _, topic=topic: rig.world.silent.add(topic), 1.0)
+        assert result.end == 'aborted' and name in result.message, result.message
+        assert 1 <= moves == result.steps < 40
+    rig.aborted(name)

@@ -12,7 +12,6 @@ from types import MappingProxyType
 
 import cv2
 from jinja2 import Environment
-from matplotlib.figure import Figure
 import numpy as np
 from PIL import Image
 from tap_ros.files import write_atomically
@@ -32,7 +31,6 @@ HEIGHT = 2 * SMALL + HEAD  # of a run's picture beside both
 FRAME_MS, HOLD_MS = 100, 1800  # of a film: of each frame, and of the end of a scene
 QUALITY = 70  # of films, 0 to 100
 MODE_NAMES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
-MODE_COLOURS = {'direct': '#648fff', 'subgoal': '#dc267f'}
 
 
 @dataclass(frozen=True)
@@ -189,25 +187,7 @@ def _figures(scene: SceneRuns) -> Iterator[tuple[str, str]]:
         yield (f'{MODE_NAMES[mode]}: {100 * run.distances[-1].mean():.1f} cm after '
                f'{len(run.frames) - 1} steps, median planning time {run.planning_ms:.0f} ms. '
                f'{run.message}', _uri('png', png_bytes(grid([film_strip(run.frames)], scale=2))))
-    if scene.runs:
-        yield 'error over time', _uri('svg+xml', _error_plot(scene))
 
 
 def _uri(kind: str, data: bytes) -> str:
     return f'data:image/{kind};base64,{base64.b64encode(data).decode()}'
-
-
-def _error_plot(scene: SceneRuns) -> bytes:
-    """Plot the distances of the objects to their goals over time; return SVG bytes."""
-    figure = Figure(figsize=(5.2, 2.6), layout='constrained')
-    axes = figure.subplots()
-    for mode, run in scene.runs.items():
-        colour = MODE_COLOURS[mode]
-        axes.plot(100 * run.distances.mean(1), color=colour, label=MODE_NAMES[mode], lw=2)
-        axes.plot(100 * run.distances, color=colour, lw=0.7, alpha=0.6)
-    axes.plot([], color='#555', lw=0.7, label='thin: each object; thick: their mean')
-    axes.set(xlabel='step', ylabel='distance to the goal, cm', ylim=(0, None))
-    axes.legend(fontsize=8)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='svg')
-    return buffer.getvalue()

@@ -48,7 +48,7 @@ LOG_LINES = 50
 FORGOTTEN_S = 60.0  # after which a node that is silent is shown no more
 PICTURES = ('camera', 'goal', 'subgoal', 'plan')
 COLUMNS, MAX_SHOWN = 4, 12  # subgoals of one answer in the page
-HISTORY_S, POINTS = 600.0, 300  # of distances: what is kept, and how many of them are shown
+POINTS = 1000  # of distances: of so many pictures, four minutes in real time
 
 Place = tuple[float, ...]  # x, y, z in m, u, v in pixels
 
@@ -61,8 +61,8 @@ class ExplorerNode(Node):
     was begun goes on when browsers leave; it is cancelled when this node ends.
     """
 
-    def __init__(self) -> None:
-        super().__init__('explorer_node')
+    def __init__(self, **options: Any) -> None:
+        super().__init__('explorer_node', **options)
         self.params = declare_parameters(self)
         self._lock = threading.Lock()
         self._newest: dict[str, tuple[Any, float]] = {}  # kind -> message, when it came
@@ -98,7 +98,12 @@ class ExplorerNode(Node):
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(PERIOD_S, self._show, clock=clock)
         self.create_timer(ADAPT_PERIOD, self._look_after, clock=clock)
-        self.get_logger().info(f'ready: open {self._server.url}')
+        self.get_logger().info(f'ready: open {self.url}')
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return self._server.url
 
     def close(self) -> None:
         """End the goal that a browser began, and say goodbye to browsers."""
@@ -306,7 +311,7 @@ class Distances:
 
     def __init__(self) -> None:
         self._of: tuple[tuple[str, ...], str] = (), ''  # names, unit
-        self._points: deque[tuple[float, tuple[float, ...]]] = deque()
+        self._points: deque[tuple[float, tuple[float, ...]]] = deque(maxlen=POINTS)
 
     def clear(self) -> None:
         """Forget what was."""
@@ -334,17 +339,13 @@ class Distances:
         if self._points and self._points[-1][0] == time:
             self._points.pop()
         self._points.append((time, values))
-        while self._points[0][0] < time - HISTORY_S:
-            self._points.popleft()
 
     def shown(self) -> dict[str, Any]:
-        """Return unit, names, times (s) and values (a list for each name) of POINTS moments."""
-        points = list(self._points)
-        points = points[::-1][::max(1, math.ceil(len(points) / POINTS))][::-1]  # with the newest
+        """Return unit, names, times (s) and values (a list for each name)."""
         names, unit = self._of
-        return {'unit': unit if points else '', 'names': list(names),
-                'times': [round(time, 2) for time, _ in points],
-                'values': [[round(values[k], 2) for _, values in points]
+        return {'unit': unit if self._points else '', 'names': list(names),
+                'times': [round(time, 2) for time, _ in self._points],
+                'values': [[round(values[k], 2) for _, values in self._points]
                            for k in range(len(names))]}
 
 

@@ -11,6 +11,7 @@ import time
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Subgoal
 from tap_msgs.srv import PredictSubgoal
@@ -18,17 +19,23 @@ from tap_ros.errors import ConfigError, TapError
 from tap_ros.images.drawing import overlay
 from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.lifecycle import LifecycleBase
-from tap_ros.nodes.parameters import check_device
+from tap_ros.nodes.lifecycle import declare_autostart, LifecycleBase
+from tap_ros.nodes.parameters import (
+    check_device,
+    declare_device,
+    declare_transport,
+    Parameters,
+)
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
-from tap_ros.nodes.predictor.requests import encode_answer, PendingRequest, RequestReader
-from tap_ros.nodes.predictor.settings import (
-    declare_parameters,
+from tap_ros.nodes.predictor.requests import (
+    encode_answer,
     MAX_ROWS,
     MAX_TOGETHER,
     MAX_WAITING,
+    PendingRequest,
+    RequestReader,
 )
-from tap_ros.nodes.robot_view import warn_if_unlike
+from tap_ros.nodes.robot_view import declare_robot_mask, warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import (
@@ -40,6 +47,7 @@ from tap_ros.nodes.services import (
 from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
 from tap_ros.training.robot_mask import trained_robot_mask
+from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 
 Found = tuple[list[PredictedSubgoal], float]  # of one request, and ms that the network took
 Send = Callable[[PredictSubgoal.Response], object]
@@ -199,6 +207,23 @@ def predict(predictor: Predictor, tasks: list[PendingRequest]) -> list[Found]:
     found = predictor.predict_together([task.question for task in tasks])
     elapsed_ms = (time.perf_counter() - begin) * 1e3
     return [(subgoals, elapsed_ms) for subgoals in found]
+
+
+def declare_parameters(node: Node) -> Parameters:
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    declare_autostart(parameters)
+    shipped = ', '.join(PREDICTORS)
+    parameters.declare('weights', DEFAULT_PREDICTOR,
+                       f'A subgoal predictor: shipped weights ({shipped}), a file '
+                       '(.safetensors), or NAME:ARGUMENT of another one, such as '
+                       'nearest_keyframe:bags/push2. Can be changed while the node is '
+                       'unconfigured.',
+                       read_only=False)
+    declare_device(parameters)
+    declare_transport(parameters)
+    declare_robot_mask(parameters)
+    return parameters
 
 
 def main(args: list[str] | None = None) -> int:

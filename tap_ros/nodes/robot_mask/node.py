@@ -4,35 +4,33 @@
 
 from collections import deque
 import math
+from pathlib import Path
 import time
 from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
-from tap_ros.errors import KinematicsError, TapError
+from tap_ros.errors import ConfigError, KinematicsError, TapError
 from tap_ros.messages.images import decode_camera_info
 from tap_ros.messages.joints import JointHistory
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import reception_time
-from tap_ros.nodes.robot_mask.settings import (
-    camera_pose,
-    declare_parameters,
-    declared_light,
-    named_robot,
-)
+from tap_ros.nodes.parameters import declare_mount, declared_mount, Parameters
 from tap_ros.nodes.ros_messages import encode_mask
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.plugins import names
-from tap_ros.robots.arm import TIP_FRAME
-from tap_ros.robots.silhouette import Body, draw_mask, PinholeCamera
-from tap_ros.robots.urdf import read_urdf, Robot
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
+from tap_ros.robots.description import robot_description
+from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
+from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
 from tap_ros.text import escaped
 
 STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
@@ -171,6 +169,106 @@ class RobotMaskNode(Node):
         self._diagnostics.error(error)
         self.get_logger().error(
             f'no robot mask: {escaped(error, 1000)}', throttle_duration_sec=5.0)
+
+
+def declare_parameters(node: Node) -> Parameters:
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('urdf', '',
+                       'Shape of the robot: a URDF file; the name of an arm: that arm, at '
+                       'mount_x and so on; empty: the topic robot_description.')
+    parameters.declare('joint_prefix', '',
+                       'What names in joint_states begin with, before those of the robot.')
+    parameters.declare('hand_link', '',
+                       'Link that is the hand, with all that it carries; empty: there is none, or '
+                       'with a named arm its own.')
+    parameters.declare('hand_radius', 0.06,
+                       'With a named arm: radius of a cylinder around the hand, from the flange '
+                       'to the fingertips, m.', low=0.001, high=1.0)
+    for axis in 'xyz':
+        parameters.declare(f'camera_{axis}', 0.0,
+                           f'{axis} of the camera in base_frame, m.', low=-100.0, high=100.0)
+    for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
+        parameters.declare(
+            f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
+            'optical frame (z forward, x right, y down in the picture) into base_frame.',
+            low=-1.0, high=1.0)
+    parameters.declare('base_frame', '',
+                       'Link of the robot in which the pose of the camera is given; empty: its '
+                       'root.')
+    parameters.declare('rectified', False,
+                       'The pictures are rectified: P of camera_info counts, else K.')
+    parameters.declare('dilation', 1.0,
+                       'Pixels by which the mask is larger than the shapes on all sides.',
+                       low=0.0, high=100.0, read_only=False)
+    parameters.declare('shadow', False,
+                       'Mark the shadow on the table, too, as of one light from afar.')
+    parameters.declare('table_height', 0.0, 'z of the table in base_frame, m.',
+                       low=-10.0, high=10.0)
+    for axis, value in zip('xyz', (0.0, 0.0, -1.0)):
+        parameters.declare(f'light_{axis}', value,
+                           f'{axis} of the direction in which the light shines, in base_frame.',
+                           low=-100.0, high=100.0)
+    parameters.declare('max_silence', 0.35,
+                       'Seconds; a picture without joint states nearer to it than this gets no '
+                       'mask.', low=0.05, high=60.0, read_only=False)
+    named = parameters['urdf'] in names('tap_ros.arms')
+    declare_mount(parameters, parameters['urdf'] if named else DEFAULT_ARM)
+    return parameters
+
+
+def named_robot(parameters: Parameters) -> Robot | None:
+    """
+    Return the robot that the parameter urdf names, None where it comes as a message.
+
+    :raises ConfigError: when the file cannot be used.
+    """
+    urdf = parameters['urdf']
+    if not urdf:
+        return None
+    if urdf in names('tap_ros.arms'):
+        text = robot_description(
+            get_arm(urdf), declared_mount(parameters), parameters['hand_radius'])
+        return read_urdf(text, urdf)
+    path = Path(urdf)
+    try:
+        if not path.is_file() or path.stat().st_size > MOST_CHARACTERS:
+            raise ConfigError(f'parameter urdf: {escaped(urdf)} is no file of at most '
+                              f'{MOST_CHARACTERS} bytes; expected a URDF, or '
+                              f'one of {", ".join(names("tap_ros.arms"))}')
+        return read_urdf(path.read_text('utf-8', 'replace'), escaped(urdf))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f'parameter urdf: {escaped(urdf)}: {escaped(error)}') from error
+
+
+def declared_light(parameters: Parameters) -> Light | None:
+    """
+    Return the light whose shadows are marked, if they are.
+
+    :raises ConfigError: for a light that does not shine down.
+    """
+    if not parameters['shadow']:
+        return None
+    direction = np.array([parameters[f'light_{axis}'] for axis in 'xyz'])
+    if direction[2] >= 0:
+        raise ConfigError(f'parameter light_z: is {direction[2]:g}; expected less than 0: light '
+                          'shines down')
+    return Light(direction, parameters['table_height'])
+
+
+def camera_pose(parameters: Parameters) -> np.ndarray:
+    """
+    Return the pose (4, 4) of the camera in base_frame.
+
+    :raises ConfigError: for a quaternion of length 0.
+    """
+    quaternion = [parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')]
+    if np.linalg.norm(quaternion) < 0.1:
+        raise ConfigError('parameters camera_qx to camera_qw: a quaternion of no direction')
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    pose[:3, 3] = [parameters[f'camera_{axis}'] for axis in 'xyz']
+    return pose
 
 
 def main(args: list[str] | None = None) -> int:
