@@ -85,7 +85,9 @@ ENCODINGS = {
     'bayer_rggb8': _bayer('BG'), 'bayer_bggr8': _bayer('RG'), 'bayer_gbrg8': _bayer('GR'),
     'bayer_grbg8': _bayer('GB')}
 _DEEP = re.compile(r'(mono|rgb|bgr|rgba|bgra|bayer_[rgb]{4})16|(16|32|64)[US FC]+\d*')
-_COMPRESSED = ('JPEG', 'PNG', 'WEBP')
+_COMPRESSED = ('JPEG', 'PNG', 'WEBP', 'AVIF', 'JPEG2000')
+_MARKER = re.compile(rb'\xff[^\0\xff\xd0-\xd7]')  # what ends the data of a JPEG's scan
+_PADDING = 3  # bytes: the last one of a JPEG's data, and what cameras may put behind it
 
 
 def find_encoding(name: str) -> Encoding:
@@ -96,12 +98,10 @@ def find_encoding(name: str) -> Encoding:
     """
     if name in ENCODINGS:
         return ENCODINGS[name]
-    why = ''
-    if _DEEP.fullmatch(name):
-        why = (' (it has more than 8 bits a channel, as depth cameras have; record the colour '
-               'camera, or let its driver send 8 bits)')
-    raise ImageError(f"encoding '{escaped(name, 40)}' cannot be used{why}; valid encodings: "
-                     f'{", ".join(ENCODINGS)}; let the driver send one of them')
+    why = ('it has more than 8 bits a channel, as depth cameras have; record the colour camera, '
+           'or let its driver send 8 bits' if _DEEP.fullmatch(name) else
+           f'valid encodings: {", ".join(ENCODINGS)}; let the driver send one of them')
+    raise ImageError(f"encoding '{escaped(name, 40)}' cannot be used; {why}")
 
 
 def to_rgb(pixels: np.ndarray, name: str) -> np.ndarray:
@@ -127,7 +127,7 @@ def decompress(data: bytes | memoryview | np.ndarray, description: str,
     """
     Decode a compressed picture.
 
-    :param data: of sensor_msgs/CompressedImage: a JPEG, PNG or WebP file.
+    :param data: of sensor_msgs/CompressedImage: a file of one of _COMPRESSED.
     :param description: its field `format`, such as 'rgb8; jpeg compressed bgr8'.
     :param most: bytes of rgb.
     :return: uint8 (H, W, 3) rgb, turned upright as its EXIF data say.
@@ -135,26 +135,64 @@ def decompress(data: bytes | memoryview | np.ndarray, description: str,
     """
     from PIL import Image, ImageOps, UnidentifiedImageError
     if 'compresseddepth' in description.lower():
-        raise ImageError('a compressed depth picture; name the topic of the colour camera')
+        raise ImageError('a compressed depth picture, which shows no colours; record the colour '
+                         'camera')
+    stream = _Parts(bytes(data))
     try:
-        with Image.open(io.BytesIO(bytes(data)), formats=_COMPRESSED) as file:
+        with Image.open(stream, formats=_COMPRESSED) as file:
             width, height = file.size
             if width * height * 3 > most:
                 raise ImageError(f'{width}x{height} pixels are more than {most} bytes '
                                  'of rgb; send a smaller picture')
             encoding = description.split(';')[0].strip()
-            if file.mode == 'L' and encoding.startswith('bayer_') and encoding in ENCODINGS:
-                return to_rgb(np.array(file)[..., None], encoding)  # the raw mosaic
             raw = file.tile[0][3] if file.tile else ''  # such as RGB;16B
             if file.mode[:1] in 'IF' or (isinstance(raw, str) and ';16' in raw):
                 raise ImageError('a compressed picture with more than 8 bits a channel; send 8')
-            picture = file.convert('RGB')
+            if file.format == 'JPEG':
+                stream.divide('progressive' in file.info)
+            file.load()
+            if stream.left:
+                raise OSError('some of its data are missing or altered')
+            if file.mode == 'L' and encoding.startswith('bayer_') and encoding in ENCODINGS:
+                return to_rgb(np.array(file)[..., None], encoding)  # the raw mosaic
+            picture = file if file.mode == 'RGB' else file.convert('RGB')
             with suppress(struct.error, SyntaxError, TypeError, ValueError):  # broken EXIF data
                 picture = ImageOps.exif_transpose(picture)
             return np.array(picture)
     except UnidentifiedImageError:
         raise ImageError(
-            f"format '{escaped(description, 40)}' cannot be used; valid are JPEG, PNG and WebP"
-        ) from None
+            f"format '{escaped(description, 40)}' cannot be used; valid are JPEG, PNG, WebP, "
+            'AVIF and JPEG 2000') from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ImageError(f'damaged compressed picture: {escaped(error, 80)}') from error
+
+
+class _Parts(io.BytesIO):
+    """
+    A JPEG file that Pillow is given in two parts, which shows whether it is whole.
+
+    libjpeg fills in what is damaged, and warns where Pillow does not listen. But it needs all
+    data of a good picture for its last row: one that is done before the end holds too much, one
+    that is not done there too little. Marks behind, also that of the end, need not be there.
+
+    :param data: of the file.
+    :ivar left: parts that were not asked for.
+    """
+
+    left: list[bytes] | None = None
+
+    def divide(self, progressive: bool) -> None:
+        """Give what is read from now on in parts; the header has been read."""
+        data, scan = self.getvalue(), self.tell()
+        found = _MARKER.search(data, scan)
+        end = found.start() if found else len(data)
+        kept = max(scan, len(data[:end].rstrip(b'\0\xff')) - _PADDING)
+        self.left = [data[kept:end] + bytes(16), data[:kept]]
+        if progressive or b'\xff\xda' in data[scan:]:  # rows come when all scans are read
+            self.left = [data + b'\xff\xd9']
+
+    def read(self, size: int | None = -1) -> bytes:
+        """Return the next part."""
+        if self.left is None:
+            return super().read(size)
+        return self.left.pop() if self.left else b''

@@ -77,13 +77,19 @@ def decode_mask(message: Any, name: str = '', size: Sequence[int] | None = None)
     """
     Turn a message into a robot mask.
 
-    :param message: sensor_msgs/Image in MASK_ENCODING; rows may be padded.
+    :param message: sensor_msgs/Image in MASK_ENCODING, rows may be padded; or
+        sensor_msgs/CompressedImage, without loss.
     :param name: how an error calls it.
     :param size: the (height, width) of its picture, or None for any.
     :return: uint8 (H, W) of contract.ROBOT_MASK_FREE, _HAND and _ARM.
     :raises ImageError: for another encoding, size, step, length or value.
     """
     with _named(name):
+        if hasattr(message, 'format'):
+            grey, *colours = np.moveaxis(decode_image(message, size=size), -1, 0)
+            if any((grey != each).any() for each in colours):
+                raise ImageError('a robot mask with colours; expected one of greys, as PNG')
+            return check_mask(np.ascontiguousarray(grey))
         _check_kind(message, MASK_ENCODING, size, ' like its picture')
         return check_mask(np.ascontiguousarray(_rows(message, 1)))
 

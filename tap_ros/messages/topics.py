@@ -47,18 +47,20 @@ class Topic:
 
     def is_called(self, topic: str) -> bool:
         """Return whether a full name is this topic's in some namespace."""
-        return topic.endswith(f'/{self.name}')
+        plain = topic.removesuffix('/compressed') if self.type == IMAGE_TYPE else topic
+        return plain.endswith(f'/{self.name}')
 
 
 IMAGE = Topic('camera/image_raw', IMAGE_TYPE, 'frame', periodic=True, needed=True, compressed=True)
-ROBOT_MASK = Topic('camera/robot_mask', IMAGE_TYPE, 'mask')
+ROBOT_MASK = Topic('camera/robot_mask', IMAGE_TYPE, 'mask', compressed=True)
 CAMERA_INFO = Topic('camera/camera_info', 'sensor_msgs/msg/CameraInfo', periodic=True)
 OBJECTS = Topic('objects', 'tap_msgs/msg/ObjectStates', 'object', periodic=True)
 JOINT_STATES = Topic('joint_states', 'sensor_msgs/msg/JointState', 'joint', periodic=True)
 TWIST = Topic('arm/delta_twist_cmds', 'geometry_msgs/msg/TwistStamped', 'twist')
 GRIPPER_COMMAND = Topic('gripper/command', 'std_msgs/msg/Float64', 'command')
-GOAL_IMAGE = Topic('goal/image', IMAGE_TYPE, 'goal', latched=True)
-GOAL_ROBOT_MASK = Topic('goal/robot_mask', IMAGE_TYPE, 'goal_mask', latched=True)
+GOAL_IMAGE = Topic('goal/image', IMAGE_TYPE, 'goal', latched=True, compressed=True)
+GOAL_ROBOT_MASK = Topic('goal/robot_mask', IMAGE_TYPE, 'goal_mask', latched=True,
+                        compressed=True)
 GOAL_OBJECTS = Topic('goal/objects', 'tap_msgs/msg/ObjectStates', 'goal_object', latched=True)
 EPISODE = Topic('episode', 'tap_msgs/msg/Episode', 'mark')
 CLOCK = Topic('clock', 'rosgraph_msgs/msg/Clock')

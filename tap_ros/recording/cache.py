@@ -21,6 +21,7 @@ import multiprocessing
 import os
 from pathlib import Path
 import shutil
+import signal
 import tempfile
 
 import numpy as np
@@ -30,8 +31,8 @@ from tap_ros.errors import RecordingError
 from tap_ros.recording.align import assemble, EpisodeTable, runs_of
 from tap_ros.recording.bags import check_sizes, find_bags, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
+from tap_ros.recording.copies import copies, sqlite_logs
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.foreign import sqlite_logs
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tap_ros.recording.topic_choice import find_topics, list_paths
@@ -197,9 +198,15 @@ def _built(jobs: Iterable[_Job]) -> Iterator[_Job]:
     workers = min(_workers(), len(left))
     if (workers > 1 and sum(job.size for job in left) > _ALONE_BYTES
             and not multiprocessing.current_process().daemon):  # which may not have children
-        with ProcessPoolExecutor(workers, multiprocessing.get_context('spawn')) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context('spawn'), _begin,
+                                 (copies,)) as pool:
             try:
-                tasks = {pool.submit(_build, job): job for job in left}
+                # Ctrl-C ends a worker in silence: until `_begin` lets it, it has to wait.
+                masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+                try:
+                    tasks = {pool.submit(_build, job): job for job in left}
+                finally:
+                    signal.pthread_sigmask(signal.SIG_SETMASK, masked)
                 for task in as_completed(tasks):
                     task.result()
                     left.remove(tasks[task])
@@ -212,6 +219,13 @@ def _built(jobs: Iterable[_Job]) -> Iterator[_Job]:
     for job in left:
         _build(job)
         yield job
+
+
+def _begin(copied: dict[tuple[object, ...], Path]) -> None:
+    """Prepare a worker: it ends at Ctrl-C without a word, and uses the copies of its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    copies.update(copied)
 
 
 def _build(job: _Job) -> None:

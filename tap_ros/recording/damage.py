@@ -4,6 +4,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+import re
 
 import numpy as np
 from tap_ros.text import escaped
@@ -28,10 +29,12 @@ class Loss:
     start: int | None = None  # log times of what is missing (ns), from one end to the other
     end: int | None = None
     cuts: bool = True
+    where: str = ''  # another word for the place
 
     def place(self) -> str:
         """Return where it is, in words."""
-        words = [] if self.byte is None else [f'at byte {self.byte}']
+        words = [self.where] if self.where else []
+        words += [] if self.byte is None else [f'at byte {self.byte}']
         if self.start is not None and self.start > -FAR:
             end = '' if self.end is None or self.end == self.start else f' to {seconds(self.end)}'
             words.append(f'log time {seconds(self.start)}{end} s')
@@ -49,12 +52,14 @@ def describe(losses: Iterable[Loss]) -> list[str]:
     Put losses in words.
 
     :param losses: list of Loss.
-    :return: list of lines, one a cause, with the number of its losses and the first places.
+    :return: list of lines, one a kind of cause, with the number of its losses and the first
+        places; of whys that differ in numbers or details the first stands for all.
     """
     groups: dict[tuple[str, str], list[Loss]] = {}
     for loss in losses:
-        groups.setdefault((loss.what, loss.why), []).append(loss)
-    lines = [_line(*key, group) for key, group in list(groups.items())[:CAUSES]]
+        kind = re.sub(r'\d+', '', loss.why.partition(': ')[0]) if loss.what else loss.why
+        groups.setdefault((loss.what, kind), []).append(loss)
+    lines = [_line(group[0].what, group[0].why, group) for group in list(groups.values())[:CAUSES]]
     if len(groups) > CAUSES:
         rest = sum(len(group) for group in list(groups.values())[CAUSES:])
         lines.append(f'{rest} more losses, of {len(groups) - CAUSES} other causes')

@@ -13,8 +13,8 @@ What cannot be used is noted as a loss.
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from io import BytesIO
+from itertools import chain
 import mmap
 import os
 from pathlib import Path
@@ -32,6 +32,8 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.errors import RecordingError
+from tap_ros.recording.channels import Channel, converted, DAMAGE
+from tap_ros.recording.copies import readable
 from tap_ros.recording.damage import FAR, Loss
 from tap_ros.text import escaped
 import zstandard
@@ -47,17 +49,6 @@ _TOPICS: dict[int, type[Schema | ChannelRecord]] = {
 _DAMAGE = (McapError, struct.error, ValueError, OverflowError)  # mcap's, for damaged bytes
 Record = TypeVar('Record', bound=McapRecord)
 Found = tuple[int, int, int, memoryview]  # number of the channel, log and publish time, data
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A topic in a file."""
-
-    topic: str
-    type_name: str
-    encoding: str  # of messages; 'cdr' is all we read
-    schema_encoding: str  # 'ros2msg' when schema is the text of the definition
-    schema: str
 
 
 class McapFile:
@@ -81,6 +72,7 @@ class McapFile:
         self._pending: list[tuple[str, str, int]] = []  # losses before the next message
         self._newest: int | None = None  # log time so far
         self._counts: Counter[int] = Counter()  # messages read by channel
+        self._is_read = False  # to the end
         self._shift = 0  # bytes by which the summary is not where it should be
         self._end, self._is_without_summary = self.size, False  # of the data
         self._stopped: int | None = None  # the byte from which on records are not understood
@@ -104,11 +96,11 @@ class McapFile:
         return {channel.topic: channel for channel in self.channels.values()}
 
     def counts(self) -> Counter[tuple[str, str]]:
-        """Return the number of messages by topic and type; empty where no summary tells it."""
+        """Return the number of messages by topic and type; empty where nothing tells it."""
         found, statistics = Counter[tuple[str, str]](), self._summary.statistics
-        for number, channel in self.channels.items() if statistics else ():
-            found[channel.topic, channel.type_name] += (
-                statistics.channel_message_counts.get(number, 0))
+        counts = statistics.channel_message_counts if statistics else self._counts
+        for number, channel in self.channels.items() if statistics or self._is_read else ():
+            found[channel.topic, channel.type_name] += counts.get(number, 0)
         return found
 
     def messages(self, wanted: Collection[str]) -> Iterator[tuple[Channel, int, int, memoryview]]:
@@ -120,14 +112,26 @@ class McapFile:
         :param wanted: the topics.
         :return: iterator over (channel, log time and publish time in ns, data).
         """
+        for number, log, publish, data in chain.from_iterable(self._blocks()):
+            channel = self.channels.get(number)
+            if channel is None or channel.topic not in wanted:
+                continue
+            log, publish = min(log, FAR), min(publish, FAR)
+            try:
+                yield channel, log, publish, data if channel.convert is None else memoryview(
+                    channel.convert(data, log))
+            except DAMAGE as error:
+                self.losses.append(Loss(f'damaged message: {escaped(error)}',
+                                        f'topic {escaped(channel.topic)}', None, log, log))
+        self._conclude(wanted)
+        self._is_read = True
+
+    def _blocks(self) -> Iterator[list[Found]]:
+        """Yield the messages of the file, block by block."""
         indexed = bool(self._summary.chunk_indexes and self.channels)
         for found in self._indexed() if indexed else self._one_by_one():
             self._take_notice(found)
-            for number, log, publish, data in found:
-                channel = self.channels.get(number)
-                if channel is not None and channel.topic in wanted:
-                    yield channel, min(log, FAR), min(publish, FAR), data
-        self._conclude(wanted)
+            yield found
 
     def _find_summary(self) -> Summary:
         """Return what the end of the file says it holds; nothing, where that cannot be used."""
@@ -183,6 +187,8 @@ class McapFile:
                 what = 'chunk' if kind == Opcode.CHUNK else 'record'
                 self._pending.append((str(error), what, start))
             yield found
+        if self._stopped is not None and self._end == self.size:
+            yield self._scan(self._rest_of_chunk(self._stopped), is_whole=False)
 
     def _walk(self) -> Iterator[tuple[int, int, int]]:
         """Yield (opcode, start, end) of the records before the summary; note where they stop."""
@@ -229,14 +235,34 @@ class McapFile:
             raise RecordingError('its checksum or size is wrong; restore the file from a copy')
         return self._scan(memoryview(data))
 
-    def _scan(self, data: memoryview) -> list[Found]:
-        """Return the messages among records, all of which are checked; take notice of topics."""
+    def _rest_of_chunk(self, start: int) -> memoryview:
+        """Return the records at the beginning of a chunk that the file ends in."""
+        stream = ReadDataStream(BytesIO(self._data[start:start + 100]))
+        try:
+            kind, _, _, _ = stream.read1(), stream.read8(), stream.read8(), stream.read8()
+            size, _ = stream.read8(), stream.read4()
+            name, _ = stream.read_prefixed_string(), stream.read8()
+            if kind != Opcode.CHUNK or size > MAX_CHUNK_BYTES:
+                return memoryview(b'')
+            return memoryview(_unpack(name, self._data[start + stream.count:], size, False))
+        except (*_DAMAGE, zstandard.ZstdError, RuntimeError, RecordingError):
+            return memoryview(b'')
+
+    def _scan(self, data: memoryview, is_whole: bool = True) -> list[Found]:
+        """
+        Return the messages among records; take notice of topics.
+
+        :param data: of the records.
+        :param is_whole: raise RecordingError for what is damaged or cut off, else end there.
+        """
         found: list[Found] = []
         position = 0
         try:
             while position < len(data):
                 kind, length = RECORD.unpack_from(data, position)
                 end = position + RECORD.size + length
+                if end > len(data) and not is_whole:
+                    break
                 if kind == Opcode.MESSAGE:
                     _, _, number, _, log, publish = _MESSAGE.unpack_from(data, position)
                     if position + _MESSAGE.size > end:
@@ -248,8 +274,9 @@ class McapFile:
                     raise RecordingError(f'it holds a damaged record: opcode {kind}')
                 position = end
         except struct.error as error:
-            raise RecordingError('it holds a damaged record: cut off') from error
-        if position != len(data):
+            if is_whole:
+                raise RecordingError('it holds a damaged record: cut off') from error
+        if is_whole and position != len(data):
             raise RecordingError('it holds a damaged record: wrong length')
         return found
 
@@ -259,9 +286,9 @@ class McapFile:
             self._schemas.setdefault(record.id, record)
         elif record.id not in self.channels:
             schema = self._schemas.get(record.schema_id, Schema(0, b'', '', ''))
-            self.channels[record.id] = Channel(
+            self.channels[record.id] = converted(Channel(
                 record.topic, schema.name, record.message_encoding, schema.encoding,
-                schema.data.decode(errors='replace'))
+                schema.data.decode(errors='replace')))
 
     def _take_notice(self, found: list[Found]) -> None:
         """Count messages; what was lost before them ends with the first."""
@@ -301,7 +328,7 @@ class McapFile:
         if self._stopped is not None and not is_whole:
             self.losses.append(Loss(
                 f'the file is cut off at byte {self._stopped} of {self.size}; '
-                'all that was written completely before is used',
+                'what is whole before that is used; copy it again if it was cut by copying',
                 start=None if end is None else end + 1, end=end))
         elif not is_whole and not self._is_without_summary:
             self.losses.append(Loss('its summary is damaged, so that nothing tells whether all '
@@ -327,26 +354,20 @@ def read_record(kind: type[Record], content: bytes | memoryview, whole: bool = T
     return record
 
 
-def _bytes_of(path: str | Path) -> mmap.mmap | bytes:
-    """Map a file into memory, or unpack one that is compressed as a whole, if it is MCAP."""
+def _bytes_of(path: str | Path) -> mmap.mmap:
+    """Map a file into memory, unpacked, if it is MCAP."""
     try:
         mode = os.stat(path).st_mode  # opening a FIFO would wait for its writer
         if not stat.S_ISREG(mode):
             raise RecordingError(f'{path}: not a regular file; expected an .mcap file')
-        with open(path, 'rb') as stream:
+        if not os.path.getsize(path):
+            raise RecordingError(f'{path}: the file is empty; it holds no message')
+        with open(readable(Path(path)), 'rb') as stream:
             if stream.seek(0, 2) == 0:
-                raise RecordingError(f'{path}: the file is empty; it holds no message')
-            data: mmap.mmap | bytes = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-            if data[:4] == zstandard.FRAME_HEADER:
-                stream.seek(0)
-                data = zstandard.ZstdDecompressor().stream_reader(
-                    stream, read_across_frames=True).read()
+                raise RecordingError(f'{path}: does not unpack: it is cut short')
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
-    except zstandard.ZstdError as error:
-        raise RecordingError(f'{path}: does not unpack: {error}') from error
-    if not data:
-        raise RecordingError(f'{path}: does not unpack: it is cut short')
     if data[:len(MAGIC)] != MAGIC:
         raise RecordingError(f'{path}: not an MCAP file: it starts with {data[:8].hex(" ")}, '
                              f'not {MAGIC.hex(" ")}')
@@ -368,10 +389,13 @@ def _read_summary(data: memoryview) -> Summary:
     return summary
 
 
-def _unpack(compression: str, data: bytes, size: int) -> bytes:
+def _unpack(compression: str, data: bytes | memoryview, size: int,
+            is_whole: bool = True) -> bytes | memoryview:
     """Unpack the data of a chunk, which never takes more memory than it claims."""
     if compression == '':
-        return data
+        return data[:size] if not is_whole else data
+    if compression == 'zstd' and not is_whole:
+        return zstandard.ZstdDecompressor().stream_reader(data).read(size)
     if compression == 'zstd':
         # What the frame says about its size counts more for the decompressor than our limit.
         if zstandard.frame_content_size(data) not in (-1, size):

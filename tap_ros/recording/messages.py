@@ -146,7 +146,11 @@ def check_schema(type_name: str, text: str) -> None:
     known = typestore().fielddefs
     for name, (_, theirs) in types.items():
         ours = list(known[name][1]) if name in known else list(theirs)
-        if list(theirs) != ours[:len(theirs)]:  # one that is cut off says nothing else
+        last, kind = theirs[-1] if theirs else ('', None)
+        # One that is cut off, also amid the name of a field, says nothing else.
+        if list(theirs[:-1]) != ours[:len(theirs)][:-1] or not (
+                not theirs or any(name.startswith(last) and kind == each
+                                  for name, each in ours[len(theirs) - 1:len(theirs)])):
             theirs, ours = (', '.join(field for field, _ in fields) for fields in (theirs, ours))
             raise RecordingError(
                 f'message type {name}: recorded with the fields {theirs}; expected {ours}')

@@ -18,6 +18,7 @@ from typing import Any
 from tap_ros.errors import RecordingError
 from tap_ros.files import write_atomically
 from tap_ros.plugins import names
+from tap_ros.recording.copies import PACKED
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
 from tap_ros.text import escaped, listing
 import yaml
@@ -27,7 +28,6 @@ MAX_BYTES = 2**23  # of either
 _UNUSABLE = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _KEY = 'rosbag2_bagfile_information'
-PACKED = '.zstd'  # behind the name of a file that rosbag2 compressed as a whole
 
 
 def bag_information(files: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -22,10 +22,10 @@ from tap_ros.errors import ImageError, RecordingError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import decode_positions, PLACE
 from tap_ros.messages.topics import BY_COLUMNS, COMPRESSED_TYPE, IMAGE, JOINT_STATES, Topic, TOPICS
+from tap_ros.recording.channels import Channel
 from tap_ros.recording.damage import describe
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.foreign import explain, explain_video, is_video, open_file
-from tap_ros.recording.mcap_file import Channel
 from tap_ros.recording.messages import check_schema, decode
 from tap_ros.robots.arm import find_joints, known_arms
 from tap_ros.text import escaped, listing
@@ -80,15 +80,17 @@ class _Bag:
         self.every: dict[tuple[str, str], Channel] = {}  # by topic and type
         self.counts = Counter[str]()  # of messages with the types, as far as they are known
         counts = Counter[tuple[str, str]]()
+        self.unusable: dict[str, str] = {}  # why no picture of a topic can be used
         damage = []
         for file in map(open_file, files):
             file.topics()
             self.every |= {(one.topic, one.type_name): one for one in file.channels.values()}
             for one, count in file.counts().items():
                 counts[one] += count
-            losses = [loss for loss in file.losses if loss.what]  # more than that it is cut off
-            if not file.channels and losses:
-                damage.append(f'{file.path}: {describe(losses)[0]}')
+            losses = sorted(file.losses, key=lambda loss: not loss.what)
+            if losses and not any(file.counts().values()):
+                damage.append(f'{file.path}: holds no message that can be read; '
+                              f'{describe(losses)[0]}')
         for (topic, kind), channel in self.every.items():
             if topic not in self.channels or kind in (_named_best(topic) or IMAGE).types:
                 self.channels[topic] = channel
@@ -104,10 +106,13 @@ class _Bag:
                     if channel.type_name in IMAGE.types]
         if wanted:
             if wanted not in pictures and f'{wanted}/compressed' in pictures:
-                return f'{wanted}/compressed'
+                wanted = f'{wanted}/compressed'
             if wanted not in pictures:
                 raise RecordingError(f'{self.source}: no topic {escaped(wanted)} of type '
                                      f'{" or ".join(IMAGE.types)}; {self.known}')
+            if self.counts.get(wanted) == 0:
+                raise RecordingError(f'{self.source}: topic {escaped(wanted)} holds no message; '
+                                     f'{self.known}')
             return wanted
         left = [topic for topic in pictures if self.counts.get(topic) != 0
                 and _named_best(topic) in (None, IMAGE)] or [
@@ -115,13 +120,11 @@ class _Bag:
         most = max((self.counts.get(topic, 0) for topic in left), default=0)
         rules: tuple[Callable[[str], object], ...] = (
             self.is_main_one,
-            lambda topic: (_named_best(topic.removesuffix('/compressed')) is IMAGE
-                           and self.picture(topic) is not None),
+            lambda topic: _named_best(topic) is IMAGE and self.picture(topic) is not None,
             lambda topic: self.counts.get(topic, most) * _FEW > most,
             lambda topic: self.picture(topic) is not None,
             # Of a camera that is there raw, too, nothing more is learned from compressed pictures.
-            lambda topic: topic.removesuffix('/compressed') == topic
-            or topic.removesuffix('/compressed') not in left,
+            lambda topic: _plain(topic) == topic or _plain(topic) not in left,
             self.is_coloured)
         for rule in rules:
             if len(left) > 1:
@@ -132,6 +135,10 @@ class _Bag:
             raise RecordingError(
                 f'{self.source}: no topic ends in {IMAGE.recorded} with type {IMAGE.type}; name '
                 f'the camera topic (--image-topic) if it is called otherwise; {self.known}')
+        if all(self.picture(topic) is None for topic in left) and len(left) > 1:
+            why = '; '.join(f'{escaped(topic)}: {self.unusable[topic]}' for topic in left[:3])
+            raise RecordingError(f'{self.source}: none of its topics of pictures can be used: '
+                                 f'{self.listing(left)}; {why}')
         if len(left) > 1:
             raise RecordingError(
                 f'{self.source}: several topics could be {IMAGE.recorded}: {self.listing(left)}; '
@@ -145,7 +152,7 @@ class _Bag:
 
     def is_main_one(self, topic: str) -> bool:
         """Tell whether its other topic, raw or compressed, has less than twice its pictures."""
-        raw = topic.removesuffix('/compressed')
+        raw = _plain(topic)
         other = raw if raw != topic else f'{topic}/compressed'
         return not (0 < 2 * self.counts[topic] <= self.counts[other]
                     and self.channels[other].type_name in IMAGE.types
@@ -154,9 +161,11 @@ class _Bag:
     def beside(self, one: Topic, camera: str) -> list[str]:
         """Return the topics that are read as one of ours, beside a camera."""
         found = [topic for topic, channel in self.channels.items()
-                 if channel.type_name == one.type and _named_best(topic) is one
+                 if channel.type_name in one.types and _named_best(topic) is one
                  and self.counts.get(topic) != 0]
-        above = [topic for topic in found if camera.startswith(topic.removesuffix(one.name))]
+        found = [topic for topic in found if _plain(topic) == topic or _plain(topic) not in found]
+        above = [topic for topic in found
+                 if camera.startswith(_plain(topic).removesuffix(one.name))]
         if above or len(found) < 2:
             return sorted(above, key=len)[-1:] or found
         if one is JOINT_STATES:
@@ -174,9 +183,12 @@ class _Bag:
 
     def picture(self, topic: str) -> np.ndarray | None:
         """Return one of the first pictures of a topic, None without any that can be used."""
+        self.unusable[topic] = 'damaged'
         for message in self._first(topic):
-            with suppress(ImageError):
+            try:
                 return decode_image(message)
+            except ImageError as error:
+                self.unusable[topic] = str(error)
         return None
 
     def is_coloured(self, topic: str) -> bool:
@@ -201,8 +213,8 @@ class _Bag:
     def known(self) -> str:
         """All topics, in words."""
         return 'topics found: ' + (listing((
-            f'{topic} ({channel.type_name})' for topic, channel in sorted(self.channels.items())),
-            20) or 'none')
+            f'{topic} ({channel.type_name}, {self.counts.get(topic, "?")} messages)'
+            for topic, channel in sorted(self.channels.items())), 20) or 'none')
 
     def _first(self, topic: str) -> list[Any]:
         """Return the first messages of a topic that can be decoded."""
@@ -215,6 +227,11 @@ class _Bag:
             if found:
                 break
         return found
+
+
+def _plain(topic: str) -> str:
+    """Return the topic of raw pictures."""
+    return topic.removesuffix('/compressed')
 
 
 def _named_best(name: str) -> Topic | None:

@@ -38,8 +38,13 @@ def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
     """
     usable = [i for i in range(len(store)) if store.lengths[i] >= min_frames]
     if not usable:
+        begins = np.array([store[i].stamps[0] for i in range(len(store))])
+        pauses = np.diff(begins)[np.diff(begins) > 0] / 1e9
+        together = '' if store.marked or not len(pauses) else (
+            f', or, as there is a picture each {np.median(pauses):.2g} s, keep them together: '
+            f'--gap {2 * np.median(pauses):.2g}')
         raise RecordingError(f'recordings: no episode has at least {min_frames} frames; '
-                             'record longer ones')
+                             f'record longer ones{together}')
     chosen = np.array(usable)
     if held_out:
         places = {Path(path).resolve() for path in held_out}

@@ -282,5 +282,5 @@ def test_files_that_unpack_to_what_no_recording_holds_are_refused_in_time(tmp_pa
             (pack(bytes(50 * 2**20), 1000), 'more than it claims')):
         (tmp_path / 'a.mcap').write_bytes(b'\x89MCAP0\r\n' + chunks)
         assert (tmp_path / 'a.mcap').stat().st_size < 10**5
-        with pytest.raises(RecordingError, match=f'a.mcap: chunk .*{words}'):
+        with pytest.raises(RecordingError, match=f'a.mcap: .*chunk .*{words}'):
             open_recordings(tmp_path)

@@ -4,7 +4,6 @@
 
 import base64
 from contextlib import closing
-import json
 from pathlib import Path
 import shlex
 import shutil
@@ -184,7 +183,8 @@ def test_damage_of_other_bags_is_named(tmp_path):
     for path in (write_ros1(tmp_path / 'a.bag'), write_bare_db3(tmp_path), packed):
         data = path.read_bytes()
         path.write_bytes(data[:len(data) // 3])
-        with pytest.raises(RecordingError, match=path.name + ': (cannot be r|does not u|.* lost)'):
+        words = path.name + ': (cannot be r|does not u|.*cut off)'
+        with pytest.raises(RecordingError, match=words):
             list(iter_episodes(path))
 
 
@@ -234,9 +234,9 @@ def test_packets_of_video_become_a_bag_by_the_command_that_is_told(
 
 
 def test_other_encodings_are_named_instead_of_a_topic_to_choose(tmp_path):
-    path = write_mcap(tmp_path / 'a.mcap', 'jsonschema', 'json', [
-        (TOPIC, 'foxglove.RawImage', json.dumps({}).encode(), SECOND)])
-    with pytest.raises(RecordingError, match='encoded as json; only those of ROS') as error:
+    path = write_mcap(tmp_path / 'a.mcap', 'flatbuffer', 'flatbuffer', [
+        (TOPIC, 'foxglove.RawImage', b'x', SECOND)])
+    with pytest.raises(RecordingError, match='encoded as flatbuffer; only those of ROS') as error:
         list(iter_episodes(path))
     assert '--image-topic' not in str(error.value)
 

@@ -5,6 +5,7 @@
 import os
 from pathlib import Path
 import struct
+import warnings
 
 import cv2
 import google_crc32c
@@ -64,8 +65,10 @@ def rlds(frames, **cameras):
 
 def run_import(capsys, *words):
     """Run a command; return its exit code and all that it printed."""
-    code = main(list(map(str, words)))
-    return code, ''.join(capsys.readouterr())
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter('always')
+        code = main(list(map(str, words)))
+    return code, ''.join((*capsys.readouterr(), *(str(each.message) for each in told)))
 
 
 @pytest.mark.parametrize('make, task', [(bair, ''), (rlds, 'put it there')])
@@ -99,18 +102,23 @@ def test_a_camera_is_asked_for_only_among_those_that_show_something(tmp_path, ca
     assert next(iter_episodes(tmp_path / 'b')).frames.shape == (6, 8, 8, 3)
 
 
-def test_damage_is_named_with_its_record_and_leaves_nothing(tmp_path, capsys):
+def test_damage_is_named_with_its_record_and_the_rest_is_read(tmp_path, capsys):
     file, good = tmp_path / 'a.tfrecord', record(rlds(make_frames(0)))
     spoiled = rlds(make_frames(0))
     spoiled['steps/observation/image_0'][3] = b'\x89PNG not really'
-    for data, words in ((good + good[:-1], 'record 1 is cut off'),
-                        (good[:40] + b'x' + good[41:], 'record 0 is damaged'),
-                        (record(spoiled), "record 0: format 'unknown' cannot"),
-                        (record({'steps/reward': [1.0]}), 'there are none')):
+    wrong = good[:40] + b'x' + good[41:]
+    for number, (data, words, lengths) in enumerate((
+            (good + good[:-1], 'record 1 of a.tfrecord: it is cut off', [6]),
+            (wrong + good, 'record 0 of a.tfrecord: it is damaged', [6]),
+            (record(spoiled), "picture 3 of record 0 of a.tfrecord: format 'unknown'", [5]),
+            (wrong, 'its CRC does not match', []), (b'x' * 20, 'no uncompressed TFRecord', []),
+            (record({'steps/reward': [1.0]}), 'there are none', []))):
         file.write_bytes(data)
-        code, said = run_import(capsys, 'import-tfrecord', file, '--out', tmp_path / 'bag')
-        assert code == 1 and words in said
-        assert list(tmp_path.iterdir()) == [file]
+        out = tmp_path / str(number)
+        code, said = run_import(capsys, 'import-tfrecord', file, '--out', out)
+        assert code == (not lengths) and words in said
+        assert out.exists() == bool(lengths)
+        assert not lengths or [len(e) for e in iter_episodes(out)] == lengths
 
 
 def write_video(path, frames, fps):

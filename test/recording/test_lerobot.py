@@ -7,10 +7,8 @@ With LEROBOT_PYTHON=/path/to/python of an environment that has lerobot (it needs
 another torch), its own loader reads what was exported, too.
 """
 
-import io
 import json
 import os
-from pathlib import Path
 import re
 import shutil
 import subprocess
@@ -181,34 +179,44 @@ def test_of_another_robot_pictures_are_taken_and_the_rest_is_named(
         assert (new.object_names, new.seed, new.outcome) == ((), i, '')
 
 
-def test_damage_is_named_in_one_line_and_leaves_no_half_file(lossless, tmp_path, capsys):
-    data, info = 'data/chunk-000/file-000.parquet', 'meta/info.json'
-    table = parquet.read_table(lossless / data)
+def spoil(folder, number=3):
+    """Spoil a picture of the first file."""
+    file = folder / 'data/chunk-000/file-000.parquet'
+    table = parquet.read_table(file)
     cells = table[CAMERA].to_pylist()
-    cells[3]['bytes'] = b'no picture'
-    spoiled = io.BytesIO()
+    cells[number]['bytes'] = b'no picture'
     parquet.write_table(table.set_column(
         table.column_names.index(CAMERA), CAMERA,
-        pyarrow.array(cells, table.schema.field(CAMERA).type)), spoiled)
-    text = (lossless / info).read_text()
-    for path, content, words in (
-            (info, None, 'info.json: cannot be read, so this is no LeRobot data set: No such'),
-            (info, b'{', 'not the description'),
-            (info, text.replace('v3.0', 'v1.6').encode(), 'v1.6, .* expected v2 or v3'),
-            (info, text.replace('"features"', '"other"').encode(), "garbles 'features'"),
-            (data, None, 'file-000.parquet: cannot be read'),
-            (data, (lossless / data).read_bytes()[:5000], 'file-000.parquet: cannot be read'),
-            (data, spoiled.getvalue(), "episode 0 cannot be read: format 'unknown'")):
-        folder = tmp_path / 'set'
-        shutil.copytree(lossless, folder)
-        (folder / path).unlink()
-        if content is not None:
-            (folder / path).write_bytes(content)
-        assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 1
-        error = capsys.readouterr().err.splitlines()[-1]
-        assert re.search(words, error), error
-        assert not list(Path(tmp_path, 'bag').glob('*.mcap*'))
-        shutil.rmtree(folder)
+        pyarrow.array(cells, table.schema.field(CAMERA).type)), file)
+
+
+@pytest.mark.parametrize('path, change, words, left', [
+    ('meta/info.json', lambda file: file.unlink(), 'so this is no LeRobot data set: No such', 0),
+    ('meta/info.json', lambda file: file.write_text('{'), 'not the description', 0),
+    ('meta/info.json', lambda file: file.write_text(file.read_text().replace('v3.0', 'v1.6')),
+     'v1.6, .* expected v2 or v3', 0),
+    ('meta/info.json', lambda file: file.write_text(file.read_text().replace('feat', 'other')),
+     "garbles 'features'", 0),
+    ('meta/episodes/chunk-000/file-000.parquet', lambda file: file.unlink(), 'no episode', 0),
+    ('data/chunk-000/file-000.parquet', lambda file: file.unlink(),
+     '12 episodes: .*file-000.parquet: cannot be read.* 2 and 9 more', 8),
+    ('data/chunk-000/file-001.parquet', lambda file: file.write_bytes(file.read_bytes()[:5000]),
+     '8 episodes: .*file-001.parquet: cannot be read', 12),
+    ('', spoil, "picture 3 of episode 0: format 'unknown' cannot be used", 20)])
+def test_what_is_damaged_is_counted_and_the_rest_imported(
+        path, change, words, left, lossless, truth, tmp_path, capsys, recwarn):
+    folder = shutil.copytree(lossless, tmp_path / 'set')
+    change(folder / path)
+    code = main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')])
+    said = capsys.readouterr().err + ''.join(str(each.message) for each in recwarn)
+    assert code == (not left) and re.search(words, said), said
+    found = list(iter_episodes(tmp_path / 'bag')) if left else []
+    assert len(found) == left and bool(left) == (tmp_path / 'bag').exists()
+    for new in found:
+        old, = (old for old in truth if old.seed == new.seed)
+        rows = [t for t in range(len(old)) if new.seed != truth[0].seed or path or t != 3]
+        np.testing.assert_array_equal(new.frames, old.frames[rows])
+        np.testing.assert_array_equal(new.object_pixels, old.object_pixels[rows])
 
 
 def rewrite(folder, path, change):
@@ -300,12 +308,16 @@ def test_rows_of_another_rate_than_described_keep_their_times(filmed, tmp_path):
             8 * number, 8 * number + 8)).max() < 5
 
 
-def test_a_video_that_ends_early_is_named(filmed, tmp_path, capsys):
+def test_rows_beyond_the_end_of_a_video_are_left_out(filmed, tmp_path, capsys, recwarn):
     folder, key = filmed
     rewrite(folder, 'data', lambda table: table.set_column(
         0, 'timestamp', pyarrow.array(np.float32(table['timestamp']) * 3)))
-    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 1
-    assert 'has no frame at' in capsys.readouterr().err
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 0
+    assert re.search('7 pictures: videos/.* has no frame', str(recwarn[0].message))
+    assert [len(episode) for episode in iter_episodes(tmp_path / 'bag')] == [6, 3]
+    (folder / f'videos/{key}/chunk-000/file-000.mp4').unlink()
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'b')]) == 1
+    assert '2 episodes: ' in (said := capsys.readouterr().err) and 'is not there' in said
 
 
 def test_a_depth_camera_is_no_candidate(lossless, truth, tmp_path, capsys):

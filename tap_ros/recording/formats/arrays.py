@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.errors import ConfigError
 from tap_ros.images.encodings import decompress
 from tap_ros.options import default_text
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.foreign import natural
-from tap_ros.recording.formats.pictures import make_episode, Paths, Target, write_bag
+from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
 from tap_ros.text import escaped, listing
 from tyro import conf
 
@@ -53,20 +53,25 @@ def run(args: Options) -> None:
         sorted((file for file in path.rglob('*') if file.suffix in ('.hdf5', '.h5')), key=natural)
         or [path])]
 
+    lacking = Lacking()
+
     def episodes() -> Iterator[Episode]:
         number = 0
         for file in files:
-            try:
+            name = escaped(file.name)
+            with lacking.passing_over('file', name):
                 for pictures in _episodes(_open(file), args.camera):
-                    frames = [args.cut.image(_picture(each)) for each in pictures]
-                    yield make_episode(frames, np.arange(len(frames)) / args.fps, task=args.task,
-                                       seed=number)
+                    frames, rows = [], []
+                    for row, each in enumerate(pictures):
+                        with lacking.passing_over('picture', f'{row} of episode {number}'):
+                            frames.append(args.cut.image(_picture(each)))
+                            rows.append(row)
+                    if frames:
+                        yield make_episode(frames, np.array(rows) / args.fps, task=args.task,
+                                           seed=number)
                     number += 1
-            except (OSError, KeyError, ValueError) as error:
-                raise RecordingError(
-                    f'{escaped(file)}: cannot be read: {escaped(error, 200)}') from error
 
-    print(write_bag(args, episodes()))
+    print(write_bag(args, episodes(), lacking=lacking))
 
 
 def _open(path: Path) -> Any:

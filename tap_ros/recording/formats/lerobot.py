@@ -21,11 +21,18 @@ import warnings
 
 import numpy as np
 from tap_ros.contract import GRIPPER_JOINTS
-from tap_ros.errors import ConfigError, ImageError, RecordingError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
-from tap_ros.recording.formats.pictures import make_episode, Target, video_frames, write_bag
+from tap_ros.recording.formats.pictures import (
+    DAMAGE,
+    Lacking,
+    make_episode,
+    Target,
+    video_frames,
+    write_bag,
+)
 from tap_ros.text import escaped, listing
 from tyro import conf
 
@@ -36,7 +43,6 @@ NAMES = {ACTION: ['dx', 'dy', 'dz', 'opening'], STATE: list(GRIPPER_JOINTS)}  # 
 INDICES = ('frame_index', 'episode_index', 'index', 'task_index')  # columns that all sets have
 SEED, OUTCOME = 'tap_ros/seed', 'tap_ros/outcome'  # columns of ours beside LeRobot's
 _INFO_BYTES = 2**24
-_DAMAGE = (KeyError, TypeError, ValueError, IndexError, ImageError, OSError)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +66,8 @@ def run(args: Options) -> None:
     :raises TapError: for a set that cannot be read, and a folder that holds something.
     """
     data = DataSet(args.path, args.camera)
-    print(f'{write_bag(args, data.episodes(args.cut), len(data.rows))} of {data.camera}')
+    said = write_bag(args, data.episodes(args.cut), len(data.rows), data.lacking)
+    print(f'{said} of {data.camera}')
     if data.unused:
         print(f'not taken: {listing(data.unused)}')
 
@@ -73,6 +80,7 @@ class DataSet:
     :param camera: feature whose pictures are taken; '': the only one of colour.
     :ivar rows: of meta/episodes, dicts in the order of the episodes, in the form of version 3.
     :ivar unused: features that are not taken over.
+    :ivar lacking: what could not be used so far.
     :raises RecordingError: when it is none, or damaged.
     :raises ConfigError: for a camera that it has not, or has not alone.
     """
@@ -86,7 +94,8 @@ class DataSet:
             version, self.fps = str(info['codebase_version']), float(info['fps'])
             self.features = dict(info['features'])
             self._data_path, self._video_path = str(info['data_path']), info.get('video_path')
-            self._chunk = int(info.get('chunks_size', 1000))
+            self._chunk, count = int(info.get('chunks_size', 1000)), int(
+                info.get('total_episodes', 0))
             cameras = {name: feature for name, feature in self.features.items()
                        if feature['dtype'] in ('image', 'video')}
         except OSError as error:
@@ -99,7 +108,8 @@ class DataSet:
             raise RecordingError(f'{escaped(self.folder)}: version {escaped(version, 20)}, '
                                  f'{self.fps} frames a second; expected v2 or v3')
         self._file: tuple[Path, Any] | None = None  # data file in memory
-        self.rows = self._read_rows()
+        self.lacking = Lacking()
+        self.rows = self._read_rows(count)
         colour = [name for name in cameras if not self._is_depth(name)]
         if camera not in cameras and (camera or len(colour) != 1):
             raise ConfigError(f'{escaped(self.folder)}: --camera: expected one of '
@@ -115,18 +125,14 @@ class DataSet:
 
     def episodes(self, crop: Crop) -> Iterator[Episode]:
         """
-        Yield the episodes.
+        Yield the episodes, without the rows whose pictures cannot be used.
 
         :param crop: Crop of the pictures.
-        :raises RecordingError: for what cannot be read; it names the file.
         """
         for row in self.rows:
-            try:
-                yield self._episode(row, crop)
-            except _DAMAGE as error:
-                raise RecordingError(
-                    f'{escaped(self.folder)}: episode {escaped(row["episode_index"], 20)} cannot '
-                    f'be read: {escaped(error, 200)}') from error
+            with self.lacking.passing_over('episode', escaped(row['episode_index'], 20)):
+                episode = self._episode(row, crop)
+                yield episode
 
     @property
     def _is_video(self) -> bool:
@@ -150,22 +156,26 @@ class DataSet:
         names = tuple(column.removesuffix('_u') for column in columns[::2])
         return names if object_columns(names) == columns else ()
 
-    def _read_rows(self) -> list[dict[str, Any]]:
-        """Return the rows of meta/episodes, or the lines of episodes.jsonl."""
+    def _read_rows(self, count: int) -> list[dict[str, Any]]:
+        """Return the rows of meta/episodes, or the lines of episodes.jsonl, of so many."""
         rows: list[dict[str, Any]] = []
         for file in sorted((self.folder / 'meta' / 'episodes').glob('*/*.parquet')):
-            table = _read_parquet(file)
-            rows += table.select(
-                [name for name in table.column_names if not name.startswith('stats/')]).to_pylist()
+            with self.lacking.passing_over('file', f'meta/episodes/{escaped(file.name)}'):
+                table = _read_parquet(file)
+                rows += table.select([name for name in table.column_names
+                                      if not name.startswith('stats/')]).to_pylist()
         lines = self.folder / 'meta' / 'episodes.jsonl'
-        try:
-            if not rows and lines.exists():
-                rows = [json.loads(line) for line in lines.read_text().splitlines() if line]
+        if not rows and lines.is_file():
+            for number, line in enumerate(filter(None, lines.read_bytes().splitlines())):
+                with self.lacking.passing_over('line', f'{number} of meta/episodes.jsonl'):
+                    row = json.loads(line)
+                    rows.append(row | {'length': int(row['length'])})
+        with self.lacking.passing_over('file', 'meta/episodes'):
             rows = sorted(rows, key=lambda row: (int(row['episode_index']), int(row['length'])))
-        except _DAMAGE as error:
-            raise RecordingError(f'{escaped(lines)}: cannot be read: {escaped(error)}') from error
         if not rows:
             raise RecordingError(f'{escaped(self.folder)}: meta/episodes holds no episode')
+        if len(rows) < count:
+            self.lacking.note(f'meta/episodes tells of {len(rows)} of {count} episodes', '', '')
         return rows
 
     def _is_depth(self, camera: str) -> bool:
@@ -177,7 +187,7 @@ class DataSet:
             return False
         try:
             data = self._file_of(self._rows_of(self.rows[0])[camera][0].as_py())
-        except _DAMAGE:
+        except DAMAGE:
             return False
         return data.startswith(b'\x89PNG') and data[24] == 16
 
@@ -222,15 +232,21 @@ class DataSet:
 
     def _episode(self, row: dict[str, Any], crop: Crop) -> Episode:
         """Return the episode of a row."""
-        part, T, frames, size = self._rows_of(row), row['length'], [], (1, 1)
-        for picture in self._decode(row, part) if self._is_video else (
-                decompress(self._file_of(cell), 'unknown')
-                for cell in part[self.camera].to_pylist()):
-            frames.append(crop.image(picture))
-            size = picture.shape[:2]
+        part, frames, kept, size = self._rows_of(row), [], [], (1, 1)
+        for t, picture in enumerate(
+                (self._filmed if self._is_video else self._pictures)(row, part)):
+            if isinstance(picture, str):
+                self.lacking.note(picture, 'picture', f'{t} of episode {row["episode_index"]}')
+            else:
+                frames.append(crop.image(picture))
+                kept.append(t)
+                size = picture.shape[:2]
+        if not frames:
+            raise ValueError('none of its pictures can be used')
+        T = len(kept)
 
         def numbers(key: str, width: int) -> np.ndarray:
-            return np.array(part[key].to_pylist(), np.float32).reshape(T, width)
+            return np.array(part[key].to_pylist(), np.float32).reshape(-1, width)[kept]
 
         known: dict[str, Any] = {}
         if self._objects:
@@ -240,12 +256,12 @@ class DataSet:
             known['actions'] = np.append(numbers(ACTION, 4)[:-1], np.zeros((1, 4), np.float32), 0)
         if self._is_ours(STATE):
             known['grippers'] = numbers(STATE, 4)
-        outcome, seconds = row.get(OUTCOME, ''), np.arange(T) / self.fps
+        outcome, seconds = row.get(OUTCOME, ''), np.arange(len(part)) / self.fps
         told = np.array(part['timestamp'], float).ravel()
         if (np.abs(told - told[0] - seconds) > 0.5 / self.fps).any() and (np.diff(told) > 0).all():
             seconds = told  # another rate than that of the description
         return make_episode(
-            frames, seconds, self._objects,
+            frames, seconds[kept], self._objects,
             task=str((row.get('tasks') or [''])[0]), seed=int(row.get(SEED, row['episode_index'])),
             outcome=outcome if outcome in OUTCOMES else '', **known)
 
@@ -254,8 +270,16 @@ class DataSet:
         data = cell.get('bytes') if isinstance(cell, dict) else None
         return data or (self.folder / str(cell['path'])).read_bytes()
 
-    def _decode(self, row: dict[str, Any], part: Any) -> Iterator[np.ndarray]:
-        """Yield the frames of a video at the times of rows."""
+    def _pictures(self, row: dict[str, Any], part: Any) -> Iterator[np.ndarray | str]:
+        """Yield the picture of each row, or why it cannot be used."""
+        for cell in part[self.camera].to_pylist():
+            try:
+                yield decompress(self._file_of(cell), 'unknown')
+            except DAMAGE as error:
+                yield str(error)
+
+    def _filmed(self, row: dict[str, Any], part: Any) -> Iterator[np.ndarray | str]:
+        """Yield the frame of a video at the time of each row, or why there is none."""
         path = self._path(self._video_path, row, f'videos/{self.camera}')
         times = self._starts[row['episode_index']] + np.array(part['timestamp'], float).ravel()
         if self._video is None or self._video.path != path or self._video.now[0] > times[0]:
@@ -263,8 +287,9 @@ class DataSet:
         for at in times.tolist():
             seen, picture = self._video.at(at)
             if abs(seen - at) > 1 / self.fps:
-                raise ValueError(f'{path}: has no frame at {at:.3f} s, the last is at {seen:.3f}')
-            yield picture
+                yield f'{path.relative_to(self.folder)} has no frame at {at:.3f} s'
+            else:
+                yield picture
 
 
 class _Video:

@@ -9,21 +9,23 @@ another meaning.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 import shutil
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
+import warnings
 
 import cv2
 import numpy as np
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.files import only_writer, storage_errors
 from tap_ros.images.crop import Crop
 from tap_ros.options import default_text, Folder, Topic
 from tap_ros.recording.bags import find_bags
-from tap_ros.recording.episode import Episode
+from tap_ros.recording.damage import describe, Loss
+from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.foreign import natural, video_packets, VIDEOS
 from tap_ros.recording.reading_options import Part
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
@@ -32,6 +34,7 @@ from tqdm import tqdm
 from tyro import conf
 
 EPISODES_PER_FILE = 25
+DAMAGE = (ImageError, RecordingError, OSError, LookupError, TypeError, ValueError)
 EPISODE_SPACING_NS = 60 * 10**9  # between the end of an episode and the start of the next
 Paths = Annotated[conf.Positional[tuple[str, ...]], conf.arg(
     metavar='PATH [PATH ...]', help_behavior_hint='(required)')]
@@ -88,16 +91,21 @@ def run(args: Options) -> None:
 
     files = [file for path in args.paths for file in _find_videos(Path(path), args.camera)]
 
+    lacking = Lacking()
+
     def episodes() -> Iterator[Episode]:
         for number, path in enumerate(files):
-            seconds, frames = zip(*(
-                (at, args.cut.image(frame)) for at, frame in (
-                    video_frames(path) if path.suffix.lower() in VIDEOS else
-                    _bag_frames(path, args.image_topic))))
-            yield make_episode(frames, np.arange(len(frames)) / args.fps if args.fps else seconds,
-                               task=args.task, seed=number)
+            with lacking.passing_over('video', escaped(path.name)):
+                seconds, frames = zip(*(
+                    (at, args.cut.image(frame)) for at, frame in (
+                        video_frames(path) if path.suffix.lower() in VIDEOS else
+                        _bag_frames(path, args.image_topic))))
+                episode = make_episode(
+                    frames, np.arange(len(frames)) / args.fps if args.fps else seconds,
+                    task=args.task, seed=number)
+                yield episode
 
-    print(write_bag(args, episodes(), len(files)))
+    print(write_bag(args, episodes(), len(files), lacking))
 
 
 def _find_videos(path: Path, camera: str) -> list[Path]:
@@ -111,6 +119,38 @@ def _find_videos(path: Path, camera: str) -> list[Path]:
         raise ConfigError(f'--camera: expected one of {listing(sorted(names))}, which '
                           f'{escaped(path)} holds of several demonstrations')
     return [file for file in found if camera in ('', file.stem)]
+
+
+class Lacking:
+    """What of an import cannot be used; the rest is written, and this counted and named."""
+
+    def __init__(self) -> None:
+        self._losses: list[Loss] = []
+
+    def note(self, why: object, what: str, where: str) -> None:
+        """Note why a part cannot be used: what it is, such as a picture, and where it stands."""
+        self._losses.append(Loss(escaped(why), what, where=where))
+
+    @contextmanager
+    def passing_over(self, what: str, where: str) -> Iterator[None]:
+        """Note what cannot be read within, and go on behind it; what is read must be whole."""
+        try:
+            yield
+        except DAMAGE as error:
+            self.note(error, what, where)
+
+    def tell(self, out: Path, is_empty: bool) -> None:
+        """
+        Warn of what was noted, a line a cause.
+
+        :raises RecordingError: when nothing at all could be used.
+        """
+        lines = [f'{escaped(out)}: {line}' for line in describe(self._losses)]
+        if is_empty:
+            raise RecordingError(
+                lines[0] if lines else f'{escaped(out)}: there is no episode to import')
+        for line in lines:
+            warnings.warn(line, RecordingWarning, stacklevel=3)
 
 
 def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.ndarray,
@@ -136,13 +176,15 @@ def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.nda
                    **(fields | known))
 
 
-def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = None) -> str:
+def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = None,
+              lacking: Lacking | None = None) -> str:
     """
     Write episodes one after the other, in files of EPISODES_PER_FILE: all of them, or nothing.
 
     :param target: Target.
     :param episodes: iterable of Episode, whose stamps count from anywhere.
     :param count: how many there are, to show progress.
+    :param lacking: what could not be used of them, when they have been read.
     :return: a line that says what was written.
     :raises ConfigError: for a folder that holds something.
     :raises RecordingError: when there is no episode.
@@ -165,8 +207,7 @@ def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = N
                     writer.write(replace(episode, stamps=stamps))
                     begin, size = int(stamps[-1]) + EPISODE_SPACING_NS, episode.frames.shape[1:3]
                     frames, done = frames + len(episode), done + 1
-            if not done:
-                raise RecordingError(f'{escaped(out)}: there is no episode to import')
+            (lacking or Lacking()).tell(out, is_empty=not done)
             write_metadata(part)
             with storage_errors(out):
                 part.rename(out)

@@ -33,7 +33,7 @@ from tap_ros.images.encodings import decompress
 from tap_ros.options import default_text
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.foreign import natural
-from tap_ros.recording.formats.pictures import make_episode, Paths, Target, write_bag
+from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
 from tap_ros.text import escaped, listing
 from tyro import conf
 
@@ -63,7 +63,6 @@ _POOL = descriptor_pool.DescriptorPool()  # its own, so that TensorFlow may be l
 _POOL.Add(text_format.Parse(_PROTO, descriptor_pb2.FileDescriptorProto()))
 _Example = message_factory.GetMessageClass(_POOL.FindMessageTypeByName('tap_ros.Example'))
 _FILES = b'\xff\xd8\xff', b'\x89PNG'  # JPEG, PNG
-_REMEDY = 'fetch the file again or leave it out'
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,28 +90,33 @@ def run(args: Options) -> None:
         raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000')
     files = [file for path in map(Path, args.paths) for file in (
         sorted(path.rglob('*.tfrecord*'), key=natural) if path.is_dir() else [path])]
-    camera, blank = args.camera, Counter[bool]()
+    camera, blank, lacking = args.camera, Counter[bool](), Lacking()
 
     def episodes() -> Iterator[Episode]:
         nonlocal camera
         numbers = count()
         for file in files:
-            for record, data in enumerate(read_records(file)):
-                number = next(numbers)
-                try:
+            for record, data in read_records(file, lacking):
+                number, place = next(numbers), f'{record} of {escaped(file.name)}'
+                with lacking.passing_over('record', place):
                     features = parse_example(data)
                     camera = _choose(features, camera)
-                    pictures = list(map(_picture, _pictures(features, camera)))
-                except (RecordingError, ImageError) as error:
-                    raise RecordingError(f'{escaped(file)}: record {record}: {error}') from error
-                blank[_is_blank(pictures[0])] += 1
-                if not _is_blank(pictures[0]):
+                    frames, rows = [], []
+                    for row, each in enumerate(_pictures(features, camera)):
+                        with lacking.passing_over('picture', f'{row} of record {place}'):
+                            frames.append(_picture(each))
+                            rows.append(row)
+                    if not frames:
+                        raise ValueError('none of its pictures can be used')
+                    is_blank = _is_blank(frames[0])
+                    blank[is_blank] += 1
                     said: Any = features.get('steps/language_instruction') or [b'']
-                    yield make_episode(
-                        list(map(args.cut.image, pictures)), np.arange(len(pictures)) / args.fps,
-                        task=said[0].decode(errors='replace'), seed=number)
+                    if not is_blank:
+                        yield make_episode(
+                            list(map(args.cut.image, frames)), np.array(rows) / args.fps,
+                            task=said[0].decode(errors='replace'), seed=number)
 
-    print(f'{write_bag(args, episodes())} of {escaped(camera)}')
+    print(f'{write_bag(args, episodes(), lacking=lacking)} of {escaped(camera)}')
     if blank[True]:
         print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
 
@@ -166,35 +170,33 @@ def _is_blank(picture: np.ndarray) -> bool:
     return bool((picture == picture[0, 0]).all())
 
 
-def read_records(path: str | Path) -> Iterator[bytes]:
+def read_records(path: Path, lacking: Lacking) -> Iterator[tuple[int, bytes]]:
     """
     Yield the records of a TFRecord file, each checked against its CRC.
 
     :param path: of the file, not compressed.
-    :return: generator of bytes.
-    :raises RecordingError: at the first record that is cut off or damaged; the message names it,
-        counted from 0.
+    :param lacking: is told of records that are damaged or cut off.
+    :return: generator of (number from 0, bytes).
     """
-    try:
-        with open(path, 'rb') as stream:
-            number = 0
-            while head := stream.read(12):
-                where = f'{path}: record {number}'
+    with lacking.passing_over('file', escaped(path.name)), open(path, 'rb') as stream:
+        number = 0
+        while head := stream.read(12):
+            with lacking.passing_over('record', f'{number} of {escaped(path.name)}'):
                 if len(head) < 12:
-                    raise RecordingError(f'{where} is cut off; {_REMEDY}')
+                    raise RecordingError('it is cut off; fetch the file again')
                 length, crc = struct.unpack('<QI', head)
                 if _masked_crc(head[:8]) != crc:
-                    raise RecordingError(
-                        f'{where} is damaged, or this is no uncompressed TFRecord file; {_REMEDY}')
+                    stream.seek(0, 2)  # nothing tells where the next one begins
+                    raise RecordingError('it is damaged, or this is no uncompressed TFRecord '
+                                         'file; fetch the file again')
                 data, tail = stream.read(length), stream.read(4)
                 if len(data) + len(tail) < length + 4:
-                    raise RecordingError(f'{where} is cut off; {_REMEDY}')
+                    raise RecordingError('it is cut off; fetch the file again')
                 if _masked_crc(data) != int.from_bytes(tail, 'little'):
-                    raise RecordingError(f'{where} is damaged: its CRC does not match; {_REMEDY}')
-                yield data
-                number += 1
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
+                    raise RecordingError('it is damaged: its CRC does not match; fetch the file '
+                                         'again')
+                yield number, data
+            number += 1
 
 
 def parse_example(data: bytes) -> dict[str, list[bytes] | np.ndarray]:
