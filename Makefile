@@ -11,7 +11,7 @@ ENTER := . scripts/environment.bash
 DOMAIN := export ROS_DOMAIN_ID=$${ROS_DOMAIN_ID:-$$((1 + $$$$ % 100))}
 
 WHEELS := requirements.txt requirements-dev.txt requirements-experiments.txt requirements-extras.txt \
-  requirements-ros.txt constraints.txt scripts/setup.bash scripts/mend_wheels.py
+  requirements-worlds.txt requirements-ros.txt constraints.txt scripts/setup.bash scripts/mend_wheels.py
 SOURCES := package.xml setup.py setup.cfg tap_ros/contract.py resource/tap_ros $(wildcard config/*.yaml config/layouts/* launch/*.py) \
   tap_msgs/CMakeLists.txt tap_msgs/package.xml $(wildcard tap_msgs/*/*.msg tap_msgs/*/*.srv \
   tap_msgs/*/*.action)

@@ -132,8 +132,7 @@ make_wheels() {
   step 'torch' "${pip[@]}" $(torch_index) "$(grep '^torch==' requirements.txt)"
   step 'Python packages' "${pip[@]}" -r requirements.txt -r requirements-dev.txt \
     -r requirements-experiments.txt -r requirements-extras.txt
-  # Without its dependencies: it asks for an older mujoco, and works with ours.
-  step 'Meta-World' "${pip[@]}" --no-deps metaworld==3.1.1
+  step 'worlds of others' "${pip[@]}" --no-deps -r requirements-worlds.txt
   step 'ROS 2 Jazzy' "${pip[@]}" -r requirements-ros.txt
   step 'CMake files of the ROS 2 wheels' .venv/bin/python scripts/mend_wheels.py
   step 'drawing without a screen' env MUJOCO_GL="${MUJOCO_GL:-egl}" .venv/bin/python -c \

@@ -33,6 +33,7 @@ from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
+BOTTLENECKS_FILE = 'bottlenecks.json'  # as tap_ros/prediction/marks.py reads it
 TABLE = 'mujoco_table'
 MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 
@@ -42,9 +43,10 @@ class CollectConfig:
     """
     What to collect: all that a recording follows from.
 
-    :param world: mujoco_table, or another whose expert demonstrates: metaworld, where scripts
-        act as unsteadily as a person and the camera alone is recorded.
-    :param task: one that the world has, such as push2; of metaworld door-open-v3.
+    :param world: mujoco_table, or another whose expert demonstrates: metaworld or ogbench, where
+        scripts act as unsteadily as a person, the camera alone is recorded, and a file beside the
+        recording says when the bottleneck is, by the simulator.
+    :param task: one that the world has, such as push2; of metaworld door-open-v3; of ogbench cube.
     :param episodes: how many in all; a larger number later adds to the same folder.
     :param seed: of the first episode; the others count on from it.
     :param image_size: width and height in pixels.
@@ -172,6 +174,7 @@ def _collect_missing(folder: Path, config: CollectConfig, engine: Engine, progre
     with tqdm(total=total, unit='episode', disable=not progress) as bar:
         for _, get in run_tasks(tasks, engine, stop):
             done.append(get())
+            _note_bottlenecks(folder, done[-1]['bottlenecks'])
             bar.update(len(done[-1]['outcomes']))
 
     def every(key: str) -> list[Any]:
@@ -239,11 +242,15 @@ def _collect_shard(folder: str | Path, config: CollectConfig, shard: int) -> dic
     """Collect one file; runs in a worker process. Return what is told of its episodes."""
     world = _make(config)
     stats: dict[str, list[Any]] = {
-        key: [] for key in ('frames', 'outcomes', 'distances', 'act', 'write')}
+        key: [] for key in ('frames', 'outcomes', 'distances', 'bottlenecks', 'act', 'write')}
     with EpisodeWriter(_shard_path(folder, shard), camera_matrix=world.camera_matrix) as writer:
         for i in _episodes(config, shard):
             begin = time.perf_counter()
-            episode = _demonstrated(world, config, i)
+            episode, bottleneck = _demonstrated(world, config, i)
+            if bottleneck is not None:
+                seconds = [float(episode.stamps[t]) / 1e9 for t in bottleneck]
+                stats['bottlenecks'].append(
+                    {'recording': '.', 'episode': i, 'stamps': [seconds]})
             acted = time.perf_counter()
             writer.write(episode)
             stats['write'].append(time.perf_counter() - acted)
@@ -255,14 +262,27 @@ def _collect_shard(folder: str | Path, config: CollectConfig, shard: int) -> dic
     return stats
 
 
-def _demonstrated(world: World, config: CollectConfig, i: int) -> Episode:
-    """Let the expert of a world act; return episode i."""
+def _demonstrated(world: World, config: CollectConfig,
+                  i: int) -> tuple[Episode, tuple[int, int] | None]:
+    """Let the expert of a world act; return episode i and the frames of its bottleneck."""
     seed, start_ns = config.seed + i, (i + 1) * EPISODE_SPACING_NS
     if isinstance(world, Simulator):
         return make_episode(world, *run_episode(
-            world, seed, config.frames, config.timing, config.misses), start_ns)
-    episode: Episode = ability(world, 'demonstrate')(seed, config.frames)
-    return replace(episode, stamps=episode.stamps + start_ns)
+            world, seed, config.frames, config.timing, config.misses), start_ns), None
+    found = ability(world, 'demonstrate')(seed, config.frames)
+    episode = replace(found.episode, stamps=found.episode.stamps + start_ns)
+    return episode, found.bottleneck
+
+
+def _note_bottlenecks(folder: Path, found: list[dict[str, Any]]) -> None:
+    """Add marks to the file beside the recording, one a line."""
+    if not found:
+        return
+    path = folder / BOTTLENECKS_FILE
+    known = json.loads(path.read_text())['marks'] if path.exists() else []
+    marks = {mark['episode']: json.dumps(mark) for mark in known + found}
+    lines = ',\n'.join(marks[i] for i in sorted(marks))
+    write_atomically(path, f'{{"marks": [\n{lines}\n]}}\n')
 
 
 def make_episode(simulator: Simulator, observations: Sequence[Observation], actions: np.ndarray,

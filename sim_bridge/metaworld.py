@@ -13,6 +13,7 @@ import warnings
 
 import mujoco
 import numpy as np
+from sim_bridge.demonstrations import demonstrate, Demonstration
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera, drawing
 from tap_ros.contract import (
@@ -22,7 +23,6 @@ from tap_ros.contract import (
     ROBOT_MASK_HAND,
 )
 from tap_ros.errors import ConfigError, SceneError
-from tap_ros.recording.episode import Episode
 
 ORIGIN = np.array([0.0, 0.65, 0.01])  # m, of our frame in Meta-World's
 TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about the vertical
@@ -32,14 +32,7 @@ SIDE = replace(CAMERA, tilt=0.87, position=(0.85, 0.5, 0.85), turn=2.1)
 GAIN = 8.0  # of the command over the gap to where the fingertips shall be, 1/m
 SOLVING_STEPS = 400  # environment steps that the scripted policy has at most
 SETTLING_STEPS = 5  # after the success
-# Demonstrations, in environment steps of 12.5 ms:
-EVERY = 4  # from picture to picture
-MOST_FRAMES, LEAST_FRAMES = 70, 12
-TRIES = 20  # a demonstration that fails is made anew
-SPEED, NOISE = (0.45, 1.0), (0.0, 0.15)  # shares of the script's own command
-DETOUR_SHARE, DETOUR_STEPS = 0.8, 60  # of demonstrations; at most
-DETOUR_LOW, DETOUR_HIGH = np.array([[-0.35, 0.45, 0.12], [0.35, 0.8, 0.4]])  # m, their frame
-PAUSES, PAUSE_STEPS, PAUSE_RANGE = (1, 3), (4, 15), (5, 160)
+REACH = np.array([[-0.35, 0.45, 0.12], [0.35, 0.8, 0.4]])  # m, in their frame
 
 
 class MetaWorld(GymWorld):
@@ -53,6 +46,7 @@ class MetaWorld(GymWorld):
     """
 
     object_names: tuple[str, ...] = ('object_0',)
+    steps, reach = 4, REACH  # of demonstrations
 
     def __init__(self, task: str = 'push-v3', image_size: int = 64) -> None:
         self.task_name = task
@@ -71,6 +65,8 @@ class MetaWorld(GymWorld):
         self._option = mujoco.MjvOption()
         self._option.sitegroup[:] = 0  # the goal is drawn as a site
         self._labels = _labels(model)
+        self._movable = _movable(model)
+        self.step_ns = round(1e9 * self.env.dt)
         self._seen: np.ndarray = np.empty(0)
         self._info: dict[str, Any] = {}
 
@@ -108,7 +104,7 @@ class MetaWorld(GymWorld):
 
     def draw(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the picture, without the marker of the goal, and the robot mask."""
-        image, renderer = self._picture(), self._renderer
+        image, renderer = self._draw('corner'), self._renderer
         renderer.enable_segmentation_rendering()
         try:
             ids = renderer.render()
@@ -117,7 +113,7 @@ class MetaWorld(GymWorld):
         geom = ids[..., 1] == mujoco.mjtObj.mjOBJ_GEOM
         return image, np.where(geom, self._labels[ids[..., 0]], ROBOT_MASK_FREE).astype(np.uint8)
 
-    def _picture(self, camera: str = 'corner') -> np.ndarray:
+    def _draw(self, camera: str) -> np.ndarray:
         self._renderer.update_scene(self.env.data, camera, self._option)
         return self._renderer.render()
 
@@ -128,7 +124,7 @@ class MetaWorld(GymWorld):
         :raises SceneError: if it does not come to that.
         """
         for _ in range(SOLVING_STEPS):
-            self.act(self._command())
+            self.act(self.command())
             if self.succeeds():
                 break
         else:
@@ -137,73 +133,27 @@ class MetaWorld(GymWorld):
         for _ in range(SETTLING_STEPS):
             self.act(np.array([0, 0, 0, 1 - 2 * self.gripper()[3]]))
 
-    def demonstrate(self, seed: int, num_frames: int = 0) -> Episode:
-        """
-        Let the scripted policy act as unsteadily as a person, and record a camera beside it alone.
+    def demonstrate(self, seed: int, num_frames: int = 0) -> Demonstration:
+        """Let the scripted policy act as demonstrations.demonstrate says."""
+        return demonstrate(self, seed, num_frames)
 
-        Its speed, a detour before it begins, pauses and noise are drawn from the seed, as the
-        scene is. What does not succeed is drawn anew, TRIES times at most.
-
-        :param num_frames: at most; 0: MOST_FRAMES.
-        :return: Episode without objects, gripper and commands.
-        """
-        for attempt in range(TRIES):
-            rng = np.random.default_rng([seed, attempt])
-            self.begin(int(rng.integers(2 ** 31)))
-            frames, done = self._act_unsteadily(rng, num_frames or MOST_FRAMES)
-            if done and len(frames) >= LEAST_FRAMES:
-                break
-        count = len(frames)
-        actions = np.full((count, 4), np.nan, np.float32)
-        actions[-1] = 0
-        return Episode(
-            frames=np.stack(frames),
-            stamps=np.arange(count) * round(1e9 * EVERY * self.env.dt), actions=actions,
-            grippers=np.full((count, 4), np.nan, np.float32), object_names=(),
-            object_pixels=np.zeros((count, 0, 2), np.float32),
-            object_poses=np.zeros((count, 0, 7)), goal_frame=None,
-            goal_pixels=np.zeros((0, 2), np.float32), goal_poses=np.zeros((0, 7)),
-            task=self.task_name, seed=seed, outcome='success' if done else 'failure')
-
-    def _act_unsteadily(self, rng: np.random.Generator,
-                        num_frames: int) -> tuple[list[np.ndarray], bool]:
-        """Return the frames of one try, and whether it succeeded."""
-        speed, noise = rng.uniform(*SPEED), rng.uniform(*NOISE)
-        pauses = {int(rng.integers(*PAUSE_RANGE)): int(rng.integers(*PAUSE_STEPS, endpoint=True))
-                  for _ in range(rng.integers(*PAUSES, endpoint=True))}
-        pauses[0] = int(rng.integers(10))  # before the first motion
-        goes_on = int(rng.integers(2, 14))  # after the success
-        by = np.clip(self._seen[:3] + rng.uniform((-0.2, -0.1, -0.05), 0.2),
-                     DETOUR_LOW, DETOUR_HIGH)
-        detour = DETOUR_STEPS if rng.random() < DETOUR_SHARE else 0
-        frames, resting, done, action = [], 0, False, np.array([0, 0, 0, -1.0])
-        for step in range(num_frames * EVERY):
-            if step % EVERY == 0:
-                frames.append(self._picture('corner3'))
-            resting = pauses.get(step, resting)
-            if resting:
-                resting -= 1
-                action = np.array([0, 0, 0, action[3]])
-            elif detour:
-                gap = by - self._seen[:3]
-                action = np.append(speed * np.clip(10 * gap, -1, 1), -1)
-                detour = detour - 1 if np.linalg.norm(gap) > 0.04 else 0
-            else:
-                action = self._command()
-                unsteady = rng.normal(0, noise, 3) * np.linalg.norm(action[:3]).clip(max=1)
-                action[:3] = speed * action[:3] + unsteady
-            self.act(action)
-            done = done or self.succeeds()
-            goes_on -= done
-            if not goes_on:
-                return frames, True
-        return frames, False
-
-    def _command(self) -> np.ndarray:
+    def command(self) -> np.ndarray:
         """Return what the scripted policy commands now, (4,) in [-1, 1]."""
         with warnings.catch_warnings(action='ignore'):  # it commands more than is allowed
             action = self.policy.get_action(self._seen)
         return np.clip(np.asarray(action, np.float64), -1, 1)
+
+    def hand(self) -> np.ndarray:
+        """Return where the hand is, (3,) m in Meta-World's frame."""
+        return np.array(self._seen[:3])
+
+    def movable(self) -> np.ndarray:
+        """Return where all is that is not the robot, without orientations."""
+        return np.array(self.env.data.qpos[self._movable])
+
+    def picture(self) -> np.ndarray:
+        """Return what a camera beside the robot sees."""
+        return self._draw('corner3')
 
     def close(self) -> None:
         """Free the renderer and the environment."""
@@ -226,8 +176,8 @@ def make_env(task: str) -> tuple[Any, Any]:
         from metaworld.policies import ENV_POLICY_MAP
     except ModuleNotFoundError as error:
         raise ConfigError(
-            'world metaworld: Meta-World is not installed; type `pip install gymnasium imageio '
-            '&& pip install --no-deps metaworld`, as it asks for an older mujoco') from error
+            'world metaworld: Meta-World is not installed; type `pip install --no-deps -r '
+            'requirements-worlds.txt` in the folder of tap_ros') from error
     if task not in ALL_V3_ENVIRONMENTS:
         raise SceneError(f'task {task!r} is unknown; valid: {", ".join(ALL_V3_ENVIRONMENTS)}')
     # Meta-World 3.1 writes rows of 11 numbers; MuJoCo 4 has 12.
@@ -252,15 +202,24 @@ def _reset_mocap_welds(self: Any) -> None:
     self.model.eq_data[welds, :11] = (0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5)
 
 
+def _below(model: mujoco.MjModel, root: str) -> set[int]:
+    """Return a body and those that hang on it."""
+    found = {mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, root)}
+    for body in range(1, model.nbody):  # parents come first
+        if model.body_parentid[body] in found:
+            found.add(body)
+    return found
+
+
 def _labels(model: mujoco.MjModel) -> np.ndarray:
     """Return what each geom is in a robot mask, uint8 (G,)."""
-    def below(root: str) -> set[int]:
-        found = {mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, root)}
-        for body in range(1, model.nbody):  # parents come first
-            if model.body_parentid[body] in found:
-                found.add(body)
-        return found
-
-    hand, arm = below('hand'), below('base')
+    hand, arm = _below(model, 'hand'), _below(model, 'base')
     return np.array([ROBOT_MASK_HAND if body in hand else ROBOT_MASK_ARM if body in arm
                      else ROBOT_MASK_FREE for body in model.geom_bodyid], np.uint8)
+
+
+def _movable(model: mujoco.MjModel) -> np.ndarray:
+    """Return where positions of what is not the robot stand in qpos, int (Q,)."""
+    robot, sizes = _below(model, 'hand') | _below(model, 'base'), {mujoco.mjtJoint.mjJNT_FREE: 3}
+    return np.concatenate([np.arange(sizes.get(kind, 1)) + first for body, kind, first in zip(
+        model.jnt_bodyid, model.jnt_type, model.jnt_qposadr) if body not in robot])

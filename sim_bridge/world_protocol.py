@@ -49,7 +49,7 @@ class World(Protocol):
     world lacks the method. The MuJoCo table, simulator.Simulator, has all of them:
     `observer_picture()`, `move_goal(names, pixels)`, `put_object(name, pose, velocity)`,
     `object_motions()`. Others may have `demonstrate(seed, num_frames)`, which lets an expert act
-    and returns an Episode, for `collect`; num_frames is the most, 0 as is usual. Keyword
+    and returns a demonstrations.Demonstration, for `collect`. Keyword
     arguments look=, appearance= and arm= are the table's, too.
 
     :ivar task_name: of the present task.

@@ -34,7 +34,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         'order2': 'sim_bridge.tasks.order:ORDER2', 'order3': 'sim_bridge.tasks.order:ORDER3',
         'stack2': 'sim_bridge.tasks.stack:STACK2', 'stack3': 'sim_bridge.tasks.stack:STACK3'},
     'tap_ros.worlds': {'metaworld': 'sim_bridge.metaworld:MetaWorld',
-                       'mujoco_table': 'sim_bridge.simulator:Simulator'},
+                       'mujoco_table': 'sim_bridge.simulator:Simulator',
+                       'ogbench': 'sim_bridge.ogbench:OGBench'},
 }
 
 

@@ -103,13 +103,11 @@ def undeclared(folders, *files):
 
 
 def test_what_is_imported_is_declared_and_what_is_required_is_imported():
-    # scripts/setup.bash installs metaworld, without its dependencies.
-    assert undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
-                      'requirements-extras.txt') in ([], ['metaworld'])
+    assert not undeclared(('tap_ros', 'sim_bridge', 'launch'), 'requirements.txt',
+                          'requirements-extras.txt', 'requirements-worlds.txt')
     assert not undeclared(('experiments',), 'requirements.txt', 'requirements-experiments.txt',
                           'requirements-dev.txt')
-    # By way of torch.utils.tensorboard, and of Meta-World.
-    used = {'tensorboard', 'gymnasium', 'imageio'}
+    used = {'tensorboard'}  # by way of torch.utils.tensorboard
     for name in imported_packages('tap_ros', 'sim_bridge', 'experiments', 'test'):
         used |= distributions_of(name)
     for name in ('requirements', 'requirements-experiments', 'requirements-extras'):
@@ -119,7 +117,8 @@ def test_what_is_imported_is_declared_and_what_is_required_is_imported():
 def test_requirements_and_constraints_agree():
     pinned = requirements('constraints.txt')
     for name in ('requirements.txt', 'requirements-dev.txt', 'requirements-experiments.txt',
-                 'requirements-extras.txt', 'requirements-ros.txt', 'requirements-ros2.txt'):
+                 'requirements-extras.txt', 'requirements-worlds.txt', 'requirements-ros.txt',
+                 'requirements-ros2.txt'):
         for distribution, version in requirements(name).items():
             assert pinned[distribution] == version, f'{name}: {distribution}'
 

@@ -3,10 +3,12 @@
 """A Gymnasium environment is a World: a dummy of a few lines, and Meta-World."""
 
 from dataclasses import replace
+import json
 
 import numpy as np
 import pytest
-from sim_bridge.collect import collect, CollectConfig
+from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
+from sim_bridge.demonstrations import demonstrate, find_bottleneck
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from sim_bridge.world_protocol import make_world
@@ -123,6 +125,11 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
     topics = find_topics(sorted(folder.glob('*.mcap')))
     assert set(topics) <= {'/camera/image_raw', '/camera/camera_info', '/clock', '/episode'}
     assert (first.frames[0] != second.frames[0]).any(), 'each has a scene of its own'
+    marks = json.loads((folder / BOTTLENECKS_FILE).read_text())['marks']
+    assert [mark['episode'] for mark in marks] == [0, 1]
+    for mark, episode in zip(marks, (first, second)):
+        (begin, end), = mark['stamps']
+        assert episode.stamps[0] < 1e9 * begin <= 1e9 * end < episode.stamps[-1]
     # An interrupted collection goes on to the same files.
     whole = (folder / 'bag_1.mcap').read_bytes()
     (folder / 'bag_1.mcap').unlink()
@@ -133,3 +140,60 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
         with pytest.raises(TapError, match=words):
             collect(tmp_path / 'bad', replace(config, **bad), progress=False)
     assert not (tmp_path / 'bad').exists()
+
+
+class Slider:
+    """A hand that goes to a thing at 1 m and pushes it by 0.5 m."""
+
+    task_name, steps, step_ns = 'slide', 2, 10 ** 7
+    reach = np.array([[-0.1, -0.1, 0], [0.1, 0.1, 0]])
+
+    def begin(self, seed):
+        self.at, self.thing = np.zeros(3), 1.0
+
+    def act(self, command):
+        self.at = self.at + 0.02 * command[:3]
+        self.thing = max(self.thing, self.at[0])
+
+    def command(self):
+        return np.array([np.clip(10 * (1.5 - self.at[0]), -1, 1), *(-10 * self.at[1:]), 1.0])
+
+    def hand(self):
+        return self.at
+
+    def movable(self):
+        return np.array([self.thing])
+
+    def picture(self):
+        return np.full((4, 4, 3), 100 * self.thing, np.uint8)
+
+    def succeeds(self):
+        return self.thing > 1.45
+
+
+def test_the_bottleneck_is_where_the_hand_is_at_what_it_is_about_to_move():
+    stage = Slider()
+    lengths = set()
+    for seed in range(5):
+        found = demonstrate(stage, seed, 300)
+        things = found.episode.frames[:, 0, 0, 0]
+        first, last = found.bottleneck
+        assert found.episode.outcome == 'success' and 0 < first <= last
+        assert (things[:first] == 100).all() and 100 < things[last] < 112
+        lengths.add(len(things))
+    assert len(lengths) > 2, 'each goes at its own speed'
+    still = np.zeros((9, 3))
+    assert find_bottleneck(still, np.zeros((9, 1))) is None, 'nothing moves'
+    assert find_bottleneck(still, np.arange(9.0)[:, None]) is None, 'it moves from the start on'
+
+
+@pytest.mark.parametrize('task', ['button', 'cube', 'drawer', 'window'])
+def test_oracles_of_ogbench_demonstrate_too(task):
+    pytest.importorskip('ogbench')
+    world = make_world('ogbench', task, 32)
+    found, again = world.demonstrate(2), world.demonstrate(2)
+    world.close()
+    assert found.episode.outcome == 'success' and found.bottleneck == again.bottleneck is not None
+    np.testing.assert_array_equal(found.episode.frames, again.episode.frames)
+    with pytest.raises(SceneError, match='collect --world ogbench'):
+        world.reset(0)

@@ -1,0 +1,165 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Demonstrations of scripts that act as unsteadily as a person who teleoperates.
+
+Speed, a detour before the script begins, pauses and noise are drawn from a seed, as the scene is.
+A camera beside the robot is recorded and nothing else: what a user has of another's robot.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from tap_ros.recording.episode import Episode
+
+MOST_FRAMES, LEAST_FRAMES = 70, 12
+TRIES = 20  # a demonstration that fails is made anew
+SPEED, NOISE = (0.45, 1.0), (0.0, 0.15)  # shares of the script's own command
+DETOUR_SHARE, DETOUR_FRAMES = 0.8, 15  # of demonstrations; at most
+DETOUR_LOW, DETOUR_HIGH = (-0.2, -0.1, -0.05), (0.2, 0.2, 0.2)  # m, from where the hand is
+REACHED = 0.04  # m
+PAUSES, PAUSE_FRAMES, PAUSE_RANGE = (1, 3), (1, 4), (1, 40)  # count, length, begin
+BEFORE, AFTER = (0, 3), (1, 4)  # frames at rest before it begins, and after its success
+NEAR = 0.03  # m, between the hand and where it is when things begin to move
+BEGUN, GONE = 0.02, 0.15  # shares of their way that things have moved
+
+
+class Stage(Protocol):
+    """
+    An environment with a script that solves it.
+
+    :ivar task_name: what it is about.
+    :ivar steps: of the environment from picture to picture.
+    :ivar step_ns: nanoseconds of a step.
+    :ivar reach: (2, 3) m, lowest and highest place that the hand is sent to.
+    """
+
+    task_name: str
+    steps: int
+    step_ns: int
+    reach: np.ndarray
+
+    def begin(self, seed: int) -> None:
+        """Begin the scene of a seed."""
+
+    def act(self, command: np.ndarray) -> None:
+        """Take a step with a command (A,) in [-1, 1]: three of motion, the last of the gripper."""
+
+    def command(self) -> np.ndarray:
+        """Return what the script commands now."""
+
+    def hand(self) -> np.ndarray:
+        """Return where the hand is, (3,) m."""
+
+    def movable(self) -> np.ndarray:
+        """Return where all that can be moved is, (Q,) m and rad."""
+
+    def picture(self) -> np.ndarray:
+        """Return what the camera sees, (H, W, 3) uint8."""
+
+    def succeeds(self) -> bool:
+        """Return whether the environment is solved."""
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """
+    What is recorded of a script.
+
+    :param episode: without objects, gripper and commands.
+    :param bottleneck: its first and last frame, by the simulator; None if nothing moved.
+    """
+
+    episode: Episode
+    bottleneck: tuple[int, int] | None
+
+
+def demonstrate(stage: Stage, seed: int, num_frames: int = 0) -> Demonstration:
+    """
+    Let the script of a stage act; what does not succeed is drawn anew, TRIES times at most.
+
+    :param num_frames: at most; 0: MOST_FRAMES.
+    """
+    for attempt in range(TRIES):
+        rng = np.random.default_rng([seed, attempt])
+        stage.begin(int(rng.integers(2 ** 31)))
+        frames, hands, places, done = _act_unsteadily(stage, rng, num_frames or MOST_FRAMES)
+        if done and len(frames) >= LEAST_FRAMES:
+            break
+    count = len(frames)
+    actions = np.full((count, 4), np.nan, np.float32)
+    actions[-1] = 0
+    episode = Episode(
+        frames=np.stack(frames), stamps=np.arange(count) * stage.steps * stage.step_ns,
+        actions=actions, grippers=np.full((count, 4), np.nan, np.float32), object_names=(),
+        object_pixels=np.zeros((count, 0, 2), np.float32),
+        object_poses=np.zeros((count, 0, 7)), goal_frame=None,
+        goal_pixels=np.zeros((0, 2), np.float32), goal_poses=np.zeros((0, 7)),
+        task=stage.task_name, seed=seed, outcome='success' if done else 'failure')
+    return Demonstration(episode, find_bottleneck(np.stack(hands), np.stack(places)))
+
+
+def find_bottleneck(hands: np.ndarray, places: np.ndarray) -> tuple[int, int] | None:
+    """
+    Find the frames in which the hand is at what it is about to move.
+
+    They begin where the hand has come, for good, NEAR to where it is when things begin to move,
+    and end when things have gone the share GONE of their way.
+
+    :param hands: (T, 3) m.
+    :param places: (T, Q) m and rad, of all that can be moved.
+    :return: first and last of these frames; None if nothing moves, or from the start on.
+    """
+    way = np.linalg.norm(places - places[1], axis=1)  # things settle in the first frame
+    way[0] = 0
+    if way.max() <= 1e-6:
+        return None
+    begun, gone = (int((way > share * way.max()).argmax()) for share in (BEGUN, GONE))
+    away = np.flatnonzero(np.linalg.norm(hands[:begun] - hands[begun], axis=1) >= NEAR)
+    first, last = (int(away[-1]) + 1 if len(away) else 0), min(gone, len(hands) - 2)
+    return (first, last) if 0 < first <= last else None
+
+
+def _act_unsteadily(stage: Stage, rng: np.random.Generator, num_frames: int
+                    ) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], bool]:
+    """Return frames, hands and places of one try, and whether it succeeded."""
+    steps = stage.steps
+
+    def some(frames: tuple[int, int]) -> int:
+        return int(rng.integers(steps * frames[0], steps * frames[1], endpoint=True))
+
+    speed, noise = rng.uniform(*SPEED), rng.uniform(*NOISE)
+    pauses = {some(PAUSE_RANGE): some(PAUSE_FRAMES)
+              for _ in range(rng.integers(*PAUSES, endpoint=True))}
+    pauses[0] = some(BEFORE)
+    goes_on = some(AFTER)
+    by = np.clip(stage.hand() + rng.uniform(DETOUR_LOW, DETOUR_HIGH), *stage.reach)
+    detour = DETOUR_FRAMES * steps if rng.random() < DETOUR_SHARE else 0
+    frames, hands, places = [], [], []
+    resting, done = 0, False
+    action = np.zeros_like(stage.command())
+    action[-1] = -1
+    for step in range(num_frames * steps):
+        if step % steps == 0:
+            frames.append(stage.picture())
+            hands.append(stage.hand().copy())
+            places.append(stage.movable().copy())
+        resting = pauses.get(step, resting)
+        if resting:
+            resting -= 1
+            action[:-1] = 0
+        elif detour:
+            gap = by - stage.hand()
+            action[:3], action[3:-1] = speed * np.clip(10 * gap, -1, 1), 0
+            detour = detour - 1 if np.linalg.norm(gap) > REACHED else 0
+        else:
+            action = stage.command()
+            unsteady = rng.normal(0, noise, 3) * np.linalg.norm(action[:3]).clip(max=1)
+            action[:3] = speed * action[:3] + unsteady
+        stage.act(np.clip(action, -1, 1))
+        done = done or stage.succeeds()
+        goes_on -= done
+        if not goes_on:
+            return frames, hands, places, True
+    return frames, hands, places, False
