@@ -11,6 +11,7 @@ collection goes on with the files that are not there yet.
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 import json
+import math
 from pathlib import Path
 import time
 from typing import Annotated, Any
@@ -21,7 +22,7 @@ from sim_bridge.tasks.tasks import get_task, run_episode, TIMINGS
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
 from sim_bridge.world_protocol import ability, make_world, Observation, World
 from tap_ros.engines import Engine, LOCAL, run_tasks, Work
-from tap_ros.errors import ConfigError, RecordingError
+from tap_ros.errors import check_fields, ConfigError, RecordingError
 from tap_ros.files import only_writer, storage_errors, write_atomically
 from tap_ros.options import Folder, one_of
 from tap_ros.plugins import names
@@ -134,16 +135,10 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
 
 def _check(config: CollectConfig) -> None:
     """Raise ConfigError, or SceneError, for what cannot be collected."""
-    if not 0 <= config.misses <= 1:
-        raise ConfigError(f'misses is {config.misses:g}; expected a share from 0 to 1')
-    if min(config.episodes, config.episodes_per_file) < 1:
-        raise ConfigError('episodes and episodes_per_file must be at least 1')
-    if config.frames and not MIN_FRAMES <= config.frames <= MAX_FRAMES:
-        raise ConfigError(f'frames is {config.frames}; expected {MIN_FRAMES} to {MAX_FRAMES}, or '
-                          f'0 for what is usual for the task')
-    if config.timing not in TIMINGS:
-        raise ConfigError(
-            f'timing {config.timing!r} is unknown; valid timings: {", ".join(TIMINGS)}')
+    check_fields(config, {'misses': (0, 1), 'episodes': (1, math.inf),
+                          'episodes_per_file': (1, math.inf)})
+    if config.frames:  # 0: as is usual for the task
+        check_fields(config, {'frames': (MIN_FRAMES, MAX_FRAMES)})
     if config.world != TABLE:
         usual = CollectConfig()
         said = [name for name in ('timing', 'misses', 'look', 'appearance', 'arm')

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sim_bridge.world.camera import Camera
+from sim_bridge.world.camera import OneCamera
 from sim_bridge.world_protocol import clip_action, Observation
 from tap_ros.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import SceneError
 
 
-class GymWorld(ABC):
+class GymWorld(OneCamera, ABC):
     """
     What environments have in common.
 
@@ -27,7 +27,6 @@ class GymWorld(ABC):
 
     task_name: str
     object_names: tuple[str, ...]
-    camera: Camera
     arm = None  # its joints are not told
     seed: int | None = None  # of the scene
     _goal: Observation | None = None
@@ -67,16 +66,6 @@ class GymWorld(ABC):
     @abstractmethod
     def close(self) -> None:
         """Free what the environment holds."""
-
-    @property
-    def camera_matrix(self) -> np.ndarray:
-        """Return the intrinsics (3, 3) in pixels."""
-        return self.camera.K
-
-    @property
-    def camera_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) of the camera's optical frame in the world."""
-        return self.camera.pose
 
     def reset(self, seed: int) -> Observation:
         """

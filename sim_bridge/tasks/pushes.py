@@ -7,7 +7,7 @@ from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
-from sim_bridge.tasks.tasks import moves
+from sim_bridge.tasks.tasks import moves, straight
 from sim_bridge.world.table import divided, OBJECT_QPOS_START, ramp_controls, SUBSTEPS, Table
 from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
 
@@ -59,21 +59,15 @@ def push_actions(push: Push, hand: np.ndarray, place: np.ndarray, goal: np.ndarr
     lowest, highest = WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2]
     start = np.clip(start, lowest, highest)
     end = np.clip(start + max(length, 0.04) * along, lowest, highest)
-    waypoints = []
+    path, above, behind = [hand[:3]], np.append(hand[:2], LIFTED), np.append(start, LOW)
     travel = np.linalg.norm(start - hand[:2])
     if travel > 0.02:
         if hand[2] < LIFTED - 0.03:
-            waypoints.append(np.append(hand[:2], LIFTED)[None])
-        steps = int(np.ceil(travel / push.travel_speed))
-        path = hand[:2] + np.linspace(0, 1, steps + 1)[1:, None] * (start - hand[:2])
-        waypoints.append(np.column_stack([path, np.full(steps, LIFTED)]))
-    waypoints.append(np.append(start, LOW)[None])
+            path.append(above)
+        path += straight(above, np.append(start, LIFTED), int(np.ceil(travel / push.travel_speed)))
     steps = int(np.ceil(np.linalg.norm(end - start) / push.speed))
-    if steps:
-        path = start + np.linspace(0, 1, steps + 1)[1:, None] * (end - start)
-        waypoints.append(np.column_stack([path, np.full(steps, LOW)]))
-    positions = np.concatenate([hand[None, :3], *waypoints])[:max_steps + 1]
-    return moves(positions)
+    path += [behind, *straight(behind, np.append(end, LOW), steps)]
+    return moves(path[:max_steps + 1])
 
 
 def after_plans(table: Table, moment: Moment,

@@ -101,6 +101,22 @@ class Camera:
         return replace(self, width=width, height=height)
 
 
+class OneCamera:
+    """A world whose pictures one camera takes, as world_protocol.World tells of it."""
+
+    camera: Camera
+
+    @property
+    def camera_matrix(self) -> np.ndarray:
+        """Return the intrinsics (3, 3) in pixels."""
+        return self.camera.K
+
+    @property
+    def camera_pose(self) -> np.ndarray:
+        """Return the pose (4, 4) of the camera's optical frame in the world."""
+        return self.camera.pose
+
+
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
     """Raise SceneError, with the remedy, where MuJoCo cannot draw off-screen."""

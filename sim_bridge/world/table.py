@@ -11,6 +11,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from numpy.typing import ArrayLike
+from sim_bridge.world.camera import OneCamera
 from sim_bridge.world.looks import choose_appearance, DEFAULT_LOOK, get_look, OBSERVER, USUAL
 from sim_bridge.world.scene import (
     build_scene,
@@ -71,7 +72,7 @@ def ramp_controls(target: np.ndarray, actions: np.ndarray,
     return controls.reshape(*actions.shape[:-2], -1, 5), targets
 
 
-class Table:
+class Table(OneCamera):
     """
     A table with a gripper, objects and a camera.
 
@@ -103,16 +104,6 @@ class Table:
         self._renderer: Studio | None = None
         self._observer: Studio | None = None
         self._worn = USUAL  # the appearance of the present scene
-
-    @property
-    def camera_matrix(self) -> np.ndarray:
-        """Return the intrinsics (3, 3) in pixels."""
-        return self.camera.K
-
-    @property
-    def camera_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) of the camera's optical frame in the world."""
-        return self.camera.pose
 
     def load(self, shapes: Sequence[ObjectShape], poses: np.ndarray, gripper: np.ndarray,
              seed: int) -> None:

@@ -53,7 +53,7 @@ def make_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int],
     Read windows and change how they look: mirrored left to right, in other colours.
 
     :param episodes: (B,) episode indices; starts (B,) first frames; steps T.
-    :param homography: (3, 3) tensor, or (E, 3, 3), one for each episode of the store.
+    :param homography: (3, 3) of the table.
     :param mirrored: (B,) bool; orders (B,) index to COLOUR_ORDERS.
     :param robot_mask: see robot_mask.hidden_pixels; the episodes have masks unless it is 'none'.
     :return: Windows; the grippers and actions of mirrored ones have x negated.
@@ -75,12 +75,10 @@ def make_windows(store: 'Episodes', episodes: np.ndarray | Sequence[int],
         raise RecordingError(
             f'/joint_states: episode {bad} lacks gripper positions; the forward model needs '
             f'{", ".join(GRIPPER_JOINTS)} at every picture')
-    tables = homography if homography.ndim == 2 else homography[
-        torch.as_tensor(np.asarray(episodes))]
     batch = Windows(
         to_float(np.stack(images)), torch.from_numpy(np.stack(hidden)[:, :, None]),
         torch.from_numpy(hands), torch.from_numpy(np.stack(actions).astype(np.float32)),
-        tables.expand(len(images), 3, 3).clone(), torch.from_numpy(np.asarray(mirrored)),
+        homography.expand(len(images), 3, 3).clone(), torch.from_numpy(np.asarray(mirrored)),
         torch.tensor([COLOUR_ORDERS[i] for i in orders]))
     batch.images = recolour(batch.images, batch.colours[:, None])
     batch.images = mirror(batch.images, batch.mirrored)

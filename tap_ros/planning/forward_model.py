@@ -30,13 +30,12 @@ from tap_ros.errors import check_fields, ConfigError
 from tap_ros.images.crop import Crop, TrainedCrop
 from tap_ros.planning.forward_networks import action_terms, crop_points, PushNet, SceneEncoder
 from tap_ros.planning.table import (
-    channels_first,
-    channels_last,
     grid_points,
     pixel_points,
     project,
     sample,
     sample_picture,
+    shifted,
     Table,
 )
 from tap_ros.training.devices import has_bfloat16, placed
@@ -75,18 +74,12 @@ class ForwardModelConfig:
     camera_size: tuple[int, int] = field(default=(0, 0), metadata=LATER)  # (0, 0): unknown
 
     def __post_init__(self) -> None:
-        if len(self.table) != 9 or len(self.arm) != 12:
+        if len(self.table) != 9 or len(self.arm) != 12 or self.image_size % 4 or any(
+                n % 2 for n in self.crop_cells):
             raise ConfigError(
-                f'forward model: expected 9 numbers for table and 12 for arm, got '
-                f'{len(self.table)} and {len(self.arm)}')
-        if self.image_size % 4 or any(n % 2 for n in self.crop_cells):
-            raise ConfigError(
-                f'forward model: image_size {self.image_size} must be a multiple of 4 and '
-                f'crop_cells {self.crop_cells} even')
-        if len(self.crop_cells) != 2 or not all(
-                isinstance(n, int) and 2 <= n <= 1024 for n in self.crop_cells):
-            raise ConfigError('forward model: crop_cells: expected 2 whole numbers of 2..1024, '
-                              f'got {self.crop_cells}')
+                'forward model: expected 9 numbers for table and 12 for arm, image_size a '
+                f'multiple of 4, crop_cells even; got {len(self.table)}, {len(self.arm)}, '
+                f'{self.image_size}, {self.crop_cells}')
         sizes = ('image_size', 'table_cells', 'features', 'width', 'blocks', 'encoder_width',
                  'sprite_size')
         check_fields(self, {**dict.fromkeys(sizes, (1, 1024)),
@@ -125,7 +118,10 @@ class LearnedForwardModel(nn.Module):
         distance = (pixel_points((size, size)) - (size - 1) / 2).norm(dim=-1)
         sprite[0, 3] = 2 - distance
         self.sprite = nn.Parameter(sprite)
-        constant = self._constant
+
+        def constant(name: str, value: torch.Tensor) -> None:
+            self.register_buffer(name, value, persistent=False)
+
         constant('homography', torch.tensor(config.table).view(3, 3).float())
         constant('arm_camera', torch.tensor(config.arm).view(3, 4).float())
         constant('grid', grid_points(config.table_cells))
@@ -179,9 +175,6 @@ class LearnedForwardModel(nn.Module):
         return Table(self.homography, (config.image_size,) * 2, config.table_cells,
                      config.table_half)
 
-    def _constant(self, name: str, value: torch.Tensor) -> None:
-        self.register_buffer(name, value, persistent=False)
-
     def draw_arm(self, gripper: torch.Tensor) -> torch.Tensor:
         """
         Draw the arm where its kinematics put it.
@@ -225,9 +218,9 @@ class LearnedForwardModel(nn.Module):
 
     def move_gripper(self, gripper: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Return where the gripper is after an action: clipped to limits and workspace."""
-        step = torch.maximum(torch.minimum(action[:, :3], self.move_limit), -self.move_limit)
+        step = action[:, :3].clamp(-self.move_limit, self.move_limit)
         moved = torch.cat([gripper[:, :3] + step, action[:, 3:]], 1)
-        return torch.maximum(torch.minimum(moved, self.limits[1]), self.limits[0])
+        return moved.clamp(*self.limits)
 
     def advance(self, features: torch.Tensor, flow: torch.Tensor, gripper: torch.Tensor,
                 action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -250,15 +243,15 @@ class LearnedForwardModel(nn.Module):
         here = gripper[:, None, :2] / half
         at = torch.baddbmm(here, self.crop.expand(len(turn), -1, -1), turn)
         at = at.view(-1, *self.config.crop_cells, 2)
-        crop = sample(features, at + channels_last(sample(channels_first(flow), at)))
+        crop = sample(features, shifted(at, flow))
         # 2. predict the flow of this step, from new places back to old ones
         local, masks = self.push(crop, action_terms(gripper, following, direction, length))
         step = (turn.mT @ local.flatten(2)) * (length / half)[..., None]  # (N, 2, h w) on table
         # 3. compose, where the crop reaches: phi'(x) = f(x) + phi(x + f(x))
         window, points = self._window(gripper)
         step = sample(step.view_as(local), self._crop_coordinates(points, gripper, turn), 'zeros')
-        back = points + channels_last(step)
-        moved = back - points + channels_last(sample(channels_first(flow), back))
+        back = points + step.movedim(1, -1)
+        moved = back - points + sample(flow.movedim(-1, 1), back).movedim(1, -1)
         return flow.index_put(window, moved), following, masks
 
     def _window(self, gripper: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
@@ -266,11 +259,11 @@ class LearnedForwardModel(nn.Module):
         n, m = self.config.table_cells, self.config.window_cells
         corner = (gripper[:, :2] / self.config.table_half + 1) * ((n - 1) / 2) - (m - 1) / 2
         corner = corner.round().long().clamp(0, n - m)  # (N, 2) column, row
-        line = torch.arange(m, device=gripper.device)
+        line, which = (torch.arange(k, device=gripper.device) for k in (m, len(gripper)))
         columns, rows = corner[:, :1] + line, corner[:, 1:] + line  # (N, m)
-        which = torch.arange(len(gripper), device=gripper.device)[:, None, None]
         first = corner[:, None, None] * (2 / (n - 1))  # (N, 1, 1, 2)
-        return (which, rows[:, :, None], columns[:, None]), self.grid[:m, :m] + first
+        return (which[:, None, None], rows[:, :, None], columns[:, None]), (
+            self.grid[:m, :m] + first)
 
     def _crop_coordinates(self, points: torch.Tensor, gripper: torch.Tensor,
                           turn: torch.Tensor) -> torch.Tensor:
@@ -314,7 +307,7 @@ class LearnedForwardModel(nn.Module):
         half = self.config.table_half
         table = project(torch.linalg.inv(homography), pixels.flatten(0, 1)) / half
         table = table.unflatten(1, pixels.shape[:2])  # (B, H, W, 2)
-        source = table + channels_last(sample(channels_first(flow), table, 'zeros'))
+        source = shifted(table, flow, 'zeros')
         source = project(homography, source.flatten(1, 2) * half).view_as(table)
         objects = sample_picture(scene.objects, source)
         arm_mask = arm[:, 3:]
@@ -339,10 +332,8 @@ class LearnedForwardModel(nn.Module):
         :param actions: (N, horizon, 4).
         """
         count = len(actions)
-        features = features.expand(count, -1, -1, -1)
-        maps = maps.expand(count, -1, -1, -1)
-        gripper = gripper.expand(count, -1)
-        flow = self.still(count)
+        features, maps = (x.expand(count, -1, -1, -1) for x in (features, maps))
+        gripper, flow = gripper.expand(count, -1), self.still(count)
         for t, action in enumerate(actions.unbind(1), 1):
             # above all objects the gripper moves none, whatever the network says
             following = self.move_gripper(gripper, action)

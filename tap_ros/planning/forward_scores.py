@@ -51,40 +51,30 @@ def measure_maps(model: LearnedForwardModel, store: 'Episodes', episodes: Iterab
         `nothing_moves`, how far they moved. Steps at which none moved are left out.
     """
     horizon = SCORED_STEPS[-1]
-    errors: list[np.ndarray] = []
-    moves: list[np.ndarray] = []
-    exact: list[np.ndarray] = []
+    windows: list[np.ndarray] = []  # (T, K, 3) px: error, of true places, way
     table = model.table.pixels().flatten(0, 1)
     device = table.device
     for i in episodes:
         episode = store[int(i)]
-        pixels = np.asarray(episode.object_pixels)
         for start in range(0, len(episode.frames) - horizon, stride):
-            true = pixels[start:start + horizon + 1]
-            if not true.shape[1] or not np.isfinite(true).all() or len(errors) >= max_windows:
+            true = torch.tensor(episode.object_pixels[start:start + horizon + 1], device=device)
+            if not true.shape[1] or not true.isfinite().all() or len(windows) >= max_windows:
                 continue
-            gripper = torch.from_numpy(np.array(episode.grippers[start:start + 1])).to(device)
-            actions = torch.from_numpy(np.array(episode.actions[None, start:start + horizon]))
+            gripper, actions = (torch.tensor(values, device=device) for values in (
+                episode.grippers[start:start + 1], episode.actions[None, start:start + horizon]))
             image = to_float(np.array(episode.frames[start]))[None].to(device)
-            maps = model.table.seed_maps(torch.from_numpy(true[0].copy()).to(device))
-            carried = model.carried_maps(
-                model.begin(image, gripper), gripper, maps, actions.to(device))
-            here = torch.from_numpy(true[0].copy()).to(device)
+            carried = model.carried_maps(model.begin(image, gripper), gripper,
+                                         model.table.seed_maps(true[0]), actions)
             expected = torch.stack([  # a lost map is scored as one that did not move
-                m[0].flatten(1) @ table + (1 - m[0].sum((-1, -2)))[:, None] * here
-                for m in carried]).cpu().numpy()
-            errors.append(np.linalg.norm(expected - true[1:], axis=-1))  # (T, K)
-            places = torch.from_numpy(true[1:].reshape(-1, 2).copy()).to(device)
-            ideal = model.table.seed_maps(places)
-            ideal = (ideal.flatten(1) @ table).cpu().numpy().reshape(true[1:].shape)
-            exact.append(np.linalg.norm(ideal - true[1:], axis=-1))
-            moves.append(np.linalg.norm(true[1:] - true[:1], axis=-1))
+                m[0].flatten(1) @ table + (1 - m[0].sum((-1, -2)))[:, None] * true[0]
+                for m in carried])
+            ideal = model.table.seed_maps(true[1:].flatten(0, 1)).flatten(1) @ table
+            windows.append(torch.stack([expected, ideal.view_as(expected), true[:1].expand_as(
+                expected)]).sub(true[1:]).norm(dim=-1).movedim(0, -1).cpu().numpy())
     measured = {}
-    for t in SCORED_STEPS if moves else ():
-        moved, exact_t, error = (
-            np.concatenate([values[t - 1] for values in part]) for part in (moves, exact, errors))
-        chosen = moved > MOVED_PIXELS
-        if chosen.any():
-            measured[t] = {'map_error': error[chosen], 'true_simulator': exact_t[chosen],
-                           'nothing_moves': moved[chosen]}
+    for t in SCORED_STEPS if windows else ():
+        found = np.concatenate([window[t - 1] for window in windows])
+        found = found[found[:, 2] > MOVED_PIXELS].T
+        if found.size:
+            measured[t] = dict(zip(('map_error', 'true_simulator', 'nothing_moves'), found))
     return measured

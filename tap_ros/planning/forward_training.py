@@ -17,7 +17,7 @@ from tap_ros.planning.forward_loss import draw_arm_like, draw_windows, forward_l
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_scores import map_errors
 from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig
-from tap_ros.planning.table import fit_arm, fit_shift, fit_table
+from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training import run
 from tap_ros.training.inpainted import Episodes, FilledStore
@@ -42,11 +42,11 @@ def _prepare(this: run.Run) -> run.Course[LearnedForwardModel, Item]:
     # The picture that is looked at shows what a node would show; see FreeView.
     episodes: Episodes = store if config.robot_mask == 'none' else FilledStore(
         store, config.robot_mask, this.progress, fill_from_past)
-    tables = episode_tables(store, state.network)
+    homography = state.network.homography.cpu()
 
     def batches(first: int, last: int) -> Iterator[Item]:
         for step in range(first, last):
-            yield draw_step(config, episodes, training, step, tables)
+            yield draw_step(config, episodes, training, step, homography)
 
     def step(item: Item) -> Callable[[], run.Numbers]:
         windows, shown = item
@@ -87,32 +87,19 @@ def model_config(config: ForwardTrainingConfig, store: EpisodeStore,
         camera_size=store.camera_size or (0, 0))
 
 
-def episode_tables(store: EpisodeStore, model: LearnedForwardModel) -> torch.Tensor:
-    """
-    Return where the table is in the pictures of every episode, on the CPU.
-
-    :return: (E, 3, 3); where the robot is masked, shifted as far as the camera was, see fit_shift.
-    """
-    table = model.homography.cpu()
-    if model.config.robot_mask == 'none':
-        return table.expand(len(store), 3, 3)
-    return torch.from_numpy(np.stack([
-        fit_shift(store[i], table.double().numpy()) for i in range(len(store))])).float()
-
-
 def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarray, step: int,
               homography: torch.Tensor) -> tuple[Windows, set[int]]:
     """
     Draw the windows of one step, and which of their pictures are compared.
 
-    :param homography: (3, 3), or (E, 3, 3) of every episode.
+    :param homography: (3, 3) of the table, on the CPU.
     :return: Windows, set of picture indices from 1 to their length.
     """
     rng = np.random.default_rng([config.seed, step])
     growth = min(1.0, (step + 1) / max(1, config.grow * config.steps))
     length = max(1, round(min(2, config.horizon) + growth * (config.horizon - 2)))
     batch = draw_windows(
-        store, training, config.batch_size, length, homography.cpu(), rng, config.augment,
+        store, training, config.batch_size, length, homography, rng, config.augment,
         config.robot_mask)
     return batch, set((rng.permutation(length)[:config.pictures] + 1).tolist())
 

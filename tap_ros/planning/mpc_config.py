@@ -3,9 +3,10 @@
 """Settings of the planner, and presets of them; without torch, for command lines."""
 
 from dataclasses import dataclass, replace
+import math
 from typing import Any
 
-from tap_ros.errors import ConfigError
+from tap_ros.errors import check_fields, ConfigError
 from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.protocols import SearchConfig, Solver
 
@@ -48,16 +49,12 @@ class VisualMPCConfig:
     threads: int = 0  # 0: as many as there are cores
 
     def __post_init__(self) -> None:
-        if self.batch_size < 1:
-            raise ConfigError(f'batch_size: expected at least 1, got {self.batch_size}')
-        if self.cost_every < 1 or HORIZON % self.cost_every:
+        check_fields(self, {'batch_size': (1, math.inf), 'recheck': (0, math.inf),
+                            'proposals': (0, self.search.num_samples),
+                            'cost_every': (1, HORIZON)})
+        if HORIZON % self.cost_every:
             raise ConfigError(f'cost_every: expected a divisor of the horizon {HORIZON}, '
                               f'got {self.cost_every}')
-        if self.recheck < 0:
-            raise ConfigError(f'recheck: expected at least 0, got {self.recheck}')
-        if not 0 <= self.proposals <= self.search.num_samples:
-            raise ConfigError(f'proposals: expected 0..{self.search.num_samples} '
-                              f'(num_samples), got {self.proposals}')
 
 
 PRESETS = {

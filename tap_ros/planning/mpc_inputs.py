@@ -82,37 +82,25 @@ def tabulate(table: Table, pixels: ArrayLike | None = None,
     """
     if (maps is None) == (pixels is None):
         raise PlanningError('goal: give exactly one of pixels and maps')
-    cells = table.pixels().flatten(0, 1)  # (n n, 2)
-    if pixels is not None:
-        goals = _check_goal_pixels(pixels, table.image_size)
+    cells, (height, width) = table.pixels().flatten(0, 1), table.image_size
+    if maps is None:
+        with _as_planning_error():
+            goals = check_pixels(pixels, 'goal_pixels')
+        outside = goals[~in_picture(goals, table.image_size)].tolist()
+        if outside:
+            raise PlanningError(f'goal_pixels: {outside} outside the {width}x{height} picture')
         distances = torch.cdist(torch.from_numpy(goals).to(cells.device), cells)
-    if maps is not None:
-        goals = _check_goal_maps(maps, table.image_size)
+    else:
+        goals = np.ascontiguousarray(maps, np.float32)
+        if goals.ndim != 3 or goals.shape[1:] != (height, width):
+            raise PlanningError(f'goal_maps: expected shape (K, {height}, {width}), one map for '
+                                f'each object, got {goals.shape}')
+        mass = goals.sum((1, 2))
+        if not np.isfinite(goals).all() or (goals < 0).any() or (mass <= 0).any():
+            raise PlanningError('goal_maps: expected finite values of at least 0 and a positive '
+                                f'sum for each object, got sums {mass.tolist()}')
         distances = distances_to_places(torch.from_numpy(goals).to(cells.device), cells)
     return Goal(distances, table.points()[distances.argmin(1)].cpu().numpy())
-
-
-def _check_goal_pixels(pixels: ArrayLike, size: Sequence[int]) -> np.ndarray:
-    """Return goal pixels (K, 2) as float32; raise PlanningError for unknown or outside ones."""
-    with _as_planning_error():
-        pixels = check_pixels(pixels, 'goal_pixels')
-    outside = pixels[~in_picture(pixels, size)].tolist()
-    if outside:
-        raise PlanningError(f'goal_pixels: {outside} outside the {size[1]}x{size[0]} picture')
-    return pixels
-
-
-def _check_goal_maps(maps: ArrayLike, size: Sequence[int]) -> np.ndarray:
-    """Return goal maps (K, H, W) as float32; raise PlanningError for what is no map."""
-    maps = np.ascontiguousarray(maps, np.float32)
-    if maps.ndim != 3 or maps.shape[1:] != tuple(size):
-        raise PlanningError(f'goal_maps: expected shape (K, {size[0]}, {size[1]}), one map for '
-                            f'each object, got {maps.shape}')
-    mass = maps.sum((1, 2))
-    if not np.isfinite(maps).all() or (maps < 0).any() or (mass <= 0).any():
-        raise PlanningError('goal_maps: expected finite values of at least 0 and a positive sum '
-                            f'for each object, got sums {mass.tolist()}')
-    return maps
 
 
 @contextmanager

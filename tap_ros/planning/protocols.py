@@ -4,10 +4,11 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Protocol, runtime_checkable, TYPE_CHECKING
 
 import numpy as np
-from tap_ros.errors import ConfigError
+from tap_ros.errors import check_fields
 
 if TYPE_CHECKING:
     from tap_ros.planning.table import Table
@@ -63,11 +64,7 @@ class SearchConfig:
     num_elites: int = 10
 
     def __post_init__(self) -> None:
-        if not 1 <= self.num_elites <= self.num_samples:
-            raise ConfigError(f'num_elites: expected 1..{self.num_samples} (num_samples), '
-                              f'got {self.num_elites}')
-        if self.num_iterations < 1:
-            raise ConfigError(f'num_iterations: expected at least 1, got {self.num_iterations}')
+        check_fields(self, {'num_elites': (1, self.num_samples), 'num_iterations': (1, inf)})
 
 
 @dataclass(frozen=True)

@@ -87,14 +87,13 @@ def grid_points(cells: int) -> torch.Tensor:
     These are table units: metres divided by half the table's side.
     """
     line = torch.linspace(-1, 1, cells)
-    y, x = torch.meshgrid(line, line, indexing='ij')
-    return torch.stack([x, y], dim=-1)
+    return torch.stack(torch.meshgrid(line, line, indexing='xy'), dim=-1)
 
 
 def pixel_points(size: Sequence[int]) -> torch.Tensor:
     """Return the pixel centres (H, W, 2) as (u, v)."""
-    v, u = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing='ij')
-    return torch.stack([u, v], dim=-1).float()
+    lines = torch.arange(size[1]), torch.arange(size[0])
+    return torch.stack(torch.meshgrid(*lines, indexing='xy'), dim=-1).float()
 
 
 def sample_picture(images: torch.Tensor, pixels: torch.Tensor,
@@ -111,14 +110,9 @@ def sample(fields: torch.Tensor, points: torch.Tensor, padding: str = 'border') 
     return F.grid_sample(fields, points, padding_mode=padding, align_corners=True)
 
 
-def channels_last(x: torch.Tensor) -> torch.Tensor:
-    """View (N, C, h, w) as (N, h, w, C)."""
-    return x.permute(0, 2, 3, 1)
-
-
-def channels_first(x: torch.Tensor) -> torch.Tensor:
-    """View (N, h, w, C) as (N, C, h, w)."""
-    return x.permute(0, 3, 1, 2)
+def shifted(points: torch.Tensor, flow: torch.Tensor, padding: str = 'border') -> torch.Tensor:
+    """Return points (B, h, w, 2) moved by the flow (B, n, n, 2) that is there."""
+    return points + sample(flow.movedim(-1, 1), points, padding).movedim(1, -1)
 
 
 def mirror_table(homography: torch.Tensor, width: int) -> torch.Tensor:
@@ -173,21 +167,17 @@ def fit_arm(episodes: Iterable['Episode']) -> np.ndarray:
     """
     points, pixels = [], []
     for episode in episodes:
+        hands = episode.grippers[:, :3]
         if episode.robot_masks is not None:
-            hand = (episode.robot_masks == ROBOT_MASK_HAND).astype(np.float32)
-            middle, good = _middle(hand)
-            good &= np.isfinite(episode.grippers[:, :3]).all(1)
-            points.append(episode.grippers[good, :3])
-            pixels.append(middle[good])
-            continue
-        frames = episode.frames.astype(np.float32)
-        change = np.abs(np.diff(frames, axis=0)).sum(-1)  # (T-1, H, W)
-        change[change < 30] = 0
-        changed, good = _middle(change)
-        middle = (episode.grippers[1:, :3] + episode.grippers[:-1, :3]) / 2
-        good &= np.isfinite(middle).all(1)
-        points.append(middle[good])
-        pixels.append(changed[good])
+            mass = (episode.robot_masks == ROBOT_MASK_HAND).astype(np.float32)
+        else:
+            hands = (hands[1:] + hands[:-1]) / 2
+            mass = np.abs(np.diff(episode.frames.astype(np.float32), axis=0)).sum(-1)
+            mass[mass < 30] = 0
+        middle, good = _middle(mass)
+        good &= np.isfinite(hands).all(1)
+        points.append(hands[good])
+        pixels.append(middle[good])
     points = np.concatenate(points)
     if len(points) < 50 or points[:, :2].std(0).min() < 0.01:
         raise RecordingError(
@@ -215,31 +205,11 @@ def fit_table(episodes: Iterable['Episode'], arm: np.ndarray) -> np.ndarray:
     :param arm: (3, 4), see fit_arm.
     :return: (3, 3) float64.
     """
-    points, pixels = map(np.concatenate, zip(*map(_seen_places, episodes)))
+    points, pixels = (np.concatenate([values[..., :2].reshape(-1, 2) for values in all_values])
+                      for all_values in zip(*((e.object_poses, e.object_pixels)
+                                              for e in episodes)))
+    known = np.isfinite(points).all(1) & np.isfinite(pixels).all(1)
+    points, pixels = points[known], pixels[known]
     if len(points) < 50 or points.std(0).min() < 0.01:
         return arm[:, [0, 1, 3]]
     return fit_projection(points.astype(np.float64), pixels.astype(np.float64))
-
-
-def _seen_places(episode: 'Episode') -> tuple[np.ndarray, np.ndarray]:
-    """Return where objects are, metres on the table and pixels, both (N, 2), as far as known."""
-    xy = episode.object_poses[..., :2].reshape(-1, 2)
-    uv = episode.object_pixels.reshape(-1, 2)
-    good = np.isfinite(xy).all(1) & np.isfinite(uv).all(1)
-    return xy[good], uv[good]
-
-
-def fit_shift(episode: 'Episode', table: np.ndarray) -> np.ndarray:
-    """
-    Fit how the camera of one episode differs from the usual one: by a shift of the picture.
-
-    :param episode: Episode; as for fit_table, without object positions nothing is known.
-    :param table: (3, 3), see fit_table.
-    :return: (3, 3) float64, the table of this episode.
-    """
-    xy, uv = _seen_places(episode)
-    shifted = np.eye(3)
-    if len(xy):
-        rays = np.column_stack([xy, np.ones(len(xy))]) @ table.T
-        shifted[:2, 2] = np.median(uv - rays[:, :2] / rays[:, 2:], axis=0)
-    return shifted @ table

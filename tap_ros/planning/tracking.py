@@ -36,8 +36,7 @@ class ObjectTracker:
         self.pixels = np.asarray(pixels, np.float32).copy()
         device = model.table.device
         line = (torch.arange(CELLS, device=device) - (CELLS - 1) / 2) * CELL
-        y, x = torch.meshgrid(line, line, indexing='ij')
-        self._cells = torch.stack([x, y], -1).view(-1, 2)  # metres around an object
+        self._cells = torch.cartesian_prod(line, line).flip(-1)  # metres around an object
         self._angles = np.zeros(len(self.pixels))
         with torch.inference_mode():
             picture, arm = self._prepare(image, gripper)

@@ -14,7 +14,7 @@ from tap_ros.planning.forward_loss import forward_loss, make_windows
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
 from tap_ros.planning.forward_training import draw_step, train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
-from tap_ros.planning.table import fit_shift, project
+from tap_ros.planning.table import project
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.inpainted import FilledStore
 from tap_ros.training.robot_mask import fill_from_past
@@ -168,12 +168,3 @@ def test_a_masked_robot_leaves_no_trace_in_loss_and_gradients(bags):
         assert torch.equal(mine, others)
     second.hidden[:] = False
     assert not torch.equal(learn(first)[0], learn(second)[0])
-
-
-def test_a_camera_that_was_moved_is_found_by_its_objects():
-    episode = make_episode(4)
-    moved = replace(episode, object_pixels=episode.object_pixels + np.float32([1.5, -2]))
-    table = fit_shift(moved, np.array(TABLE).reshape(3, 3))
-    places = torch.from_numpy(episode.object_poses[:, 0, :2])
-    np.testing.assert_allclose(
-        project(torch.from_numpy(table), places), moved.object_pixels[:, 0], atol=1e-4)
