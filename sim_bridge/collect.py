@@ -45,8 +45,8 @@ class CollectConfig:
     What to collect: all that a recording follows from.
 
     :param world: mujoco_table, or another whose expert demonstrates: metaworld or ogbench, where
-        scripts act as unsteadily as a person, the camera alone is recorded, and a file beside the
-        recording says when the bottleneck is, by the simulator.
+        scripts act as unsteadily as a person; a camera and the commands are recorded, and a file
+        beside the recording says when the bottleneck is, by the simulator.
     :param task: one that the world has, such as push2; of metaworld door-open-v3; of ogbench cube.
     :param episodes: how many in all; a larger number later adds to the same folder.
     :param seed: of the first episode; the others count on from it.

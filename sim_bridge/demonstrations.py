@@ -4,7 +4,7 @@
 Demonstrations of scripts that act as unsteadily as a person who teleoperates.
 
 Speed, a detour before the script begins, pauses and noise are drawn from a seed, as the scene is.
-A camera beside the robot is recorded and nothing else: what a user has of another's robot.
+A camera beside the robot and the commands are recorded: what a user has of another's robot.
 """
 
 from dataclasses import dataclass
@@ -33,18 +33,20 @@ class Stage(Protocol):
     :ivar steps: of the environment from picture to picture.
     :ivar step_ns: nanoseconds of a step.
     :ivar reach: (2, 3) m, lowest and highest place that the hand is sent to.
+    :ivar scale: (3,) m along x, y, z that a command of 1 asks for in a step.
     """
 
     task_name: str
     steps: int
     step_ns: int
     reach: np.ndarray
+    scale: np.ndarray
 
     def begin(self, seed: int) -> None:
         """Begin the scene of a seed."""
 
     def act(self, command: np.ndarray) -> None:
-        """Take a step with a command (A,) in [-1, 1]: three of motion, the last of the gripper."""
+        """Take a step with a command (A,) in [-1, 1]: three of motion, the last closes."""
 
     def command(self) -> np.ndarray:
         """Return what the script commands now."""
@@ -67,7 +69,7 @@ class Demonstration:
     """
     What is recorded of a script.
 
-    :param episode: without objects, gripper and commands.
+    :param episode: without objects and gripper; its actions are what was commanded.
     :param bottleneck: its first and last frame, by the simulator; None if nothing moved.
     """
 
@@ -84,15 +86,16 @@ def demonstrate(stage: Stage, seed: int, num_frames: int = 0) -> Demonstration:
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, attempt])
         stage.begin(int(rng.integers(2 ** 31)))
-        frames, hands, places, done = _act_unsteadily(stage, rng, num_frames or MOST_FRAMES)
+        frames, commands, hands, places, done = _act_unsteadily(
+            stage, rng, num_frames or MOST_FRAMES)
         if done and len(frames) >= LEAST_FRAMES:
             break
     count = len(frames)
-    actions = np.full((count, 4), np.nan, np.float32)
-    actions[-1] = 0
+    commands[-1][:] = 0
     episode = Episode(
         frames=np.stack(frames), stamps=np.arange(count) * stage.steps * stage.step_ns,
-        actions=actions, grippers=np.full((count, 4), np.nan, np.float32), object_names=(),
+        actions=np.array(commands, np.float32),
+        grippers=np.full((count, 4), np.nan, np.float32), object_names=(),
         object_pixels=np.zeros((count, 0, 2), np.float32),
         object_poses=np.zeros((count, 0, 7)), goal_frame=None,
         goal_pixels=np.zeros((0, 2), np.float32), goal_poses=np.zeros((0, 7)),
@@ -121,9 +124,9 @@ def find_bottleneck(hands: np.ndarray, places: np.ndarray) -> tuple[int, int] | 
     return (first, last) if 0 < first <= last else None
 
 
-def _act_unsteadily(stage: Stage, rng: np.random.Generator, num_frames: int
-                    ) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], bool]:
-    """Return frames, hands and places of one try, and whether it succeeded."""
+def _act_unsteadily(stage: Stage, rng: np.random.Generator, num_frames: int) -> tuple[
+        list[np.ndarray], list[np.ndarray], list[np.ndarray], list[np.ndarray], bool]:
+    """Return frames, commands, hands and places of one try, and whether it succeeded."""
     steps = stage.steps
 
     def some(frames: tuple[int, int]) -> int:
@@ -136,13 +139,14 @@ def _act_unsteadily(stage: Stage, rng: np.random.Generator, num_frames: int
     goes_on = some(AFTER)
     by = np.clip(stage.hand() + rng.uniform(DETOUR_LOW, DETOUR_HIGH), *stage.reach)
     detour = DETOUR_FRAMES * steps if rng.random() < DETOUR_SHARE else 0
-    frames, hands, places = [], [], []
+    frames, commands, hands, places = [], [], [], []
     resting, done = 0, False
     action = np.zeros_like(stage.command())
     action[-1] = -1
     for step in range(num_frames * steps):
         if step % steps == 0:
             frames.append(stage.picture())
+            commands.append(np.zeros(4))  # dx, dy, dz in m till the next picture, opening
             hands.append(stage.hand().copy())
             places.append(stage.movable().copy())
         resting = pauses.get(step, resting)
@@ -157,9 +161,12 @@ def _act_unsteadily(stage: Stage, rng: np.random.Generator, num_frames: int
             action = stage.command()
             unsteady = rng.normal(0, noise, 3) * np.linalg.norm(action[:3]).clip(max=1)
             action[:3] = speed * action[:3] + unsteady
-        stage.act(np.clip(action, -1, 1))
+        action = np.clip(action, -1, 1)
+        stage.act(action)
+        commands[-1][:3] += stage.scale * action[:3]
+        commands[-1][3] = (1 - action[-1]) / 2
         done = done or stage.succeeds()
         goes_on -= done
         if not goes_on:
-            return frames, hands, places, True
-    return frames, hands, places, False
+            break
+    return frames, commands, hands, places, done and not goes_on

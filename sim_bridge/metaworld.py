@@ -66,7 +66,7 @@ class MetaWorld(GymWorld):
         self._option.sitegroup[:] = 0  # the goal is drawn as a site
         self._labels = _labels(model)
         self._movable = _movable(model)
-        self.step_ns = round(1e9 * self.env.dt)
+        self.step_ns, self.scale = round(1e9 * self.env.dt), self.env.action_scale * TURN
         self._seen: np.ndarray = np.empty(0)
         self._info: dict[str, Any] = {}
 
@@ -220,6 +220,7 @@ def _labels(model: mujoco.MjModel) -> np.ndarray:
 
 def _movable(model: mujoco.MjModel) -> np.ndarray:
     """Return where positions of what is not the robot stand in qpos, int (Q,)."""
-    robot, sizes = _below(model, 'hand') | _below(model, 'base'), {mujoco.mjtJoint.mjJNT_FREE: 3}
-    return np.concatenate([np.arange(sizes.get(kind, 1)) + first for body, kind, first in zip(
-        model.jnt_bodyid, model.jnt_type, model.jnt_qposadr) if body not in robot])
+    robot, free = _below(model, 'hand') | _below(model, 'base'), mujoco.mjtJoint.mjJNT_FREE
+    joints = zip(model.jnt_bodyid, model.jnt_type, model.jnt_qposadr)
+    return np.concatenate([np.arange(3 if kind == free else 1) + first
+                           for body, kind, first in joints if body not in robot])

@@ -41,7 +41,7 @@ class OGBench:
         self.task_name = task
         self.env, self.oracle = _make_env(task)
         self.step_ns = round(1e9 * self.env._control_timestep)
-        self.reach = self.env._arm_sampling_bounds
+        self.reach, self.scale = self.env._arm_sampling_bounds, self.env.action_high[:3]
         self._info: dict[str, Any] = {}
         self.env.reset(seed=0)  # it makes the model
         self.camera_matrix = Camera(image_size, image_size, fovy=FOVY).K

@@ -123,7 +123,8 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
     assert (first.task, first.seed, first.outcome) == ('plate-slide-v3', 3, 'success')
     assert len({12, len(first), len(second)}) == 3, 'each goes its own way at its own speed'
     topics = find_topics(sorted(folder.glob('*.mcap')))
-    assert set(topics) <= {'/camera/image_raw', '/camera/camera_info', '/clock', '/episode'}
+    assert set(topics) <= {'/camera/image_raw', '/camera/camera_info', '/clock', '/episode',
+                           '/arm/delta_twist_cmds', '/gripper/command'}
     assert (first.frames[0] != second.frames[0]).any(), 'each has a scene of its own'
     marks = json.loads((folder / BOTTLENECKS_FILE).read_text())['marks']
     assert [mark['episode'] for mark in marks] == [0, 1]
@@ -145,7 +146,7 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
 class Slider:
     """A hand that goes to a thing at 1 m and pushes it by 0.5 m."""
 
-    task_name, steps, step_ns = 'slide', 2, 10 ** 7
+    task_name, steps, step_ns, scale = 'slide', 2, 10 ** 7, np.full(3, 0.02)
     reach = np.array([[-0.1, -0.1, 0], [0.1, 0.1, 0]])
 
     def begin(self, seed):
@@ -179,6 +180,8 @@ def test_the_bottleneck_is_where_the_hand_is_at_what_it_is_about_to_move():
         things = found.episode.frames[:, 0, 0, 0]
         first, last = found.bottleneck
         assert found.episode.outcome == 'success' and 0 < first <= last
+        way = found.episode.actions[:, 0].sum()
+        assert abs(way - stage.at[0]) < 0.05 and found.episode.actions[-2, 3] == 0, 'its commands'
         assert (things[:first] == 100).all() and 100 < things[last] < 112
         lengths.add(len(things))
     assert len(lengths) > 2, 'each goes at its own speed'
