@@ -16,9 +16,11 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from tap_ros.contract import NODE_MODULES
 from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE_TYPE, TOPICS
 from tap_ros.text import escaped, listing
 
+OURS = NODE_MODULES.keys() - {'sim_node'}  # nodes whose pictures are no camera's
 ADAPT_PERIOD = 0.5  # s between two comparisons with what is offered
 
 
@@ -124,8 +126,9 @@ def why_silent(node: Node, topic: str, message_type: type | None) -> str:
     """
     kind = '' if message_type is None else (
         f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}')
-    published = {name: types for name, types in node.get_topic_names_and_types()
-                 if node.count_publishers(name)}
+    offered = {name: {one.topic_type for one in node.get_publishers_info_by_topic(name)
+                      if one.node_name not in {node.get_name(), *OURS}}
+               for name, _ in node.get_topic_names_and_types() if name != topic}
     here = {one.topic_type for one in node.get_publishers_info_by_topic(topic)}
     if here and (not kind or kind in here):
         return ''
@@ -136,12 +139,13 @@ def why_silent(node: Node, topic: str, message_type: type | None) -> str:
     beside = {IMAGE_TYPE: (f'{topic}/compressed', COMPRESSED_TYPE, 'compressed'),
               COMPRESSED_TYPE: (topic.removesuffix('/compressed'), IMAGE_TYPE, 'raw')}
     other, other_kind, transport = beside.get(kind, ('', '', ''))
-    if other_kind in published.get(other, ()) or other_kind in here:
-        return (f'{why}; {escaped(other)} is: start this node with '
-                f'-p image_transport:={transport}')
-    alike = sorted(name for name, types in published.items() if kind in types and not any(
-        one.is_called(name) and not one.is_called(topic) for one in TOPICS) and any(
-        one.node_name != node.get_name() for one in node.get_publishers_info_by_topic(name)))
-    alike = alike or get_close_matches(topic, list(published), 3, 0.7)
+    start = f'start this node with -p image_transport:={transport}'
+    if other_kind in offered.get(other, ()):
+        return f'{why}; {escaped(other)} is: {start}'
+    if other_kind in here:
+        return f'{why}; {start} -r {escaped(other)}:={escaped(topic)}'
+    alike = sorted(name for name, kinds in offered.items() if kind in kinds and not any(
+        one.is_called(name) and not one.is_called(topic) for one in TOPICS))
+    alike = alike or get_close_matches(topic, [name for name in offered if offered[name]], 3, 0.7)
     return why if not alike else (
         f'{why}; published are {listing(alike, 5)}: remap one, -r {topic}:={escaped(alike[0])}')

@@ -29,14 +29,18 @@ def test_what_is_published_instead_and_the_remedy_are_named():
              [f'{eye}/compressed is', '-p image_transport:=compressed']),
             (CompressedImage, f'{eye}/compressed', {eye: Image}, [f'{eye} is', 'transport:=raw']),
             (Image, eye, {eye: CompressedImage},
-             ['published there is sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Image']),
+             ['published there is sensor_msgs/msg/CompressedImage; expected sensor_msgs/msg/Image',
+              f'-p image_transport:=compressed -r {eye}/compressed:={eye}']),
+            (JointState, '/joint_states', {'/joint_states': String}, ['expected sensor_msgs/msg']),
             (Image, eye, {'/front/color': Image, '/goal/image': Image},
              ['published are /front/color:', f'-r {eye}:=/front/color']),
             (JointState, '/joint_states', {f'/{side}/joint_states': JointState
                                            for side in ('left', 'right')},
              ['/left/joint_states, /right/joint_states', ':=/left/joint_states']),
             (None, eye, {'/eye/image_ra': String}, ['no node publishes it', '/eye/image_ra'])):
-        with Client('camera') as camera, Client('looking') as node:
+        with (Client('camera') as camera, Client('looking') as node,
+              Client('visual_mpc_node') as ours):
+            ours.create_publisher(Image, '/a/plan', STREAM)
             for name, other in published.items():
                 camera.create_publisher(other, name, STREAM)
 
@@ -44,7 +48,10 @@ def test_what_is_published_instead_and_the_remedy_are_named():
                 return all(word in why_silent(node, topic, kind) for word in words)
 
             assert until(fits, 10), (published, why_silent(node, topic, kind))
-            assert '/goal/image' not in why_silent(node, topic, kind)
+            assert f'{topic}:={topic}' not in why_silent(node, topic, kind)
+            assert until(lambda node=node: node.count_publishers('/a/plan'))
+            assert not {'/goal/image', '/a/plan'} & set(
+                why_silent(node, topic, kind).replace(',', ' ').replace(':', ' ').split())
             assert why_silent(node, next(iter(published)), next(iter(published.values()))) == ''
 
 

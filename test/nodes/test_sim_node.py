@@ -12,13 +12,12 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from sim_bridge.ros.sim_node import SimNode
 from sim_bridge.simulator import Simulator
 from std_msgs.msg import Float64
-from std_srvs.srv import SetBool
-from tap_msgs.msg import CommandRefused, Episode, ObjectState, ObjectStates
-from tap_msgs.srv import ResetScene, SetGoal, StepScene
+from tap_msgs.msg import CommandRefused, Episode, ObjectStates
+import tap_ros
 from tap_ros.errors import TapError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import call
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 
 PERIOD_NS = 250_000_000
@@ -34,35 +33,29 @@ class Rig:
         self.objects = Newest(node, ObjectStates, 'objects', STREAM)
         self.joints = Newest(node, JointState, 'joint_states', STREAM)
         self.clock = Newest(node, Clock, 'clock', STREAM)
-        self.refused = Newest(node, CommandRefused, 'arm/refused', STREAM)
+        self.refusals = Newest(node, CommandRefused, 'arm/refused', STREAM)
         self.marks = []
         node.create_subscription(Episode, 'episode', self.marks.append, STREAM)
         self.twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
         self.goal_image = Newest(node, Image, 'goal/image', LATCHED)
         self.goal_mask = Newest(node, Image, 'goal/robot_mask', LATCHED)
         self.goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
-        self.reset_client = node.create_client(ResetScene, 'sim/reset')
-        self.goal_client = node.create_client(SetGoal, 'sim/set_goal')
-        self.step_client = node.create_client(StepScene, 'sim/step')
-        self.pause_client = node.create_client(SetBool, 'sim/pause')
+        self.client = tap_ros.Client(node=node)
 
     def reset(self, **request):
         """Reset, and wait until all that is published then has come."""
         count = len(self.marks)
         before = to_nanoseconds(self.image.wait(10).header.stamp) if self.image.count else -1
-        response = call(self.reset_client, ResetScene.Request(**request), 20)
-        if response.success:
-            image = self.image.wait(10, lambda m: to_nanoseconds(m.header.stamp) > before)
-            for topic in (self.info, self.objects, self.joints):
-                topic.wait(10, lambda m: m.header.stamp == image.header.stamp)
-            assert until(lambda: len(self.marks) >= count + 2)
-        return response
+        self.client.call('reset', **request)
+        image = self.image.wait(10, lambda m: to_nanoseconds(m.header.stamp) > before)
+        for topic in (self.info, self.objects, self.joints):
+            topic.wait(10, lambda m: m.header.stamp == image.header.stamp)
+        assert until(lambda: len(self.marks) >= count + 2)
 
-    def set_goal(self, **pixels):
-        """Put objects of the goal elsewhere, {name: (u, v)}."""
-        return call(self.goal_client, SetGoal.Request(objects=ObjectStates(objects=[
-            ObjectState(name=name, u=float(u), v=float(v))
-            for name, (u, v) in pixels.items()])), 20)
+    def refused(self, words, service, **fields):
+        """Check that a call is refused for this reason."""
+        with pytest.raises(CallError, match=words):
+            self.client.call(service, **fields)
 
     def goal(self, stamp):
         """Return the goal of a stamp: picture, mask and objects, once they have come."""
@@ -70,7 +63,8 @@ class Rig:
                 for topic in (self.goal_image, self.goal_mask, self.goal_objects)]
 
     def step(self, periods):
-        return call(self.step_client, StepScene.Request(num_periods=periods), 20)
+        """Let control periods pass; return the stamp then, in ns."""
+        return to_nanoseconds(self.client.call('step', num_periods=periods).stamp)
 
     def send(self, x=0.0, y=0.0, z=0.0, stamp=None):
         message = TwistStamped()
@@ -95,7 +89,6 @@ def rig(tmp_path_factory):
     try:
         with Client() as node:
             rig = Rig(node, process.wait_for('ready'))
-            assert rig.reset_client.wait_for_service(20)
             rig.reset(seed=3)
             yield rig
     finally:
@@ -104,7 +97,7 @@ def rig(tmp_path_factory):
 
 def test_everything_about_one_moment_has_the_same_stamp(rig):
     before = len(rig.marks)
-    assert rig.reset(task='push2', seed=5).success
+    rig.reset(task='push2', seed=5)
     image = rig.image.wait(10)
     for topic in (rig.info, rig.objects, rig.joints):
         assert topic.wait(10).header.stamp == image.header.stamp
@@ -137,8 +130,7 @@ def test_a_goal_that_is_moved_is_published_as_that_of_a_reset(rig):
     sim = Simulator('push2')
     sim.reset(5)
     for pixel in ((50.0, 20.0), (14.5, 44.25)):  # at the same moment, and yet told apart
-        answer = rig.set_goal(object_1=pixel)
-        assert answer.success, answer.message
+        rig.client.set_goal({'object_1': pixel})
         image = rig.goal_image.wait(10, lambda m: to_nanoseconds(m.header.stamp) > taken[-1])
         taken.append(to_nanoseconds(image.header.stamp))
         image, mask, objects = rig.goal(image.header.stamp)
@@ -150,7 +142,7 @@ def test_a_goal_that_is_moved_is_published_as_that_of_a_reset(rig):
         assert bytes(image.data) == goal.image.tobytes()
         assert bytes(mask.data) == goal.robot_mask.tobytes()
     # No time has passed, and what follows does so as without it.
-    assert to_nanoseconds(rig.step(1).stamp) == to_nanoseconds(stamp) + PERIOD_NS
+    assert rig.step(1) == to_nanoseconds(stamp) + PERIOD_NS
     picture = rig.image.wait(
         10, lambda m: to_nanoseconds(m.header.stamp) > to_nanoseconds(stamp))
     sim.step(np.zeros(4))
@@ -165,22 +157,21 @@ def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(rig):
     _, second = goal.objects
     count = rig.goal_image.count
     for pixels, words in (
-            ({}, ['objects', 'empty', 'object_0, object_1']),
-            ({'object_1': (64, 30)}, ['object_1', '64', '63.5']),
-            ({'object_1': (63, 10)}, ['object_1', 'out of reach', '0.35 m'])):
-        answer = rig.set_goal(**pixels)
-        assert not answer.success and all(word in answer.message for word in words)
+            ({}, 'objects.* empty.* object_0, object_1'),
+            ({'object_1': (64, 30)}, 'object_1.*64.*63.5'),
+            ({'object_1': (63, 10)}, 'object_1.* out of reach.* 0.35 m')):
+        with pytest.raises(CallError, match=words):
+            rig.client.set_goal(pixels)
     # Poses do not count: it stays where its pixel is.
     second.pose.position.x = float('nan')
-    assert call(rig.goal_client, SetGoal.Request(objects=ObjectStates(objects=[second])),
-                20).success
+    rig.client.call('set_goal', objects=ObjectStates(objects=[second]))
     rig.goal_image.wait(10, lambda m: m.header.stamp != goal.header.stamp)
     assert rig.goal_image.count == count + 1, 'nothing was published for what was refused'
-    assert rig.reset(task='grasp', seed=1).success
-    answer = rig.set_goal(object_0=(30, 30))
-    assert not answer.success and 'grasp' in answer.message and 'push2' in answer.message
+    rig.reset(task='grasp', seed=1)
+    with pytest.raises(CallError, match='(?=.*grasp).*push2'):
+        rig.client.set_goal({'object_0': (30, 30)})
     for task in ('push3', 'push2'):
-        assert rig.reset(task=task, seed=1).success
+        rig.reset(task=task, seed=1)
         rig.objects.wait(10, lambda m, count=int(task[-1]): len(m.objects) == count)
 
 
@@ -196,23 +187,21 @@ def test_what_answers_no_picture_lets_no_time_pass(rig):
     for ns in (first, first - PERIOD_NS):
         rig.process.wait_for(f'{ns} ns was answered before')
     rig.process.wait_for('newer than the newest image')
-    for answer, words in ((rig.reset(task='juggle', seed=1), ['juggle', 'push2']),
-                          (rig.step(101), ['100'])):
-        assert not answer.success and all(word in answer.message for word in words)
-    assert to_nanoseconds(rig.step(1).stamp) == to_nanoseconds(second) + PERIOD_NS
+    rig.refused('juggle.*push2', 'reset', task='juggle')
+    rig.refused('101; expected 1 to 100', 'step', num_periods=101)
+    assert rig.step(1) == to_nanoseconds(second) + PERIOD_NS
 
 
 def test_a_paused_simulation_takes_no_commands_but_steps(rig):
     rig.reset(seed=5)
     first = rig.image.wait(10)
-    call(rig.pause_client, SetBool.Request(data=True), 10)
+    rig.client.pause()
     rig.send(x=0.05, stamp=first.header.stamp)
     rig.process.wait_for('the simulation is paused')
-    refused = rig.refused.wait(10, lambda m: m.header.stamp == first.header.stamp)
+    refused = rig.refusals.wait(10, lambda m: m.header.stamp == first.header.stamp)
     assert 'paused' in refused.message
-    response = rig.step(1)
-    assert to_nanoseconds(response.stamp) == to_nanoseconds(first.header.stamp) + PERIOD_NS
-    call(rig.pause_client, SetBool.Request(data=False), 10)
+    assert rig.step(1) == to_nanoseconds(first.header.stamp) + PERIOD_NS
+    rig.client.pause(False)
     rig.act(x=0.01)
 
 
@@ -241,14 +230,13 @@ def test_in_real_time_the_clock_runs_unless_paused_and_old_commands_move_nothing
                 twists.publish(command)
                 moved.append(abs(later(joints, before, 4).position[0] - before.position[0]))
             assert moved[0] < 0.002 and moved[1] > 0.03
-            step = node.create_client(StepScene, '/second/sim/step')
-            response = call(step, StepScene.Request(), 10)
-            assert not response.success and 'sim/pause' in response.message
-            pause = node.create_client(SetBool, '/second/sim/pause')
-            assert call(pause, SetBool.Request(data=True), 10).success
-            stamp = call(step, StepScene.Request(num_periods=3), 10).stamp
-            assert to_nanoseconds(call(step, StepScene.Request(), 10).stamp) \
-                == to_nanoseconds(stamp) + PERIOD_NS
+            with tap_ros.Client('/second') as client:
+                with pytest.raises(CallError, match='sim/pause'):
+                    client.call('step')
+                client.pause()
+                first, then = (to_nanoseconds(client.call('step', num_periods=periods).stamp)
+                               for periods in (3, 1))
+            assert then == first + PERIOD_NS
             assert process.end() == 0, process.text
             assert 'Traceback' not in process.text
     finally:

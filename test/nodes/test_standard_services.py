@@ -11,7 +11,6 @@ import numpy as np
 from processes import Client, NodeProcess
 import pytest
 from std_msgs.msg import Float64
-from std_srvs.srv import SetBool
 from tap_msgs.msg import Episode
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import call, wait_for_future
@@ -49,11 +48,7 @@ class Rig(SimRig):
             ('get_simulation_state', srv.GetSimulationState),
             ('set_simulation_state', srv.SetSimulationState),
             ('step_simulation', srv.StepSimulation))}
-        for client in (*self.clients.values(), self.step_client, self.pause_client):
-            assert client.wait_for_service(20)
-
-    def pause(self, paused):
-        assert call(self.pause_client, SetBool.Request(data=paused), 20).success
+        assert all(client.wait_for_service(20) for client in self.clients.values())
 
     def ask(self, name, **fields):
         """Call a standard service, and have an answer."""
@@ -90,6 +85,11 @@ class Rig(SimRig):
         """Return picture, objects and joints of a stamp, once they have come."""
         return [topic.wait(20, lambda m: to_nanoseconds(m.header.stamp) == stamp)
                 for topic in (self.image, self.objects, self.joints)]
+
+    def refusal(self, picture):
+        """Return why a command that answered this picture was refused."""
+        return self.refusals.wait(
+            20, lambda m: m.header.stamp == picture.header.stamp).message
 
     def command(self, header, **move):
         """Send a command for arm and gripper."""
@@ -165,8 +165,7 @@ def test_an_entity_that_is_put_elsewhere_is_seen_there_and_an_absurd_state_is_re
     if rig.lock_step:
         assert rig.set_state(PLAYING) == OK
         rig.command(before.header, x=0.05)  # for what was seen before
-        refused = rig.refused.wait(20, lambda m: m.header.stamp == before.header.stamp)
-        assert 'the newest is stamped' in refused.message
+        assert 'the newest is stamped' in rig.refusal(before)
         assert rig.set_state(PAUSED) == OK
 
 
@@ -188,14 +187,14 @@ def test_steps_pass_only_when_paused_and_as_many_as_were_asked_for(rig):
 def test_states_are_those_of_the_own_services_too(rig):
     rig.begin()
     assert rig.state() == PAUSED and rig.set_state(PAUSED) == ALREADY
-    rig.pause(False)
+    rig.client.pause(False)
     assert rig.state() == PLAYING and rig.set_state(PLAYING) == ALREADY
     assert rig.set_state(STOPPED) == OK and rig.set_state(STOPPED) == ALREADY
-    assert rig.step(1).success
+    rig.step(1)
     assert rig.state() == PAUSED, 'no longer at its start'
     assert rig.set_state(STOPPED) == OK
     assert rig.code('reset_simulation') == OK and rig.state() == STOPPED
-    assert rig.reset(seed=SEED + 1).success
+    rig.reset(seed=SEED + 1)
     assert rig.state() == PAUSED, 'another scene'
     for state in (SimulationState.STATE_NO_WORLD, SimulationState.STATE_LOADING_WORLD, 200):
         assert rig.set_state(state) == UNSUPPORTED
@@ -209,7 +208,7 @@ def test_a_reset_starts_the_first_or_the_present_scene_and_no_clock_goes_back(ri
 
     rig.begin()
     first = places()
-    assert rig.reset(task='push3', seed=9).success
+    rig.reset(task='push3', seed=9)
     other, stamp = places(), rig.stamp()
     assert len(other) == 3 and rig.state() == PAUSED
     for scope, wanted in ((2, other), (255, first), (2, first), (0, first)):
@@ -229,7 +228,7 @@ def test_paused_nothing_moves_and_no_command_is_made_up_for(rig):
     before = decode_gripper(joints)
     rig.command(image.header, x=0.08)
     rig.process.wait_for('gripper/command ignored: the simulation is paused')
-    assert 'paused' in rig.refused.wait(20, lambda m: m.header.stamp == image.header.stamp).message
+    assert 'paused' in rig.refusal(image)
     # Two requests wait for one that takes long; the command comes while the first of them is
     # carried out, and so is taken after the second, with which time passes again.
     stamp = rig.stamp()
@@ -245,8 +244,7 @@ def test_paused_nothing_moves_and_no_command_is_made_up_for(rig):
     rig.command(newest.header, x=0.08)
     assert all(wait_for_future(future, 60) for future in waiting)
     assert all(future.result().result.result == OK for future in waiting)
-    refused = rig.refused.wait(20, lambda m: m.header.stamp == newest.header.stamp)
-    assert 'paused' in refused.message
+    assert 'paused' in rig.refusal(newest)
     if not rig.lock_step:
         rig.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > stamp + 205 * PERIOD_NS)
     assert rig.set_state(PAUSED) == OK
@@ -255,9 +253,9 @@ def test_paused_nothing_moves_and_no_command_is_made_up_for(rig):
     if rig.lock_step:  # nor what was commanded before a pause
         *_, joints = rig.begin(PLAYING)
         rig.gripper.publish(Float64(data=1.0))
-        rig.pause(True)
+        rig.client.pause(True)
         assert rig.code('step_simulation', steps=2) == OK
         assert rig.set_state(PLAYING) == OK
-        assert rig.step(2).success
+        rig.step(2)
         *_, after = rig.seen(rig.stamp())
         np.testing.assert_allclose(decode_gripper(after), decode_gripper(joints), atol=1e-3)
