@@ -20,9 +20,9 @@ SOURCES := package.xml setup.py setup.cfg tap_ros/contract.py resource/tap_ros $
 $(shell PYTHON='$(PYTHON)' scripts/setup.bash check)
 
 # Two processes share two cores best when each takes one.
-paper: export OMP_NUM_THREADS ?= 1
+paper worlds: export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo explore test test-all paper faults build lint bench ros2 clean
+.PHONY: help demo explore test test-all paper worlds faults build lint bench ros2 clean
 
 help:
 	@echo 'make demo    push objects to where a goal picture shows them, predict a stack'
@@ -33,6 +33,7 @@ help:
 	@echo 'make test-all also the tests that take minutes each'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
 	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
+	@echo 'make worlds  demonstrations of other simulators, and keyframes scored on them; goes on'
 	@echo 'make faults  inject every fault into real nodes and files, in docs/results: five hours;'
 	@echo '             ARGS="-k silent": only those; ARGS="--share 0.1": a tenth of the trials'
 	@echo 'make bench   measure the speed of each part; ARGS=...'
@@ -59,6 +60,9 @@ test-all: build
 
 paper: build
 	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(if $(SCALE),--scale $(SCALE)) $(ARGS)
+
+worlds: build
+	@$(ENTER); python -m tap_ros worlds --jobs $(or $(JOBS),2) $(ARGS)
 
 faults: build
 	@$(ENTER); $(DOMAIN); python -m pytest -m fault --share 1 --report docs/results test/faults $(ARGS)

@@ -1,0 +1,55 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Keyframes of foreign demonstrations, and how often they are the true bottleneck."""
+
+import json
+
+from experiments.worlds import command, keyframes
+from made_episodes import move_squares, write_bag
+import numpy as np
+import pytest
+from tap_ros.errors import ConfigError
+from tap_ros.recording.reader import iter_episodes
+
+
+def film(places, size=28):
+    """Draw a bright square at places (T,) px along a row; uint8 (T, size, size, 3)."""
+    frames = np.zeros((len(places), size, size, 3), np.uint8)
+    for frame, place in zip(frames, places):
+        frame[4:16, int(place):int(place) + 12] = 255
+    return frames
+
+
+REST = film([0, 0, 0, 2, 4, 5, 6, 6, 6, 6, 6, 8, 10, 11, 12, 12])  # from frame 6 to 10
+
+
+def test_the_slowest_frame_is_where_things_rest_on_the_way_and_not_at_the_ends():
+    assert 6 < keyframes.slowest(REST) < 10 and keyframes.middle(REST) == 7
+
+
+def test_the_last_subgoal_is_where_the_way_turns_to_the_goal():
+    there_and_on = film([6, 5, 4, 3, 2, 1, 0, 3, 6, 9, 12, 12])
+    assert abs(keyframes.uvd(there_and_on) - 6) <= 1
+    assert keyframes.uvd(film(range(12))) == 0  # none
+
+
+def test_scores_are_shares_of_the_demonstrations_with_their_intervals():
+    rows = {row['method']: row for row in command.score(50 * [(REST, (7, 8))])}
+    assert rows['random']['hit']['value'] == pytest.approx(2 / 14)
+    assert rows['slowest']['hit']['value'] == rows['12 marks']['near']['value'] == 1
+    assert rows['UVD-like']['hit'] | {'low': 0} == {'value': 0, 'low': 0, 'high': pytest.approx(
+        0.0876, abs=1e-3)} and rows['slowest']['n'] == command.HELD_OUT
+    told = command.table([row | {'world': 'a', 'task': 'b'} for row in rows.values()])
+    assert told.splitlines()[1].split()[:5] == ['a/b', '14%', '(29%)', '100%', '(100%)']
+
+
+def test_bottlenecks_are_read_by_their_stamps(tmp_path):
+    with pytest.raises(ConfigError, match='bottlenecks.json: is not there'):
+        command.read(tmp_path)
+    write_bag(tmp_path / 'bag', [move_squares([[3, 3]], [[8, 8]], length=7, seed=seed)
+                                 for seed in range(2)])
+    stamps = [list(episode.stamps / 1e9) for episode in iter_episodes(tmp_path / 'bag')]
+    (tmp_path / 'bag' / 'bottlenecks.json').write_text(json.dumps(
+        {'marks': [{'recording': '.', 'episode': 1, 'stamps': [[stamps[1][2], stamps[1][4]]]}]}))
+    (frames, window), = command.read(tmp_path / 'bag')
+    assert len(frames) == 7 and window == (2, 4)
