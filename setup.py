@@ -20,7 +20,7 @@ setup(
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
     package_data={
         NAME: ['*.pyi', 'nodes/demo/*.html', 'nodes/explorer/page/*', 'nodes/*.xml',
-               'py.typed', 'weights/*.safetensors', 'weights/*.md'],
+               'prediction/page/*', 'py.typed', 'weights/*.safetensors', 'weights/*.md'],
         'sim_bridge': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

@@ -40,6 +40,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'import-lerobot': ('import a LeRobot data set', 'tap_ros.recording.formats.lerobot'),
     'export-lerobot': ('export recordings as a LeRobot data set',
                        'tap_ros.recording.formats.lerobot_export'),
+    'mark': ('mark the bottleneck in a few demonstrations, on a page in the browser',
+             'tap_ros.prediction.mark_command'),
     'train': ('train on recordings', {
         'predictor': ('train a subgoal predictor', 'tap_ros.prediction.training_config'),
         'forward': ("train the planner's forward model",

@@ -24,6 +24,7 @@ from tap_ros.evaluation.bottleneck import (
     THRESHOLDS,
     VISIBLE,
 )
+from tap_ros.evaluation.hits import print_hits, score_hits
 from tap_ros.evaluation.intervals import bootstrap, Interval, mean_interval
 from tap_ros.evaluation.samples import draw_latents, SAMPLES, SampleScores, score_samples
 from tap_ros.evaluation.shown import SHOWN, ShownScorer
@@ -31,9 +32,10 @@ from tap_ros.files import write_atomically
 from tap_ros.images.drawing import grid, overlay
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.messages.subgoals import Subgoal
-from tap_ros.options import Bags, Flag, Folder, Topic
+from tap_ros.options import Bags, File, Flag, Folder, Topic
 from tap_ros.prediction.batches import Batch, make_batch, Sampling
 from tap_ros.prediction.losses import changed_pixels, l1_errors, match_step
+from tap_ros.prediction.marks import read_marks
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files, Question
@@ -42,16 +44,16 @@ from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.training.inpainted import fill, Filled, with_masks
 from tap_ros.training.robot_mask import trained_robot_mask
-from tap_ros.training.split import split_episodes, TEST_FRACTION
+from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few
 from tap_ros.weights import PREDICTORS
 import torch
 from tyro import conf
 
 METHODS = ('prediction', 'copy-start', 'copy-goal')
 _BATCH = 64
-_SHOWN = ('min_l1', 'changed_l1', 'match_fraction', 'match_fraction_std', 'bottleneck_median',
-          'bottleneck_1px', 'bottleneck_2px', 'visible_bottleneck_2px', 'bottleneck_5px',
-          'shows_hand', 'shows_objects', 'shows_both')
+_SHOWN = ('min_l1', 'copying_l1', 'changed_l1', 'match_fraction', 'match_fraction_std',
+          'bottleneck_median', 'bottleneck_1px', 'bottleneck_2px', 'visible_bottleneck_2px',
+          'bottleneck_5px', 'shows_hand', 'shows_objects', 'shows_both')
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ class EpisodeScores:
     :param object_mass: (N,), likewise; below bottleneck.VISIBLE an object is left out.
     :param hand: (N,), how much of the hand is shown, see shown.ShownScorer; NaN where unknown.
     :param objects: (N,), likewise of the objects.
+    :param copying: (N,), error of the nearer input against the frame of match_step.
     """
 
     min_l1: np.ndarray
@@ -80,6 +83,7 @@ class EpisodeScores:
     object_mass: np.ndarray
     hand: np.ndarray
     objects: np.ndarray
+    copying: np.ndarray
 
     def intervals(self) -> dict[str, Interval]:
         """
@@ -92,6 +96,7 @@ class EpisodeScores:
         """
         result = {
             'min_l1': mean_interval(self.min_l1),
+            'copying_l1': mean_interval(self.copying),
             'match_step': mean_interval(self.match_step),
             'match_step_std': bootstrap(partial(np.std, axis=-1), self.match_step),
             'match_fraction': mean_interval(self.match_fraction),
@@ -163,13 +168,14 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
         for m, method in enumerate(methods):
             match = match_step(errors[:, m], batch.valid)[:, None]
             times = batch.times.gather(1, match)
+            copied = errors[:, 1:].amin(1).gather(1, match)[:, 0].cpu().numpy()
             row = [errors[:, m].gather(1, match), times, times / batch.end,
                    _changed_l1(images[:, m], batch, match[:, 0], measured)[:, None]]
             pictures = ((images[:, m] + 1) / 2).movedim(1, -1).cpu().numpy()
             shown = [scorer.score(picture, int(time)) for scorer, picture, time in zip(
                 scorers, pictures, times[:, 0].tolist())]
             parts[method].append([*(part[:, 0].cpu().numpy() for part in row), placed[:, m],
-                                  mass[:, m], *np.array(shown).T])
+                                  mass[:, m], *np.array(shown).T, copied])
     return {method: EpisodeScores(*(np.concatenate(column) for column in zip(*rows)))
             for method, rows in parts.items()}
 
@@ -265,6 +271,7 @@ class Options:
     :param goal_picture: the episode's last frame, or the goal's own picture where reached, with
         the arm elsewhere.
     :param samples: how many to draw of weights with z.
+    :param marks: file of marks (see `mark`) that the matched frames are compared with.
     :param out: write scores.json and pictures.png there.
     """
 
@@ -277,6 +284,7 @@ class Options:
     all: Flag = False
     goal_picture: Literal['last', 'recorded'] = 'recorded'
     samples: int = SAMPLES
+    marks: File = ''
     out: Folder = ''
 
 
@@ -309,12 +317,27 @@ def run(args: Options) -> None:
                           'give more of them, or --all')
     filled = fill(store, robot_mask)
     scores = evaluate(network, store, episodes, goal_picture=args.goal_picture, filled=filled)
-    print(f'{len(episodes)} episodes, goal picture: {args.goal_picture}; l1 on [0, 1]; object '
-          'positions: ground truth; in brackets 95% intervals over the episodes')
+    sources = {(store[i].object_source or 'unknown').replace('_', ' ')
+               for i in episodes if store[i].object_names}
+    print(f'{len(episodes)} episodes, goal picture: {args.goal_picture}; l1 on [0, 1]; '
+          + ''.join(f'object positions: {source}; ' for source in sorted(sources))
+          + 'in brackets 95% intervals over the episodes')
+    warn_if_few(episodes)
     _print_table(scores)
+    seen = None
+    if len(kept) and not args.all and training.get('data_hash') == store.data_hash:
+        seen = evaluate(network, store, kept[:len(episodes)], goal_picture=args.goal_picture,
+                        filled=filled)['prediction']
+    words = verdict(scores['prediction'], seen)
+    print('\n'.join(words))
     about: dict[str, Any] = {method: value.summary() | {'intervals': {
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
+    if args.marks:
+        marks = read_marks(args.marks, store)
+        hits = score_hits(store, marks, episodes, scores['prediction'].match_step, training)
+        print_hits(hits, len(set(marks.episodes) & set(episodes.tolist())))
+        about['marks'] = hits
     if isinstance(network, PredictorNetwork) and network.config.latent_size:
         about['samples'] = _report_samples(score_samples(
             network, store, episodes, goal_picture=args.goal_picture, count=args.samples,
@@ -322,13 +345,40 @@ def run(args: Options) -> None:
     if args.out:
         folder = Path(args.out)
         about = {'weights': str(args.weights), 'data_hash': store.data_hash,
-                 'goal_picture': args.goal_picture, 'margin': 0, 'scores': about}
+                 'goal_picture': args.goal_picture, 'margin': 0, 'verdict': words,
+                 'scores': about}
         if robot_mask != 'none':
             about['robot_mask'] = robot_mask
         write_atomically(folder / 'scores.json', json.dumps(about, indent=2) + '\n')
         if isinstance(network, PredictorNetwork):
             write_pictures(folder / 'pictures.png', network, store, episodes[:12],
                            args.goal_picture, filled=filled)
+
+
+def verdict(held_out: EpisodeScores, training: EpisodeScores | None) -> list[str]:
+    """
+    Compare predictions with copying the nearer input, both at the matched frame, in words.
+
+    A low error alone says nothing: frames beside an input are predicted well by copying it.
+
+    :param held_out: scores of episodes that were not trained on; training: of some that were.
+    :return: lines.
+    """
+    lines, gains = [], []
+    for name, scores in (('held-out episodes', held_out), ('training episodes', training)):
+        if scores is None:
+            continue
+        gain = bootstrap(lambda errors, copied: 1 - errors.mean(-1) / copied.mean(-1),
+                         scores.min_l1, scores.copying)
+        gains.append(gain)
+        words = ('better than copying' if gain.low > 0 else 'worse than copying'
+                 if gain.high < 0 else 'not told from copying')
+        lines.append(f'{name}, at the matched frame: {words}, error {scores.min_l1.mean():.4f} '
+                     f'against {scores.copying.mean():.4f}, lower by {_text(gain)}')
+    if len(gains) == 2 and gains[0].low <= 0 < gains[1].low:
+        lines.append('memorised: only what it was trained on is predicted better than by copying; '
+                     'record more, or train fewer steps')
+    return lines
 
 
 def _print_table(scores: Mapping[str, EpisodeScores]) -> None:
@@ -340,11 +390,6 @@ def _print_table(scores: Mapping[str, EpisodeScores]) -> None:
             print(f'{name:20s}' + ''.join(
                 f'{_text(column[name]) if name in column else "-":>28s}'
                 for column in columns.values()))
-    for method in METHODS[1:]:
-        if method in scores:
-            gain = bootstrap(lambda errors, copied: 1 - errors.mean(-1) / copied.mean(-1),
-                             scores['prediction'].min_l1, scores[method].min_l1)
-            print(f'min_l1 below {method} by {_text(gain)}')
 
 
 def _report_samples(samples: SampleScores, count: int) -> dict[str, float]:

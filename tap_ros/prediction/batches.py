@@ -41,6 +41,8 @@ class Batch:
         and video are then; None: the context itself.
     :param seen: bool (B, H, W), False where the robot hides a pixel that is never free. There
         targets, video and bare are black, and nothing counts; None: True everywhere.
+    :param preference: float32 (B, levels, T), w(t) of Eq. 5 for selection marks, of each level of
+        recursion; else None.
     """
 
     context: torch.Tensor
@@ -53,6 +55,7 @@ class Batch:
     video: torch.Tensor | None = None
     bare: torch.Tensor | None = None
     seen: torch.Tensor | None = None
+    preference: torch.Tensor | None = None
 
     @property
     def measured(self) -> torch.Tensor:
@@ -168,7 +171,8 @@ def fixed_time(fraction: float, end: int, first: int, last: int) -> int:
 def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
                sampling: Sampling = Sampling(), frames: Frames | None = None,
                rng: np.random.Generator | None = None, part: slice = slice(None),
-               filled: 'Filled | None' = None) -> Batch:
+               filled: 'Filled | None' = None,
+               preference: Sequence[np.ndarray] | None = None) -> Batch:
     """
     Gather context pictures and targets.
 
@@ -179,6 +183,7 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     :param part: slice of the episodes whose pictures are gathered; the others only count for what
         is drawn and for T.
     :param filled: with a robot mask, where targets and video come from; see training/inpainted.py.
+    :param preference: of every episode of the store w of its frames, (levels, T).
     :return: Batch.
     """
     rng = rng or np.random.default_rng(0)
@@ -200,7 +205,9 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     batch = Batch(
         frames(episodes, context), free(episodes, shown), torch.from_numpy(times),
         first, last, end, torch.from_numpy(valid),
-        free(episodes, video) if sampling.video_frames else None)
+        free(episodes, video) if sampling.video_frames else None,
+        preference=None if preference is None else torch.from_numpy(np.stack(
+            [preference[i][:, at] for i, at in zip(episodes, shown)])))
     if filled is None:
         return batch
     bare = free(episodes, context)

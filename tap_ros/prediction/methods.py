@@ -11,12 +11,12 @@ from tap_ros.errors import ConfigError
 Mode = Literal['bidirectional', 'forward']
 MODES = get_args(Mode)
 Loss = Literal['fix', 'min', 'genmin']
-Selection = Literal['absolute', 'relative', 'progress']
+Selection = Literal['absolute', 'relative', 'progress', 'marks']
 Latent = Literal['none', 'vae']
 Decoder = Literal['separate', 'shared']
 
 _NAME = re.compile(r'(?P<loss>fix|min|genmin)(?P<number>\d+(\.\d+)?)?'
-                   r'(?P<model>-wo-gan|-vae-gan|-vae)?(\+(?P<selection>relative|progress))?')
+                   r'(?P<model>-wo-gan|-vae-gan|-vae)?(\+(?P<selection>relative|progress|marks))?')
 # Settings of earlier versions, and the value at which they did nothing.
 _GONE = {'bell_edge': 2 / 3, 'changed_weight': 0.0, 'match_temperature': 0.0, 'match_share': 0.5,
          'flow_scale': 16.0, 'max_frames': 0, 'pretrain_steps': 0}
@@ -28,7 +28,7 @@ def method_fields(name: str) -> dict[str, Any]:
 
     As in the paper's tables, fix, min and genmin alone are trained with l1 and GAN; -wo-gan is l1
     only, -vae the CVAE without GAN (Eq. 9), -vae-gan both (Eq. 10). A number is the fraction of
-    fix or the beta of genmin. +relative and +progress are not in the paper.
+    fix or the beta of genmin. +relative, +progress and +marks are not in the paper.
 
     :param name: for example 'fix0.25', 'genmin4', 'genmin-vae-gan', 'genmin-wo-gan+relative'.
     :return: dict of loss, selection, gan, latent, fraction and beta.
@@ -39,7 +39,7 @@ def method_fields(name: str) -> dict[str, Any]:
             found['loss'] != 'genmin' and found['selection']):
         raise ConfigError(f'method {name!r} is unknown; expected fix, fix<fraction>, min, genmin '
                           'or genmin<beta>, each with -wo-gan, -vae or -vae-gan, and genmin with '
-                          '+relative or +progress')
+                          '+relative, +progress or +marks')
     loss, model, number = found['loss'], found['model'], found['number']
     return {'loss': loss, 'selection': found['selection'] or 'absolute',
             'gan': model in (None, '-vae-gan'),

@@ -221,7 +221,7 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
     """
     batch, valid = targets.batch, targets.batch.valid
     losses, counts = [loss], [len(context)]
-    for _ in range(1, config.recursion):
+    for level in range(1, config.recursion):
         matched = batch.times.gather(1, match[:, None])
         valid = remaining_targets(valid, batch.times, matched, config.forward)
         left = valid.any(1)
@@ -235,7 +235,8 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
         with autocast():
             prediction = networks.predictor(context, z)
         # Preferences lie between the inputs of this level.
-        between = replace(batch, valid=valid | ~left[:, None])
+        between = replace(batch, valid=valid | ~left[:, None], preference=(
+            None if batch.preference is None else batch.preference[:, level:]))
         if not config.forward:
             end = torch.where(left[:, None], matched, batch.end)
             between = replace(between, end=end, last=torch.where(

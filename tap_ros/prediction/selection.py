@@ -29,6 +29,9 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
     """
     if config.loss == 'min':
         return error
+    if config.selection == 'marks':
+        assert batch.preference is not None, 'learned before the training'
+        return losses.relative_to_copying(error, copy_error(), batch.preference[:, 0])
     preference = (losses.linear_preference(batch.times, batch.end, config.beta) if config.forward
                   else losses.bell_preference(batch.times, batch.first, batch.last))
     if config.selection == 'relative':

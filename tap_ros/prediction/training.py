@@ -17,6 +17,7 @@ from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.batches import Augmentation, Batch, episode_order, make_batch, Sampling
 from tap_ros.prediction.losses import l1_error
+from tap_ros.prediction.marks import learn_marks, read_marks, tell
 from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import (
@@ -78,6 +79,7 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
                    if device.type == 'cuda' else MappedFrames)
     frames = make_frames(store)
     filled = fill(store, config.robot_mask, make_frames, this.progress)
+    preference, about = _learn(this)
     processes.wait()  # before the first one writes a checkpoint
     compiled: Callable[[Any], Any] = (
         torch.compile if config.compile else lambda module: module)
@@ -93,9 +95,25 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
         return lambda: _values(outcome, batch, processes) | {'gradient_norm': norm.item()}
 
     return run.Course(
-        state, partial(_batches, store, frames, filled, this.training, config, processes), step,
-        partial(_score, this, state, frames, filled, autocast),
-        (config.learning_rate, config.discriminator_rate))
+        state, partial(_batches, store, frames, filled, this.training, config, processes,
+                       preference=preference), step,
+        partial(_score, this, state, frames, filled, preference, autocast),
+        (config.learning_rate, config.discriminator_rate), about)
+
+
+def _learn(this: run.Run) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
+    """Return w of the frames of every episode, and what the weights file tells of the marks."""
+    config, store = this.config, this.store
+    if not config.marks:
+        return None, {}
+    marks = read_marks(config.marks, store)
+    learned = learn_marks(store, marks, this.training, config.recursion, config.forward,
+                          config.robot_mask)
+    if this.processes.first:
+        tell(learned.about)
+    return learned.over(store, config.robot_mask), {'marks': {
+        'sha256': marks.digest, 'levels': learned.about,
+        'preferences': [preference.to_json() for preference in learned.preferences]}}
 
 
 def _step(state: TrainingState[PredictorNetwork], networks: Networks, batch: Batch,
@@ -128,8 +146,8 @@ def _step(state: TrainingState[PredictorNetwork], networks: Networks, batch: Bat
 
 
 def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episodes: np.ndarray,
-             config: TrainingConfig, processes: Processes, first: int,
-             last: int) -> Iterator[Item]:
+             config: TrainingConfig, processes: Processes, first: int, last: int,
+             preference: list[np.ndarray] | None = None) -> Iterator[Item]:
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
     whole = config.latent == 'vae' and config.posterior == 'video'
     sampling = Sampling(
@@ -141,7 +159,7 @@ def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episode
     def make(step: int) -> Item:
         rng = np.random.default_rng([config.seed, 2, step])
         chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
-        batch = make_batch(store, chosen, sampling, frames, rng, part, filled)
+        batch = make_batch(store, chosen, sampling, frames, rng, part, filled, preference)
         augmentation = Augmentation.draw(
             len(chosen), config.flip, config.colour, config.brightness, rng)
         return step, batch, augmentation.part(part)
@@ -168,7 +186,7 @@ def _values(outcome: Outcome, batch: Batch, processes: Processes) -> dict[str, f
 
 
 def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames,
-           filled: Filled | None,
+           filled: Filled | None, preference: list[np.ndarray] | None,
            autocast: Autocast) -> tuple[run.Numbers, Mapping[str, np.ndarray]]:
     """Score the averaged network on held-out episodes, and show some of all."""
     config, held_out = this.config, this.held_out
@@ -177,7 +195,8 @@ def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames
         forward=config.forward, fraction=config.only_fraction, fill_context=config.fill_context)
 
     def batch(episodes: np.ndarray) -> Batch:
-        return make_batch(this.store, episodes, sampling, frames, filled=filled).to(this.device)
+        return make_batch(this.store, episodes, sampling, frames, filled=filled,
+                          preference=preference).to(this.device)
 
     scores, pictures = {}, {}
     if len(held_out):

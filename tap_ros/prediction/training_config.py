@@ -37,8 +37,10 @@ class ObjectiveSettings:
     :param mode: 'bidirectional', from start and goal, or 'forward', from the start alone.
     :param loss: 'fix' (Eq. 1), 'min' (Eq. 2) or 'genmin' (Eq. 5).
     :param selection: which error chooses the target of genmin: the 'absolute' one, divided by the
-        preference over time, as in the paper; the one 'relative' to copying an input; or the
-        absolute one with the preference over the 'progress' that pictures show (losses.py).
+        preference over time, as in the paper; the one 'relative' to copying an input; the
+        absolute one with the preference over the 'progress' that pictures show (losses.py); or
+        the relative one with the preference learned from 'marks'.
+    :param marks: JSON file of demonstrations whose bottleneck a person has marked, see `mark`.
     :param gan: add the GAN's terms (Eq. 7).
     :param latent: 'vae' adds z (Eq. 9, with a GAN Eq. 10).
     :param fraction: share of the episode at which fix has its target.
@@ -65,6 +67,7 @@ class ObjectiveSettings:
     mode: Mode = 'bidirectional'
     loss: Loss = 'genmin'
     selection: Selection = 'progress'
+    marks: str = ''
     gan: bool = False
     latent: Latent = 'none'
     fraction: float = 0.5
@@ -197,6 +200,9 @@ class TrainingConfig(PredictorOptimizer, NetworkSettings, DataSettings, Objectiv
         for wrong, advice in (
                 (self.forward and self.loss == 'genmin' and self.selection == 'progress',
                  'selection: progress needs a goal picture; with mode forward choose absolute'),
+                ((self.selection == 'marks') != bool(self.marks) or (
+                    self.marks and self.loss != 'genmin'),
+                 'marks: they go with loss genmin and selection marks; give both options or none'),
                 (self.recursion > 1 and self.loss == 'fix',
                  'recursion: the targets of Eq. 3 follow the match; expected 1 with loss fix'),
                 (self.posterior == 'frame' and (

@@ -158,8 +158,8 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
                 f'{escaped(path)}: made with {name}={escaped(repr(before))}, not {value!r}; to go '
                 'on with it give the same settings, else choose another --out folder')
     if about.get('data_hash') != data_hash:
-        raise ConfigError(f'{escaped(path)}: made from other recordings; to go on with it give '
-                          'the same ones in the same order, else choose another --out folder')
+        raise ConfigError(f'{escaped(path)}: made from other recordings or marks; to go on with '
+                          'it give the same in the same order, else choose another --out folder')
     try:
         _put_back(state, tensors)
     except (LookupError, RuntimeError, TypeError, ValueError) as error:

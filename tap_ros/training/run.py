@@ -9,7 +9,8 @@ and a score are.
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -49,6 +50,7 @@ class Run:
         Reading.
     :param kind: of the weights file, 'predictor' or 'forward_model'.
     :param training: indices of the episodes to train on; held_out: of those to score.
+    :param data_hash: of the recordings and of marks on them.
     :param processes: Processes that train together.
     """
 
@@ -60,6 +62,7 @@ class Run:
     held_out: np.ndarray
     processes: Processes
     progress: bool
+    data_hash: str
 
     @property
     def checkpoint(self) -> Path:
@@ -75,7 +78,7 @@ class Run:
         :param todays: makes settings of earlier versions into those of today.
         """
         state = start(network, self.config.learning_rate, self.device, helpers)
-        load_checkpoint(self.checkpoint, state, asdict(self.config), self.store.data_hash, todays)
+        load_checkpoint(self.checkpoint, state, asdict(self.config), self.data_hash, todays)
         return state
 
 
@@ -89,6 +92,7 @@ class Course(Generic[Trained, Item]):
         The first two are on the progress bar.
     :param score: makes the scores of the averaged network and pictures (H, W, 3), both by name.
     :param rates: of each optimizer, the learning rate at its highest.
+    :param about: what else the weights file tells of the run; what JSON can hold.
     """
 
     state: TrainingState[Trained]
@@ -96,6 +100,7 @@ class Course(Generic[Trained, Item]):
     step: Callable[[Item], Callable[[], Numbers]]
     score: Callable[[], tuple[Numbers, Mapping[str, np.ndarray]]]
     rates: tuple[float, ...]
+    about: Mapping[str, Any] = field(default_factory=dict)
 
 
 def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
@@ -139,10 +144,18 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
                                      'train on; name others')
             warn_if_few(parts[1])
             torch.manual_seed(config.seed)
-            this = Run(config, kind, device, store, *parts, processes, progress)
+            this = Run(config, kind, device, store, *parts, processes, progress,
+                       _data_hash(store, getattr(config, 'marks', '')))
             _train(this, prepare(this), min(config.steps, stop_at or config.steps), deadline,
                    after_step)
     return str(Path(config.out) / f'{kind}.safetensors')
+
+
+def _data_hash(store: EpisodeStore, marks: str) -> str:
+    """Return what tells from which data a checkpoint is: recordings, and marks if there are."""
+    if not marks or not Path(marks).is_file():  # who reads them says so
+        return store.data_hash
+    return hashlib.sha256(store.data_hash.encode() + Path(marks).read_bytes()).hexdigest()
 
 
 def _paths(config: Any) -> list[str]:
@@ -184,7 +197,7 @@ def _train(run: Run, course: Course[Trained, Item], last: int, deadline: float,
                     state.step % config.save_every == 0 or state.step == last or stopped):
                 state.seconds = time.monotonic() - began
                 _report(run, course, curves)  # first: one that is killed in between reports again
-                save_checkpoint(run.checkpoint, state, asdict(config), run.store.data_hash)
+                save_checkpoint(run.checkpoint, state, asdict(config), run.data_hash)
             if stopped:
                 break
     if interrupted.is_set():
@@ -244,7 +257,7 @@ def _report(run: Run, course: Course[Trained, Item], curves: SummaryWriter) -> N
         'episodes': len(run.training), 'held_out': len(run.held_out),
         'machine': f'{platform.machine()}, {torch.get_num_threads()} threads, '
                    f'{device_name(run.device)}',
-        'torch': torch.__version__, 'python': platform.python_version()}
+        'torch': torch.__version__, 'python': platform.python_version(), **course.about}
     settings = asdict(run.config)
     for name, values in (('config', settings), ('run', about), ('scores', scores)):
         write_atomically(Path(run.config.out, f'{name}.json'), json.dumps(values, indent=2) + '\n')

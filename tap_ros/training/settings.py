@@ -16,7 +16,7 @@ from tyro import conf
 Recordings = Annotated[conf.Positional[tuple[str, ...]], conf.arg(
     metavar='BAG [BAG ...]', help_behavior_hint='(required)')]
 # Settings that change where a run happens and what it shows, not what it learns.
-FREE = ('recordings', 'out', 'device', 'threads', 'log_every', 'save_every')
+FREE = ('recordings', 'marks', 'out', 'device', 'threads', 'log_every', 'save_every')
 _RANGES: dict[str, tuple[float, float]] = {
     'test_fraction': (0, 0.9), 'threads': (0, math.inf), 'log_every': (1, math.inf),
     'save_every': (1, math.inf), 'steps': (1, math.inf), 'batch_size': (1, math.inf),

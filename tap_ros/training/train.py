@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.recording.reading import Reading
-from tap_ros.training.recipes import DEFAULT, find_recipe, Model, RECIPES
+from tap_ros.training.recipes import DEFAULT, find_recipe, Model, Recipe, RECIPES
 from tap_ros.training.settings import TrainOptions
 
 Options = TypeVar('Options', bound=TrainOptions)
@@ -60,9 +60,11 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
                               + (f'; did you mean {near[0]!r}?' if near else ''))
     if isinstance(settings.get('held_out'), str | Path):
         settings['held_out'] = (str(settings['held_out']),)
+    if 'marks' in settings:
+        settings['marks'] = str(settings['marks'])
     chosen = find_recipe(model, recipe or recipe_of(model, bags, settings))
-    return Path(function(config_class(
-        recordings=bags, out=str(out or f'runs/{model}'), **{**chosen.settings, **settings})))
+    return Path(function(config_class(recordings=bags, out=str(out or f'runs/{model}'), **{
+        **_chosen_settings(chosen, settings), **settings})))
 
 
 def recipe_of(model: str, recordings: Sequence[str], settings: Mapping[str, Any]) -> str:
@@ -97,11 +99,16 @@ def with_recipe(model: Model, args: Options) -> Options:
     if not given['recordings']:
         raise ConfigError('missing: BAG; name the recordings, or see --help')
     chosen = find_recipe(model, args.recipe or recipe_of(model, given['recordings'], given))
+    wanted = _chosen_settings(chosen, given)
     changed: dict[str, Any] = {
-        name: replace(part, **{key: chosen.settings[key]
-                               for key in asdict(part).keys() & chosen.settings})
+        name: replace(part, **{key: wanted[key] for key in asdict(part).keys() & wanted})
         for name, part in vars(args).items() if name != 'recipe'}
     return replace(args, **changed)
+
+
+def _chosen_settings(recipe: Recipe, given: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the settings of a recipe; where marks are given, they choose what is matched."""
+    return {**recipe.settings, 'selection': 'marks'} if given.get('marks') else recipe.settings
 
 
 def settings_of(args: TrainOptions) -> dict[str, Any]:

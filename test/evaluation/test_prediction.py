@@ -15,12 +15,15 @@ from tap_ros.evaluation.bottleneck import (
     bottleneck_share,
     MIN_MOTION,
 )
-from tap_ros.evaluation.prediction import evaluate, Options, run
+from tap_ros.evaluation.prediction import evaluate, Options, run, verdict
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
 from tap_ros.options import parse
+from tap_ros.prediction.marks import write_marks
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.episode import RecordingWarning
 from tap_ros.training.weights import save_weights
 import torch
 
@@ -129,6 +132,22 @@ def test_leaving_out_and_copying_cost_all_of_a_changed_pixel():
     assert 'changed_l1' not in scores['prediction'].summary()
 
 
+def test_a_verdict_is_of_the_matched_frame_and_memorised_is_said():
+    def scored(errors, copied):
+        return replace(blank, min_l1=np.array(errors), copying=np.array(copied))
+
+    blank = evaluate(Pasting(), EPISODES, range(3))['prediction']
+    frames = [episode.frames.astype(float) / 255 for episode in EPISODES]
+    assert blank.copying == pytest.approx([min(
+        np.abs(f[4] - f[0]).mean(), np.abs(f[4] - f[-1]).mean()) for f in frames], abs=1e-6)
+    good, bad = scored([0.1, 0.2, 0.1], [0.3, 0.3, 0.2]), scored([0.3, 0.4, 0.3], [0.2, 0.3, 0.2])
+    assert 'better than copying' in verdict(good, None)[0]
+    assert 'worse than copying' in verdict(bad, None)[0]
+    assert 'not told from' in verdict(scored([0.1, 0.4, 0.2], [0.2, 0.3, 0.2]), None)[0]
+    assert len(verdict(good, good)) == 2
+    assert verdict(bad, good)[2].startswith('memorised')
+
+
 def test_copying_matches_the_frame_beside_it_and_is_no_bottleneck():
     scores = evaluate(Pasting(), EPISODES, range(3))
     assert scores['copy-start'].match_step.tolist() == [1, 1, 1]
@@ -215,14 +234,23 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     common = ['--weights', str(weights), '--recordings', str(bag)]
     with pytest.raises(ConfigError, match='--all'):
         run(parse(Options, common))
-    run(parse(Options, [*common, '--all', '--samples', '3', '--out', str(tmp_path / 'out')]))
+    marks = tmp_path / 'marks.json'
+    write_marks(marks, open_recordings([bag], progress=False), [bag], {0: [(2, 4)], 2: [(7, 7)]})
+    with pytest.warns(RecordingWarning, match='3 episodes are'):
+        run(parse(Options, [*common, '--all', '--samples', '3', '--marks', str(marks), '--out',
+                            str(tmp_path / 'out')]))
     shown = capsys.readouterr().out
-    assert ('best of 3' in shown) == ('latent_size' in options)
+    assert 'positions: unknown' in shown and 'in 2 marked episodes' in shown
     scores = json.loads((tmp_path / 'out' / 'scores.json').read_text())['scores']
+    hits = scores.pop('marks')
+    assert hits['middle'][0][0] == hits['middle'][1][0] == 0.5
+    assert hits['random'][0][0] == pytest.approx((3 / 7 + 1 / 7) / 2)
+    assert hits['random'][1][0] == pytest.approx((5 / 7 + 2 / 7) / 2)
+    assert ('best of 3' in shown) == ('latent_size' in options)
     methods = {'prediction', 'copy-start', 'copy-goal'} - (
         {'copy-goal'} if 'num_context' in options else set())
-    assert set(scores) - {'samples'} == methods and all(method in shown for method in methods - {
-        'prediction'})
+    assert set(scores) - {'samples'} == methods
+    assert all(method in shown for method in methods)
     assert scores['prediction']['episodes'] == 3
     low, high = scores['prediction']['intervals']['min_l1']
     assert low <= scores['prediction']['min_l1'] <= high

@@ -1,0 +1,224 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The command `python -m tap_ros mark`: a page in the browser to mark the bottleneck in a few frames.
+
+The server is for this machine alone, and a page of another site cannot write through it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+import json
+from pathlib import Path
+import threading
+from typing import Annotated, Any
+
+import cv2
+import numpy as np
+from tap_ros.errors import ConfigError, TapError
+from tap_ros.options import File
+from tap_ros.prediction.marks import features_of, Mark, read_marks, write_marks
+from tap_ros.prediction.preference import learn_preference, LEAST_FRAMES
+from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.reading import reading_of
+from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.text import escaped
+from tyro import conf
+
+ENOUGH = 4  # marked demonstrations, from which on the others are proposed by what is learned
+_HOST = '127.0.0.1'
+_LARGEST = 2 ** 16  # bytes of a request
+_PAGE = {'/': ('mark.html', 'text/html'), '/mark.js': ('mark.js', 'text/javascript')}
+_POLICY = ("default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; "
+           "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+           "frame-ancestors 'none'")
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param recordings: .mcap files, bag folders, or folders of these.
+    :param marks: file to write, and to go on from where it is there; by default beside the first
+        recording, as its name with .marks.json.
+    :param port: of the page; 0: any that is free.
+    """
+
+    recordings: Annotated[conf.Positional[tuple[str, ...]], conf.arg(metavar='BAG [BAG ...]')]
+    marks: File = ''
+    port: int = 8010
+    reading: ReadingOptions = ReadingOptions()
+
+
+class Marking:
+    """
+    The marks of recordings, kept in their file, and which demonstration to mark next.
+
+    :param path: of the file.
+    :param recordings: paths of the store.
+    :raises ConfigError: for a file that is not of these recordings.
+    """
+
+    def __init__(self, store: EpisodeStore, recordings: Sequence[str], path: Path) -> None:
+        self.store, self.path, self._recordings = store, path, recordings
+        self._lock = threading.Lock()
+        self._marks: dict[int, Sequence[Mark]] = {}
+        if path.exists():
+            self._marks = dict(read_marks(path, store).episodes)
+        self._usable = [i for i in range(len(store)) if store.lengths[i] >= LEAST_FRAMES]
+        if not self._usable:
+            raise ConfigError(f'recordings: no episode has {LEAST_FRAMES} frames; record longer '
+                              'ones')
+        # Later nobody waits for it.
+        threading.Thread(target=lambda: self._features, daemon=True).start()
+
+    def mark(self, episode: int, frames: Sequence[int]) -> None:
+        """
+        Replace the marks of an episode, and write the file; without frames it has none.
+
+        :raises ConfigError: for an episode that there is not, and frames not between its ends.
+        """
+        known = isinstance(episode, int) and episode in self._usable
+        if not known or not all(isinstance(t, int) and 0 < t < self.store.lengths[episode] - 1
+                                for t in frames):
+            raise ConfigError('expected an episode and frames between its start and its goal')
+        with self._lock:
+            self._marks[episode] = [(t, t) for t in sorted(set(frames))]
+            if not frames:
+                del self._marks[episode]
+            write_marks(self.path, self.store, self._recordings, self._marks)
+
+    def state(self) -> dict[str, Any]:
+        """Return what the page shows."""
+        with self._lock:
+            return {'file': str(self.path), 'lengths': self.store.lengths.tolist(),
+                    'marks': {i: [(first + last) // 2 for first, last in marks]
+                              for i, marks in self._marks.items()},
+                    'next': self._next()}
+
+    def _next(self) -> int | None:
+        """Return the demonstration from whose marks most is to be learned, None if all have."""
+        left = [i for i in self._usable if i not in self._marks]
+        if not left or not self._marks:
+            return left[0] if left else None
+        if len(self._marks) < ENOUGH:  # far from those that are marked
+            return max(left, key=lambda i: min(abs(i - marked) for marked in self._marks))
+        marked = sorted(self._marks)
+        learned = learn_preference(
+            [self._features[i] for i in marked],
+            [(self._marks[i][-1][0] + self._marks[i][-1][1]) // 2 for i in marked])
+        doubts = {}
+        for i in left:  # entropy of w, as a share of the largest that it can have
+            share = learned(self._features[i])[1:-1]
+            share = share / share.sum()
+            doubts[i] = -(share * np.log(share)).sum() / np.log(max(len(share), 2))
+        return max(left, key=doubts.__getitem__)
+
+    @cached_property
+    def _features(self) -> dict[int, np.ndarray]:
+        return {i: features_of(self.store, i, 'none') for i in self._usable}
+
+
+def make_server(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
+    """
+    Make the server of the page; its server_port says where it is.
+
+    :raises ConfigError: for a port that cannot be used.
+    """
+    class Handler(BaseHTTPRequestHandler):
+        """Answers `/state`, `/frame/EPISODE/FRAME`, the page's files, and `/mark` that marks."""
+
+        def do_GET(self) -> None:
+            """Answer what only shows."""
+            if not self._is_own():
+                return
+            path, *numbers = self.path.strip('/').split('/')
+            if self.path in _PAGE:
+                name, kind = _PAGE[self.path]
+                self._send(files('tap_ros.prediction').joinpath('page', name).read_bytes(), kind)
+            elif path == 'state':
+                self._send_state()
+            elif path == 'frame' and len(numbers) == 2 and all(map(str.isdecimal, numbers)):
+                self._send_frame(*map(int, numbers))
+            else:
+                self._send(b'There is nothing here.', 'text/plain', HTTPStatus.NOT_FOUND)
+
+        def do_POST(self) -> None:
+            """Mark what the page asks for."""
+            if not self._is_own():
+                return
+            try:
+                size = int(self.headers.get('Content-Length', 0))
+                asked = json.loads(self.rfile.read(min(size, _LARGEST)))
+                marking.mark(asked['episode'], asked['frames'])
+            except (LookupError, TypeError, ValueError, TapError) as error:
+                self._send(str(error).encode(), 'text/plain', HTTPStatus.BAD_REQUEST)
+            else:
+                self._send_state()
+
+        def _is_own(self) -> bool:
+            """Return whether our own page asks, under the name of this machine alone."""
+            host, origin = self.headers.get('Host', ''), self.headers.get('Origin')
+            own = host.rpartition(':')[0] in (_HOST, 'localhost') and origin in (
+                None, f'http://{host}')
+            if not own:
+                self._send(b'This page may not be used from there.', 'text/plain',
+                           HTTPStatus.FORBIDDEN)
+            return own
+
+        def _send_state(self) -> None:
+            self._send(json.dumps(marking.state()).encode(), 'application/json')
+
+        def _send_frame(self, episode: int, t: int) -> None:
+            if episode >= len(marking.store) or t >= marking.store.lengths[episode]:
+                self._send(b'', 'text/plain', HTTPStatus.NOT_FOUND)
+                return
+            frame = np.ascontiguousarray(marking.store.frames(episode)[t][..., ::-1])
+            self._send(cv2.imencode('.png', frame)[1].tobytes(), 'image/png')
+
+        def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+            self.send_response(status)
+            for name, value in (('Content-Type', f'{kind}; charset=utf-8'),
+                                ('Content-Length', str(len(body))),
+                                ('Content-Security-Policy', _POLICY),
+                                ('X-Content-Type-Options', 'nosniff'),
+                                ('Cache-Control', 'no-store')):
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            """Print nothing."""
+
+    class Server(ThreadingHTTPServer):
+        """Says nothing of browsers that go away."""
+
+        def handle_error(self, *_: object) -> None:
+            """Print nothing."""
+
+    try:
+        return Server((_HOST, port), Handler)
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f'port {port}: cannot be listened at ({error}); choose another, or 0 '
+                          'for any that is free') from error
+
+
+def run(args: Options) -> None:
+    """
+    Serve the page until Ctrl-C.
+
+    :raises TapError: for recordings or marks that cannot be used.
+    """
+    first = Path(args.recordings[0]).resolve()
+    path = Path(args.marks) if args.marks else first.with_name(f'{first.name}.marks.json')
+    store = open_recordings(args.recordings, reading=reading_of(args.reading))
+    server = make_server(Marking(store, args.recordings, path), args.port)
+    print(f'open http://{_HOST}:{server.server_port} in a browser; marks go to {escaped(path)}; '
+          'Ctrl-C ends', flush=True)
+    with server:
+        server.serve_forever()

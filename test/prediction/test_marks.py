@@ -1,0 +1,217 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of marks: their file, what is learned from them and trained with it, and their page."""
+
+from dataclasses import replace
+import json
+import threading
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+from made_episodes import make_episode, write_bag
+import numpy as np
+import pytest
+from tap_ros.cli import main
+from tap_ros.errors import ConfigError
+from tap_ros.prediction.batches import make_batch, Sampling
+from tap_ros.prediction.mark_command import make_server, Marking
+from tap_ros.prediction.marks import chance, learn_marks, read_marks, write_marks
+from tap_ros.prediction.networks import Prediction
+from tap_ros.prediction.objective import Networks, predictor_loss
+from tap_ros.prediction.preference import FLOOR, Preference
+from tap_ros.prediction.training import train
+from tap_ros.prediction.training_config import TrainingConfig
+from tap_ros.recording.cache import open_recordings
+from tap_ros.training.weights import load_weights
+import torch
+
+
+@pytest.fixture
+def store(bag):
+    return open_recordings([bag], progress=False)
+
+
+@pytest.fixture
+def marks(bag, store, tmp_path):
+    """Mark the middle of the first ten demonstrations."""
+    path = tmp_path / 'marks.json'
+    write_marks(path, store, [bag], {i: [(n // 2, n // 2)] for i, n in enumerate(
+        store.lengths[:10].tolist())})
+    return path
+
+
+def test_marks_are_read_as_they_were_written_by_hand_too(bag, store, tmp_path):
+    episodes = {0: [(2, 2), (4, 4)], 3: [(1, 5)], 20: [(3, 3)]}
+    path = tmp_path / 'deep' / 'marks.json'
+    write_marks(path, store, [bag], episodes)
+    found = read_marks(path, store)
+    assert found.episodes == episodes and len(found.digest) == 64
+    first = int(store[3].stamps[0])
+    for seconds in (first / 1e9 + 0.5, first / 1e9 + 0.6):  # frames are 0.25 s apart
+        path.write_text(json.dumps({'marks': [
+            {'recording': str(bag), 'episode': 3, 'stamps': [seconds]}]}))
+        assert read_marks(path, store).episodes == {3: [(2, 2)]}
+
+
+def test_marks_of_something_else_are_refused_with_the_file_and_the_reason(bag, store, tmp_path):
+    other = write_bag(tmp_path / 'other', [make_episode(1)])
+    begin, end = (int(store[0].stamps[k]) / 1e9 for k in (0, -1))
+    path = tmp_path / 'marks.json'
+
+    def refusal(data):
+        path.write_text(data if isinstance(data, str) else json.dumps({'marks': [
+            {'recording': str(bag), 'episode': 0, 'stamps': [begin + 0.5], **data}] * 1}))
+        with pytest.raises(ConfigError) as error:
+            read_marks(path, store)
+        text = str(error.value)
+        assert text.startswith(str(path)) and text.isprintable()
+        return text
+
+    for data, said in (
+            ({'recording': str(other)}, 'none of those that are read'),
+            ({'episode': 24}, 'expected 0 to 23'), ({'episode': 'x'}, 'episode x'),
+            ({'stamps': [begin - 1]}, 'outside'), ({'stamps': [end + 1]}, 'outside'),
+            ({'stamps': [begin]}, 'start or the goal'), ({'stamps': []}, 'list of seconds'),
+            ({'stamps': [begin + 1, begin + 0.5]}, 'in order'), ({'stamps': 3}, 'list of seconds'),
+            ({'stamps': [float('nan')]}, 'as seconds'), ('[]', 'no file of marks'),
+            ('{"marks": [{"episode": 1}]}', 'no file of marks'), ('{', 'no file of marks')):
+        assert said in refusal(data), data
+    entry = {'recording': str(bag), 'episode': 0, 'stamps': [begin + 0.5]}
+    assert 'marked above' in refusal(json.dumps({'marks': [entry, entry]}))
+    with pytest.raises(ConfigError, match='tap_ros mark'):
+        read_marks(tmp_path / 'none.json', store)
+
+
+class Showing(torch.nn.Module):
+    """Predicts one picture, whatever it is given."""
+
+    def __init__(self, image):
+        super().__init__()
+        self.image = image
+
+    def forward(self, context, z=None):
+        return Prediction(self.image, None, None, None)
+
+
+def test_the_learned_preference_is_of_the_frame_whatever_piece_is_shown(store):
+    config = TrainingConfig(('x',), 'x', selection='marks', marks='x', recursion=2)
+    preference = []
+    for n in store.lengths:
+        w = np.full((2, n), FLOOR, np.float32)
+        w[0, n - 3] = w[1, n - 5] = 1  # the later mark first
+        preference.append(w)
+    for start_crop in (0.0, 0.5):
+        batch = make_batch(store, range(8), Sampling(start_crop=start_crop), preference=preference,
+                           rng=np.random.default_rng(1))
+        for b in range(8):
+            late = store.lengths[b] - 1 - batch.end[b, 0]
+            valid = batch.valid[b]
+            assert batch.preference[b][:, valid].numpy() == pytest.approx(
+                preference[b][:, (late + batch.times[b][valid]).tolist()])
+    grey = torch.zeros(8, 3, 32, 32)
+    seen = []
+
+    def noted(module, inputs, outputs):
+        seen.append(inputs[0])
+
+    network = Showing(grey)
+    network.register_forward_hook(noted)
+    match = predictor_loss(Networks(network), batch, None, config).match
+    assert (batch.times.gather(1, match[:, None]) == batch.end - 2).all()
+    assert len(seen) == 2
+
+
+def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_path, capsys):
+    config = TrainingConfig(
+        (str(bag),), str(tmp_path / 'run'), base_width=4, batch_size=4, steps=4, margin=1,
+        test_fraction=0.3, threads=1, save_every=2, precision='float32', selection='marks',
+        marks=str(marks))
+    about = load_weights(train(config, stop_at=2, progress=False), 'predictor')[2]
+    told = capsys.readouterr().err
+    assert 'demonstrations. Learned from the others, a mark is found within one' in told
+    found = about['marks']
+    assert found['sha256'] == read_marks(marks, store).digest
+    levels, = found['levels']
+    assert levels['demonstrations'] == 5 and levels['found'] >= 4 and 0 < levels['random'] < 0.8
+    assert about['settings']['marks'] == str(marks)
+    assert Preference.from_json(found['preferences'][0]).weights.any()
+    train(config, progress=False)
+    marks.write_text(marks.read_text().replace('"episode": 2', '"episode":  2'))
+    with pytest.raises(ConfigError, match='other recordings or marks'):
+        train(config, progress=False)
+    for values, said in (({'recursion': 2}, 'has 1 marks, and each needs 2'),
+                         ({'held_out': (str(bag),)}, 'too short|held out')):
+        with pytest.raises(Exception, match=said):
+            train(replace(config, out=str(tmp_path / 'other'), **values), progress=False)
+    for values in ({'marks': ''}, {'loss': 'min'}, {'selection': 'relative'}):
+        with pytest.raises(ConfigError, match='^marks'):
+            replace(config, **values)
+    with pytest.raises(ConfigError, match='mark some of those that are not held out'):
+        learn_marks(store, read_marks(marks, store), np.array([23]), 1, False, 'none')
+
+
+def test_the_option_alone_chooses_them(bag, marks, tmp_path, capsys):
+    out = tmp_path / 'run'
+    assert main(['train', 'predictor', str(bag), '--out', str(out), '--marks', str(marks),
+                 '--recipe', 'debug']) == 0
+    settings = json.loads((out / 'config.json').read_text())
+    assert settings['selection'] == 'marks'
+    assert 'by a random frame in' in capsys.readouterr().err
+    assert main(['train', 'predictor', str(bag), '--marks', str(tmp_path / 'none'),
+                 '--out', str(tmp_path / 'b')]) == 1
+    assert str(tmp_path / 'none') in capsys.readouterr().err
+
+
+def test_by_chance_a_mark_is_hit_as_often_as_it_is_wide():
+    assert chance((4, 4), 12) == 0.3 and chance((1, 1), 12) == 0.2
+    assert chance((3, 6), 12, 0) == 0.4
+
+
+@pytest.fixture
+def page(bag, store, tmp_path):
+    """Serve the page; return what asks it, and the file it writes."""
+    path = tmp_path / 'marks.json'
+    server = make_server(Marking(store, [str(bag)], path))
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+
+    def ask(place, data=None, **headers):
+        return urlopen(Request(f'http://127.0.0.1:{server.server_port}/{place}', data, headers))
+
+    yield ask, path
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_the_page_shows_frames_and_writes_marks_at_once(page, bag, store):
+    ask, path = page
+    assert b'mark.js' in ask('').read() and b'ArrowLeft' in ask('mark.js').read()
+    assert ask('frame/3/2').read().startswith(b'\x89PNG')
+    state = json.load(ask('state'))
+    assert state['lengths'] == store.lengths.tolist() and state['next'] == 0
+    visited = []
+    for _ in range(24):
+        i = state['next']
+        visited.append(i)
+        state = json.load(ask('mark', json.dumps({'episode': i, 'frames': [4, 2]}).encode()))
+        assert read_marks(path, store).episodes[i] == [(2, 2), (4, 4)]
+        assert state['marks'][str(i)] == [2, 4]
+    assert sorted(visited) == list(range(24)) and state['next'] is None
+    assert visited[1] == 23 and 8 < visited[2] < 15  # far from those before
+    state = json.load(ask('mark', b'{"episode": 5, "frames": []}'))
+    assert state['next'] == 5 and 5 not in read_marks(path, store).episodes
+    assert Marking(store, [str(bag)], path).state() == json.loads(
+        json.dumps(state), object_hook=lambda d: {int(k) if k.isdecimal() else k: v
+                                                  for k, v in d.items()})
+    before = path.read_bytes()
+    for place, data, headers, code in (
+            ('mark', b'{"episode": 99, "frames": [1]}', {}, 400),
+            ('mark', b'{"episode": 1, "frames": [0]}', {}, 400), ('mark', b'x', {}, 400),
+            ('mark', b'{"episode": 1, "frames": [1]}', {'Origin': 'http://evil.example'}, 403),
+            ('state', None, {'Host': 'evil.example'}, 403), ('frame/99/0', None, {}, 404),
+            ('../setup.py', None, {}, 404)):
+        with pytest.raises(HTTPError) as error:
+            ask(place, data, **headers)
+        assert error.value.code == code, (place, data)
+    assert path.read_bytes() == before
