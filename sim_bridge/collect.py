@@ -215,9 +215,12 @@ def _check_settings(folder: Path, config: CollectConfig) -> None:
 
 def _is_whole(folder: Path, config: CollectConfig, shard: int) -> bool:
     """Say whether a file is there with all its episodes; the last may have been of fewer."""
-    path = _shard_path(folder, shard)
+    path, episodes = _shard_path(folder, shard), _episodes(config, shard)
+    marked = _bottlenecks(folder)
+    if marked and marked.keys().isdisjoint(episodes):
+        return False  # killed before its bottlenecks were noted
     try:
-        return path.exists() and count_episodes(path) == len(_episodes(config, shard))
+        return path.exists() and count_episodes(path) == len(episodes)
     except RecordingError:  # it is made anew
         return False
 
@@ -271,13 +274,17 @@ def _demonstrated(world: World, config: CollectConfig,
 
 def _note_bottlenecks(folder: Path, found: list[dict[str, Any]]) -> None:
     """Add marks to the file beside the recording, one a line."""
-    if not found:
-        return
+    if found:
+        marks = _bottlenecks(folder) | {mark['episode']: mark for mark in found}
+        lines = ',\n'.join(json.dumps(marks[i]) for i in sorted(marks))
+        write_atomically(folder / BOTTLENECKS_FILE, f'{{"marks": [\n{lines}\n]}}\n')
+
+
+def _bottlenecks(folder: Path) -> dict[int, dict[str, Any]]:
+    """Return the marks beside the recording, by episode."""
     path = folder / BOTTLENECKS_FILE
-    known = json.loads(path.read_text())['marks'] if path.exists() else []
-    marks = {mark['episode']: json.dumps(mark) for mark in known + found}
-    lines = ',\n'.join(marks[i] for i in sorted(marks))
-    write_atomically(path, f'{{"marks": [\n{lines}\n]}}\n')
+    return {mark['episode']: mark for mark in json.loads(path.read_text())['marks']
+            } if path.exists() else {}
 
 
 def make_episode(simulator: Simulator, observations: Sequence[Observation], actions: np.ndarray,

@@ -133,9 +133,10 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
         assert episode.stamps[0] < 1e9 * begin <= 1e9 * end < episode.stamps[-1]
     # An interrupted collection goes on to the same files.
     whole = (folder / 'bag_1.mcap').read_bytes()
-    (folder / 'bag_1.mcap').unlink()
+    (folder / BOTTLENECKS_FILE).write_text(json.dumps({'marks': marks[:1]}))
     assert collect(folder, config, Engine(workers=1), progress=False)['episodes'] == 1
     assert (folder / 'bag_1.mcap').read_bytes() == whole
+    assert json.loads((folder / BOTTLENECKS_FILE).read_text())['marks'] == marks
     for bad, words in (({'look': 'arm', 'misses': 0.5}, 'misses, look: of world mujoco_table'),
                        ({'task': 'door-opn-v3'}, "'door-opn-v3' is unknown")):
         with pytest.raises(TapError, match=words):
@@ -190,7 +191,7 @@ def test_the_bottleneck_is_where_the_hand_is_at_what_it_is_about_to_move():
     assert find_bottleneck(still, np.arange(9.0)[:, None]) is None, 'it moves from the start on'
 
 
-@pytest.mark.parametrize('task', ['button', 'cube', 'drawer', 'window'])
+@pytest.mark.parametrize('task', ['cube', 'drawer'])
 def test_oracles_of_ogbench_demonstrate_too(task):
     pytest.importorskip('ogbench')
     world = make_world('ogbench', task, 32)
