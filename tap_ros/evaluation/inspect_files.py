@@ -28,6 +28,7 @@ from tap_ros.training.split import split_episodes, warn_if_few
 from tyro import conf
 
 LARGE = 256  # px; pictures with a longer side are not decoded whole
+MANY = 5000  # pictures that take long
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ def run(args: Options) -> None:
         _, about = load_tensors(args.path)
         print(json.dumps(about, indent=2))
         return
-    for number, (topic, kind, count) in enumerate(list_topics(args.path)):
+    found = list_topics(args.path)
+    for number, (topic, kind, count) in enumerate(found):
         print(f'{"" if number else "topics":<11} {escaped(topic)}  {escaped(kind)}  '
               + ('unknown' if count is None else f'{count} messages'))
     reading = reading_of(args.reading)
@@ -77,9 +79,13 @@ def run(args: Options) -> None:
                 rate = max(0.5, 2 / reading.gap if reading.gap else 0)
                 shown = replace(reading, crop=reading.crop or CENTRE, size=64,
                                 rate=min(reading.rate or rate, rate))
-    store = open_recordings([args.path], reading=shown)
     cameras = {next(iter(find_topics(bag, camera))) for bag in find_bags(args.path)
                for camera in reading.cameras}
+    count = sum(count or 0 for topic, _, count in found if topic in cameras)
+    if not shown.rate and count > MANY:
+        print(f'decoding    {count} pictures, 2 to 10 ms each on one core a file; the cache keeps '
+              'them for the next time', flush=True)
+    store = open_recordings([args.path], reading=shown)
     episodes = [store[i] for i in range(len(store))]
     lengths = np.array([len(e.frames) for e in episodes])
     objects = sorted({len(e.object_names) for e in episodes})

@@ -157,7 +157,7 @@ def decompress(data: bytes | memoryview | np.ndarray, description: str,
                 return to_rgb(np.array(file)[..., None], encoding)  # the raw mosaic
             picture = file if file.mode == 'RGB' else file.convert('RGB')
             with suppress(struct.error, SyntaxError, TypeError, ValueError):  # broken EXIF data
-                picture = ImageOps.exif_transpose(picture)
+                ImageOps.exif_transpose(picture, in_place=True)
             return np.array(picture)
     except UnidentifiedImageError:
         raise ImageError(

@@ -114,7 +114,7 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     bags, cameras = zip(*itertools.product(found, reading.cameras))
     cache_dir = Path(cache_dir) if cache_dir else cache_folder()
     with tqdm(total=sum(file.stat().st_size for bag in bags for file in bag),
-              desc='opening recordings', unit='B', unit_scale=True, disable=not progress,
+              desc='decoding once', unit='B', unit_scale=True, disable=not progress,
               delay=1) as bar:
         jobs = _jobs(bags, list(map(find_topics, bags, cameras)), reading, cache_dir)
         loaded = {job: _load(job) for bag in jobs for job in bag}

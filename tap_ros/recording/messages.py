@@ -140,17 +140,17 @@ def check_schema(type_name: str, text: str) -> None:
     :raises RecordingError: when fields differ; it names the type and both lists of fields.
     """
     types: dict[str, Any] = {}
+    head, _, last = text.rpartition('\n')
+    if last and any(line != last and line.startswith(last)
+                    for line in schema_text(type_name).splitlines()):
+        text = head  # it is cut off amid its last line
     with suppress(*_UNREADABLE):
         if len(text) <= _MAX_SCHEMA:
             types = get_types_from_msg(text.replace('\r\n', '\n'), type_name)
     known = typestore().fielddefs
     for name, (_, theirs) in types.items():
         ours = list(known[name][1]) if name in known else list(theirs)
-        last, kind = theirs[-1] if theirs else ('', None)
-        # One that is cut off, also amid the name of a field, says nothing else.
-        if list(theirs[:-1]) != ours[:len(theirs)][:-1] or not (
-                not theirs or any(name.startswith(last) and kind == each
-                                  for name, each in ours[len(theirs) - 1:len(theirs)])):
+        if list(theirs) != ours[:len(theirs)]:  # one that is cut off says nothing else
             theirs, ours = (', '.join(field for field, _ in fields) for fields in (theirs, ours))
             raise RecordingError(
                 f'message type {name}: recorded with the fields {theirs}; expected {ours}')

@@ -55,7 +55,8 @@ class OtherBag(McapFile):
 
     def _lose(self, why: str) -> None:
         """Note that all behind the newest message is lost."""
-        self.losses.append(Loss(why, start=self._newest, end=self._newest))
+        behind = None if self._newest is None else self._newest + 1
+        self.losses.append(Loss(why, start=behind, end=self._newest))
 
     def _describe(self, path: Path) -> None:
         """Learn of the channels, and how many messages each has."""
@@ -107,19 +108,19 @@ class Ros1File(OtherBag):
             self._data = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
         header = next((fields for fields, *_ in _records(self._data, len(_MAGIC))), {})
         index = _LONG.unpack(header.get(b'index_pos', bytes(8)))[0]
-        if not len(_MAGIC) < index < len(self._data):
-            self._counts.update(number for number, *_ in self._messages())
-            self.losses = []  # they will be met again
-            return
-        for fields, content, _ in _records(self._data, index):
+        is_whole = False
+        for fields, content, end in _records(self._data, max(index, len(_MAGIC))) if index else ():
+            is_whole = end == len(self._data)
             if fields[b'op'][0] == _CONNECTION:
                 self._connect(fields, content)
             elif fields[b'op'][0] == _CHUNK_INFO:
                 for number, count in struct.iter_unpack('<II', content):
                     self._counts[number] += count
+        if not is_whole:  # its index is missing, or cut off
+            self._counts = Counter(number for number, *_ in self._messages())
 
     def _messages(self) -> Iterator[Found]:
-        end = 0  # of what is whole
+        end, self.losses = 0, []  # of what is whole; what is lost is met again
         for fields, content, end in _records(self._data, len(_MAGIC)):
             kind = fields[b'op'][0]
             if kind == _CHUNK:

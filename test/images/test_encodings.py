@@ -94,6 +94,52 @@ def test_sizes_that_an_encoding_does_not_have_are_refused():
             to_rgb(np.zeros((height, width, size), np.uint8), name)
 
 
+def smooth(seed, size=(120, 160)):
+    """Return a picture as of a camera: colours that change slowly, and noise."""
+    random = np.random.default_rng(seed)
+    coarse = cv2.resize(random.integers(0, 256, (6, 8, 3), np.uint8), size[::-1])
+    return np.clip(coarse + random.normal(0, 4, coarse.shape), 0, 255).astype(np.uint8)
+
+
+def test_a_jpeg_that_holds_every_pixel_is_read_whatever_stands_around_them():
+    for picture in (smooth(0), SCENE, smooth(1)[..., 0], np.zeros((8, 8, 3), np.uint8)):
+        for options in ({}, {'progressive': True}, {'restart_marker_rows': 1}, {'quality': 20},
+                        {'optimize': True, 'subsampling': 0}):
+            buffer = io.BytesIO()
+            Picture.fromarray(picture).save(buffer, 'JPEG', **options)
+            data, expected = buffer.getvalue(), Picture.open(buffer).convert('RGB')
+            body = data[:-2]  # without the mark of its end
+            tables = data.index(b'\xff\xc4'), data.index(b'\xff\xda')
+            others = [] if len(options) or picture.ndim == 2 else [
+                data[:tables[0]] + data[tables[1]:]]  # Motion JPEG: the usual tables
+            for changed in (data, body, body + b'\xff', body + bytes(99), data + b'behind',
+                            body + bytes(3) + data[-2:], body + b'\xff\xff' + data[-2:],
+                            body + b'\xff\xfe\0\5hey' + data[-2:], *others):
+                np.testing.assert_array_equal(decompress(changed, 'jpeg'), expected)
+
+
+def test_a_jpeg_that_lacks_pixels_or_holds_others_is_damaged():
+    random = np.random.default_rng(0)
+    for seed in range(8):
+        data = packed(smooth(seed), 'JPEG')
+        begin = data.index(b'\xff\xda') + 14
+        at = int(random.integers(begin, len(data) - 700))
+        for changed in (data[:at] + random.bytes(500) + data[at + 500:], data[:at],
+                        data[:at] + random.bytes(300) + data[at:], data[:at] + data[at + 600:],
+                        data[:at] + bytes(600) + data[at + 600:], data[:at] + data[-2:],
+                        data[:at] + bytes(len(data) - at)):
+            with pytest.raises(ImageError, match='damaged compressed picture'):
+                decompress(changed, 'jpeg')
+
+
+def test_other_files_are_read_and_png_without_its_end():
+    for form, error in (('PNG', 0), ('WEBP', 9), ('AVIF', 9), ('JPEG2000', 9)):
+        found = decompress(packed(smooth(2), form), form)
+        assert np.abs(found.astype(int) - smooth(2)).mean() <= error
+    data = packed(smooth(2), 'PNG')
+    np.testing.assert_array_equal(decompress(data[:-12], 'png'), smooth(2))
+
+
 def test_compressed_pictures_that_cannot_be_used_are_refused_with_the_reason():
     deep = np.full((8, 8), 40000, np.uint16)
     _, colour = cv2.imencode('.png', np.full((8, 8, 3), 40000, np.uint16))
@@ -102,7 +148,7 @@ def test_compressed_pictures_that_cannot_be_used_are_refused_with_the_reason():
             (b'no picture', 'jpeg', "format 'jpeg' cannot be used; valid are JPEG, PNG"),
             (packed(deep, 'PNG'), '16UC1; png compressed', 'more than 8 bits a channel'),
             (colour.tobytes(), 'rgb16; png compressed', 'more than 8 bits a channel'),
-            (packed(deep, 'PNG'), '16UC1; compressedDepth png', 'topic of the colour camera'),
+            (packed(deep, 'PNG'), '16UC1; compressedDepth png', 'record the colour camera'),
             (packed(np.zeros((4000, 4000, 3), np.uint8), 'PNG'), 'png', '4000x4000 pixels are')):
         with pytest.raises(ImageError, match=words):
             decompress(data, form)

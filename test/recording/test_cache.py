@@ -4,6 +4,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -73,6 +74,26 @@ def test_large_recordings_are_decoded_in_other_processes(tmp_path, bag, episodes
         writer.write(make_episode(seed=99))
     with pytest.raises(RecordingError, match='push2_1.mcap: images of different sizes'):
         open_recordings(bag)
+
+
+def test_ctrl_c_while_others_decode_is_one_line(tmp_path, bag):
+    script = tmp_path / 'script.py'
+    script.write_text(
+        'import sys, time\nfrom tap_ros import cli\nfrom tap_ros.recording import cache\n'
+        'cache._ALONE_BYTES = 0\ncache._workers = lambda: 2\n'
+        'decode = cache.decode_file\n'
+        'def slow(*args):\n    print("begun", flush=True)\n    time.sleep(60)\n'
+        'cache.decode_file = slow\n'
+        'if __name__ == "__main__":\n    sys.exit(cli.main(["inspect", sys.argv[1]]))\n')
+    for wait in ('topics', 'begun'):
+        run = subprocess.Popen([sys.executable, script, bag], stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, text=True, start_new_session=True,
+                               env=os.environ | {'PYTHONPATH': os.getcwd()})
+        while not run.stdout.readline().startswith(wait):
+            pass
+        os.killpg(run.pid, signal.SIGINT)
+        _, said = run.communicate(timeout=30)
+        assert run.returncode == 130 and 'Traceback' not in said and said.count('\n') < 3, said
 
 
 def test_a_script_that_other_processes_cannot_import_gets_its_episodes(tmp_path, bag, episodes):

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags that others recorded, with other topics, encodings and habits."""
 
+import re
+
 from made_bags import (
     camera,
     command,
@@ -24,6 +26,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_typestore, Stores
+from tap_ros.cli import main
 from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
@@ -78,6 +81,29 @@ def test_an_empty_topic_or_one_of_another_type_is_passed_over_whatever_its_name(
         ], [('/camera/image_raw', IMAGE), ('/c/objects', 'tap_msgs/msg/ObjectStates')])
     assert topics_of(tmp_path)['/front/rgb'] == 'frame'
     assert topics_of(tmp_path, '/front/rgb')['/b/objects'] == 'object'
+
+
+def test_a_topic_that_cannot_be_the_camera_is_answered_with_all_topics_and_their_counts(tmp_path):
+    def deep(topic, form):
+        return [camera(t, topic=topic, encoding=form, step=6, data=bytes(12)) for t in (1, 2)]
+
+    write_mcap(tmp_path / 'a.mcap', [camera(t) for t in (1, 2, 3)], [('/front/rgb', IMAGE)])
+    write_mcap(tmp_path / 'b.mcap', deep('/depth', '16UC1') + deep('/far', '32FC1'))
+    for name, wanted, words in (
+            ('a', '/front/rgb', r'/front/rgb holds no message; .*/camera/image_raw .*3 messages'),
+            ('a', '/other', r'no topic /other .*/camera/image_raw .*3 mes.*/front/rgb .*0 mes'),
+            ('b', '', r'can be used: /depth \(2 messages\), /far .*record the colour camera')):
+        with pytest.raises(RecordingError, match=words) as error:
+            find_topics([tmp_path / f'{name}.mcap'], wanted)
+        assert name == 'a' or '--image-topic' not in str(error.value)
+
+
+def test_pictures_seconds_apart_are_kept_together_by_the_gap_that_is_told(tmp_path, capsys):
+    pixels = np.zeros((64, 64, 3), np.uint8)
+    bag = record(tmp_path / 'bag', [camera(6 * t, pixels) for t in range(1, 20)])
+    assert main(['inspect', str(bag)]) == 1
+    option = re.search(r'--gap [0-9.]+', capsys.readouterr().err)[0].split()
+    assert main(['inspect', str(bag), *option]) == 0
 
 
 def test_topics_in_a_namespace(tmp_path, episodes):

@@ -4,6 +4,7 @@
 
 import base64
 from contextlib import closing
+import json
 from pathlib import Path
 import shlex
 import shutil
@@ -11,6 +12,7 @@ import sqlite3
 import struct
 import sys
 from types import SimpleNamespace
+import warnings
 
 import cv2
 from made_bags import camera, joints, record, SECOND
@@ -21,7 +23,9 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Writer as Ros2Writer
 from tap_ros.cli import main, read
 from tap_ros.errors import RecordingError
+from tap_ros.recording import channels, copies
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.messages import encode, typestore
 from tap_ros.recording.reader import iter_episodes
 import zstandard
@@ -83,9 +87,11 @@ def write_packed(folder):
     return folder
 
 
-def write_ros1(path):
-    store = typestore()
-    with Ros1Writer(path) as writer:
+def write_ros1(path, compression=None):
+    store, writer = typestore(), Ros1Writer(path)
+    if compression:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    with writer:
         topics = {}
         for topic, kind, data, log in SENT:
             if topic not in topics:
@@ -94,41 +100,74 @@ def write_ros1(path):
     return path
 
 
-def write_mcap(path, schema_encoding, encoding, messages):
-    """Write (topic, type, data, log time) as messages of another encoding."""
+def write_without_index(path):
+    """Write a bag of ROS 1 as a killed recorder leaves it."""
+    data = write_ros1(path, 'LZ4').read_bytes()
+    at = data.index(b'index_pos=') + 10
+    index, = struct.unpack_from('<Q', data, at)
+    path.write_bytes(data[:at] + bytes(8) + data[at + 8:index])
+    return path
+
+
+def write_mcap(path, messages):
+    """Write (topic, type, data, log time, schema encoding, encoding)."""
     with open(path, 'wb') as stream:
         writer = McapWriter(stream)
         writer.start()
         channels = {}
-        for topic, kind, data, log in messages:
-            if topic not in channels:
-                channels[topic] = writer.register_channel(
+        for topic, kind, data, log, schema_encoding, encoding in messages:
+            if (topic, kind) not in channels:
+                channels[topic, kind] = writer.register_channel(
                     topic, encoding, writer.register_schema(kind, schema_encoding, b''))
-            writer.add_message(channels[topic], log, bytes(data), log)
+            writer.add_message(channels[topic, kind], log, bytes(data), log)
         writer.finish()
     return path
 
 
 def write_ros1_mcap(path):
-    return write_mcap(path, 'ros1msg', 'ros1', [
-        (topic, kind.replace('/msg/', '/'), typestore().cdr_to_ros1(data, kind), log)
-        for topic, kind, data, log in SENT])
+    return write_mcap(path, [
+        (topic, kind.replace('/msg/', '/'), typestore().cdr_to_ros1(data, kind), log, 'ros1msg',
+         'ros1') for topic, kind, data, log in SENT])
 
 
 @pytest.mark.parametrize('write, name', [
-    (write_sqlite3, 'bag'), (write_bare_db3, ''), (write_ros1, 'a.bag'),
-    (write_unmerged, ''), (write_packed, 'bag'),
-    (write_ros1_mcap, 'a.mcap')])
-def test_other_bags_say_what_a_bag_of_ours_says(write, name, tmp_path):
+    (write_sqlite3, 'bag'), (write_bare_db3, ''), (write_unmerged, ''), (write_packed, 'bag'),
+    (write_ros1, 'a.bag'), (lambda path: write_ros1(path, 'BZ2'), 'a.bag'),
+    (write_without_index, 'a.bag'), (write_ros1_mcap, 'a.mcap')])
+def test_other_bags_say_what_a_bag_of_ours_says(write, name, tmp_path, monkeypatch):
     expected, = iter_episodes(record(tmp_path / 'ours', SENT))
     (tmp_path / 'theirs').mkdir()
     path = write(tmp_path / 'theirs' / name)
+    made = []
+    monkeypatch.setattr(copies, '_copy', lambda *args, copy=copies._copy: made.append(
+        args) or copy(*args))
     for place in (path, tmp_path / 'theirs'):
         for found in (list(iter_episodes(place)), [open_recordings(place)[0]]):
             np.testing.assert_array_equal(found[0].frames, expected.frames)
             np.testing.assert_array_equal(found[0].stamps, expected.stamps)
             np.testing.assert_array_equal(found[0].grippers, expected.grippers)
             assert len(found) == 1
+    assert len(made) == (write in (write_unmerged, write_packed))  # once, however often opened
+
+
+def test_a_cut_bag_of_ros_1_gives_what_is_before_the_cut(tmp_path):
+    for number, write in enumerate((write_ros1, write_without_index)):
+        whole = write(tmp_path / f'{number}.bag')
+        data, seen = whole.read_bytes(), set()
+        for length in range(4200, len(data) - 1, 150):  # behind a header of 4 kB
+            whole.write_bytes(data[:length])
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter('always')
+                try:
+                    values = [frame[0, 0, 0] for each in iter_episodes(whole)
+                              for frame in each.frames]
+                except RecordingError as error:
+                    assert 'cut off' in str(error)
+                    continue
+            assert values == [1, 2, 3, 4, 5][:len(values)]
+            assert len(values) == 5 or any('cut off' in str(each.message) for each in told)
+            seen.add(len(values))
+        assert 5 in seen or write is write_without_index
 
 
 def test_what_is_beside_a_file_is_read_and_stays_as_it_is(tmp_path):
@@ -153,29 +192,45 @@ def length_delimited(number, data):
     return bytes([number << 3 | 2]) + bytes([len(data) & 127 | 128, len(data) >> 7]) + data
 
 
-def foxglove_image(t, compressed):
-    """Return a picture as protobuf: (type, bytes, pixels)."""
+def foxglove_image(t, name, encoding):
+    """Return a picture of one of Foxglove's schemas: type, bytes and pixels."""
     pixels = np.full((8, 8, 3), 20 * t, np.uint8)
-    stamp = length_delimited(1, b'\x08' + bytes([t]))
-    if compressed:
-        data = cv2.imencode('.png', pixels)[1].tobytes()
-        return 'foxglove.CompressedImage', (
-            stamp + length_delimited(2, data) + length_delimited(3, b'png')), pixels
-    numbers = b''.join(bytes([number << 3 | 5]) + struct.pack('<I', value)
-                       for number, value in ((2, 8), (3, 8), (5, 24)))
-    return 'foxglove.RawImage', (
-        stamp + numbers + length_delimited(4, b'rgb8')
-        + length_delimited(6, pixels.tobytes())), pixels
+    known = {'data': cv2.imencode('.png', pixels)[1].tobytes(), 'format': 'png'} if (
+        name == 'CompressedImage') else {
+        'width': 8, 'height': 8, 'encoding': 'rgb8', 'step': 24, 'data': pixels.tobytes()}
+    if encoding == 'protobuf':
+        data = length_delimited(1, b'\x08' + bytes([t]))
+        for number, value in enumerate(known.values(), 2):
+            data += bytes([number << 3 | 5]) + struct.pack('<I', value) if isinstance(
+                value, int) else length_delimited(
+                    number, value.encode() if isinstance(value, str) else value)
+        return f'foxglove.{name}', data, pixels
+    if encoding == 'json':
+        coded = base64.b64encode(known['data']).decode()
+        return f'foxglove.{name}', json.dumps(
+            known | {'data': coded, 'timestamp': {'sec': t, 'nsec': 0}}).encode(), pixels
+    channels._register()
+    kind = f'foxglove_msgs/msg/{name}'
+    data = encode(kind, known | {'timestamp': {'sec': t}})
+    if encoding == 'ros1':
+        return f'foxglove_msgs/{name}', typestore().cdr_to_ros1(data, kind), pixels
+    return kind, data, pixels
 
 
-@pytest.mark.parametrize('compressed', [False, True])
-def test_pictures_of_foxglove_are_read_from_protobuf(compressed, tmp_path):
-    sent = [foxglove_image(t, compressed) for t in range(1, 5)]
-    path = write_mcap(tmp_path / 'a.mcap', 'protobuf', 'protobuf', [
-        ('/cam', kind, data, t * SECOND) for t, (kind, data, _) in enumerate(sent, 1)])
-    episode, = iter_episodes(path)
+@pytest.mark.parametrize('name', ['RawImage', 'CompressedImage'])
+@pytest.mark.parametrize('encoding', ['protobuf', 'json', 'cdr', 'ros1'])
+def test_pictures_of_foxglove_are_read_however_they_are_encoded(encoding, name, tmp_path):
+    sent = [foxglove_image(t, name, encoding) for t in range(1, 5)]
+    messages = [('/cam', kind, data, t * SECOND, '', encoding)
+                for t, (kind, data, _) in enumerate(sent, 1)]
+    episode, = iter_episodes(write_mcap(tmp_path / 'a.mcap', messages))
     np.testing.assert_array_equal(episode.frames, [pixels for *_, pixels in sent])
     assert episode.stamps.tolist() == [t * SECOND for t in range(1, 5)]
+    both = [messages[0], ('/cam', *camera(2, sent[1][2])[1:], '', 'cdr'), *messages[2:],
+            ('/cam', *messages[0][1:2], b'\xff', 5 * SECOND, '', encoding)]
+    with pytest.warns(RecordingWarning, match='/cam: 1 message cannot be used'):
+        episode, = iter_episodes(write_mcap(tmp_path / 'b.mcap', both))
+    np.testing.assert_array_equal(episode.frames, [pixels for *_, pixels in sent])
 
 
 def test_damage_of_other_bags_is_named(tmp_path):
@@ -221,8 +276,9 @@ VIDEO = {'foxglove_msgs/msg/CompressedVideo': (
 def test_packets_of_video_become_a_bag_by_the_command_that_is_told(
         kind, tmp_path, capsys, monkeypatch):
     encoding, wrap = VIDEO[kind]
-    path = write_mcap(tmp_path / 'a.mcap', '', encoding, [
-        ('/video', kind, wrap(data), t * SECOND // 2) for t, data in enumerate(PACKETS, 1)])
+    path = write_mcap(tmp_path / 'a.mcap', [
+        ('/video', kind, wrap(data), t * SECOND // 2, '', encoding)
+        for t, data in enumerate(PACKETS, 1)])
     assert main(['inspect', str(path)]) == 1
     said = capsys.readouterr().err
     advice = shlex.split(said[said.index('python -m tap_ros'):].split(';')[0])
@@ -234,8 +290,8 @@ def test_packets_of_video_become_a_bag_by_the_command_that_is_told(
 
 
 def test_other_encodings_are_named_instead_of_a_topic_to_choose(tmp_path):
-    path = write_mcap(tmp_path / 'a.mcap', 'flatbuffer', 'flatbuffer', [
-        (TOPIC, 'foxglove.RawImage', b'x', SECOND)])
+    path = write_mcap(tmp_path / 'a.mcap', [
+        (TOPIC, 'foxglove.RawImage', b'x', SECOND, 'flatbuffer', 'flatbuffer')])
     with pytest.raises(RecordingError, match='encoded as flatbuffer; only those of ROS') as error:
         list(iter_episodes(path))
     assert '--image-topic' not in str(error.value)

@@ -5,6 +5,7 @@
 import dataclasses
 import re
 
+import cv2
 from made_bags import camera, read
 from made_bags import record as write
 from made_episodes import assert_all_equal, cover, make_episode, write_bag
@@ -13,6 +14,8 @@ import pytest
 from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import inspect_files
+from tap_ros.messages.topics import COMPRESSED_TYPE
+from tap_ros.recording.messages import decode, encode
 from tap_ros.recording.writer import EpisodeWriter
 
 PERIOD = 0.25  # s
@@ -92,6 +95,29 @@ def test_the_mask_of_a_goal_has_the_stamp_of_its_picture(tmp_path):
             assert found[0].goal_mask is None
         else:
             np.testing.assert_array_equal(found[0].goal_mask, episode.goal_mask)
+
+
+def test_goals_and_masks_may_be_compressed_wherever_they_may_be_raw(tmp_path):
+    def small(one):
+        topic, kind, data, log = one
+        raw = decode(kind, data)
+        pixels = np.frombuffer(raw.data, np.uint8).reshape(raw.height, raw.width, -1)
+        png = cv2.imencode('.png', pixels[..., ::-1])[1]
+        return f'{topic}/compressed', COMPRESSED_TYPE, encode(COMPRESSED_TYPE, {
+            'header': {'stamp': vars(raw.header.stamp)}, 'format': 'png', 'data': png}), log
+
+    episode = cover(make_episode())
+    pictures, others = stream(episode.frames), [
+        *stream(episode.robot_masks), ('/goal/image', 0.5, 0.5, episode.goal_frame),
+        ('/goal/robot_mask', 0.5, 0.6, episode.goal_mask)]
+    messages = sorted((camera(stamp, values, log, topic) for topic, stamp, log, values in (
+        *pictures, *others)), key=lambda one: one[3])
+    for number, packed in enumerate((('goal', 'mask'), ('goal', 'mask', 'camera'), ())):
+        (found,), told = read(write(tmp_path / str(number), [
+            small(one) if any(word in one[0] for word in packed) else one for one in messages]))
+        for name in ('frames', 'robot_masks', 'goal_frame', 'goal_mask'):
+            np.testing.assert_array_equal(getattr(found, name), getattr(episode, name))
+        assert not told
 
 
 def test_inspect_tints_what_masks_mark(tmp_path, capsys):
