@@ -7,7 +7,10 @@ import json
 from pathlib import Path
 
 import cv2
+from experiments.pages import render
+from experiments.worlds import keyframes
 import numpy as np
+import pandas as pd
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError
@@ -23,7 +26,7 @@ TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-in
          'ogbench/window')
 HELD_OUT, MARKED = 40, 12  # demonstrations that are scored, the last ones; and marked, the first
 SIZE = 64  # px, of the pictures that keyframes are chosen by
-STRIPS = 6  # demonstrations that are drawn
+STRIPS = 6  # demonstrations that are drawn, of each task
 
 
 @dataclass(frozen=True)
@@ -36,12 +39,12 @@ class Options:
     :param image_size: width and height in pixels, as recorded.
     :param seed: of the first demonstration.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
-    :param out: folder for worlds.json.
+    :param out: folder for worlds.json, worlds.md and worlds.png.
     :param results_only: collect nothing.
     """
 
     tasks: tuple[str, ...] = TASKS
-    episodes: int = 130
+    episodes: int = 100
     image_size: int = 128
     seed: int = 0
     bags: Folder = 'bags/worlds'
@@ -52,7 +55,7 @@ class Options:
 
 def run(args):
     """Collect, draw strips of the bottlenecks, score keyframes, write what they hit."""
-    rows = []
+    rows, strips = [], []
     for name in args.tasks:
         world, _, task = name.partition('/')
         folder = Path(args.bags, world, task)
@@ -61,10 +64,15 @@ def run(args):
                 world=world, task=task, episodes=args.episodes, seed=args.seed,
                 image_size=args.image_size, episodes_per_file=10), args.engine)
         demonstrations = read(folder)
-        draw_strips(folder / 'bottlenecks.png', demonstrations)
+        drawn = [strip(*one) for one in demonstrations[:STRIPS]]
+        cv2.imwrite(str(folder / 'bottlenecks.png'), grid(drawn)[..., ::-1])
+        strips += drawn[:1]
         rows += [{'world': world, 'task': task, **row} for row in score(demonstrations, args.seed)]
-    write_atomically(Path(args.out, 'worlds.json'), json.dumps(rows, indent=1) + '\n')
-    print(table(rows))
+    out = Path(args.out)
+    write_atomically(out / 'worlds.json', '[' + ',\n'.join(map(json.dumps, rows)) + ']\n')
+    write_atomically(out / 'worlds.md', page(rows))
+    cv2.imwrite(str(out / 'worlds.png'), grid(strips)[..., ::-1])
+    print(out / 'worlds.md')
 
 
 def read(folder):
@@ -87,11 +95,9 @@ def read(folder):
     return found
 
 
-def draw_strips(path, demonstrations):
-    """Draw the start, the bottleneck's first, middle and last frame, and the goal of some."""
-    rows = [[frames[i] for i in (0, first, (first + last) // 2, last, -1)]
-            for frames, (first, last) in demonstrations[:STRIPS]]
-    cv2.imwrite(str(path), grid(rows)[..., ::-1])
+def strip(frames, window):
+    """Return the start, the bottleneck's first, middle and last frame, and the goal."""
+    return [frames[i] for i in (0, window[0], sum(window) // 2, window[1], -1)]
 
 
 def score(demonstrations, seed=0):
@@ -103,7 +109,6 @@ def score(demonstrations, seed=0):
     :return: list of dicts: method, hit and near (at most a frame beside the bottleneck), each
         with value, low and high, n, and the mean frames of bottlenecks and demonstrations.
     """
-    from experiments.worlds import keyframes
     small = [(np.stack([cv2.resize(frame, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
                         for frame in frames]), window) for frames, window in demonstrations]
     marked, held_out = small[:MARKED], small[-HELD_OUT:]
@@ -135,13 +140,15 @@ def _random(demonstrations, beside):
         for frames, (first, last) in demonstrations])
 
 
-def table(rows):
-    """Write hits in percent, in brackets those within a frame, a line for each task."""
-    methods = list(dict.fromkeys(row['method'] for row in rows))
-    lines = [f'{"task":36s}' + ''.join(f'{method:>14s}' for method in methods)]
-    for world, task in dict.fromkeys((row['world'], row['task']) for row in rows):
-        cells = {row['method']: f"{row['hit']['value']:.0%} ({row['near']['value']:.0%})"
-                 for row in rows if (row['world'], row['task']) == (world, task)}
-        lines.append(f'{world}/{task}'.ljust(36) + ''.join(
-            f'{cells[method]:>14s}' for method in methods))
-    return '\n'.join(lines)
+def page(rows):
+    """Write the page of the results, a line for each task."""
+    lines = {}
+    for row in rows:
+        line = lines.setdefault((row['world'], row['task']), {
+            'task': f"{row['world']} {row['task']}",
+            'frames': f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f} of the bottleneck"})
+        hit, near = row['hit'], row['near']
+        line[row['method']] = (f"{hit['value']:.0%} ({100 * hit['low']:.0f} to "
+                               f"{100 * hit['high']:.0f}), {near['value']:.0%}")
+    return render('worlds/templates/worlds.md.j2', n=rows[0]['n'], marked=MARKED,
+                  table=pd.DataFrame(list(lines.values())))

@@ -39,8 +39,8 @@ def test_scores_are_shares_of_the_demonstrations_with_their_intervals():
     assert rows['slowest']['hit']['value'] == rows['12 marks']['near']['value'] == 1
     assert rows['UVD-like']['hit'] | {'low': 0} == {'value': 0, 'low': 0, 'high': pytest.approx(
         0.0876, abs=1e-3)} and rows['slowest']['n'] == command.HELD_OUT
-    told = command.table([row | {'world': 'a', 'task': 'b'} for row in rows.values()])
-    assert told.splitlines()[1].split()[:5] == ['a/b', '14%', '(29%)', '100%', '(100%)']
+    page = command.page([row | {'world': 'a', 'task': 'b'} for row in rows.values()])
+    assert '| a b | 16, 2.0 of the bottleneck | 14% (14 to 14), 29% | 100% (91 to 100)' in page
 
 
 def test_bottlenecks_are_read_by_their_stamps(tmp_path):
