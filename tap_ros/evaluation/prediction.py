@@ -130,8 +130,8 @@ class EpisodeScores:
 
 
 def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
-             episodes: Sequence[int] | np.ndarray, margin: int = 0, goal_picture: str = 'last',
-             seed: int = 0, filled: Filled | None = None) -> dict[str, EpisodeScores]:
+             episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
+             filled: Filled | None = None) -> dict[str, EpisodeScores]:
     """
     Measure a predictor, and copying, on episodes it was not trained on.
 
@@ -141,9 +141,7 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
     :param network: PredictorNetwork in eval mode, or any other Predictor.
     :param store: the EpisodeStore.
     :param episodes: indices of at least one episode, each of at least 3 frames.
-    :param margin: frames beside the context pictures that do not count as matches.
     :param goal_picture: see batches.make_batch.
-    :param seed: of z.
     :param filled: the targets without the robot, see batches.make_batch.
     :return: dict from METHODS (without copy-goal where there is no goal) to EpisodeScores.
     """
@@ -153,11 +151,11 @@ def evaluate(network: PredictorNetwork | Predictor, store: EpisodeStore,
     for at in range(0, len(episodes), _BATCH):
         chosen = episodes[at:at + _BATCH]
         batch = make_batch(store, chosen, Sampling(
-            margin, goal_picture=goal_picture, forward=forward), filled=filled)
+            goal_picture=goal_picture, forward=forward), filled=filled)
         with torch.inference_mode():
             if isinstance(network, torch.nn.Module):
                 batch = batch.to(next(network.parameters()).device)
-                image, maps_of = _ask_network(network, batch, chosen, seed)
+                image, maps_of = _ask_network(network, batch, chosen)
             else:
                 image, maps_of = _ask(network, batch)
             measured = to_float(batch.measured)
@@ -185,12 +183,12 @@ def _is_forward(network: PredictorNetwork | Predictor) -> bool:
         network.mode == 'forward')
 
 
-def _ask_network(network: PredictorNetwork, batch: Batch, episodes: Sequence[int] | np.ndarray,
-                 seed: int) -> tuple[torch.Tensor, MapsOf]:
+def _ask_network(network: PredictorNetwork, batch: Batch,
+                 episodes: Sequence[int] | np.ndarray) -> tuple[torch.Tensor, MapsOf]:
     """Return the pictures (B, 3, H, W) of a network, and its maps, see score_bottlenecks."""
     z, size = None, network.config.latent_size
     if size:
-        z = draw_latents(episodes, 1, size, seed)[:, 0].to(batch.context.device)
+        z = draw_latents(episodes, 1, size)[:, 0].to(batch.context.device)
     prediction = network(to_float(batch.context), z)
     return prediction.image, lambda b, pixels: predicted_maps(pixels, prediction, b)
 
@@ -223,7 +221,7 @@ def _changed_l1(images: torch.Tensor, batch: Batch, match: torch.Tensor,
 
 def write_pictures(path: str | Path, network: PredictorNetwork, store: EpisodeStore,
                    episodes: Sequence[int] | np.ndarray, goal_picture: str = 'last',
-                   scale: int = 2, filled: Filled | None = None) -> None:
+                   filled: Filled | None = None) -> None:
     """
     Write a sheet of predictions, a row for each episode.
 
@@ -235,7 +233,6 @@ def write_pictures(path: str | Path, network: PredictorNetwork, store: EpisodeSt
     :param store: the EpisodeStore.
     :param episodes: indices of episodes.
     :param goal_picture: see batches.make_batch.
-    :param scale: whole number of times to enlarge each pixel.
     :param filled: as in evaluate.
     """
     from matplotlib.image import imsave
@@ -256,7 +253,7 @@ def write_pictures(path: str | Path, network: PredictorNetwork, store: EpisodeSt
             maps = predicted_maps(pixels, prediction, b).maps
             row.append(overlay(images[b], maps.cpu().numpy()))
         rows.append(row)
-    imsave(path, grid(rows, scale))
+    imsave(path, grid(rows, 2))
 
 
 @dataclass(frozen=True)

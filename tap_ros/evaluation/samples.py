@@ -49,24 +49,23 @@ class SampleScores:
     spread_px: np.ndarray
 
 
-def draw_latents(episodes: Iterable[int], count: int, size: int, seed: int = 0) -> torch.Tensor:
+def draw_latents(episodes: Iterable[int], count: int, size: int) -> torch.Tensor:
     """
     Draw z from the prior, for each episode its own, whichever others are asked for.
 
     :param episodes: (B,) indices of episodes.
     :param count: samples of each; fewer are the first ones of more.
     :param size: length of z.
-    :param seed: of the draws.
     :return: float32 (B, count, size).
     """
     return torch.from_numpy(np.stack([
-        np.random.default_rng([seed, int(i)]).standard_normal((count, size), np.float32)
+        np.random.default_rng([0, int(i)]).standard_normal((count, size), np.float32)
         for i in episodes]))
 
 
 def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: Iterable[int],
-                  margin: int = 0, goal_picture: str = 'last', count: int = SAMPLES,
-                  seed: int = 0, filled: 'Filled | None' = None) -> SampleScores:
+                  goal_picture: str = 'last', count: int = SAMPLES,
+                  filled: 'Filled | None' = None) -> SampleScores:
     """
     Measure many samples of each episode.
 
@@ -75,10 +74,8 @@ def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: It
     :param network: PredictorNetwork with z, in eval mode.
     :param store: the EpisodeStore.
     :param episodes: indices of at least one episode.
-    :param margin: frames beside the context pictures that do not count as matches.
     :param goal_picture: see batches.make_batch.
     :param count: samples of each episode.
-    :param seed: of the draws.
     :param filled: as in prediction.evaluate.
     :return: SampleScores.
     """
@@ -86,9 +83,9 @@ def score_samples(network: PredictorNetwork, store: 'EpisodeStore', episodes: It
     rows = []
     for i in episodes:
         batch = make_batch(store, [i], Sampling(
-            margin, goal_picture=goal_picture,
+            goal_picture=goal_picture,
             forward=network.config.num_context == 1), filled=filled).to(device)
-        z = draw_latents([i], count, network.config.latent_size, seed)[0].to(device)
+        z = draw_latents([i], count, network.config.latent_size)[0].to(device)
         with torch.inference_mode():
             prediction = network(to_float(batch.context).expand(count, -1, -1, -1, -1), z)
             errors = l1_errors(

@@ -8,7 +8,6 @@ The server is for this machine alone, and a page of another site cannot write th
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -49,7 +48,8 @@ class Options:
     :param port: of the page; 0: any that is free.
     """
 
-    recordings: Annotated[conf.Positional[tuple[str, ...]], conf.arg(metavar='BAG [BAG ...]')]
+    recordings: Annotated[conf.Positional[tuple[str, ...]], conf.arg(
+        metavar='BAG [BAG ...]', help_behavior_hint='(required)')]
     marks: File = ''
     port: int = 8010
     reading: ReadingOptions = ReadingOptions()
@@ -74,8 +74,9 @@ class Marking:
         if not self._usable:
             raise ConfigError(f'recordings: no episode has {LEAST_FRAMES} frames; record longer '
                               'ones')
-        # Later nobody waits for it.
-        threading.Thread(target=lambda: self._features, daemon=True).start()
+        self._features: dict[int, np.ndarray] = {}
+        threading.Thread(target=lambda: list(map(self._described, self._usable)),
+                         daemon=True).start()  # nobody waits for it later
 
     def mark(self, episode: int, frames: Sequence[int]) -> None:
         """
@@ -110,18 +111,20 @@ class Marking:
             return max(left, key=lambda i: min(abs(i - marked) for marked in self._marks))
         marked = sorted(self._marks)
         learned = learn_preference(
-            [self._features[i] for i in marked],
+            [self._described(i) for i in marked],
             [(self._marks[i][-1][0] + self._marks[i][-1][1]) // 2 for i in marked])
         doubts = {}
         for i in left:  # entropy of w, as a share of the largest that it can have
-            share = learned(self._features[i])[1:-1]
+            share = learned(self._described(i))[1:-1]
             share = share / share.sum()
             doubts[i] = -(share * np.log(share)).sum() / np.log(max(len(share), 2))
         return max(left, key=doubts.__getitem__)
 
-    @cached_property
-    def _features(self) -> dict[int, np.ndarray]:
-        return {i: features_of(self.store, i, 'none') for i in self._usable}
+    def _described(self, i: int) -> np.ndarray:
+        """Return the features of an episode."""
+        if i not in self._features:
+            self._features[i] = features_of(self.store, i, 'none')
+        return self._features[i]
 
 
 def make_server(marking: Marking, port: int = 0) -> ThreadingHTTPServer:

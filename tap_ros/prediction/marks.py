@@ -114,7 +114,8 @@ def _frames(stamps: np.ndarray, seconds: Sequence[Any]) -> Sequence[Mark]:
         if not begin - half <= ends[0] <= ends[1] <= end + half:
             raise ValueError(f'stamp {escaped(json.dumps(one))} is outside; the episode goes from '
                              f'{begin:.3f} to {end:.3f} s')
-        if first < 1 or last > len(stamps) - 2:
+        first, last = max(first, 1), min(last, len(stamps) - 2)
+        if first > last:
             raise ValueError(f'stamp {escaped(json.dumps(one))} is that of the start or the goal '
                              'picture; mark a moment between them')
         marks.append((first, last))

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training the predictor on recordings (section 3, appendix C)."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 import contextlib
 from dataclasses import asdict
@@ -188,7 +188,7 @@ def _values(outcome: Outcome, batch: Batch, processes: Processes) -> dict[str, f
 def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames,
            filled: Filled | None, preference: list[np.ndarray] | None,
            autocast: Autocast) -> tuple[run.Numbers, Mapping[str, np.ndarray]]:
-    """Score the averaged network on held-out episodes, and show some of all."""
+    """Score the averaged network, z at 0, where its method matches; show some of all."""
     config, held_out = this.config, this.held_out
     sampling = Sampling(
         config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
@@ -198,10 +198,18 @@ def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames
         return make_batch(this.store, episodes, sampling, frames, filled=filled,
                           preference=preference).to(this.device)
 
-    scores, pictures = {}, {}
-    if len(held_out):
-        parts = (batch(held_out[i:i + 64]) for i in range(0, len(held_out), 64))
-        scores = held_out_scores(state.average, parts, config, autocast)
+    scores, pictures, losses, fractions = {}, {}, [], []
+    for i in range(0, len(held_out), 64):
+        part = batch(held_out[i:i + 64])
+        prediction, match = matched(state.average, part, config, autocast)
+        frame = part.targets[torch.arange(len(match), device=match.device), match]
+        image = part.visible(prediction.image[:, None])[:, 0]
+        losses.append(l1_error(image, to_float(frame)).cpu())
+        fractions.append((part.times.gather(1, match[:, None]) / part.end)[:, 0].cpu())
+    if losses:
+        shares = torch.cat(fractions)
+        scores = {'loss': torch.cat(losses).mean().item(), 'match_fraction': shares.mean().item(),
+                  'match_fraction_std': shares.std(correction=0).item()}
     for name, episodes in (('training', this.training), ('held_out', held_out)):
         if len(episodes):
             shown = batch(episodes[:_SHOWN])
@@ -225,30 +233,6 @@ def matched(network: PredictorNetwork, batch: Batch, config: TrainingConfig,
         prediction = network(context)
     targets = Targets(batch, None, config)
     return prediction, targets.match(prediction.image, targets.measured(context))
-
-
-@torch.no_grad()
-def held_out_scores(network: PredictorNetwork, batches: Iterable[Batch], config: TrainingConfig,
-                    autocast: Autocast = contextlib.nullcontext) -> dict[str, float]:
-    """
-    Measure a network by the error at the frames that its method chooses; z is 0.
-
-    :param network: PredictorNetwork in eval mode.
-    :param batches: iterable of batches.Batch, on the network's device.
-    :param autocast: makes the context manager to run the network in.
-    :return: dict of loss (the l1 error), match_fraction and match_fraction_std.
-    """
-    losses, fractions = [], []
-    for batch in batches:
-        prediction, match = matched(network, batch, config, autocast)
-        rows = torch.arange(len(match), device=match.device)
-        image = batch.visible(prediction.image[:, None])[:, 0]
-        losses.append(l1_error(image, to_float(batch.targets[rows, match])).cpu())
-        fractions.append((batch.times.gather(1, match[:, None]) / batch.end)[:, 0].cpu())
-    fractions = torch.cat(fractions)
-    return {'loss': torch.cat(losses).mean().item(),
-            'match_fraction': fractions.mean().item(),
-            'match_fraction_std': fractions.std(correction=0).item()}
 
 
 @torch.no_grad()

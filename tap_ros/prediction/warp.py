@@ -93,8 +93,8 @@ def expected_pixels(maps: torch.Tensor) -> torch.Tensor:
     return torch.stack([u, v], -1)
 
 
-def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor, masks: torch.Tensor,
-                     min_mass: float = MIN_MASS) -> WarpedMaps:
+def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor,
+                     masks: torch.Tensor) -> WarpedMaps:
     """
     Find where a prediction puts each object, by its own flow and masks (appendix E).
 
@@ -107,28 +107,27 @@ def warp_object_maps(maps: torch.Tensor, flow: torch.Tensor, masks: torch.Tensor
     :param flow: (B, C, 2, H, W) in pixels.
     :param masks: (B, C or C+1, 1, H, W); the new pixels' mask is left out, for new pixels
         have no origin.
-    :param min_mass: a map with less than this is taken for lost.
     :return: WarpedMaps.
     """
     masks = masks[:, :maps.shape[1]]
     candidates = [combine(warp(maps, flow), masks)]  # B, K, H, W
     mass = candidates[0].sum((-2, -1))
-    if bool((mass < min_mass).any()):
+    if bool((mass < MIN_MASS).any()):
         candidates.append(combine(warp(blur(maps), flow), masks))
         candidates.append(combine(maps, masks))
         candidates.append(maps.mean(1))
     warped = candidates[-1]
     for candidate in reversed(candidates[:-1]):
-        kept = candidate.sum((-2, -1), keepdim=True) >= min_mass
+        kept = candidate.sum((-2, -1), keepdim=True) >= MIN_MASS
         warped = torch.where(kept, candidate, warped)
     return WarpedMaps(warped / warped.sum((-2, -1), keepdim=True), mass)
 
 
-def blur(maps: torch.Tensor, sigma: float = 1.0) -> torch.Tensor:
-    """Blur maps (..., H, W) by a Gaussian of sigma pixels; at the border mass stays inside."""
+def blur(maps: torch.Tensor) -> torch.Tensor:
+    """Blur maps (..., H, W) by a Gaussian of one pixel; at the border mass stays inside."""
     for dim in (-1, -2):
         at = torch.arange(maps.shape[dim], device=maps.device, dtype=maps.dtype)
-        kernel = torch.exp(-((at[:, None] - at) ** 2) / (2 * sigma ** 2))
+        kernel = torch.exp(-((at[:, None] - at) ** 2) / 2)
         kernel = kernel / kernel.sum(0)  # column: how the mass of one pixel is shared out
         maps = (maps.transpose(dim, -1) @ kernel.T).transpose(dim, -1)
     return maps

@@ -51,6 +51,11 @@ def test_marks_are_read_as_they_were_written_by_hand_too(bag, store, tmp_path):
         path.write_text(json.dumps({'marks': [
             {'recording': str(bag), 'episode': 3, 'stamps': [seconds]}]}))
         assert read_marks(path, store).episodes == {3: [(2, 2)]}
+    beside = bag / 'bottlenecks.json'
+    beside.write_text(json.dumps({'marks': [
+        {'recording': '.', 'episode': 3, 'stamps': [[first / 1e9, first / 1e9 + 0.5]]}]}))
+    assert read_marks(beside, store).episodes == {3: [(1, 2)]}
+    beside.unlink()
 
 
 def test_marks_of_something_else_are_refused_with_the_file_and_the_reason(bag, store, tmp_path):
@@ -60,7 +65,7 @@ def test_marks_of_something_else_are_refused_with_the_file_and_the_reason(bag, s
 
     def refusal(data):
         path.write_text(data if isinstance(data, str) else json.dumps({'marks': [
-            {'recording': str(bag), 'episode': 0, 'stamps': [begin + 0.5], **data}] * 1}))
+            {'recording': str(bag), 'episode': 0, 'stamps': [begin + 0.5], **data}]}))
         with pytest.raises(ConfigError) as error:
             read_marks(path, store)
         text = str(error.value)
@@ -158,7 +163,7 @@ def test_the_option_alone_chooses_them(bag, marks, tmp_path, capsys):
     assert settings['selection'] == 'marks'
     assert 'by a random frame in' in capsys.readouterr().err
     assert main(['train', 'predictor', str(bag), '--marks', str(tmp_path / 'none'),
-                 '--out', str(tmp_path / 'b')]) == 1
+                 '--threads', '1', '--out', str(tmp_path / 'b')]) == 1
     assert str(tmp_path / 'none') in capsys.readouterr().err
 
 

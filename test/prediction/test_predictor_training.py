@@ -148,7 +148,7 @@ def test_the_command_line_sets_every_field_and_one_needs_no_held_out_episodes(co
     assert main([
         'train', 'predictor', *config.recordings, '--out', config.out, '--steps', '1',
         '--no-flip', '--base-width', '4', '--batch-size', '2', '--loss', 'min', '--new-pixels',
-        '--test-fraction', '0']) == 0
+        '--test-fraction', '0', '--threads', '1']) == 0
     assert capsys.readouterr().out.strip() == f'{config.out}/predictor.safetensors'
     settings = json.loads(Path(config.out, 'config.json').read_text())
     assert settings['loss'] == 'min' and settings['new_pixels'] and not settings['flip']

@@ -18,6 +18,8 @@ from tap_ros.training.split import split_episodes
 class Store:
     """Episodes of which only the task, the seed, the length and the time are known."""
 
+    marked = True
+
     def __init__(self, seeds, length=9, times=None):
         self._seeds, self.lengths = seeds, np.full(len(seeds), length)
         self._times = times or range(len(seeds))
