@@ -210,24 +210,16 @@ class SimNode(Node):
 
     def _on_reset(self, request: ResetScene.Request,
                   response: ResetScene.Response) -> ResetScene.Response:
-        try:
-            self._reset(request.task or 'push2', request.seed, request.hide_arm)
-        except TapError as error:
-            response.message = str(error)
-            return response
+        self._reset(request.task or 'push2', request.seed, request.hide_arm)
         response.success = True
         response.message = f'{self._sim.task_name}, seed {request.seed}'
         return response
 
     def _on_set_goal(self, request: SetGoal.Request,
                      response: SetGoal.Response) -> SetGoal.Response:
-        try:
-            names, pixels = decode_objects(
-                request.objects, 'objects', self._sim.goal().image.shape[:2])
-            ability(self._sim, 'move_goal')(names, pixels)
-        except TapError as error:
-            response.message = str(error)
-            return response
+        names, pixels = decode_objects(
+            request.objects, 'objects', self._sim.goal().image.shape[:2])
+        ability(self._sim, 'move_goal')(names, pixels)
         self._publish_goal()
         response.success = True
         response.message = f'moved {", ".join(names)}'

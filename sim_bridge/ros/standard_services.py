@@ -190,20 +190,16 @@ def name_of(kind: type) -> str:
     return '~/' + re.sub('(?<=[a-z])(?=[A-Z])', '_', kind.__name__).lower()
 
 
-def refusal(kind: type, message: str, code: int = Result.RESULT_OPERATION_FAILED) -> Any:
+def refusal(kind: type, reason: str, error: Exception) -> Any:
     """Return a response of this type with a Result alone."""
-    return kind(result=Result(result=code, error_message=message))
+    code = getattr(error, 'code', Result.RESULT_OPERATION_FAILED)
+    return kind(result=Result(result=code, error_message=reason))
 
 
 def _responding(answer: Answer) -> Callable[[Any, Any], Any]:
-    """Let a function fill a response; its Result is by what the function raises."""
+    """Let a function fill a response; its Result is that it did not raise."""
     def respond(request: Any, response: Any) -> Any:
-        try:
-            answer(request, response)
-        except Refused as error:
-            return refusal(type(response), str(error), error.code)
-        except TapError as error:
-            return refusal(type(response), str(error))
+        answer(request, response)
         if hasattr(response, 'result'):  # all but GetSimulatorFeatures
             response.result.result = Result.RESULT_OK
         return response

@@ -27,25 +27,28 @@ def internal_error(error: Exception) -> str:
     return f'internal error: {type(error).__name__}: {escaped(error)}'
 
 
-def refusal(kind: type, message: str) -> Any:
+def refusal(kind: type, reason: str, error: Exception) -> Any:
     """Return a response of this type, with the fields success and message, that refuses."""
-    return kind(success=False, message=message)
+    return kind(success=False, message=reason)
 
 
 def answering(node: Node, callback: Callable[[Any, Any], Any],
-              refuse: Callable[[type, str], Any] = refusal) -> Callable[[Any, Any], Any]:
+              refuse: Callable[[type, str, Exception], Any] = refusal
+              ) -> Callable[[Any, Any], Any]:
     """
     Wrap the callback of a service so that any exception becomes a response.
 
     :param node: rclpy Node, for its log.
-    :param refuse: makes a response of a type and a message.
+    :param refuse: makes a response of a type, a reason and the exception.
     """
     def answer(request: Any, response: Any) -> Any:
         try:
             return callback(request, response)
+        except TapError as error:
+            return refuse(type(response), str(error), error)
         except Exception as error:
             log_error(node, 'service', error)
-            return refuse(type(response), internal_error(error))
+            return refuse(type(response), internal_error(error), error)
 
     return answer
 

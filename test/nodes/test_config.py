@@ -1,14 +1,18 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The file of parameters names what the nodes declare, with the values that they have anyway."""
+"""What nodes are set up with: the file of parameters, Fast DDS, and who calls whom."""
 
 from importlib import import_module
 from pathlib import Path
 import sys
+import threading
 
+import pytest
 from rclpy.context import Context
 from rclpy.node import Node
 from tap_ros.contract import CLIMB_LIMIT, MOVE_LIMIT, NODE_MODULES
+from tap_ros.nodes.calls import CallError, in_executor
+from tap_ros.nodes.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
 import yaml
 
 FILE = Path(__file__).parents[2] / 'config/tap_ros.yaml'
@@ -49,3 +53,35 @@ def test_the_file_has_every_parameter_with_its_default_and_reaches_the_nodes(tmp
         file.write_text(yaml.dump({f'/**/{name}': {'ros__parameters': given}}))
         values = declared(name, '--params-file', str(file))
         assert {key: values[key] for key in given} == given
+
+
+def test_what_the_user_has_chosen_is_kept():
+    discovery, localhost = 'ROS_AUTOMATIC_DISCOVERY_RANGE', {'ROS_LOCALHOST_ONLY': '1'}
+    peers = {'ROS_STATIC_PEERS': '10.0.0.1'}
+    for given, profile, reach in (
+            ({}, SUBNET, None),
+            ({discovery: 'SUBNET'}, SUBNET, 'SUBNET'),
+            ({discovery: 'LOCALHOST'}, LOCALHOST, 'SYSTEM_DEFAULT'),
+            (localhost, LOCALHOST, 'SYSTEM_DEFAULT'),
+            ({discovery: 'LOCALHOST'} | peers, SUBNET, 'LOCALHOST'),
+            (localhost | peers, LOCALHOST, 'SYSTEM_DEFAULT'),
+            ({'RMW_IMPLEMENTATION': 'rmw_cyclonedds_cpp', discovery: 'LOCALHOST'},
+             None, 'LOCALHOST'),
+            ({'FASTDDS_BUILTIN_TRANSPORTS': 'LARGE_DATA'}, None, None),
+            ({PROFILE: 'mine.xml', discovery: 'LOCALHOST'}, 'mine.xml', 'LOCALHOST')):
+        variables = dict(given)
+        configure_fast_dds(variables)
+        assert variables.get(PROFILE) == (profile and str(profile)), given
+        assert variables.get(discovery) == reach, given
+
+
+def test_a_function_is_called_in_the_thread_that_spins(client):
+    thread = in_executor(client, threading.current_thread, 10.0)
+    assert thread.name == 'spinner'
+    with pytest.raises(ZeroDivisionError):
+        in_executor(client, lambda: 1 / 0, 10.0)
+    assert in_executor(client, threading.current_thread, 10.0) is thread, 'it spins on'
+    idle = Node('idle', context=client.context)
+    with pytest.raises(CallError, match='idle is not spun'):
+        in_executor(idle, threading.current_thread, 10.0)
+    idle.destroy_node()

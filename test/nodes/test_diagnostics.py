@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What log and /diagnostics say: of inputs and work, of silence, of parameters nobody knows."""
+"""What log and /diagnostics say: of inputs and work, of silence."""
 
 import math
 from threading import Thread
@@ -9,7 +9,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 from processes import Client, LocalNode, Newest, until
 import pytest
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CompressedImage, Image, JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
@@ -17,7 +16,6 @@ from tap_ros.nodes import diagnostics
 from tap_ros.nodes.calls import call
 from tap_ros.nodes.diagnostics import Diagnostics, Record
 from tap_ros.nodes.recorder.node import RecorderNode
-from tap_ros.nodes.run import warn_of_unknown_parameters
 from tap_ros.nodes.subscriptions import why_silent
 from tap_ros.nodes.topics import STREAM
 
@@ -92,17 +90,6 @@ def test_a_recorder_that_hears_nothing_says_so_and_does_not_succeed(
         assert until(lambda: warned('/camera/image_raw/compressed', 'though it is published'))
     finally:
         assert node.end() == 0
-
-
-def test_parameters_that_a_node_does_not_have_are_named(client, capfd):
-    with Client('careful', parameter_overrides=[
-            Parameter('max_step_yx', value=0.01), Parameter('max_step_xy', value=0.02),
-            Parameter('nonsense', value='x')]) as node:
-        node.declare_parameter('max_step_xy', 0.08)
-        warn_of_unknown_parameters(node)
-    text = capfd.readouterr().err
-    assert 'max_step_yx is unknown' in text and 'did you mean max_step_xy?' in text
-    assert 'nonsense is unknown' in text and 'parameter max_step_xy is' not in text
 
 
 def statuses(message):

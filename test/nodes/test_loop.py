@@ -6,24 +6,30 @@ from collections import Counter
 from pathlib import Path
 import re
 
+from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from loop import SEED
 from mcap.reader import make_reader
 import numpy as np
 from processes import LocalNode, until
 import pytest
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from tap_msgs.action import ReachGoal
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
+from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import send_goal
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.nodes.topics import STREAM
 from tap_ros.recording.reader import iter_episodes
-from tap_ros.weights import FORWARD_MODEL
+from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL, PREDICTORS
+import yaml
 
 pytestmark = pytest.mark.slow
+FOLDER = Path(__file__).parents[2] / 'config' / 'layouts'
+MOVED = {'object_1': (14.5, 44.25)}
 
 
 def test_every_node_tells_how_it_is(loop):
@@ -43,6 +49,82 @@ def test_every_node_tells_how_it_is(loop):
     assert float(told['recorder_node: /objects']['rate_hz']) > 1  # sent again in lock-step
     assert told['predictor_node: service']['queue'] == '0'
     assert float(told['predictor_node: service']['predict_subgoal p50_ms']) > 0
+
+
+def test_all_viewers_show_topics_of_the_nodes_as_they_are_offered(loop):
+    wanted = {'/diagnostics'}
+    for file in FOLDER.iterdir():
+        found = set(re.findall(r'(?<=["\' ])/[a-z_]+(?:/[a-z_]+)*', file.read_text()))
+        assert len(found) > 2, file
+        wanted |= {name.removesuffix('/data') for name in found}
+
+    def missing():
+        return wanted - {name for name, _ in (*loop.node.get_topic_names_and_types(),
+                                              *loop.node.get_service_names_and_types())}
+
+    assert until(lambda: not missing()), missing()
+    layout = yaml.safe_load((FOLDER / 'tap_ros.rviz').read_text())
+    for display in layout['Visualization Manager']['Displays']:
+        shown = display.get('Topic') or display.get('Description Topic')
+        if shown:
+            info, = loop.node.get_publishers_info_by_topic(shown['Value'])
+            latched = info.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            assert shown['Durability Policy'] == ('Transient Local' if latched else 'Volatile')
+            assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+
+
+def set_goal(loop, pixels):
+    """Move objects of the goal, {name: (u, v)}; return all its pixels (K, 2) once they came."""
+    before = to_nanoseconds(loop.goal_objects.wait(10).header.stamp)
+    loop.client.set_goal(pixels)
+    for topic in (loop.goal_image, loop.goal_objects):
+        topic.wait(10, lambda m: to_nanoseconds(m.header.stamp) > before)
+    return decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
+
+
+def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_it(loop):
+    handle = loop.begin_moving(mode='subgoal', step_budget=1000)
+    before = loop.client.call('predict').subgoals[0]
+    set_goal(loop, MOVED)
+    result = loop.ended(handle, GoalStatus.STATUS_ABORTED, 'a new goal has come on')
+    assert result.steps >= 1 and '/goal/objects' in result.message
+    after = loop.client.call('predict').subgoals[0]
+    assert len(after.object_maps) == 2, 'objects and picture of the goal go together'
+    assert before.image.data != after.image.data
+    count = len(loop.moves())
+    # The goal is where the objects are now: nothing is left to do.
+    last = loop.image.wait(10)
+    objects = loop.objects.wait(10, lambda m: m.header.stamp == last.header.stamp)
+    names, pixels = decode_objects(objects, 'objects')
+    np.testing.assert_allclose(set_goal(loop, dict(zip(names, pixels))), pixels, atol=1e-3)
+    result = loop.reached(mode='direct')
+    assert result.success and 'reached' in result.message and result.expected_distance < 0.1
+    assert len(loop.moves()) == count
+
+
+def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
+    loop.client.record(False)
+    folder = loop.client.record().removeprefix('recording to ')
+    loop.reset(seed=7)
+    set_goal(loop, {'object_1': (31.5, 44.25)})
+    loop.reached(mode='direct', step_budget=2)
+    # Twice at the last moment of the episode: the later one counts.
+    set_goal(loop, {'object_1': (30.0, 44.25)})
+    pixels = set_goal(loop, MOVED)
+    picture = loop.goal_image.wait(1)
+    loop.reset(seed=8)
+    drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
+    loop.reach(mode='direct', step_budget=1)  # by then the recorder knows of the new episode
+    loop.client.record(False)
+    # What the scene before sent last may reach the recorder after the bag was begun.
+    episode, = (e for e in iter_episodes(folder) if e.seed == 7)
+    following, = (e for e in iter_episodes(folder) if e.seed == 8)
+    assert (len(episode), episode.outcome) == (3, 'failure')
+    np.testing.assert_array_equal(episode.goal_pixels, pixels)
+    np.testing.assert_allclose(episode.goal_pixels[1], MOVED['object_1'], atol=1e-4)
+    assert episode.goal_frame.tobytes() == bytes(picture.data)
+    assert episode.goal_mask is not None
+    np.testing.assert_array_equal(following.goal_pixels, drawn)
 
 
 def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
@@ -85,12 +167,9 @@ def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
 
 def test_bad_weights_are_refused_by_an_error_that_names_the_file(tmp_path):
     weights = tmp_path / 'weights.safetensors'
-    for make, shipped, other in (
-            (PredictorNode, 'predictor_push2', 'forward_model_push'),
-            (VisualMpcNode, 'forward_model_push', 'predictor_push2')):
-        own, others = (FORWARD_MODEL.with_name(f'{name}.safetensors').read_bytes()
-                       for name in (shipped, other))
-        for content in (None, own[:len(own) // 2], b'these are not weights', others):
+    for make, other in ((PredictorNode, FORWARD_MODEL),
+                        (VisualMpcNode, PREDICTORS[DEFAULT_PREDICTOR])):
+        for content in (None, b'these are not weights', other.read_bytes()):
             weights.unlink(missing_ok=True)
             if content is not None:
                 weights.write_bytes(content)

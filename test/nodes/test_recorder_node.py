@@ -3,13 +3,11 @@
 """What the recorder promises: whole bags, no overwriting, and staying up when the disk fails."""
 
 from pathlib import Path
-import resource
 import time
-import warnings
 
 from mcap.reader import make_reader
 import numpy as np
-from processes import LocalNode, NodeProcess, until
+from processes import LocalNode, until
 import pytest
 from rclpy.duration import Duration
 from rclpy.qos import qos_profile_sensor_data, ReliabilityPolicy
@@ -23,7 +21,6 @@ from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.recording.messages import decode
 from tap_ros.recording.metadata import ArmMount, read_mount
-from tap_ros.recording.reader import iter_episodes
 from tap_ros.robots.arm import Mount
 from tap_ros.robots.ur10e import UR10E
 
@@ -153,43 +150,6 @@ def test_topics_of_any_type_can_be_recorded_and_where_the_arm_stands(client, rec
     stood = UR10E.mount
     assert read_mount(tmp_path / 'bag') == ArmMount(
         Mount((0.25, *stood.position[1:]), stood.yaw, stood.tool), 0.5)
-
-
-def test_a_full_disk_is_told_and_the_node_stays_up(client, tmp_path):
-    """Files of its process cannot grow beyond a limit: what a full disk looks like to it."""
-    images = client.create_publisher(Image, 'camera/image_raw', STREAM)
-    process = NodeProcess('recorder_node', tmp_path / 'log.txt', {'folder': tmp_path / 'bag'})
-
-    def limit(soft):
-        resource.prlimit(process.process.pid, resource.RLIMIT_FSIZE, (soft, 1_000_000))
-
-    def send_eight():  # no more than the publisher keeps
-        for stamp in range(1, 9):
-            images.publish(random_image(stamp))
-        arrived(images)
-
-    try:
-        process.wait_for('ready')
-        assert until(images.get_subscription_count)
-        send_eight()
-        path, = (tmp_path / 'bag').glob('*.mcap')
-        assert until(lambda: path.stat().st_size >= 8 * 32 * 32 * 3)  # they are flushed
-        limit(path.stat().st_size + 1000)
-        assert until(lambda: send_eight() or 'recording has stopped after' in process.text)
-        assert str(tmp_path / 'bag') in process.text
-        assert 'recording has stopped after' in ask(client, False, success=False)
-        with warnings.catch_warnings(action='ignore'):  # that it was not finished
-            episode, = iter_episodes(tmp_path / 'bag')
-        assert len(episode) >= 8
-        limit(1_000_000)
-        assert 'bag-2' in ask(client, True)  # it stays up
-        send_eight()
-        assert until(lambda: (tmp_path / 'bag-2' / 'bag-2_0.mcap').stat().st_size > 8 * 3072)
-        limit((tmp_path / 'bag-2' / 'bag-2_0.mcap').stat().st_size + 10)
-        assert process.end() == 1, process.text
-        assert 'could not be finished' in process.text and 'Traceback' not in process.text
-    finally:
-        process.kill()
 
 
 def test_a_bad_start_names_the_parameter(record):

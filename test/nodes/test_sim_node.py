@@ -45,7 +45,7 @@ class Rig:
     def reset(self, **request):
         """Reset, and wait until all that is published then has come."""
         count = len(self.marks)
-        before = to_nanoseconds(self.image.wait(10).header.stamp) if self.image.count else -1
+        before = to_nanoseconds(self.image.wait(20).header.stamp)
         self.client.call('reset', **request)
         image = self.image.wait(10, lambda m: to_nanoseconds(m.header.stamp) > before)
         for topic in (self.info, self.objects, self.joints):

@@ -89,6 +89,10 @@ def test_drivers_that_repeat_one_stamp_move_nothing_unless_a_clock_stands_still(
         rig.world.frozen = dict.fromkeys(topics, time.time_ns())
         rig.aborted(words)
     rig.world.restore()
+    result, moves = rig.reach(40, lambda _: rig.world.frozen or rig.world.frozen.update(
+        dict.fromkeys(TOPICS, time.time_ns())), 1.0)  # from the first command on
+    assert result.end == 'aborted' and 1 <= moves < 4, result.message
+    rig.world.restore()
     now = time.time_ns()
     rig.world.frozen, rig.world.clock_ns = dict.fromkeys(TOPICS, now), now
     _, moves = rig.reach(1)
