@@ -9,7 +9,8 @@ enclose its stamp, and that is nearest in the log.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 import warnings
 
 import numpy as np
@@ -25,6 +26,7 @@ from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, 
 from tap_ros.robots.arm import get_arm
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
+_WALL_NS = 10**18  # 2001: clocks of simulations, and those since a start, show less
 _LOOKED_AT = 4096  # messages looked at together
 _LEAST_PAUSE = 0.5  # s, between two demonstrations
 
@@ -39,6 +41,7 @@ class EpisodeTable:
     places: dict[str, tuple[np.ndarray, np.ndarray]]  # of 'frame' and 'mask' (F,), and of 'goal'
     # and 'goal_mask' (E,): index into parts, and into their pictures, -1 for none; int64
     stamps: np.ndarray  # (F,) int64
+    logs: np.ndarray  # (F,) int64: when frames were recorded
     actions: np.ndarray  # (F, 4) float32
     grippers: np.ndarray  # (F, 4) float32
     objects: np.ndarray  # (F, K, 9) float64: u, v, pose
@@ -95,12 +98,25 @@ def runs_of(parts: Iterable[Columns]) -> list[list[Columns]]:
         logs = {name: part.arrays[name][:, 0] for name in NAMES if len(part.arrays.get(name, ()))}
         oldest = min((int(log.min()) for log in logs.values()), default=FAR)
         first = int(logs['frame'].min()) if 'frame' in logs else FAR
-        if not runs or oldest < newest - MAX_JITTER_NS or first < shown - MIN_MATCH_NS:
+        back = oldest < newest - MAX_JITTER_NS or first < shown - MIN_MATCH_NS
+        if not runs or back and not (newest > _WALL_NS and _is_next(runs[-1][-1], part)):
             runs.append([])
         runs[-1].append(part)
         newest = max((int(log.max()) for log in logs.values()), default=-FAR)
         shown = int(logs['frame'].max()) if 'frame' in logs else -FAR
     return runs
+
+
+def _is_next(before: Columns, part: Columns) -> bool:
+    """Tell whether a recorder that split its bag wrote one file after another, in an episode."""
+    marks = part.arrays.get('mark', np.empty((0, 4), np.int64))
+    frames = part.arrays.get('frame', np.empty((0, 4), np.int64))
+    if len(marks) and marks[0, 3] == 0 and (not len(frames) or marks[0, 2] < frames[0, 2]):
+        return False
+    (stem, number), (next_stem, next_number) = (
+        Path(one.source).name.split('.')[0].rpartition('_')[::2] for one in (before, part))
+    return (stem == next_stem and number.isdecimal() and next_number.isdecimal()
+            and int(next_number) == int(number) + 1)
 
 
 def assemble(parts: Sequence[Columns], arm: ArmMount,
@@ -116,7 +132,7 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     tracks, names, marks = join(parts)
     gaps = _gaps(parts)
     tracks['twist'] = _without_stops(tracks['twist'])
-    tracks = put_right(tracks, parts[0].source, parts[0].topics)
+    tracks = put_right(tracks, parts[0].source, parts[0].topics, gaps)
     frame = tracks['frame']
     if not marks and reading.gap:
         _propose_gap(frame.stamp, reading, parts[0].source)
@@ -124,15 +140,14 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     owner = _owner(spans, frame, gaps, parts)
     order = np.lexsort((frame.stamp, owner))
     frame, owner = frame.take(order[owner[order] >= 0]), owner[order[owner[order] >= 0]]
-    first = (np.diff(frame.stamp, prepend=-1) != 0) | (np.diff(owner, prepend=-1) != 0)
-    frame = frame.take(np.flatnonzero(first))
-    present, counts = np.unique(owner[first], return_counts=True)
+    frame, owner = _without_repeats(frame, owner)
+    present, counts = np.unique(owner, return_counts=True)
     spans = [spans[i] for i in present.tolist()]
     clock = _Clock(spans, np.concatenate([[0], np.cumsum(counts)]), frame)
     picked, goal_rows = _pick_names(tracks, clock, gaps)
     names.append(('',))  # of number -1, where there are none
     return EpisodeTable(
-        parts=parts, starts=clock.starts, spans=spans, stamps=frame.stamp,
+        parts=parts, starts=clock.starts, spans=spans, stamps=frame.stamp, logs=frame.log,
         places={'frame': (frame.file, frame.index), 'mask': _masks(tracks['mask'], clock, parts),
                 **_goals(tracks, spans, gaps)},
         actions=_actions(tracks, clock), grippers=_grippers(tracks, clock, arm),
@@ -259,6 +274,21 @@ def _owner(spans: list[Span], frame: Track, gaps: np.ndarray,
             f'{seconds(int(logs.min()))} to {seconds(int(logs.max()))} s)',
             RecordingWarning, stacklevel=4)
     return np.where(unsure, -1, owner)
+
+
+def _without_repeats(frame: Track, owner: np.ndarray) -> tuple[Track, np.ndarray]:
+    """Leave out pictures that are there twice; others of one stamp follow each other."""
+    stamp = frame.stamp.copy()
+
+    def same() -> np.ndarray:
+        return np.append(False, (np.diff(stamp) == 0) & (np.diff(owner) == 0))
+    if not same().any():
+        return frame, owner
+    kept = np.flatnonzero(~same() | (np.diff(frame.picked()[:, 0], prepend=np.nan) != 0))
+    frame, owner, stamp = frame.take(kept), owner[kept], stamp[kept]
+    while same().any():
+        stamp += same()
+    return replace(frame, stamp=stamp), owner
 
 
 def _without_stops(twist: Track) -> Track:

@@ -89,6 +89,12 @@ class EpisodeStore:
         table, local = self._index[i]
         return table.frames(local)
 
+    def seen(self, i: int) -> tuple[int, int]:
+        """Return the log times in ns from the first to the last frame of episode i."""
+        table, local = self._index[i]
+        logs = table.logs[table.starts[local]:table.starts[local + 1]]
+        return int(logs.min()), int(logs.max())
+
     def has_masks(self, i: int) -> bool:
         """Return whether every frame of episode i has a robot mask."""
         table, local = self._index[i]

@@ -3,11 +3,13 @@
 """
 Times of recorded messages, put right where they cannot be what they claim to be.
 
-Stamps of some drivers repeat, are whole seconds, zero or frozen; clocks are set back while they
-are recorded; a camera counts since it was switched on. Whatever it is, each message is kept, in
-the order in which it was written, and somebody is told.
+Only the order of writing is always true. Log times are of one clock, the recorder's, which may be
+set; stamps of each topic are of the clock of its driver, which may jump, stand still or be
+another one than the camera's. Each message is kept, and somebody is told. Times that are right
+stay as they are.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 import warnings
 
@@ -15,51 +17,60 @@ import numpy as np
 from tap_ros.messages.stamps import PROOF
 from tap_ros.recording.columns import Track
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.spans import MAX_JITTER_NS
+from tap_ros.recording.jumps import (
+    APART_NS,
+    level_change,
+    set_places,
+    settle,
+    windows,
+    without_bogus,
+)
 from tap_ros.text import escaped
 
-APART_NS = 5 * 10**9  # topics farther apart than this have clocks of their own
-SMALLEST_NS = 20 * 10**6  # a clock that is set back by less is not told from jitter
 NOMINAL_NS = 10**8  # between frames of which neither stamps nor log times tell anything
-_OFTEN_NS = 10 * 10**9  # no clock is set back so often
-AHEAD_NS = 3600 * 10**9  # a clock that jumps by more was set, and did not wait
-_AROUND = 9  # messages before and after a place that are compared
+_OVERTAKEN_NS = 10**8  # a frame may be logged so long before the mark that precedes it
+_UNEVEN_NS = 5 * 10**9  # what is about a picture may be logged so much later
+_FEW, _RARE = 3, 0.05  # messages of a topic, or the share of them, that are wrong by themselves
+_BEHIND_NS = 35 * 10**7  # only a camera is late; what else is behind it has another clock
+_NEAR = 20  # messages around a place where another topic saw that the clock was set
+_AROUND, _SMOOTH = 9, 15  # messages that tell how far two clocks are apart
 _STREAMS = ('frame', 'twist', 'joint', 'arm', 'object')
+_ANSWERS = ('mask', 'object', 'twist')  # may have the stamp of the picture that they are about
+
+Anew = Callable[[Track], Callable[[np.ndarray, np.ndarray], np.ndarray]]
 
 
-def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str]) -> dict[str, Track]:
+def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str],
+              gaps: np.ndarray) -> dict[str, Track]:
     """
     Return the messages of all names, sorted by log time.
 
     :param tracks: by name, in the order in which they were written; stamps 0 where there are none.
     :param source: what warnings call the recording.
     :param topics: by name; likewise.
+    :param gaps: (G, 2) as damage.gaps: where marks may be lost.
     """
     said: list[str] = []
     called = {name: f'topic {escaped(topics.get(name, name))}' for name in tracks}
     called['arm'] = called['joint']
-    tracks = _one_log(_moving_log(tracks, said), said)
-    tracks = {name: track.take(np.argsort(track.log, kind='stable'))
-              for name, track in tracks.items()}
-    before = tracks['frame']
-    tracks['frame'] = frame = _frames(tracks, called['frame'], said)
-    for name in _STREAMS[1:]:
-        tracks[name] = _stamped(tracks[name], tracks, called[name], said)
+    tracks = _one_log(_moving_log(dict(tracks), said), said)
+    before, anew = tracks['frame'], _anew(tracks['mark'], gaps)
+    tracks['frame'] = frame = _frames(before, anew, called['frame'], said)
     if frame.stamp is not before.stamp:
-        tracks['mask'] = _restamped(tracks['mask'], before, frame)
+        for name in _ANSWERS:
+            tracks[name] = _restamped(tracks[name], before, frame)
+        tracks['mark'] = _marked(tracks['mark'], before, frame)
+    for name in _STREAMS[1:]:
+        tracks[name] = _stamped(name, tracks[name], frame, anew, called[name], said)
     _one_clock(tracks, called, said)
     for text in dict.fromkeys(said):
         warnings.warn(f'{escaped(source)}: {text}', RecordingWarning, stacklevel=3)
-    return tracks
+    return {name: _by_log(track) for name, track in tracks.items()}
 
 
-def _set_back(times: np.ndarray, least: int) -> np.ndarray:
-    """Return where times (N,) in the order of writing go back by more than `least`, for good."""
-    newest = np.maximum.accumulate(times)
-    back = np.flatnonzero(times[1:] < times[:-1] - least) + 1
-    proofs = ((i, times[i:i + PROOF]) for i in back.tolist() if len(times) >= i + PROOF)
-    return np.array([i for i, proof in proofs if (proof < newest[i - 1] - MAX_JITTER_NS).all() or (
-        (proof < newest[i - 1]).all() and (np.diff(proof) >= 0).all())], np.int64)
+def _by_log(track: Track) -> Track:
+    """Return messages sorted by log time."""
+    return track.take(np.argsort(track.log, kind='stable'))
 
 
 def _moving_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
@@ -69,174 +80,333 @@ def _moving_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
         return tracks
     moves = (np.diff(frame.stamp) > 0).all()
     times = frame.stamp if moves else np.arange(len(frame)) * NOMINAL_NS
-    said.append(f'log times stand still; {"stamps" if moves else "the order of writing"} counts')
+    said.append('log times stand still; ' + ('stamps count' if moves else
+                                             'the order of writing counts'))
     return {name: replace(track, log=np.interp(
         track.order, frame.order, times - times[0]).astype(np.int64) + times[0])
         for name, track in tracks.items()}
 
 
 def _one_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
-    """Let log times, and stamps that went back with them, go on where the clock was set back."""
-    found = []  # (place of the first message behind, of the last one before, ns)
-    for track in (tracks[name] for name in _STREAMS):
-        both = np.intersect1d(_set_back(track.log, SMALLEST_NS),
-                              _set_back(track.stamp, SMALLEST_NS))
-        for i in np.union1d(_set_back(track.log, MAX_JITTER_NS), both).tolist():
-            step = np.diff(track.log[max(i - _AROUND, 0):i])
-            found.append((int(track.order[i]), int(track.order[i - 1]), int(
-                track.log[i - 1] - track.log[i] + (np.median(step) if len(step) else 1))))
-    end, changes = -1, 0
-    for place, last, amount in sorted(found):
-        if last < end:  # another topic at the same time
-            continue
-        end, changes = place, changes + 1
-        shared = _went_back(tracks['frame'], place, amount, True)
-        for name, track in tracks.items():
-            behind = track.order >= place
-            moved = _went_back(track, place, amount, shared) & (track.stamp != 0)
-            tracks[name] = replace(
-                track, log=np.where(behind, track.log + amount, track.log),
-                stamp=np.where(behind & moved, track.stamp + amount, track.stamp))
-        said.append(f'the clock was set back by {amount / 1e9:.2f} s; what was written after goes '
-                    'on from there')
+    """Let log times, and stamps that were set with them, go on where the recorder's clock was."""
+    found: list[int] = []
+    _one_by_one(tracks, said)
+    for name in sorted(_STREAMS, key=lambda name: -len(tracks[name])):  # the densest sees it best
+        for i, amount in reversed(set_places(tracks[name].log)):
+            place = int(tracks[name].order[i])
+            if any(_went_on(track, place, amount) for track in tracks.values()):
+                continue
+            free = [change for track in tracks.values() if not _followed(track, place, amount)
+                    and (change := _offset_change(track, place)) is not None]
+            amount = -int(np.median(free)) if free else amount
+            found.append(amount)
+            tracks = {key: _set(track, place, amount) for key, track in tracks.items()}
+    if found:
+        said.append('the clock of the recorder ' + _how_set(found))
     return tracks
 
 
-def _went_back(track: Track, place: int, amount: int, otherwise: bool) -> bool:
-    """Tell whether stamps went back together with log times."""
-    offset, behind = track.stamp - track.log, track.order >= place
-    stamped = track.stamp != 0
-    before, after = offset[~behind & stamped][-_AROUND:], offset[behind & stamped][:_AROUND]
-    if not len(before) or not len(after):
-        return otherwise
-    return bool(np.median(after) - np.median(before) < amount / 2)
+def _one_by_one(tracks: dict[str, Track], said: list[str]) -> None:
+    """Let single log times that cannot be right go on from those before, in their topic or all."""
+    order = np.argsort(np.concatenate([track.order for track in tracks.values()]))
+    logs = np.concatenate([track.log for track in tracks.values()])
+    logs[order] = without_bogus(logs[order])
+    edges = np.cumsum([len(track) for track in tracks.values()])
+    wrong = 0
+    for (name, track), every in zip(list(tracks.items()), np.split(logs, edges[:-1])):
+        if np.count_nonzero(every != track.log) > max(_FEW, len(track) * _RARE):
+            every = track.log  # all of this topic is written later than others
+        log = without_bogus(every)
+        count = int((log != track.log).sum())
+        if count:
+            wrong += count
+            tracks[name] = replace(track, log=log)
+    if wrong:
+        said.append(f'{wrong} of {len(logs)} log times cannot be right; those messages stay in '
+                    'the order in which they were written')
 
 
-def _frames(tracks: dict[str, Track], called: str, said: list[str]) -> Track:
+def _how_set(jumps: Sequence[int]) -> str:
+    """Put in words how often a clock was set, and by how much."""
+    words = []
+    for way, sizes in (('back', [-a for a in jumps if a < 0]),
+                       ('forward', [a for a in jumps if a > 0])):
+        if sizes:
+            often = f' {len(sizes)} times, by up to' if len(sizes) > 1 else ' by'
+            words.append(f'set {way}{often} {max(sizes) / 1e9:.2f} s')
+    return f'was {" and ".join(words)}; messages go on in the order in which they were written'
+
+
+def _place(track: Track, times: np.ndarray, place: int, amount: int) -> int:
+    """Return the first message that a clock stamped after it was set, near a place in the log."""
+    i = int(np.searchsorted(track.order, place))
+    first = max(i - _NEAR, 0)
+    steps = np.diff(times[first:i + _NEAR])
+    if not len(steps):
+        return i
+    unlike = np.abs(steps - np.median(steps) - amount)
+    own = int(np.argmin(unlike))
+    jumps = steps[own] < 0 if amount < 0 else steps[own] > amount / 2
+    return first + own + 1 if jumps and unlike[own] < abs(amount) / 2 else i
+
+
+def _went_on(track: Track, place: int, amount: int) -> bool:
+    """Tell whether log times of a topic show that the clock was not set at a place."""
+    i = int(np.searchsorted(track.order, place))
+    near = track.log[max(i - _NEAR, 0):i + _NEAR]
+    if not 1 < i < len(track) - 1:
+        return False
+    steps = np.diff(near) * np.sign(amount)
+    usual = np.median(np.abs(steps))
+    return bool((steps - usual * np.sign(amount)).max() < abs(amount) / 2 > usual)
+
+
+def _offset_change(track: Track, place: int) -> float | None:
+    """Return by how much stamps go ahead of log times at a place; None if nothing tells."""
+    rows = np.flatnonzero(track.stamp != 0)
+    i = int(np.searchsorted(track.order[rows], place))
+    if not 0 < i < len(rows):
+        return None
+    near = rows[max(i - _AROUND, 0):i + _AROUND] if len(rows) > 4 * PROOF else rows[i - 1:i + 1]
+    return level_change((track.stamp - track.log)[near], int(np.searchsorted(near, rows[i])))[0]
+
+
+def _followed(track: Track, place: int, amount: int) -> bool:
+    """Tell whether stamps were set together with log times, as far as one can see."""
+    change = _offset_change(track, place)
+    return change is None or abs(change) < abs(amount) / 2 or change * amount > 0
+
+
+def _set(track: Track, place: int, amount: int) -> Track:
+    """Return messages whose clock was not set by an amount at a place."""
+    if not len(track):
+        return track
+    rows = np.arange(len(track))
+    log = np.where(rows >= _place(track, track.log, place, amount), track.log - amount, track.log)
+    if not _followed(track, place, amount):
+        return replace(track, log=log)
+    behind = (rows >= _place(track, track.stamp, place, amount)) & (track.stamp != 0)
+    return replace(track, log=log, stamp=np.where(behind, track.stamp - amount, track.stamp))
+
+
+def _anew(mark: Track, gaps: np.ndarray) -> Anew:
+    """Return what tells where the clock of messages begins anew as that of the marks does."""
+    def distance(stamp: np.ndarray, log: np.ndarray, k: np.ndarray) -> np.ndarray:
+        went_on = stamp + mark.log[k] - log
+        near = np.clip(mark.stamp[k], np.minimum(stamp, went_on), np.maximum(stamp, went_on))
+        return np.abs(mark.stamp[k] - near)
+
+    def of(track: Track) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        def tell(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+            if not len(mark):
+                return np.zeros(len(before), bool)
+            stamp, log = track.stamp, track.log
+            following = np.searchsorted(mark.order, track.order[before], 'right')
+            last = np.searchsorted(mark.order, track.order[after]) - 1
+            started = np.maximum(following - 1, 0)
+            outside = (last >= following) | (following == 0) | (mark.index[started] != 0) | (
+                np.abs(log[after] - mark.log[started]) < _OVERTAKEN_NS)
+            lost = ((gaps[:, :1] <= log[after]) & (gaps[:, 1:] >= log[before])).any(0)
+            agrees = np.zeros(len(before), bool)
+            for k in (np.maximum(last, 0), np.minimum(last + 1, len(mark) - 1)):
+                behind = distance(stamp[after], log[after], k)
+                agrees |= (behind < APART_NS) & (behind <= distance(stamp[before], log[before], k))
+            return (outside | lost) & (agrees if mark.stamp.any() else last >= following)
+        return tell
+    return of
+
+
+def _frames(frame: Track, anew: Anew, called: str, said: list[str]) -> Track:
     """Return the frames, those sent again left out, with stamps that increase."""
-    frame = tracks['frame']
     if len(frame) < 2:
         return frame
-    written = frame.take(np.argsort(frame.order))
-    same = np.diff(written.stamp) == 0
-    again = same & (np.diff(written.picked()[:, 0]) == 0) & (written.stamp[1:] != 0)
-    by_log = replace(written, stamp=_increasing(written.log)).take(
-        np.argsort(written.log, kind='stable'))
+    by_log = replace(frame, stamp=_increasing(frame.log))
     if not frame.stamp.any():  # it has none
         return by_log
-    # A clock that begins at zero agrees with the next stamp.
-    jumps = np.abs(np.diff(written.stamp - written.log, append=written.stamp[-1])) > APART_NS
-    repeated, unstamped = int((same & ~again).sum()), int((jumps & (written.stamp == 0)).sum())
-    back = 0 if len(tracks['mark']) else int((np.diff(written.stamp) < -MAX_JITTER_NS).sum())
-    often = back >= PROOF and back * _OFTEN_NS > np.ptp(frame.log)
-    if repeated or unstamped or often:
-        said.append(f'{called}: of {len(frame)} stamps {repeated} are repeated, {unstamped} are '
-                    f'zero and {back} go back; its pictures are put in order by log time')
-        return by_log
-    kept = written.take(np.flatnonzero(~np.append(False, again)))
-    kept = replace(kept, stamp=_going_on(kept, tracks['mark'], called, said))
-    if kept.stamp is written.stamp and not again.any():
-        return frame
-    return kept.take(np.argsort(kept.log, kind='stable'))
+    same = np.append(False, (np.diff(frame.stamp) == 0) & (frame.stamp[1:] != 0))
+    again = same & np.append(False, np.diff(frame.picked()[:, 0]) == 0)
+    if again.any() and (same == again).all() and np.ptp(frame.stamp):
+        frame = frame.take(np.flatnonzero(~again))
+        same = np.zeros(len(frame), bool)
+    zero = _unstamped(frame)
+    settled = settle(frame.stamp, frame.log, ~(same | zero), anew(frame))
+    if settled is None:
+        back = int((np.diff(frame.stamp) < 0).sum())
+        said.append(f'{called}: of {len(frame)} stamps {int(same.sum())} are repeated, '
+                    f'{int(zero.sum())} are zero and {back} go back; its pictures are put in '
+                    'order by log time')
+        return replace(frame, stamp=_increasing(frame.log))
+    _say_settled(settled.jumps, settled.bogus, len(frame), called, said)
+    return frame if settled.stamp is frame.stamp else replace(frame, stamp=settled.stamp)
 
 
-def _stamped(track: Track, tracks: dict[str, Track], called: str, said: list[str]) -> Track:
+def _unstamped(track: Track) -> np.ndarray:
+    """Tell which messages (N,) have no stamp among others; a clock may also begin at zero."""
+    zero = track.stamp == 0
+    rows = np.flatnonzero(~zero)
+    if not zero.any() or not len(rows):
+        return zero
+    after = rows[np.minimum(np.searchsorted(rows, np.flatnonzero(zero)), len(rows) - 1)]
+    zero[zero] = track.stamp[after] - (track.log[after] - track.log[zero]) > APART_NS
+    return zero
+
+
+def _say_settled(jumps: Sequence[int], bogus: int, count: int, called: str,
+                 said: list[str]) -> None:
+    """Say what was wrong with the stamps of a topic."""
+    if jumps:
+        said.append(f'{called}: its clock {_how_set(jumps)}')
+    if bogus:
+        said.append(f'{called}: {bogus} of {count} stamps cannot be right (zero, repeated or far '
+                    'from all around); log times take their place')
+
+
+def _stamped(name: str, track: Track, frame: Track, anew: Anew, called: str,
+             said: list[str]) -> Track:
     """Return states or commands with stamps that can be compared with those of frames."""
-    frame = tracks['frame']
     if not len(frame) or not len(track):
         return track
-    newest = np.maximum(np.searchsorted(frame.log, track.log, 'right') - 1, 0)
-    by_log = track.log + (frame.stamp - frame.log)[newest]
+    shown = _by_log(frame)
+    newest = np.maximum(np.searchsorted(shown.log, track.log, 'right') - 1, 0)
+    by_log = track.log + (shown.stamp - shown.log)[newest]
     repeats = (np.diff(track.stamp) == 0) & (track.stamp[1:] != 0)
-    if len(track) > PROOF and track is not tracks['object'] and repeats.mean() > 0.5:
+    if len(track) > PROOF and name != 'object' and repeats.mean() > 0.5:
         values = track.picked()
         differ = repeats & ~np.isclose(values[1:], values[:-1], equal_nan=True).all(1)
         if differ.mean() > 0.5:  # they are not the same ones, sent again
             said.append(f'{called}: {int(repeats.sum())} of {len(track)} stamps are repeated; log '
                         'times are taken')
             return replace(track, stamp=by_log)
-    state = track is tracks['joint'] or track is tracks['arm']  # a command answers a frame
-    track = replace(track, stamp=np.where(
-        track.stamp == 0, by_log if state else frame.stamp[newest], track.stamp))
-    written = track.take(np.argsort(track.order))
-    stamp = _going_on(written, tracks['mark'], called, said)
-    return track if stamp is written.stamp else replace(written, stamp=stamp).take(
-        np.argsort(written.log, kind='stable'))
+    zero = track.stamp == 0
+    if zero.any():  # a command answers a frame
+        track = replace(track, stamp=np.where(
+            zero, by_log if name in ('joint', 'arm') else shown.stamp[newest], track.stamp))
+    settled = settle(track.stamp, track.log, np.ones(len(track), bool), anew(track), forward=False)
+    if settled is None:
+        said.append(f'{called}: its stamps jump to and fro; log times are taken')
+        return replace(track, stamp=by_log)
+    _say_settled(settled.jumps, settled.bogus, len(track), called, said)
+    return track if settled.stamp is track.stamp else replace(track, stamp=settled.stamp)
 
 
-def _going_on(track: Track, mark: Track, called: str, said: list[str]) -> np.ndarray:
-    """
-    Return stamps (N,) that go on where their clock alone was set back.
-
-    A clock that begins anew, at a mark or from its first stamp, counts another episode.
-
-    :param track: in the order of writing.
-    """
-    stamp, begin, offsets = track.stamp, 0, []
-    steps = np.diff(stamp)
-    for i in (np.flatnonzero((steps < -SMALLEST_NS) | (
-            steps - np.diff(track.log) > AHEAD_NS)) + 1).tolist():
-        back = int(stamp[i - 1] - stamp[i])
-        behind, before = (np.median((stamp - track.log)[part]) for part in (
-            slice(i, i + _AROUND), slice(max(i - _AROUND, begin), i)))
-        marked = ((mark.order > track.order[i - 1]) & (mark.order < track.order[i])).any()
-        if back > 0 and marked or (stamp[i] <= stamp[begin:i].min() and back > MAX_JITTER_NS):
-            begin = i
-        elif back < 0 or behind - before < -back / 2:
-            step = max(int(track.log[i] - track.log[i - 1]), 1)
-            offsets.append((i, back + step))
-    if offsets:
-        stamp = stamp.copy()
-        for i, offset in offsets:
-            stamp[i:] += offset
-        said.append(f'{called}: its clock was set {len(offsets)} times, back by up to '
-                    f'{max(offset for _, offset in offsets) / 1e9:.2f} s; its messages stay in '
-                    'the order in which they were written')
-    return stamp
+def _restamped(track: Track, before: Track, after: Track) -> Track:
+    """Return what is about pictures with the stamps that these have now."""
+    if not len(track) or not len(after):
+        return track
+    old = before.stamp[np.searchsorted(before.order, after.order)]
+    order = np.lexsort((after.order, old))
+    stamps, places = old[order], after.order[order]
+    first, last = (np.searchsorted(stamps, track.stamp, side) for side in ('left', 'right'))
+    # Of pictures of one stamp that which was written last before it, or else the first.
+    keys = np.lexsort((np.append(places, track.order), np.append(stamps, track.stamp)))
+    rank = np.empty(len(keys), np.int64)
+    rank[keys] = np.cumsum(keys < len(stamps))
+    found = order[np.clip(rank[len(stamps):] - 1, first, np.maximum(last - 1, first)).clip(
+        max=len(order) - 1)]
+    later = track.log - after.log[found]
+    known = (last > first) & (later < _UNEVEN_NS) & (later > -_OVERTAKEN_NS)
+    return replace(track, stamp=np.where(known, after.stamp[found], track.stamp))
 
 
-def _restamped(mask: Track, before: Track, after: Track) -> Track:
-    """Return masks with the stamps that their pictures have now."""
-    new = dict(zip(before.order.tolist(), before.stamp.tolist()))
-    old = np.array([new[order] for order in after.order.tolist()], np.int64)
-    order = np.argsort(old, kind='stable')
-    place = np.minimum(np.searchsorted(old[order], mask.stamp), max(len(old) - 1, 0))
-    if not len(old) or not len(mask):
-        return mask
-    found = order[place]
-    return replace(mask, stamp=np.where(old[found] == mask.stamp, after.stamp[found], mask.stamp))
+def _marked(mark: Track, before: Track, after: Track) -> Track:
+    """Return marks whose clock was set where that of the frames was, as far as one can see."""
+    if not len(mark) or not len(after):
+        return mark
+    moved = after.stamp - before.stamp[np.searchsorted(before.order, after.order)]
+    i = np.searchsorted(after.order, mark.order) - (mark.index != 0)
+    i = np.clip(i, 0, len(after) - 1)
+    new = mark.stamp + moved[i]
+    expected = after.stamp[i], after.stamp[i] + mark.log - after.log[i]
+    old_apart, new_apart = (
+        np.abs(one - np.clip(one, np.min(expected, 0), np.max(expected, 0)))
+        for one in (mark.stamp, new))
+    return replace(mark, stamp=np.where(
+        (mark.stamp != 0) & (new_apart < old_apart), new, mark.stamp))
 
 
 def _one_clock(tracks: dict[str, Track], called: dict[str, str], said: list[str]) -> None:
     """Bring the stamps of topics to the clock of the camera, by log time, where it is another."""
-    frame, shifts = tracks['frame'], {}
+    frame, shifts, known = tracks['frame'], {}, 0
     for name in (*_STREAMS[1:], 'mark'):
         track = tracks[name]
-        stamped = track.stamp != 0
-        if len(frame) and stamped.any():
-            shifts[name] = int(np.median(_apart(track, frame)[stamped]))
-    moved = {name: shift for name, shift in shifts.items() if abs(shift) > APART_NS}
-    for name, shift in moved.items():
-        tracks[name] = _shifted(tracks[name], shift)
-        said.append(f'{called[name]}: its clock and that of the camera are {abs(shift) / 1e9:.1f} '
-                    's apart; they are brought together by log time')
-    if moved and len(moved) == len(shifts):  # the camera's is the odd one
+        rows = np.flatnonzero(track.stamp != 0)
+        if len(frame) and len(rows):
+            known += 1
+            shift = _apart(track.take(rows), frame, name)
+            if shift.any():
+                shifts[name] = shift
+                stamp = track.stamp.copy()
+                stamp[rows] -= shift
+                tracks[name] = replace(track, stamp=stamp)
+                size, count = np.median(shift[shift != 0]), np.count_nonzero(shift)
+                said.append(
+                    f'{called[name]}: the clock of {count} of {len(rows)} messages is '
+                    f'{abs(size) / 1e9:.2f} s {"ahead of" if size > 0 else "behind"} that of the '
+                    'camera; they are brought together by log time')
+    if shifts and len(shifts) == known:  # the camera's is the odd one
+        amount = int(np.median(next(iter(shifts.values()))))
         for name in ('goal', 'goal_mask', 'goal_object'):
-            tracks[name] = _shifted(tracks[name], sorted(moved.values())[len(moved) // 2])
+            track = tracks[name]
+            tracks[name] = replace(track, stamp=np.where(
+                track.stamp == 0, 0, track.stamp - amount))
 
 
-def _apart(track: Track, frame: Track) -> np.ndarray:
-    """Return (N,) how far the clock of each message is behind that of the frame logged nearest."""
-    after = np.minimum(np.searchsorted(frame.log, track.log), len(frame) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(frame.log[after] - track.log) <= np.abs(
-        frame.log[before] - track.log), after, before)
-    return (track.log - track.stamp) - (frame.log - frame.stamp)[nearest]
+def _apart(track: Track, frame: Track, name: str) -> np.ndarray:
+    """
+    Return (N,) int64 ns by which the clock of each message is ahead of the camera's, 0: alike.
+
+    A message that was written between two frames is expected between their stamps. What has the
+    stamp of a frame, however late, is of its clock.
+
+    :param name: marks of an episode's start precede frames, those of its end follow; commands
+        answer them.
+    """
+    shift = np.zeros(len(track), np.int64)
+    behind = np.searchsorted(frame.order, track.order)
+    after, before = np.minimum(behind, len(frame) - 1), np.maximum(behind - 1, 0)
+    from_before, from_after = (
+        frame.stamp[rows] + track.log - frame.log[rows] for rows in (before, after))
+    ends = (from_before, from_after, frame.stamp[before], frame.stamp[after])
+    if name == 'mark':
+        return _marks_apart(track, frame, before, after)
+    low, high = np.min(ends, 0), np.max(ends, 0)
+    apart = track.stamp - np.clip(track.stamp, low, high)
+    inside = np.flatnonzero((behind > 0) & (behind < len(frame)) & (
+        high - low <= max(APART_NS, 2 * np.median(np.diff(frame.stamp, append=0)))))
+    if not ((apart > APART_NS) | (apart < -_BEHIND_NS)).any() or not len(inside) or (
+            np.isin(track.stamp[inside], frame.stamp).mean() > 0.5):
+        return shift
+    smooth = windows(apart[inside], _AROUND)
+    off = (smooth > APART_NS) | (smooth < -_BEHIND_NS)
+    nearest = np.where(np.abs(track.log - frame.log[before]) <= np.abs(
+        track.log - frame.log[after]), from_before, from_after)
+    for rows in np.split(np.arange(len(inside)), np.flatnonzero(np.diff(off)) + 1):
+        if off[rows[0]] and len(rows) > PROOF:
+            at = inside[rows]
+            first = 0 if rows[0] == 0 else at[0]
+            last = len(track) if rows[-1] == len(inside) - 1 else at[-1] + 1
+            shift[first:last] = np.interp(np.arange(first, last), at, windows(
+                (track.stamp - nearest)[at], _SMOOTH)).astype(np.int64)
+            if name == 'twist':
+                low, high = frame.stamp[before[at]], frame.stamp[after[at]] - 1
+                shift[at] = track.stamp[at] - np.clip(track.stamp[at] - shift[at], low, np.maximum(
+                    low, high))
+    return shift
 
 
-def _shifted(track: Track, shift: int) -> Track:
-    """Return messages with other stamps; none stays none."""
-    return replace(track, stamp=np.where(track.stamp == 0, 0, track.stamp + shift))
+def _marks_apart(mark: Track, frame: Track, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the same as _apart for marks, which are told one by one."""
+    start, sides = mark.index == 0, []
+    for own, other in ((after, before), (before, after)):
+        rows = np.where(start, own, other)
+        expected = frame.stamp[rows] + mark.log - frame.log[rows]
+        away = mark.stamp - np.clip(mark.stamp, *np.sort([frame.stamp[rows], expected], 0))
+        sides.append((away, expected, np.abs(mark.log - frame.log[rows])))
+    (apart, expected, _), (other_apart, _, near) = sides
+    apart = np.where((near < _OVERTAKEN_NS) & (np.abs(other_apart) < np.abs(apart)),
+                     other_apart, apart)
+    off = (apart > APART_NS) | (apart < -APART_NS) | ~start & (apart < -_OVERTAKEN_NS)
+    return np.where(off, mark.stamp - expected, 0)
 
 
 def _increasing(times: np.ndarray) -> np.ndarray:

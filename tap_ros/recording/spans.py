@@ -113,10 +113,8 @@ def _marked(mark: 'Track', marks: Sequence[Mark], gaps: list[list[int]]) -> list
 
 
 def _unmarked(log: np.ndarray, stamps: np.ndarray, pause: int, longest: int) -> list[Span]:
-    """Return spans that end where the camera pauses, or its clock was set; times in ns."""
-    steps = np.diff(stamps)  # a clock that is set back begins another episode, too
-    begins = np.flatnonzero((steps > pause) | (steps < -MAX_JITTER_NS)) + 1 if pause else (
-        np.empty(0, int))
+    """Return spans that end where the camera pauses; times in ns."""
+    begins = np.flatnonzero(np.diff(stamps) > pause) + 1 if pause else np.empty(0, int)
     if not len(begins) and longest and len(stamps):
         since = np.maximum.accumulate(stamps) - stamps[0]
         parts = max(-(-int(since[-1]) // longest), 1)  # rounded up

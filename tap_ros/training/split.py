@@ -66,13 +66,14 @@ def split_episodes(store: 'EpisodeStore', test_fraction: float = TEST_FRACTION,
 
 def _demonstrations(store: 'EpisodeStore', episodes: Sequence[int]) -> list[int]:
     """Return for each episode the first one of its recording that was seen at the same time."""
-    known: dict[Path, list[tuple[int, int, int]]] = {}  # of a recording: first, last stamp, number
+    known: dict[Path, list[tuple[int, int, int]]] = {}  # of a recording: from, to, number
     found = []
     for i in episodes:
-        begin, *_, end = store[i].stamps
+        begin, end = store.seen(i)
         spans = known.setdefault(store.source(i), [])
-        same = [number for first, last, number in spans if begin <= last and first <= end]
-        found.append(same[0] if same else i)
+        together = [(min(last, end) - max(first, begin), number) for first, last, number in spans]
+        longest, number = max(together, default=(-1, i))
+        found.append(number if longest >= 0 else i)
         spans.append((begin, end, found[-1]))
     return found
 

@@ -1,119 +1,295 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks that lie: every picture is kept, in the order in which it was taken, and it is told."""
+"""
+Laws of clocks that lie: every picture is kept, in order, with its actions, and it is told.
+
+Each defect is put at random into recordings of random rates and lengths; what is read is compared
+with the undamaged one.
+"""
 
 import re
+import time
+import warnings
 
-from made_bags import camera, joints, mark, read, record
+from made_bags import camera, read
+from made_bags import record as record_bag
+from made_clocks import record, Recording, SECOND, WALL
 import numpy as np
 import pytest
+from tap_ros.recording import clocks
+from tap_ros.recording.align import runs_of
+from tap_ros.recording.columns import join
+from tap_ros.recording.reading import Reading
 
-PERIOD, LATE = 0.1, 0.02  # s, between pictures, and until they are logged
-WALL = 1.7e9  # s
-TIMES = np.arange(40) * PERIOD + np.repeat([0, 12], 20)  # two demonstrations, a pause between
-
-
-def bag(path, stamps, logs, extra=()):
-    """Write numbered pictures, and others' messages, in the order of the true times."""
-    messages = [(t, camera(stamp, i, log)) for i, (t, stamp, log) in enumerate(
-        zip(TIMES, stamps, logs, strict=True))]
-    return record(path, [one for _, one in sorted([*messages, *extra], key=lambda one: one[0])])
+CAMERA, OTHERS = ('frame',), ('twist', 'joint', 'mark')
+ALL = (*CAMERA, 'mask', *OTHERS)
+SIZES = (0.25, 0.35, 0.5, 1, 1.97, 3, 10, 60, 3600, 86400)  # s
+NEAR = 3  # frames near a defect whose action or joints may be those of the next one
 
 
-def numbers(found):
-    return [episode.frames[:, 0, 0, 0].tolist() for episode in found]
+def place(bag, random, ends=False):
+    """Return the row of a picture: one of the first or last three, or any other."""
+    frames = bag.rows('frame')
+    if ends:
+        return frames[random.choice([1, 2, 3, -3, -2, -1])]
+    return frames[random.integers(5, len(frames) - 5)]
 
 
-WHOLE = [[*range(20)], [*range(20, 40)]]
-FRAMES = np.arange(40)
+def set_clock(names, way, logs=False, stamps=True, least=0.0, ends=False, twice=False):
+    """Return what sets clocks back (way -1) or forward from a place on."""
+    def spoil(bag, random):
+        frames = bag.rows('frame')
+        places = [frames[15], frames[-15]] if twice else [place(bag, random, ends)]
+        for row in places:
+            size = max(random.choice(SIZES), 2.1 / bag.rate, least)
+            behind = bag.rows(*names)
+            behind = behind[behind >= row]
+            bag.stamp[behind] += int(way * size * SECOND) * stamps
+            bag.log[behind] += int(way * size * SECOND) * logs
+    return spoil
 
 
-@pytest.mark.parametrize('stamps, words', [
-    (np.floor(WALL + TIMES), '36 are repeated'), (np.full(40, 36.858272), '39 are repeated'),
-    (WALL + np.repeat(TIMES[::2], 2), '20 are repeated'),
-    (np.where(FRAMES % 3, WALL + TIMES, 0), '14 are zero'),
-    (np.where(FRAMES == 7, 0, TIMES + 50), '1 are zero'), (np.zeros(40), ''),
-    ((TIMES + 0.55) % 1, '4 go back')])
-def test_pictures_whose_stamps_tell_nothing_go_by_log_time(tmp_path, stamps, words):
-    found, told = read(bag(tmp_path / 'bag', stamps, WALL + TIMES + LATE))
-    assert numbers(found) == WHOLE
-    np.testing.assert_allclose(np.diff(found[0].stamps), PERIOD * 1e9, atol=1000)
-    assert words in ''.join(told) and bool(words) == bool(told)
-    assert all('topic /camera/image_raw' in text for text in told)
+def off(*names):
+    """Return what stamps topics by the clock of another computer."""
+    def spoil(bag, random):
+        bag.stamp[bag.rows(*names)] += int(
+            random.choice([-1, 1]) * random.choice([1, 1.5, 3, 20, 7200]) * SECOND)
+    return spoil
 
 
-@pytest.mark.parametrize('back', [0.15, 0.35, 1.97, 3.0, 30.0, 3600.0])
-@pytest.mark.parametrize('which', ['both', 'stamps', 'logs'])
-def test_a_clock_that_is_set_back_shuffles_no_pictures(tmp_path, back, which):
-    if which == 'logs' and back < 0.5:
-        return  # jitter of the recorder
-    shift = np.where(FRAMES < 10, 0, -back)
-    found, told = read(bag(
-        tmp_path / 'bag', WALL + TIMES + shift * (which != 'logs'),
-        WALL + TIMES + shift * (which != 'stamps') + LATE,
-        [(t, joints(WALL + t - back * (t > 0.95) * (which == 'both'), gripper_x=t, gripper_y=0,
-                    gripper_z=0, gripper_opening=1, log=WALL + t + LATE - back * (
-                        t > 0.95) * (which != 'stamps'))) for t in np.arange(-1, 16, 0.04)]))
-    if which == 'stamps' and back > 1:  # from before its beginning: it may be another run
-        assert sum(numbers(found), []) == [*range(40)] and len(found) in (2, 3)
-    else:
-        assert numbers(found) == WHOLE
-    assert re.search('set back|was set', ''.join(told)) or len(found) == 3
-    if which == 'both':
-        np.testing.assert_allclose(
-            found[0].grippers[1:-1, 0], TIMES[1:19], atol=0.1)
+def started(bag, random):
+    bag.stamp[bag.rows(*CAMERA)] -= WALL - 40 * SECOND
 
 
-def test_a_clock_that_is_set_when_it_gets_the_time_cuts_nothing(tmp_path):
-    stamps = np.where(FRAMES < 6, 20, WALL) + TIMES
-    found, told = read(bag(tmp_path / 'bag', stamps, WALL + TIMES + LATE))
-    assert numbers(found) == WHOLE and 'was set 1 times' in told[0]
+def restarted(bag, random):
+    started(bag, random)
+    rows = bag.rows(*CAMERA)
+    rows = rows[rows >= place(bag, random)]
+    bag.stamp[rows] -= bag.stamp[rows[0]] - int(random.uniform(0, 10) * SECOND)
 
 
-def test_log_times_that_stand_still_leave_the_order_of_writing(tmp_path):
-    for number, stamps in enumerate((WALL + TIMES, np.full(40, 7.0), np.zeros(40))):
-        found, told = read(bag(tmp_path / str(number), stamps, np.full(40, WALL), [
-            (t, joints(WALL + t, log=WALL, gripper_x=t, gripper_y=0, gripper_z=0))
-            for t in TIMES + 0.01]))
-        assert sum(numbers(found), []) == [*range(40)] and 'stand still' in told[0]
-    assert number == 2 and len(read(tmp_path / '0')[0]) == 2
+def got_the_time(names, logs):
+    def spoil(bag, random):
+        rows = bag.rows(*names)
+        rows = rows[rows < place(bag, random)]
+        bag.stamp[rows] -= WALL - 50 * SECOND
+        bag.log[rows] -= (WALL - 50 * SECOND) * logs
+    return spoil
 
 
-def test_marks_and_states_of_another_clock_are_brought_to_the_cameras(tmp_path):
-    stamps = 36.5 + TIMES  # since it was switched on
-    extra = [(t, joints(WALL + t, log=WALL + t + 0.001, gripper_x=t, gripper_y=0, gripper_z=0))
-             for t in np.arange(-0.5, 15, 0.03)]
-    found, told = read(bag(tmp_path / 'bag', stamps, WALL + TIMES + LATE, extra))
-    np.testing.assert_allclose(found[0].grippers[:, 0], TIMES[:20], atol=0.05)
-    assert 'topic /joint_states: its clock and that of the camera are 16999' in ''.join(told)
-    marks = [(t, mark(WALL + t, event, 'success' if event else '', WALL + t + LATE))
-             for t, event in ((-0.05, 0), (1.95, 1), (13.95, 0), (16, 1))]
-    goal = (-9, camera(WALL - 9, 77, topic='/goal/image', log=WALL - 0.2))
-    found, told = read(bag(tmp_path / 'marked', stamps, WALL + TIMES + LATE,
-                           [*extra, *marks, goal]))
-    assert numbers(found) == WHOLE and [e.outcome for e in found] == ['success'] * 2
-    assert found[1].goal_frame[0, 0, 0] == 77
+def wrong(stamps=1, logs=0, ends=False):
+    def spoil(bag, random):
+        row, size = place(bag, random, ends), random.choice([-2000, -30, -6, 6, 30, 2000])
+        bag.stamp[row] += int(size * SECOND) * stamps
+        bag.log[row] += int(size * SECOND) * logs
+    return spoil
 
 
-def test_states_whose_stamps_stand_still_go_by_log_time(tmp_path):
-    for number, stamp in enumerate((lambda t: np.floor(WALL + t), lambda t: 12.0, lambda t: 0)):
-        found, _ = read(bag(tmp_path / str(number), WALL + TIMES, WALL + TIMES + LATE, [
-            (t, joints(stamp(t), log=WALL + t + LATE, gripper_x=t, gripper_y=0, gripper_z=0))
-            for t in np.arange(-0.5, 15, 0.03)]))
-        np.testing.assert_allclose(found[0].grippers[:, 0], TIMES[:20], atol=0.06)
+def stamped(name, change):
+    """Return what puts change(stamps, random) in place of the stamps of a topic."""
+    def spoil(bag, random):
+        rows = bag.rows(name)
+        bag.stamp[rows] = change(bag.stamp[rows], random)
+    return spoil
 
 
-def test_a_rate_goes_by_log_time_where_stamps_repeat(tmp_path):
-    from tap_ros.recording.reading import Reading
-    for number, stamps in enumerate((np.floor(WALL + TIMES), np.full(40, 5.0), WALL + TIMES)):
-        found, _ = read(bag(tmp_path / str(number), stamps, WALL + TIMES + LATE),
-                        reading=Reading(rate=5))
-        assert [len(episode) for episode in found] == [10, 10]
+def standing(stamps, random):
+    stamps, first = stamps.copy(), random.integers(5, len(stamps) - 12)
+    stamps[first:first + 6] = stamps[first]
+    return stamps
 
 
-def test_a_picture_that_is_sent_again_counts_once(tmp_path):
-    times = np.repeat(TIMES[::2], 2)
-    messages = [camera(WALL + t, int(round(t * 10)) % 256, WALL + t + LATE + 0.02 * (i % 2))
-                for i, t in enumerate(times)]
-    found, told = read(record(tmp_path / 'bag', messages))
-    assert [len(episode) for episode in found] == [10, 10] and not told
+def log_stands(bag, random):
+    bag.log[:] = bag.log[0]
+
+
+DEFECTS = {  # how, and what the warnings name
+    'camera back': (set_clock(CAMERA, -1), '/cam.* back'),
+    'camera forward': (set_clock(CAMERA, 1, least=1), '/cam.* forward'),
+    'camera back at an end': (set_clock(CAMERA, -1, ends=True), '/cam.*( back|[123] of)'),
+    'camera forward at an end': (set_clock(CAMERA, 1, least=6, ends=True), '/cam.* [123] of'),
+    'camera back twice': (set_clock(CAMERA, -1, twice=True), '/cam.* back'),
+    'camera since its start': (started, '/cmd.*ahead'),
+    'camera replugged': (restarted, '/cam.*back'),
+    'camera gets the time': (got_the_time(CAMERA, 0), '/cam.* forward'),
+    'all back': (set_clock(ALL, -1, logs=True), 'recorder.* back'),
+    'all back at an end': (set_clock(ALL, -1, logs=True, ends=True), 'recorder.* back'),
+    'all back twice': (set_clock(ALL, -1, logs=True, twice=True), 'recorder.* back'),
+    'all get the time': (got_the_time(ALL, 1), 'recorder.* forward'),
+    'logs back': (set_clock(ALL, -1, logs=True, stamps=False), 'recorder.* back'),
+    'logs forward': (set_clock(ALL, 1, logs=True, stamps=False), None),
+    'stamps back': (set_clock(ALL, -1), '/cam.* back'),
+    'stamps forward': (set_clock(ALL, 1, least=1), '/cam.* forward'),
+    'joints back': (set_clock(['joint'], -1), '/joint_states'),
+    'joints forward': (set_clock(['joint'], 1, least=1), '/joint_states.*ahead'),
+    'commands back': (set_clock(['twist'], -1, least=1), '/cmd'),
+    'commands forward': (set_clock(['twist'], 1, least=1), '/cmd.*ahead'),
+    'commands of another computer': (off('twist'), '/cmd'),
+    'all but the camera of another': (off(*OTHERS), '/cmd(.|\n)*/joint_states'),
+    'camera of another': (off(*CAMERA), '/cmd(.|\n)*/joint_states'),
+    'a stamp wrong': (wrong(), '/cam.* 1 of'),
+    'one wrong at an end': (wrong(ends=True), '/cam.* 1 of'),
+    'a log time wrong': (wrong(0, 1), '1 of .* log times'),
+    'both wrong': (wrong(1, 1), '1 of .* log times'),
+    'every third zero': (stamped('frame', lambda s, _: s * (np.arange(len(s)) % 3 > 0)), '/cam'),
+    'some zero': (stamped('frame', lambda s, r: s * (r.random(len(s)) > 0.1)), '/cam'),
+    'all zero': (stamped('frame', lambda s, _: 0 * s), None),
+    'frozen': (stamped('frame', lambda s, _: 0 * s + 36 * SECOND), '/cam.*repeated'),
+    'frozen in part': (stamped('frame', standing), '/cam.*5 of'),
+    'whole seconds': (stamped('frame', lambda s, _: s // SECOND * SECOND), '/cam.*repeated'),
+    'pairs': (stamped('frame', lambda s, _: s[np.arange(len(s)) // 2 * 2]), '/cam.*repeated'),
+    'joints of whole seconds': (
+        stamped('joint', lambda s, _: s // SECOND * SECOND), '/joint_states'),
+    'joints without': (stamped('joint', lambda s, _: 0 * s), None),
+    'log stands still': (log_stands, 'log times stand still')}
+
+
+@pytest.mark.parametrize('defect', DEFECTS)
+def test_what_is_read_is_what_was_recorded_whatever_the_clocks_say(defect):
+    spoil, words = DEFECTS[defect]
+    for seed in range(12):
+        random = np.random.default_rng(seed)
+        rate = [5, 10, 15, 30][seed % 4]
+        good = record(random, rate, 1 + seed // 4 % 2, marks=seed % 3 == 0,
+                      joints='joint' in defect or 'but' in defect or random.random() < 0.8)
+        good.rate = rate
+        numbers, table, said = good.read()
+        assert not said
+        bad = good.spoilt(spoil, random)
+        bad_numbers, found, told = bad.read()
+        assert bad_numbers == numbers, (seed, told)
+        assert (found.actions != table.actions).any(1).sum() <= NEAR, (seed, told)
+        joints = np.abs(found.grippers - table.grippers)[:, 0]
+        assert (joints > 0.1).sum() + (np.isnan(found.grippers[:, 0]) & ~np.isnan(
+            table.grippers[:, 0])).sum() <= NEAR, (seed, told)
+        assert (np.diff(found.stamps) > 0).all()
+        assert defect == 'log stands still' or all(map(found.has_masks, range(len(found))))
+        if words is None:
+            assert not told
+        elif 'joint' not in words or 'joint' in bad.name:
+            assert re.search(words, '\n'.join(told)), (seed, told)
+            assert len(told) == len({re.sub(r'[\d.]', '', text) for text in told}) <= 4
+            assert not re.search(r' -\d', ''.join(told))
+
+
+def simulated(random, restarts, speed, episodes=5, frames=8):
+    """Return a Recording of a simulation, whose time stands still while others work."""
+    wall, now, events, number = WALL / SECOND, 0.0, [], 0
+
+    def send(name, value):
+        events.append((name, wall + random.uniform(0.0002, 0.002), now, value))
+
+    for _ in range(episodes):
+        now = now * (not restarts) + random.choice([0.0, 9.0]) * (not restarts)
+        wall += random.uniform(0, 3)
+        for event in (0, 1):
+            send('mark', event)
+            for _ in range(frames * (1 - event)):
+                send('frame', number)
+                send('mask', number)
+                wall += random.choice([0.01, 2])
+                send('twist', number)
+                for _ in range(12):
+                    now, wall = now + 0.02, wall + 0.02 / speed * random.uniform(0.8, 1.2)
+                    send('joint', number)
+                number += 1
+    return Recording(events)
+
+
+def assert_untouched(bag):
+    """Check that times that are right stay as they are, and nothing is said."""
+    parts, _, _ = join([bag.columns()])
+    found = clocks.put_right(dict(parts), 'bag', {}, np.empty((0, 2), np.int64))
+    for name, track in parts.items():
+        order = np.argsort(track.log, kind='stable')
+        np.testing.assert_array_equal(found[name].stamp, track.stamp[order])
+        np.testing.assert_array_equal(found[name].log, track.log[order])
+
+
+def swap(bag, random):
+    """Let ten pictures arrive just before the one that was taken before them."""
+    rows = bag.rows('frame')
+    at = random.choice(len(rows) // 2 - 1, 10, replace=False) * 2
+    bag.stamp[rows[at]], bag.stamp[rows[at + 1]] = bag.stamp[rows[at + 1]], bag.stamp[rows[at]]
+
+
+@pytest.mark.filterwarnings('error')
+def test_good_recordings_stay_as_they_are():
+    for seed in range(60):
+        random = np.random.default_rng(seed)
+        assert_untouched(record(random, [5, 10, 15, 30, 60][seed % 5], marks=seed % 2, **[
+            {'jitter': 0.4, 'lost': 0.2}, {'latency': (0.01, 0.3)}, {'latency': (0.2, 0.6)}, {},
+            {'joints': False, 'frames': 5}, {'pause': 0.5, 'jitter': 0.4}][seed % 6]))
+        assert_untouched(simulated(random, seed % 2, [0.1, 0.7, 1, 3, 10][seed % 5]))
+        burst = record(random, 20)
+        burst.log = np.maximum.accumulate(burst.log // SECOND * SECOND + SECOND
+                                          + np.arange(len(burst.log)))
+        assert_untouched(burst)
+        swapped = record(random, 10, 1).spoilt(swap, random)
+        (numbers,), table, said = swapped.read()
+        assert not said and (np.diff(table.stamps) > 0).all()
+        assert sorted(numbers) == list(range(len(numbers)))
+        assert (np.array(numbers) != np.arange(len(numbers))).sum() == 20
+
+
+def test_a_camera_of_another_rate_is_told_once_it_is_far_off():
+    good = record(np.random.default_rng(3), 10, 1, 900, joints=False)
+    numbers, table, _ = good.read(episode_seconds=0)
+    drifting = good.spoilt(stamped('frame', lambda s, _: s + (s - WALL) // 50), None)
+    found, read_table, told = drifting.read(episode_seconds=0)
+    assert found == numbers and len(told) == 1 and '/cmd: the clock of' in told[0]
+    wrong = (read_table.actions != table.actions).any(1)
+    assert not wrong[:20].any() and not wrong[-300:].any()  # little at first, and then mended
+
+
+@pytest.mark.parametrize('size', [0.25, 1, 10, 3600])
+def test_a_clock_that_is_set_where_a_recorder_splits_its_bag_cuts_nothing(size):
+    for marks in (False, True):
+        good = record(np.random.default_rng(1), 10, 1, marks=marks)
+        numbers, table, _ = good.read()
+        half, bad = good.rows('frame')[23], good.spoilt(lambda *_: None, None)
+        bad.log[half:] -= int(size * SECOND)
+        bad.stamp[half:] -= int(size * SECOND)
+        files = [bad.columns(slice(None, half), 'a/demo_0.mcap'),
+                 bad.columns(slice(half, None), 'a/demo_1.mcap')]
+        (run,) = runs_of(files)
+        for part, first in zip(run, (0, 23)):
+            part.arrays['frame'][:, 3] -= first
+        found, read_table, told = bad.read(*run)
+        assert found == [[*range(23), *range(len(numbers[0]) - 23)]]
+        assert (read_table.actions != table.actions).any(1).sum() <= NEAR
+        assert len(told) == 1 and f'back by {size:.2f} s' in told[0]
+        files[1].source = 'a/other.mcap'
+        assert len(runs_of(files)) == 2
+
+
+def test_a_long_recording_takes_well_under_a_second():
+    random = np.random.default_rng(0)
+    good = record(random, 30, 2, 10_000)
+    good.rate = 30
+    for bag in (good, good.spoilt(set_clock(CAMERA, -1), random),
+                good.spoilt(set_clock(ALL, -1, logs=True), random)):
+        parts, _, _ = join([bag.columns()])
+        begin = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            clocks.put_right(parts, 'bag', {}, np.empty((0, 2), np.int64))
+        assert time.process_time() - begin < 1
+
+
+def test_bags_are_read_so_with_the_cache_and_a_rate(tmp_path):
+    times = 1.7e9 + np.arange(40) * 0.1 + np.repeat([0, 12], 20)
+    for number, (stamps, count) in enumerate((
+            (np.floor(times), 1), (np.full(40, 5.0), 1), (times, 0),
+            (np.where(np.arange(40) < 6, times - 1.7e9, times), 1))):
+        bag = record_bag(tmp_path / str(number), [
+            camera(stamp, i, log + 0.02) for i, (stamp, log) in enumerate(zip(stamps, times))])
+        found, told = read(bag)
+        assert [e.frames[:, 0, 0, 0].tolist() for e in found] == [[*range(20)], [*range(20, 40)]]
+        assert len(told) == count and all('topic /camera/image_raw' in text for text in told)
+        found, _ = read(bag, reading=Reading(rate=5))
+        assert [len(episode) for episode in found] in ([10, 10], [11, 10])
+    again = np.repeat(times[::2], 2)
+    found, told = read(record_bag(tmp_path / 'again', [
+        camera(t, round(t * 10) % 256, t + 0.02 * (1 + i % 2)) for i, t in enumerate(again)]))
+    assert [len(episode) for episode in found] == [10, 10] and not told  # each picture once

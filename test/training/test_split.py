@@ -29,8 +29,10 @@ class Store:
         return len(self._seeds)
 
     def __getitem__(self, i):
-        return SimpleNamespace(task=self.task[i], seed=self._seeds[i],
-                               stamps=10 * self._times[i] + np.arange(9))
+        return SimpleNamespace(task=self.task[i], seed=self._seeds[i])
+
+    def seen(self, i):
+        return 10 * self._times[i], 10 * self._times[i] + 8
 
     def source(self, i):
         return Path('bag/bag_0.mcap')
