@@ -29,7 +29,7 @@ class Store:
         return len(self._seeds)
 
     def __getitem__(self, i):
-        return SimpleNamespace(task=self.task[i], seed=self._seeds[i])
+        return SimpleNamespace(task=self.task[i], seed=self._seeds[i], stamps=self.seen(i))
 
     def seen(self, i):
         return 10 * self._times[i], 10 * self._times[i] + 8
