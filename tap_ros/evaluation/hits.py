@@ -11,6 +11,7 @@ from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
 from tap_ros.prediction.marks import chance, features_of, Marks
 from tap_ros.prediction.preference import FEATURES, Preference
 from tap_ros.recording.cache import EpisodeStore
+from tap_ros.text import listing
 from tap_ros.training.robot_mask import trained_robot_mask
 
 _SPEED = FEATURES.index('speed')
@@ -31,8 +32,9 @@ def score_hits(store: EpisodeStore, marks: Marks, episodes: Sequence[int] | np.n
     """
     rows = [row for row, i in enumerate(episodes) if int(i) in marks.episodes]
     if not rows:
-        raise ConfigError('marks: none of the episodes that are scored is marked; mark some that '
-                          'training held out, or give --all')
+        raise ConfigError(
+            'marks: none of the episodes that are scored is marked; mark some of them, numbers '
+            f'{listing(episodes)} in the order of the recordings, or give --all')
     learned = training.get('marks') or {}
     preferences = [Preference.from_json(one) for one in learned.get('preferences', [])[:1]]
     names = ['prediction', *['preference alone'] * len(preferences), 'slowest', 'middle']

@@ -71,7 +71,7 @@ def test_a_run_leaves_a_number_for_every_held_out_episode(places, small):
     for method in ('prediction', 'copy-start', 'copy-goal'):
         assert {name: len(values) for name, values in scores[method].items()} == dict.fromkeys(
             ('min_l1', 'match_step', 'match_fraction', 'changed_l1', 'bottleneck',
-             'object_mass', 'hand', 'objects'), held_out)
+             'object_mass', 'hand', 'objects', 'copying'), held_out)
     for name, count in {'arm_elsewhere': held_out, **dict.fromkeys(SHIFTED, EPISODES)}.items():
         for method in ('prediction', 'copy-goal'):
             assert len(scores['shifted'][name][method]['min_l1']) == count

@@ -39,6 +39,7 @@ function open(i) {
   episode = i;
   const length = state.lengths[i];
   at('slider').max = length - 1;
+  at('number').value = i;
   at('start').src = picture(0);
   at('goal').src = picture(length - 1);
   const count = Math.min(THUMBNAILS, length);
@@ -81,7 +82,7 @@ document.addEventListener('keydown', (event) => {
   const step = event.shiftKey ? 5 : 1;
   const action = {ArrowLeft: () => show(frame - step), ArrowRight: () => show(frame + step),
     Enter: mark, n: next, p: previous}[event.key];
-  if (!state || !action || event.ctrlKey || event.altKey || event.metaKey) return;
+  if (!state || !action || event.target === at('number') || event.ctrlKey || event.altKey || event.metaKey) return;
   event.preventDefault();
   action();
 });
@@ -89,6 +90,11 @@ at('slider').oninput = () => show(Number(at('slider').value));
 at('now').onclick = at('mark').onclick = mark;
 at('next').onclick = next;
 at('previous').onclick = previous;
+at('number').onchange = () => {
+  const i = Number(at('number').value);
+  if (Number.isInteger(i) && i >= 0 && i < state.lengths.length) { seen.push(episode); open(i); }
+  at('number').blur();
+};
 
 (async () => {
   state = await (await fetch('state')).json();
