@@ -25,7 +25,7 @@ from tap_ros.planning.action_sequences import FULL, Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.hierarchy import Itinerary, Target
 from tap_ros.planning.mpc_inputs import Goal, Scene
-from tap_ros.planning.tracking import ObjectTracker
+from tap_ros.planning.tracking import ObjectTracker, Tracked
 from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
 from tap_ros.text import listing
 
@@ -114,7 +114,7 @@ class _State:
     first_step: int = 0  # of this round
     earlier: tuple[Target, ...] = ()  # subgoals passed in the rounds before
     switches: tuple[int, ...] = ()  # steps at which the targets after the first one began
-    tracked: tuple[np.ndarray, np.ndarray] | None = None  # ObjectTracker.memory
+    tracked: Tracked | None = None
 
 
 class Reach:
@@ -237,7 +237,7 @@ class Reach:
             assert first is not None and first.pixels is not None, 'an Aim comes first'
             self._tracker = ObjectTracker(
                 config.follower, first.image, first.gripper, first.pixels)
-            state = replace(state, tracked=self._tracker.memory)
+            state = replace(state, tracked=self._tracker.start)
         self._state = self._next = state
         self._sent_at = now
 
@@ -294,7 +294,8 @@ class Reach:
         config, itinerary = self._config, state.itinerary
         self._next = state
         # where the objects are
-        self.pixels = pixels = self._find_objects(seen, state)
+        pixels, tracked = self._find_objects(seen, state)
+        self.pixels = pixels
         self.distance = itinerary.targets[-1].distance(pixels)
         if self.distance <= config.reached:
             return End('reached', f'{self.distance:.1f} px from the goal, reached')
@@ -305,8 +306,7 @@ class Reach:
         before = len(state.switches) - len(state.earlier)
         stage = itinerary.stage(self.steps - state.first_step, pixels, before)
         self._next = state = replace(
-            state, switches=state.switches + (self.steps,) * (stage - before),
-            tracked=None if self._tracker is None else self._tracker.memory)
+            state, switches=state.switches + (self.steps,) * (stage - before), tracked=tracked)
         if (0 < stage == len(itinerary.targets) - 1 and state.round < config.rounds
                 and self.steps > state.first_step):
             assert self._first is not None
@@ -326,17 +326,17 @@ class Reach:
             known = self._tabulated = target, self._mpc.goal(**target.goal(pixels))
         return known[1]
 
-    def _find_objects(self, seen: Seen, state: _State) -> np.ndarray:
-        """Return where the objects are, (K, 2)."""
-        if self._tracker is None or state.tracked is None:
+    def _find_objects(self, seen: Seen, state: _State) -> tuple[np.ndarray, Tracked | None]:
+        """Return where the objects are, (K, 2), and what the next search for them needs."""
+        tracked, before = state.tracked, self._answered
+        if self._tracker is None or tracked is None:
             assert seen.pixels is not None, 'without a follower objects are looked for'
-            return seen.pixels
-        self._tracker.memory = state.tracked
-        if self._answered is None:
-            return self._tracker.pixels
-        before = self._answered
-        return self._tracker.update(
-            before.seen.image, before.seen.gripper, before.plan.action, seen.image, seen.gripper)
+            return seen.pixels, None
+        if before is not None:
+            tracked = self._tracker.update(
+                tracked, before.seen.image, before.seen.gripper, before.plan.action, seen.image,
+                seen.gripper)
+        return tracked[0], tracked
 
 
 def scene_change(first: Seen, seen: Seen) -> str:

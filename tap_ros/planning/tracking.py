@@ -18,6 +18,7 @@ import torch
 CELLS, CELL = 19, 0.012  # template: cells a side, metres each
 REACH = 0.036  # m, search radius around the expected place
 TURN = 0.35  # rad, most that an object turns in one control period
+Tracked = tuple[np.ndarray, np.ndarray]  # pixels (K, 2) float32, and how objects are turned, rad
 LEAST_SEEN = 0.25  # share of an object that has to be visible for a correction
 PULL = 0.02  # cost of being REACH away from the expected place, picture range 2
 
@@ -28,81 +29,73 @@ class ObjectTracker:
 
     :param image: (H, W, 3) uint8, the first picture; gripper (4,) in it.
     :param pixels: (K, 2) where the objects are in it.
+    :ivar start: Tracked, of the first picture.
     """
 
     def __init__(self, model: LearnedForwardModel, image: np.ndarray, gripper: np.ndarray,
                  pixels: np.ndarray) -> None:
         self._model = model
-        self.pixels = np.asarray(pixels, np.float32).copy()
+        pixels = np.asarray(pixels, np.float32).copy()
+        self.start: Tracked = pixels, np.zeros(len(pixels))
         device = model.table.device
         line = (torch.arange(CELLS, device=device) - (CELLS - 1) / 2) * CELL
         self._cells = torch.cartesian_prod(line, line).flip(-1)  # metres around an object
-        self._angles = np.zeros(len(self.pixels))
         with torch.inference_mode():
             picture, arm = self._prepare(image, gripper)
             objects = model.look(picture, arm).objects[:, 3:]
-            at = self._place(self._table(self.pixels), torch.zeros(len(self.pixels)))
+            at = self._place(self._table(pixels), torch.zeros(len(pixels)))
             layers = torch.cat([picture, objects * (1 - arm)], 1)
             templates = self._read(layers, at)  # (K, 4, cells)
         inside = (self._cells.norm(dim=1) <= CELL * CELLS / 2).float()
         self._templates, self._weights = templates[:, :3], templates[:, 3] * inside
 
-    @property
-    def memory(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the objects are and how they are turned; it may be set back."""
-        return self.pixels, self._angles.copy()
-
-    @memory.setter
-    def memory(self, memory: tuple[np.ndarray, np.ndarray]) -> None:
-        self.pixels, angles = memory
-        self._angles = angles.copy()
-
     @torch.inference_mode()
-    def update(self, before: np.ndarray, gripper_before: np.ndarray, action: np.ndarray,
-               after: np.ndarray, gripper: np.ndarray) -> np.ndarray:
+    def update(self, tracked: Tracked, before: np.ndarray, gripper_before: np.ndarray,
+               action: np.ndarray, after: np.ndarray, gripper: np.ndarray) -> Tracked:
         """
         Follow the objects through one action.
 
+        :param tracked: in the picture before.
         :param before: (H, W, 3) uint8, the picture that the action answered; gripper_before (4,).
         :param action: (4,) that was executed.
         :param after: (H, W, 3) uint8, the new picture; gripper (4,) in it.
-        :return: (K, 2) float32 pixels.
+        :return: Tracked in the new picture.
         """
-        model = self._model
+        model, pixels, angles = self._model, tracked[0], tracked[1].copy()
         device = model.table.device
         # predict: the maps move by the model's own flow
         hand = torch.as_tensor(gripper_before, device=device)[None]
         features = model.begin(to_float(before)[None].to(device), hand)
-        maps = model.table.seed_maps(torch.from_numpy(self.pixels).to(device))
+        maps = model.table.seed_maps(torch.from_numpy(pixels).to(device))
         moves = torch.as_tensor(np.asarray(action, np.float32), device=device)[None, None]
         carried, = model.carried_maps(features, hand, maps, moves)
         # differences only, so that blurring and cells do not add up over the steps
         table = model.table.pixels().flatten(0, 1)
         kept = carried[0].sum((-1, -2)) > 0  # else nobody knows where it went
         shift = (carried[0] - maps).flatten(1) @ table * kept[:, None]
-        expected = self.pixels + shift.cpu().numpy()
+        expected = pixels + shift.cpu().numpy()
         # correct: match what the objects looked like
         picture, arm = self._prepare(after, gripper)
         layers = torch.cat([picture, 1 - arm], 1)
         centres = self._table(expected)
         for k in range(len(expected)):
             moved = bool(np.linalg.norm(shift[k].cpu().numpy()) > 0.05)
-            centre, self._angles[k] = self._match(k, layers, centres[k], moved)
+            centre, angles[k] = self._match(k, layers, centres[k], float(angles[k]), moved)
             if centre is not None:
                 expected[k] = project(model.homography, centre[None]).cpu().numpy()[0]
-        self.pixels = expected.astype(np.float32)
-        return self.pixels
+        return expected.astype(np.float32), angles
 
-    def _match(self, k: int, layers: torch.Tensor, centre: torch.Tensor,
+    def _match(self, k: int, layers: torch.Tensor, centre: torch.Tensor, before: float,
                moved: bool) -> tuple[torch.Tensor | None, float]:
         """
         Search object k around a place, coarsely and then finely.
 
-        :param centre: (2,) metres, the expected place; moved: the model says that it was pushed.
+        :param centre: (2,) metres, the expected place; before: rad, how it was turned.
+        :param moved: the model says that it was pushed.
         :return: (2,) metres, or None when the object is hidden; its angle.
         """
         device = layers.device
-        best, angle = centre, self._angles[k]
+        best, angle = centre, before
         # what was not pushed may have been all the same, a little
         radius, turn = (REACH, TURN) if moved else (REACH / 2, TURN / 2)
         for _ in range(3):
@@ -120,7 +113,7 @@ class ObjectTracker:
             costs = costs.where(seen > LEAST_SEEN * self._weights[k].sum(), torch.inf)
             i = int(costs.argmin())
             if not torch.isfinite(costs[i]) or self._weights[k].sum() < 1:
-                return None, self._angles[k]
+                return None, before
             best, angle = places[i], float(angles[i])
             radius, turn = radius / 3, turn / 2
         return best, angle

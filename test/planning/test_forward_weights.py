@@ -50,8 +50,10 @@ def test_a_pushed_object_is_followed_better_than_by_the_model_alone(model):
         if tracker is None:
             first = before.object_pixels
             tracker = ObjectTracker(model, before.image, before.gripper, first)
-        found = tracker.update(before.image, before.gripper, action, seen.image, seen.gripper)
+            tracked = tracker.start
+        tracked = tracker.update(
+            tracked, before.image, before.gripper, action, seen.image, seen.gripper)
     simulator.close()
-    errors = np.linalg.norm(found - seen.object_pixels, axis=1)
+    errors = np.linalg.norm(tracked[0] - seen.object_pixels, axis=1)
     assert np.linalg.norm(first - seen.object_pixels, axis=1).max() > 4
     assert np.mean(errors) < 1.0 and np.max(errors) < 2.5
