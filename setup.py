@@ -31,7 +31,7 @@ setup(
     ],
     install_requires=['setuptools'],
     extras_require={  # what only some commands need; `colcon test` runs pytest because of the last
-        'tfrecord': ['google-crc32c', 'protobuf'],
+        'tfrecord': ['google-crc32c'],
         'explorer': ['websockets'],
         'hub': ['huggingface_hub'],
         'lerobot': ['pyarrow'],

@@ -109,15 +109,17 @@ def _fields(channel: Channel, data: memoryview) -> dict[str, Any]:
         found = json.loads(bytes(data))
         return found | {'data': base64.b64decode(found.get('data', ''))}
     if channel.encoding == 'protobuf':
+        raw, known = read_protobuf(data), dict[str, Any]()
         text, numbers = _FIELDS[name]
-        raw = _read_protobuf(data)
-        found = {line.split()[1]: (line.split()[0], raw[number]) for line, number in zip(
-            text.splitlines(), numbers) if number in raw}
-        found = {key: bytes(value).decode() if kind == 'string' else
-                 bytes(value) if kind == 'uint8[]' else value
-                 for key, (kind, value) in found.items()}
-        time = _read_protobuf(raw[1]) if 1 in raw else None
-        return found | {'timestamp': time and {'sec': time.get(1, 0), 'nanosec': time.get(2, 0)}}
+        for line, number in zip(text.splitlines(), numbers):
+            kind, key = line.split()
+            if number in raw:
+                value = raw[number][-1]
+                known[key] = value if kind == 'uint32' else (
+                    bytes(value) if kind == 'uint8[]' else str(value, 'utf-8'))
+        time = read_protobuf(raw[1][-1]) if 1 in raw else None
+        return known | {'timestamp': time and {
+            name: time.get(number, [0])[-1] for number, name in ((1, 'sec'), (2, 'nanosec'))}}
     kind = f'foxglove_msgs/msg/{name}' if name else channel.type_name
     _register()
     if channel.encoding == 'ros1':
@@ -136,9 +138,9 @@ def _register() -> None:
             typestore().register(get_types_from_msg(text, kind))
 
 
-def _read_protobuf(data: memoryview) -> dict[int, Any]:
+def read_protobuf(data: memoryview) -> dict[int, list[Any]]:
     """Return the fields of a message by number: integers, and views of what has a length."""
-    found: dict[int, Any] = {}
+    found: dict[int, list[Any]] = {}
     at = 0
 
     def varint() -> int:
@@ -158,6 +160,6 @@ def _read_protobuf(data: memoryview) -> dict[int, Any]:
         if size < 0 or at + size > len(data):
             raise ValueError('no protobuf message')
         part, at = data[at:at + size], at + size
-        found[key >> 3] = varint() if key & 7 == 0 else (
-            part if key & 7 == 2 else int.from_bytes(part, 'little'))
+        found.setdefault(key >> 3, []).append(varint() if key & 7 == 0 else (
+            part if key & 7 == 2 else int.from_bytes(part, 'little')))
     return found

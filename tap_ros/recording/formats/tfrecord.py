@@ -17,51 +17,20 @@ import math
 from pathlib import Path
 import re
 import struct
-from typing import Annotated, Any
+from typing import Annotated
 
-from google.protobuf import (
-    descriptor_pb2,
-    descriptor_pool,
-    message,
-    message_factory,
-    text_format,
-)
 import google_crc32c
 import numpy as np
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.images.encodings import decompress
 from tap_ros.options import default_text
+from tap_ros.recording.channels import read_protobuf
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.foreign import natural
 from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
 from tap_ros.text import escaped, listing
 from tyro import conf
 
-# The messages of tensorflow/core/example/{example,feature}.proto.
-_PROTO = """
-name: "tap_ros/example.proto" package: "tap_ros" syntax: "proto3"
-message_type { name: "BytesList"
-  field { name: "value" number: 1 type: TYPE_BYTES label: LABEL_REPEATED } }
-message_type { name: "FloatList"
-  field { name: "value" number: 1 type: TYPE_FLOAT label: LABEL_REPEATED } }
-message_type { name: "Int64List"
-  field { name: "value" number: 1 type: TYPE_INT64 label: LABEL_REPEATED } }
-message_type { name: "Feature" oneof_decl { name: "kind" }
-  field { name: "bytes_list" number: 1 type_name: ".tap_ros.BytesList" oneof_index: 0 }
-  field { name: "float_list" number: 2 type_name: ".tap_ros.FloatList" oneof_index: 0 }
-  field { name: "int64_list" number: 3 type_name: ".tap_ros.Int64List" oneof_index: 0 } }
-message_type { name: "Features"
-  nested_type { name: "FeatureEntry" options { map_entry: true }
-    field { name: "key" number: 1 type: TYPE_STRING label: LABEL_OPTIONAL }
-    field { name: "value" number: 2 type_name: ".tap_ros.Feature" label: LABEL_OPTIONAL } }
-  field { name: "feature" number: 1 type_name: ".tap_ros.Features.FeatureEntry"
-          label: LABEL_REPEATED } }
-message_type { name: "Example"
-  field { name: "features" number: 1 type_name: ".tap_ros.Features" } }
-"""
-_POOL = descriptor_pool.DescriptorPool()  # its own, so that TensorFlow may be loaded beside it
-_POOL.Add(text_format.Parse(_PROTO, descriptor_pb2.FileDescriptorProto()))
-_Example = message_factory.GetMessageClass(_POOL.FindMessageTypeByName('tap_ros.Example'))
 _FILES = b'\xff\xd8\xff', b'\x89PNG'  # JPEG, PNG
 
 
@@ -110,7 +79,7 @@ def run(args: Options) -> None:
                         raise ValueError('none of its pictures can be used')
                     is_blank = _is_blank(frames[0])
                     blank[is_blank] += 1
-                    said: Any = features.get('steps/language_instruction') or [b'']
+                    said = features.get('steps/language_instruction') or [b'']
                     if not is_blank:
                         yield make_episode(
                             list(map(args.cut.image, frames)), np.array(rows) / args.fps,
@@ -121,10 +90,10 @@ def run(args: Options) -> None:
         print(f'left out: {blank[True]} episodes whose pictures of it are of one colour')
 
 
-def _choose(features: dict[str, Any], camera: str) -> str:
+def _choose(features: dict[str, list[bytes]], camera: str) -> str:
     """Return the camera whose pictures are taken, with the number of steps in a batch."""
-    names = {match[1] or match[2] for name, value in features.items() if isinstance(value, list)
-             and (match := re.fullmatch(r'steps/observation/(.+)|0/(.+)/encoded', name))
+    names = {match[1] or match[2] for name, value in features.items()
+             if (match := re.fullmatch(r'steps/observation/(.+)|0/(.+)/encoded', name))
              and _is_picture(value[0] if value else b'')}
     if camera in names:
         return camera
@@ -142,7 +111,7 @@ def _choose(features: dict[str, Any], camera: str) -> str:
     return (seen or found)[0]
 
 
-def _pictures(features: dict[str, Any], camera: str) -> list[bytes]:
+def _pictures(features: dict[str, list[bytes]], camera: str) -> list[bytes]:
     """Return the encoded pictures of an episode."""
     together = features.get(f'steps/observation/{camera}')
     if together is None:
@@ -199,25 +168,21 @@ def read_records(path: Path, lacking: Lacking) -> Iterator[tuple[int, bytes]]:
             number += 1
 
 
-def parse_example(data: bytes) -> dict[str, list[bytes] | np.ndarray]:
+def parse_example(data: bytes) -> dict[str, list[bytes]]:
     """
     Decode one tf.train.Example (or the context of a tf.train.SequenceExample).
 
     :param data: bytes of the message.
-    :return: dict from names to lists of bytes, float32 arrays or int64 arrays.
-    :raises RecordingError: when the bytes are no such message.
+    :return: dict from names to lists of bytes; empty lists of features that hold numbers.
+    :raises ValueError: when the bytes are no such message.
     """
-    try:
-        example = _Example.FromString(data)
-    except message.DecodeError as error:
-        raise RecordingError('holds no tf.train.Example') from error
-    features = {}
-    for name, feature in example.features.feature.items():
-        kind = feature.WhichOneof('kind')
-        values = getattr(feature, kind).value if kind else []
-        dtype = {'float_list': np.float32, 'int64_list': np.int64}.get(kind)
-        features[name] = np.array(values, dtype) if dtype else list(values)
-    return features
+    found = {}
+    for features in read_protobuf(memoryview(data)).get(1, []):
+        for entry in map(read_protobuf, read_protobuf(features).get(1, [])):
+            lists = [one for value in entry.get(2, []) for one in read_protobuf(value).get(1, [])]
+            found[str(entry[1][0], 'utf-8')] = [
+                bytes(value) for one in lists for value in read_protobuf(one).get(1, [])]
+    return found
 
 
 def _masked_crc(data: bytes) -> int:
