@@ -14,7 +14,7 @@ from tap_ros.messages.topics import COMPRESSED_TYPE
 from tap_ros.recording.channels import Channel, is_packets, packet, PICTURES
 from tap_ros.recording.copies import PACKED
 from tap_ros.recording.mcap_file import McapFile
-from tap_ros.recording.metadata import bag_files, FILE_NAME
+from tap_ros.recording.metadata import bag_files, FILE_NAME, natural
 from tap_ros.recording.other_bags import Ros1File, SqliteFile
 from tap_ros.text import escaped, listing
 import zstandard
@@ -105,11 +105,6 @@ def open_file(path: str | Path) -> McapFile:
     start = _start(Path(path))
     kind = next((kind for magic, kind in _BAGS.items() if start.startswith(magic)), McapFile)
     return kind(path)
-
-
-def natural(path: Path) -> list[int | str]:
-    """Return what sorts part_10 behind part_2."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', str(path))]
 
 
 def _bag(path: Path) -> list[Path] | None:

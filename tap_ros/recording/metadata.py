@@ -96,11 +96,16 @@ def save(folder: str | Path, files: Sequence[dict[str, Any]]) -> None:
     write_atomically(Path(folder, FILE_NAME), to_yaml({_KEY: bag_information(files)}))
 
 
+def natural(path: Path) -> list[int | str]:
+    """Return what sorts part_10 behind part_2."""
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', str(path))]
+
+
 def files_by_number(folder: str | Path) -> list[Path]:
     """Return the .mcap files of a folder in the order of the numbers in their names."""
     found = {path.name.removesuffix(PACKED): path for kind in ('*.mcap' + PACKED, '*.mcap')
              for path in Path(folder).glob(kind)}
-    return sorted(found.values(), key=_natural)
+    return sorted(found.values(), key=natural)
 
 
 def bag_files(folder: str | Path) -> list[Path]:
@@ -165,11 +170,6 @@ def qos_from_text(text: str) -> list[Any]:
     except _UNUSABLE:
         return []
     return profiles if isinstance(profiles, list) else []
-
-
-def _natural(path: Path) -> list[int | str]:
-    """Sort push2_10 behind push2_2."""
-    return [int(p) if p.isdigit() else p for p in re.split(r'(\d+)', path.name)]
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,7 @@ def spoil(folder, number=3):
      "garbles 'features'", 0),
     ('meta/episodes/chunk-000/file-000.parquet', lambda file: file.unlink(), 'no episode', 0),
     ('data/chunk-000/file-000.parquet', lambda file: file.unlink(),
-     '12 episodes: .*file-000.parquet: cannot be read.* 2 and 9 more', 8),
+     '12 episodes: .*file-000.parquet is not there.* 2 and 9 more', 8),
     ('data/chunk-000/file-001.parquet', lambda file: file.write_bytes(file.read_bytes()[:5000]),
      '8 episodes: .*file-001.parquet: cannot be read', 12),
     ('', spoil, "picture 3 of episode 0: format 'unknown' cannot be used", 20)])

@@ -320,6 +320,8 @@ def _read_parquet(path: Path) -> Any:
     """Read a table."""
     import pyarrow
     from pyarrow import parquet
+    if not path.is_file():
+        raise RecordingError(f'{escaped(path)} is not there')
     try:
         return parquet.ParquetFile(path).read()
     except (OSError, pyarrow.ArrowException) as error:

@@ -26,7 +26,8 @@ from tap_ros.options import default_text, Folder, Topic
 from tap_ros.recording.bags import find_bags
 from tap_ros.recording.damage import describe, Loss
 from tap_ros.recording.episode import Episode, RecordingWarning
-from tap_ros.recording.foreign import natural, video_packets, VIDEOS
+from tap_ros.recording.foreign import video_packets, VIDEOS
+from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading_options import Part
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 from tap_ros.text import escaped, listing

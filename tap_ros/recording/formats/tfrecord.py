@@ -26,8 +26,8 @@ from tap_ros.images.encodings import decompress
 from tap_ros.options import default_text
 from tap_ros.recording.channels import read_protobuf
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.foreign import natural
 from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
+from tap_ros.recording.metadata import natural
 from tap_ros.text import escaped, listing
 from tyro import conf
 
