@@ -43,7 +43,8 @@ def random_message(type_name, random):
 def plain(value):
     """Return a message as random_message makes it."""
     if hasattr(value, '__dataclass_fields__'):
-        return {name: plain(each) for name, each in vars(value).items() if name.islower() and name[0] != '_'}
+        return {name: plain(each) for name, each in vars(value).items()
+                if name.islower() and name[0] != '_'}
     return [plain(each) for each in value] if isinstance(value, (list, np.ndarray)) else value
 
 
