@@ -56,7 +56,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'predict': ('predict subgoals from picture files', 'tap_ros.prediction.predict_command'),
     'call': ('ask a running predictor node', 'tap_ros.nodes.call_command'),
     'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
-    'worlds': ("collect other simulators' demonstrations and score keyframes on them",
+    'worlds': ("collect other simulators' demonstrations and score who finds their bottlenecks",
                'experiments.worlds.command'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo.command'),

@@ -1,14 +1,19 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `python -m tap_ros worlds`: foreign bags, and keyframes scored by their truth."""
+"""
+The command `python -m tap_ros worlds`: who finds the bottleneck in demonstrations of others.
+
+Demonstrations of other simulators, keyframes of them, and predictors trained on them.
+"""
 
 from dataclasses import dataclass
 import json
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import cv2
 from experiments.pages import render
-from experiments.worlds import keyframes
+from experiments.worlds.trained import METHODS, place_marks, SETTINGS, train_all, write_marks
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
@@ -18,14 +23,17 @@ from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
 from tap_ros.files import write_atomically
 from tap_ros.images.drawing import grid
 from tap_ros.options import Flag, Folder
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.prediction.marks import read_marks
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.reading import Reading
+from tap_ros.training.split import split_episodes
 
+Method = Literal['fix', 'over time', 'relative', 'progress', 'marks']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
          'metaworld/window-open-v3', 'metaworld/drawer-open-v3',
          'metaworld/button-press-topdown-v3', 'ogbench/button', 'ogbench/cube', 'ogbench/drawer',
          'ogbench/window')
-HELD_OUT, MARKED = 40, 12  # demonstrations that are scored, the last ones; and marked, the first
-SIZE = 64  # px, of the pictures that keyframes are chosen by
+MARKED = 12  # demonstrations
 STRIPS = 6  # demonstrations that are drawn, of each task
 
 
@@ -38,7 +46,10 @@ class Options:
     :param episodes: demonstrations of each task.
     :param image_size: width and height in pixels, as recorded.
     :param seed: of the first demonstration.
+    :param methods: that are trained on each task, beside keyframes, which need no training.
+    :param seeds: trainings of each method.
     :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
+    :param runs: folder of the trainings, likewise.
     :param out: folder for worlds.json, worlds.md and worlds.png.
     :param results_only: collect nothing.
     """
@@ -47,7 +58,10 @@ class Options:
     episodes: int = 100
     image_size: int = 128
     seed: int = 0
+    methods: tuple[Method, ...] = tuple(METHODS)
+    seeds: int = 3
     bags: Folder = 'bags/worlds'
+    runs: Folder = 'runs/worlds'
     out: Folder = 'docs/results'
     results_only: Flag = False
     engine: Engine = Engine()
@@ -55,19 +69,21 @@ class Options:
 
 def run(args):
     """Collect, draw strips of the bottlenecks, score keyframes, write what they hit."""
-    rows, strips = [], []
+    rows, folders, strips = [], {}, []
     for name in args.tasks:
         world, _, task = name.partition('/')
-        folder = Path(args.bags, world, task)
+        folders[name] = folder = Path(args.bags, world, task)
         if not args.results_only:
             collect(folder, CollectConfig(
                 world=world, task=task, episodes=args.episodes, seed=args.seed,
                 image_size=args.image_size, episodes_per_file=10), args.engine)
-        demonstrations = read(folder)
-        drawn = [strip(*one) for one in demonstrations[:STRIPS]]
+        training, held_out = read(folder)
+        drawn = [strip(one) for one in held_out[:STRIPS]]
         cv2.imwrite(str(folder / 'bottlenecks.png'), grid(drawn)[..., ::-1])
         strips += drawn[:1]
-        rows += [{'world': world, 'task': task, **row} for row in score(demonstrations, args.seed)]
+        write_marks(folder, training[:MARKED], args.seed)
+        rows += [{'task': name, **row} for row in score(training[:MARKED], held_out, args.seed)]
+    rows += average(train_all(folders, args.methods, args.seeds, args.runs, args.engine))
     out = Path(args.out)
     write_atomically(out / 'worlds.json', '[' + ',\n'.join(map(json.dumps, rows)) + ']\n')
     write_atomically(out / 'worlds.md', page(rows))
@@ -75,59 +91,63 @@ def run(args):
     print(out / 'worlds.md')
 
 
+class Demonstration(NamedTuple):
+    """A demonstration whose bottleneck is known."""
+
+    frames: np.ndarray  # (T, H, W, 3) uint8
+    window: tuple[int, int]  # first and last frame of the bottleneck
+    stamps: np.ndarray = np.empty(0)  # (T,) int64, ns
+    number: int = 0  # in its bag
+
+
 def read(folder):
     """
     Read a bag and its true bottlenecks.
 
-    :return: list of (frames (T, H, W, 3), first and last frame of the bottleneck).
+    :return: two lists of Demonstrations, those that are trained on and those that are held out.
     :raises ConfigError: if they are not known.
     """
     path = Path(folder, BOTTLENECKS_FILE)
     if not path.exists():
         raise ConfigError(f'{path}: is not there; collect it by a world that knows bottlenecks')
-    known = {mark['episode']: np.array(mark['stamps'][0])
-             for mark in json.loads(path.read_text())['marks']}
-    found = []
-    for i, episode in enumerate(iter_episodes(folder)):
-        if i in known and episode.outcome == 'success':
-            window = np.searchsorted(episode.stamps, np.rint(1e9 * known[i]).astype(np.int64))
-            found.append((episode.frames, tuple(window.tolist())))
-    return found
+    store = open_recordings([folder], reading=Reading(size=SETTINGS['size']))
+    truth = read_marks(path, store).episodes
+    return [[Demonstration(store[i].frames, truth[i][0], store[i].stamps, i)
+             for i in part.tolist() if i in truth]
+            for part in split_episodes(store, SETTINGS['test_fraction'])]
 
 
-def strip(frames, window):
+def strip(one):
     """Return the start, the bottleneck's first, middle and last frame, and the goal."""
-    return [frames[i] for i in (0, window[0], sum(window) // 2, window[1], -1)]
+    first, last = one.window
+    return [one.frames[i] for i in (0, first, (first + last) // 2, last, -1)]
 
 
-def score(demonstrations, seed=0):
+def score(marked, held_out, seed=0):
     """
     Score keyframes.
 
-    :param demonstrations: as read returns them.
-    :param seed: of the frame by which each mark is off: -1, 0 or 1.
+    :param marked: Demonstrations that are marked.
+    :param held_out: Demonstrations that are scored.
+    :param seed: of the frame by which each mark is off, as in write_marks.
     :return: list of dicts: method, hit and near (at most a frame beside the bottleneck), each
         with value, low and high, n, and the mean frames of bottlenecks and demonstrations.
     """
-    small = [(np.stack([cv2.resize(frame, (SIZE, SIZE), interpolation=cv2.INTER_AREA)
-                        for frame in frames]), window) for frames, window in demonstrations]
-    marked, held_out = small[:MARKED], small[-HELD_OUT:]
-    off = np.random.default_rng(seed).integers(-1, 2, len(marked))
-    marks = [int(np.clip(sum(window) // 2 + by, 0, len(frames) - 1))
-             for (frames, window), by in zip(marked, off)]
+    from experiments.worlds import keyframes
     methods = {
         'middle': keyframes.middle, 'slowest': keyframes.slowest, 'UVD-like': keyframes.uvd,
-        f'{MARKED} marks': keyframes.from_marks([frames for frames, _ in marked], marks)}
-    length = float(np.mean([last - first + 1 for _, (first, last) in held_out]))
+        f'{len(marked)} marks': keyframes.from_marks(
+            [one.frames for one in marked], place_marks(marked, seed))}
+    length = float(np.mean([last - first + 1 for _, (first, last), *_ in held_out]))
     rows = []
     for name, choose in {'random': None, **methods}.items():
         found = {'hit': 0, 'near': 1}
         for key, beside in found.items():
             found[key] = _random(held_out, beside) if choose is None else share_interval([
                 first - beside <= choose(frames) <= last + beside
-                for frames, (first, last) in held_out])
+                for frames, (first, last), *_ in held_out])
         rows.append({'method': name, 'n': len(held_out), 'bottleneck_frames': length,
-                     'frames': float(np.mean([len(frames) for frames, _ in held_out])),
+                     'frames': float(np.mean([len(one.frames) for one in held_out])),
                      **{key: Interval(*map(float, value))._asdict()
                         for key, value in found.items()}})
     return rows
@@ -137,18 +157,38 @@ def _random(demonstrations, beside):
     """Return how often any frame between start and goal hits."""
     return mean_interval([
         np.mean([first - beside <= t <= last + beside for t in range(1, len(frames) - 1)])
-        for frames, (first, last) in demonstrations])
+        for frames, (first, last), *_ in demonstrations])
+
+
+def average(rows):
+    """Average over the seeds of each task and method, with intervals over the episodes."""
+    found = []
+    for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
+        same = [row for row in rows if (row['task'], row['method']) == (task, method)]
+        found.append({'task': task, 'method': method, 'n': len(same[0]['hit']),
+                      'seeds': len(same), **{
+                          key: Interval(*map(float, mean_interval(np.mean(
+                              [row[key] for row in same], axis=0))))._asdict()
+                          for key in ('hit', 'near')}})
+    return found
 
 
 def page(rows):
     """Write the page of the results, a line for each task."""
-    lines = {}
+    shared, tables = {}, [{}, {}]  # of keyframes, and of trainings
     for row in rows:
-        line = lines.setdefault((row['world'], row['task']), {
-            'task': f"{row['world']} {row['task']}",
-            'frames': f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f} of the bottleneck"})
+        trained = 'seeds' in row
+        if not trained:
+            shared[row['task']] = (f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f} of the "
+                                   'bottleneck')
+        line = tables[trained].setdefault(
+            row['task'], {'task': row['task'].replace('/', ' '), 'frames': shared[row['task']]})
         hit, near = row['hit'], row['near']
         line[row['method']] = (f"{hit['value']:.0%} ({100 * hit['low']:.0f} to "
                                f"{100 * hit['high']:.0f}), {near['value']:.0%}")
-    return render('worlds/templates/worlds.md.j2', n=rows[0]['n'], marked=MARKED,
-                  table=pd.DataFrame(list(lines.values())))
+    keyframes, trained = (pd.DataFrame(list(lines.values())) for lines in tables)
+    counts = sorted({row['n'] for row in rows})
+    return render('worlds/templates/worlds.md.j2', marked=MARKED,
+                  n=' to '.join(map(str, dict.fromkeys((counts[0], counts[-1])))),
+                  seeds=rows[-1].get('seeds', 0), steps=SETTINGS['steps'],
+                  batch=SETTINGS['batch_size'], keyframes=keyframes, trained=trained)

@@ -34,13 +34,17 @@ def test_the_last_subgoal_is_where_the_way_turns_to_the_goal():
 
 
 def test_scores_are_shares_of_the_demonstrations_with_their_intervals():
-    rows = {row['method']: row for row in command.score(50 * [(REST, (7, 8))])}
+    shown = 40 * [command.Demonstration(REST, (7, 8))]
+    rows = {row['method']: row for row in command.score(shown[:12], shown)}
     assert rows['random']['hit']['value'] == pytest.approx(2 / 14)
     assert rows['slowest']['hit']['value'] == rows['12 marks']['near']['value'] == 1
     assert rows['UVD-like']['hit'] | {'low': 0} == {'value': 0, 'low': 0, 'high': pytest.approx(
-        0.0876, abs=1e-3)} and rows['slowest']['n'] == command.HELD_OUT
-    page = command.page([row | {'world': 'a', 'task': 'b'} for row in rows.values()])
+        0.0876, abs=1e-3)} and rows['slowest']['n'] == 40
+    rows = [row | {'task': 'a/b'} for row in rows.values()]
+    runs = [{'task': 'a/b', 'method': 'marks', 'hit': [1, 0], 'near': [1, by]} for by in (0, 1)]
+    page = command.page(rows + command.average(runs))
     assert '| a b | 16, 2.0 of the bottleneck | 14% (14 to 14), 29% | 100% (91 to 100)' in page
+    assert '2 seeds' in page and '50% (0 to 100), 75%' in page
 
 
 def test_bottlenecks_are_read_by_their_stamps(tmp_path):
@@ -51,5 +55,6 @@ def test_bottlenecks_are_read_by_their_stamps(tmp_path):
     stamps = [list(episode.stamps / 1e9) for episode in iter_episodes(tmp_path / 'bag')]
     (tmp_path / 'bag' / 'bottlenecks.json').write_text(json.dumps(
         {'marks': [{'recording': '.', 'episode': 1, 'stamps': [[stamps[1][2], stamps[1][4]]]}]}))
-    (frames, window), = command.read(tmp_path / 'bag')
-    assert len(frames) == 7 and window == (2, 4)
+    found, = sum(command.read(tmp_path / 'bag'), [])
+    assert len(found.frames) == 7 and (found.window, found.number) == ((2, 4), 1)
+    assert found.frames.shape[1:] == (64, 64, 3)

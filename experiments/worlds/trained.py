@@ -1,0 +1,98 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Predictors trained on the demonstrations of a foreign task, and which frames they match."""
+
+from contextlib import redirect_stderr
+import json
+from pathlib import Path
+
+import numpy as np
+from tap_ros.engines import run_tasks, Work
+from tap_ros.files import write_atomically
+from tqdm import tqdm
+
+MARKS = 'marks.json'  # those that a person would have made
+# A name in tables: settings beside those that all have.
+METHODS = {
+    'fix': {'loss': 'fix'},
+    'over time': {'selection': 'absolute'},
+    'relative': {'selection': 'relative', 'progress_margin': 0.0},
+    'progress': {},
+    'marks': {'selection': 'marks', 'progress_margin': 0.0},
+}
+SETTINGS = {'steps': 400, 'batch_size': 8, 'size': 64, 'threads': 1, 'save_every': 10 ** 6,
+            'test_fraction': 0.3}
+
+
+def place_marks(demonstrations, seed):
+    """Return a frame each: the middle of its bottleneck, off by -1, 0 or 1."""
+    rng = np.random.default_rng(seed)
+    return [int(np.clip(sum(one.window) // 2 + rng.integers(-1, 2), 1, len(one.frames) - 2))
+            for one in demonstrations]
+
+
+def write_marks(folder, demonstrations, seed):
+    """
+    Mark demonstrations as a person would, see place_marks.
+
+    :param folder: of the bag; the file lies in it.
+    :param demonstrations: list of command.Demonstrations.
+    """
+    lines = [json.dumps({'recording': '.', 'episode': one.number,
+                         'stamps': [float(one.stamps[t]) / 1e9]})
+             for one, t in zip(demonstrations, place_marks(demonstrations, seed))]
+    write_atomically(Path(folder, MARKS), '{"marks": [\n' + ',\n'.join(lines) + '\n]}\n')
+
+
+def train_all(folders, methods, seeds, out, engine):
+    """
+    Train and score all methods on all bags; what is scored already is not done again.
+
+    :param folders: by the names of tasks.
+    :param seeds: how many trainings of each method.
+    :param out: folder of the runs.
+    :return: list of dicts: task, method, seed, and hit, near: lists of 0 and 1, an episode each.
+    """
+    work = [Work(f'{task}/{method}/{seed}', train_and_score, (
+                str(folder), method, seed, str(Path(out, task, f'{method}_{seed}'))))
+            for seed in range(seeds) for task, folder in folders.items() for method in methods]
+    rows = []
+    with tqdm(total=len(work), unit='training') as bar:
+        for task, get in run_tasks(work, engine):
+            name, method, number = task.name.rsplit('/', 2)
+            rows.append({'task': name, 'method': method, 'seed': int(number), **get()})
+            bar.update()
+    return rows
+
+
+def train_and_score(folder, method, seed, out):
+    """Train a predictor; return which held-out episodes it hits, exactly and within a frame."""
+    from sim_bridge.collect import BOTTLENECKS_FILE
+    from tap_ros.evaluation.prediction import evaluate
+    from tap_ros.prediction.marks import read_marks
+    from tap_ros.prediction.predictor import load_network
+    from tap_ros.recording.bags import reading_like
+    from tap_ros.recording.cache import open_recordings
+    from tap_ros.training.split import split_episodes
+    from tap_ros.training.train import train
+    import torch
+    path = Path(out, 'hits.json')
+    if path.exists():
+        return json.loads(path.read_text())
+    torch.set_num_threads(1)
+    marks = {'marks': str(Path(folder, MARKS))} if method == 'marks' else {}
+    Path(out).mkdir(parents=True, exist_ok=True)
+    with open(Path(out, 'log.txt'), 'a') as log, redirect_stderr(log):
+        weights = train(folder, out, seed=seed, **SETTINGS, **METHODS[method], **marks)
+    network, training = load_network(weights)
+    store = open_recordings([folder], reading=reading_like(training, [folder], ''))
+    _, episodes = split_episodes(store, SETTINGS['test_fraction'])
+    truth = read_marks(Path(folder, BOTTLENECKS_FILE), store).episodes
+    known = np.array([i for i in episodes if int(i) in truth])
+    matched = evaluate(network, store, known)['prediction'].match_step
+    windows = [truth[int(i)][0] for i in known]
+    scores = {name: [int(first - beside <= t <= last + beside)
+                     for t, (first, last) in zip(matched, windows)]
+              for name, beside in (('hit', 0), ('near', 1))}
+    write_atomically(path, json.dumps(scores) + '\n')
+    return scores
