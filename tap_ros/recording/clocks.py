@@ -93,8 +93,8 @@ def _one_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
     _one_by_one(tracks, said)
     for name in sorted(_STREAMS, key=lambda name: -len(tracks[name])):  # the densest sees it best
         for i, amount in reversed(set_places(tracks[name].log)):
-            place = int(tracks[name].order[i])
-            if any(_went_on(track, place, amount) for track in tracks.values()):
+            before, place = tracks[name].order[i - 1:i + 1].tolist()
+            if any(_went_on(track, before, place, amount) for track in tracks.values()):
                 continue
             free = [change for track in tracks.values() if not _followed(track, place, amount)
                     and (change := _offset_change(track, place)) is not None]
@@ -150,15 +150,16 @@ def _place(track: Track, times: np.ndarray, place: int, amount: int) -> int:
     return first + own + 1 if jumps and unlike[own] < abs(amount) / 2 else i
 
 
-def _went_on(track: Track, place: int, amount: int) -> bool:
-    """Tell whether log times of a topic show that the clock was not set at a place."""
-    i = int(np.searchsorted(track.order, place))
-    near = track.log[max(i - _NEAR, 0):i + _NEAR]
-    if not 1 < i < len(track) - 1:
+def _went_on(track: Track, before: int, place: int, amount: int) -> bool:
+    """Tell whether log times of a topic show that the clock was not set before a place."""
+    first, i = np.searchsorted(track.order, (before, place)).tolist()
+    if not 1 < first <= i < len(track) - 1:
         return False
-    steps = np.diff(near) * np.sign(amount)
+    steps = np.diff(track.log[max(i - _NEAR, 0):i + _NEAR]) * np.sign(amount)
     usual = np.median(np.abs(steps))
-    return bool((steps - usual * np.sign(amount)).max() < abs(amount) / 2 > usual)
+    pause = np.diff(track.log[first - 1:i + 1]).max() - usual
+    return bool(pause < abs(amount) / 2 > usual and (
+        steps - usual * np.sign(amount)).max() < abs(amount) / 2)
 
 
 def _offset_change(track: Track, place: int) -> float | None:
@@ -382,9 +383,10 @@ def _apart(track: Track, frame: Track, name: str) -> np.ndarray:
         track.log - frame.log[after]), from_before, from_after)
     for rows in np.split(np.arange(len(inside)), np.flatnonzero(np.diff(off)) + 1):
         if off[rows[0]] and len(rows) > PROOF:
-            at = inside[rows]
-            first = 0 if rows[0] == 0 else at[0]
-            last = len(track) if rows[-1] == len(inside) - 1 else at[-1] + 1
+            at = inside[rows]  # the clock was set in the middle of what nothing is known of
+            first = 0 if rows[0] == 0 else (inside[rows[0] - 1] + 1 + at[0]) // 2
+            last = len(track) if rows[-1] == len(inside) - 1 else (
+                inside[rows[-1] + 1] + 1 + at[-1]) // 2
             shift[first:last] = np.interp(np.arange(first, last), at, windows(
                 (track.stamp - nearest)[at], _SMOOTH)).astype(np.int64)
             if name == 'twist':

@@ -57,7 +57,8 @@ def set_places(times: np.ndarray) -> list[tuple[int, int]]:
         return []
     period = np.median(steps)
     least = max(LEAST_NS, 4 * np.median(np.abs(steps - period)))
-    rough = (steps <= 0) & (np.abs(steps - period) > least)
+    stands = np.append(False, steps[:-1] == 0) | np.append(steps[1:] == 0, False)
+    rough = (steps <= 0) & (np.abs(steps - period) > least) & ~((steps == 0) & stands)
     found: list[tuple[int, int]] = []
     times = times.copy()
     places = np.flatnonzero(rough | (steps > YEARS_NS)) + 1
@@ -76,7 +77,7 @@ def without_bogus(times: np.ndarray, least: int = _BOGUS_NS) -> np.ndarray:
 
     :param least: ns; they are so far away.
     """
-    wrong = _bogus(times, times - windows(times, 2 * _FEW + 1), least)
+    wrong = _bogus(times, times, least)
     wrong[:_FEW] = wrong[max(len(times) - _FEW, 0):] = False  # nothing tells on which side it is
     if not wrong.any():
         return times
@@ -123,8 +124,7 @@ def settle(stamp: np.ndarray, log: np.ndarray, valid: np.ndarray,
     shift, good = np.zeros(len(stamp), np.int64), valid.copy()
     for part in np.split(rows, begins):
         if len(part) > _FEW:
-            apart = offset[part] - windows(offset[part], 2 * _FEW + 1)
-            wrong = _bogus(stamp[part], apart, edges=ahead)
+            wrong = _bogus(stamp[part], offset[part], edges=ahead)
             good[part[wrong]] = False
             kept = part[~wrong]
             moved, jumps = _jumps(stamp[kept], log[kept], ahead)
@@ -147,28 +147,33 @@ def _comparable(steps: np.ndarray, moves: np.ndarray) -> bool:
     return bool(abs(passed - logged) <= 0.1 * passed + APART_NS)
 
 
-def _bogus(times: np.ndarray, apart: np.ndarray, least: int = _BOGUS_NS,
+def _bogus(times: np.ndarray, values: np.ndarray, least: int = _BOGUS_NS,
            edges: bool = False) -> np.ndarray:
     """
     Tell which messages (N,) are out of order and alone: a few, far from all around.
 
     :param times: (N,) int64, ns, in the order of writing.
-    :param apart: (N,) ns by which each differs from those around it.
-    :param least: ns that make it far.
+    :param values: (N,) likewise, of which those of messages near each other are alike.
+    :param least: ns that make them unlike.
     :param edges: the first and the last ones need not be out of order.
     """
-    far = np.abs(apart) > least
+    far = np.abs(values - windows(values, 2 * _FEW + 1)) > least
     wrong = np.zeros(len(times), bool)
     if not far.any():
         return wrong
+    least = max(least, 4 * int(np.median(np.abs(np.diff(values)))))
     turns = np.flatnonzero(np.diff(far, prepend=False, append=False))
     for begin, end in zip(turns[::2].tolist(), turns[1::2].tolist()):
+        around = [values[i] for i in (begin - 1, end) if 0 <= i < len(values)]
+        set_there = values is times and 0 < begin and end < len(times) and (
+            times[begin - 1] > times[end])
+        if not around or set_there:
+            continue
+        apart = np.min([np.abs(values[begin:end] - one) for one in around], 0)
+        alone = apart > (_EDGE_NS if len(around) < 2 and edges else least)
         back = (np.diff(times[max(begin - 1, 0):end + 1]) < 0).any()
-        edge = begin == 0 or end == len(times)
-        if not edge and times[begin - 1] > times[end]:
-            continue  # a clock was set there
-        edge = edge and edges and np.abs(apart[begin:end]).min() > _EDGE_NS
-        wrong[begin:end] = end - begin <= _FEW and (back or edge)
+        if alone.sum() <= _FEW and (back or len(around) < 2 and edges):
+            wrong[begin:end] = alone
     return wrong
 
 
