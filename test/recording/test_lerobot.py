@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """LeRobot data sets: what is exported comes back, and what others wrote can be read."""
 
+from itertools import islice
 import json
 import re
 import shutil
 
 import cv2
+from made_episodes import write_bag
 import numpy as np
 import pyarrow
 from pyarrow import parquet
@@ -17,39 +19,39 @@ from tap_ros.recording.formats import lerobot_export
 from tap_ros.recording.formats.lerobot import ACTION, CAMERA, OBJECTS, STATE
 from tap_ros.recording.reader import iter_episodes
 
-SAMPLE = 'bags/sample_push2'
-
 
 @pytest.fixture(scope='module')
 def truth():
-    return list(iter_episodes(SAMPLE))
+    return list(islice(iter_episodes('bags/sample_push2'), 6))
 
 
-def export(folder, *options):
-    """Export in several files."""
+def export(folder, episodes, *options):
+    """Export in files of four episodes."""
+    bag = write_bag(folder.with_name('bag'), episodes)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lerobot_export, 'EPISODES_PER_FILE', 12)
-        assert not main(['export-lerobot', '--recordings', SAMPLE, '--out', str(folder), *options])
+        patch.setattr(lerobot_export, 'EPISODES_PER_FILE', 4)
+        assert not main(['export-lerobot', '--recordings', str(bag), '--out', str(folder),
+                         *options])
     return folder
 
 
 @pytest.fixture(scope='module')
-def lossless(tmp_path_factory):
-    return export(tmp_path_factory.mktemp('sets') / 'png', '--lossless')
+def lossless(truth, tmp_path_factory):
+    return export(tmp_path_factory.mktemp('sets') / 'png', truth, '--lossless')
 
 
 @pytest.fixture(scope='module', params=['png', 'video'])
-def exported(request, lossless, tmp_path_factory):
+def exported(request, truth, lossless, tmp_path_factory):
     """Return (folder of a data set, largest mean error of its pictures)."""
     if request.param == 'png':
         return lossless, 0
-    return export(tmp_path_factory.mktemp('sets') / 'video'), 5
+    return export(tmp_path_factory.mktemp('sets') / 'video', truth), 5
 
 
 def test_what_is_exported_comes_back(exported, truth, tmp_path, capsys):
     folder, error = exported
     assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'bag')]) == 0
-    assert f'20 episodes, {sum(map(len, truth))} frames' in capsys.readouterr().out
+    assert f'6 episodes, {sum(map(len, truth))} frames' in capsys.readouterr().out
     found = list(iter_episodes(tmp_path / 'bag'))
     assert len(found) == len(truth)
     for new, old in zip(found, truth):
@@ -135,10 +137,10 @@ def spoil(folder, number=3):
      "garbles 'features'", 0),
     ('meta/episodes/chunk-000/file-000.parquet', lambda file: file.unlink(), 'no episode', 0),
     ('data/chunk-000/file-000.parquet', lambda file: file.unlink(),
-     '12 episodes: .*file-000.parquet is not there.* 2 and 9 more', 8),
+     '4 episodes: .*file-000.parquet is not there.* 2 and 1 more', 2),
     ('data/chunk-000/file-001.parquet', lambda file: file.write_bytes(file.read_bytes()[:5000]),
-     '8 episodes: .*file-001.parquet: cannot be read', 12),
-    ('', spoil, "picture 3 of episode 0: format 'unknown' cannot be used", 20)])
+     '2 episodes: .*file-001.parquet: cannot be read', 4),
+    ('', spoil, "picture 3 of episode 0: format 'unknown' cannot be used", 6)])
 def test_what_is_damaged_is_counted_and_the_rest_imported(
         path, change, words, left, lossless, truth, tmp_path, capsys, recwarn):
     folder = shutil.copytree(lossless, tmp_path / 'set')
