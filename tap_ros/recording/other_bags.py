@@ -97,7 +97,7 @@ class SqliteFile(OtherBag):
             self._lose(f'all behind is lost: {escaped(error)}')
 
     def _open(self) -> sqlite3.Connection:
-        return sqlite3.connect(f'{self._whole.absolute().as_uri()}?mode=ro', uri=True)
+        return sqlite3.connect(f'{self._whole.absolute().as_uri()}?immutable=1', uri=True)
 
 
 class Ros1File(OtherBag):
