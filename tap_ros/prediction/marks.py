@@ -201,8 +201,8 @@ def learn_marks(store: 'EpisodeStore', marks: Marks, training: np.ndarray, level
     for i in chosen:
         if len(marks.episodes[i]) != levels:
             raise ConfigError(
-                f'marks: a demonstration has {len(marks.episodes[i])} marks, and each needs '
-                f'{levels}, one for a level of recursion; mark as many, or give --recursion')
+                f'marks: demonstration {i} has {len(marks.episodes[i])}, and each needs {levels}, '
+                'one for a level of recursion; mark as many, or give --recursion')
     features = [features_of(store, i, robot_mask) for i in chosen]
     preferences, about = [], []
     for level in range(levels):

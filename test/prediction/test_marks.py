@@ -144,7 +144,7 @@ def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_p
     marks.write_text(marks.read_text().replace('"episode": 2', '"episode":  2'))
     with pytest.raises(ConfigError, match='other recordings or marks'):
         train(config, progress=False)
-    for values, said in (({'recursion': 2}, 'has 1 marks, and each needs 2'),
+    for values, said in (({'recursion': 2}, 'has 1, and each needs 2'),
                          ({'held_out': (str(bag),)}, 'too short|held out')):
         with pytest.raises(Exception, match=said):
             train(replace(config, out=str(tmp_path / 'other'), **values), progress=False)

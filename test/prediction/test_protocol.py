@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tap_ros import plugins, Predictor
 from tap_ros.cli import main
-from tap_ros.errors import ConfigError, ImageError, WeightsError
+from tap_ros.errors import ConfigError, WeightsError
 from tap_ros.images.crop import trained_crop
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.prediction.nearest_keyframe import halfway, NearestKeyframe
@@ -58,20 +58,6 @@ def test_objects_are_found_in_any_order_and_those_without_a_place_stay():
     assert (found.expected_pixels == episode.object_pixels[0]).all()
 
 
-def test_what_cannot_be_answered_is_refused():
-    predictor = NearestKeyframe(EPISODES)
-    with pytest.raises(ConfigError, match='goal'):
-        predictor.predict(EPISODES[0].frames[0])
-    with pytest.raises(ImageError, match='start'):
-        predictor.predict(EPISODES[0].frames[0][:9], EPISODES[0].frames[0])
-    with pytest.raises(ConfigError, match='nearest_keyframe:bags'):
-        load_predictor('nearest_keyframe')
-    with pytest.raises(WeightsError, match="no such weights file; did you mean 'push2'"):
-        load_predictor('pusch2')
-    with pytest.raises(WeightsError, match='no such weights file'):
-        load_predictor('nowhere/push2.safetensors')
-
-
 class Copying(Predictor):
     """Shows the goal; of the package of somebody else."""
 
@@ -94,6 +80,11 @@ def test_predictors_go_by_name_also_those_of_other_packages(bag, tmp_path, monke
     assert isinstance(load_predictor('copying:anything'), Copying)
     assert predictor_files('copying:anything') == []
     assert predictor_files('push2') == [PREDICTORS['push2']]
+    for name, error, said in (('nearest_keyframe', ConfigError, 'nearest_keyframe:bags'),
+                              ('pusch2', WeightsError, "did you mean 'push2'"),
+                              ('nowhere/push2.safetensors', WeightsError, 'no such weights')):
+        with pytest.raises(error, match=said):
+            load_predictor(name)
     start, goal, out = (str(tmp_path / f'{name}.png') for name in ('start', 'goal', 'out'))
     for path, frame in ((start, 0), (goal, -1)):
         cv2.imwrite(path, EPISODES[0].frames[frame][..., ::-1])
