@@ -126,12 +126,12 @@ def why_silent(node: Node, topic: str, message_type: type | None) -> str:
     """
     kind = '' if message_type is None else (
         f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}')
-    offered = {name: {one.topic_type for one in node.get_publishers_info_by_topic(name)
-                      if one.node_name not in {node.get_name(), *OURS}}
-               for name, _ in node.get_topic_names_and_types() if name != topic}
     here = {one.topic_type for one in node.get_publishers_info_by_topic(topic)}
     if here and (not kind or kind in here):
         return ''
+    offered = {name: {one.topic_type for one in node.get_publishers_info_by_topic(name)
+                      if one.node_name not in {node.get_name(), *OURS}}
+               for name, _ in node.get_topic_names_and_types() if name != topic}
     if here:
         why = f'what is published there is {listing(sorted(here))}; expected {kind}'
     else:
