@@ -4,17 +4,25 @@
 
 from contextlib import contextmanager, ExitStack
 import http.client
+from itertools import count
 import json
 import math
 import socket
 import threading
+import time
 
-from processes import until
+import numpy as np
+from processes import Client, LocalNode, Newest, until
 import pytest
+from sensor_msgs.msg import Image
+from tap_msgs.msg import ObjectStates
+from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.explorer.calls import CommandError, parse_command
-from tap_ros.nodes.explorer.node import Distances
+from tap_ros.nodes.explorer.node import Distances, ExplorerNode
 from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
+from tap_ros.nodes.ros_messages import encode_image, encode_objects
+from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -162,8 +170,8 @@ def at(x, **places):
 
 def test_distances_are_centimetres_or_pixels_where_a_pose_is_unknown():
     distances = Distances()
-    for time, x in ((1.0, 0.2), (1.5, 0.3), (1.5, 0.1)):  # equal time replaces
-        distances.add(time, at(x), GOALS)
+    for moment, x in ((1.0, 0.2), (1.5, 0.3), (1.5, 0.1)):  # equal time replaces
+        distances.add(moment, at(x), GOALS)
     assert distances.shown() == {'unit': 'cm', 'names': ['a', 'b'], 'times': [1.0, 1.5],
                                  'values': [[20.0, 10.0], [0.0, 0.0]]}
     distances.add(0.5, at(0.4), GOALS)
@@ -195,3 +203,62 @@ def test_a_command_reads_as_it_is_meant_and_what_makes_no_sense_is_refused_by_th
             with pytest.raises(CommandError, match=name) as refused:
                 parse_command(json.dumps({**command, name: value}))
             assert str(refused.value).isprintable()
+
+
+# Beside a real camera, where no simulator takes goal pictures
+
+
+def cup(stamp):
+    return encode_objects(
+        ['cup'], np.array([[3.0, 4.0]]), np.full((1, 7), np.nan), to_stamp(stamp), WORLD_FRAME,
+        ObjectStates.SOURCE_TRACKED)
+
+
+def problem_of(browser):
+    """Return the newest thing that could not be done, once there is one."""
+    problem = {'count': 0}
+    while not problem['count']:
+        text = browser.recv(10)
+        if isinstance(text, str):
+            problem = json.loads(text).get('problem', problem)
+    return problem['text']
+
+
+def test_a_photograph_of_a_real_camera_becomes_the_goal_with_its_own_objects_alone():
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    with ExitStack() as stack:
+        explorer = LocalNode(ExplorerNode, port=0, token='secret')
+        stack.callback(explorer.end)
+        node = stack.enter_context(Client('camera'))
+        pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
+        objects = node.create_publisher(ObjectStates, 'objects', STREAM)
+        goal_image = Newest(node, Image, 'goal/image', LATCHED)
+        goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
+        url = explorer.node.url.replace('http', 'ws').replace('/?', '/socket?')
+        assert url.endswith('?token=secret')
+        browser = stack.enter_context(connect(url, open_timeout=10))
+        stamps = count(10**9, 10**9)
+
+        def photograph(older):
+            """Publish a picture and objects that are so much older (ns), and ask for a goal."""
+            stamp = next(stamps)
+            image[0, 0] = stamp // 10**9
+            pictures.publish(encode_image(image, to_stamp(stamp), CAMERA_FRAME))
+            # Objects come after their picture, when there is a newer one already.
+            objects.publish(cup(stamp - older))
+            time.sleep(0.1)
+            browser.send('{"do": "photograph"}')
+
+        browser.send('{"do": "photograph"}')
+        assert 'the camera is silent' in problem_of(browser)
+        # A picture without any objects would be a goal.
+        assert until(lambda: all(p.get_subscription_count() for p in (pictures, objects)))
+        assert until(lambda: photograph(1) or 'no objects have the stamp' in problem_of(browser))
+        assert not goal_image.count
+        assert until(lambda: photograph(10**9) or goal_image.count)
+        while not (isinstance(text := browser.recv(10), bytes) and text.startswith(b'camera\0')):
+            pass
+        assert until(lambda: goal_image.wait(5).header.stamp == goal_objects.wait(5).header.stamp)
+        assert bytes(goal_image.wait(5).data)[3:] == image.tobytes()[3:]
+        place, = goal_objects.wait(5).objects
+        assert (place.name, place.u, place.v) == ('cup', 3.0, 4.0)
