@@ -87,7 +87,7 @@ ENCODINGS = {
 _DEEP = re.compile(r'(mono|rgb|bgr|rgba|bgra|bayer_[rgb]{4})16|(16|32|64)[US FC]+\d*')
 _COMPRESSED = ('JPEG', 'PNG', 'WEBP', 'AVIF', 'JPEG2000')
 _MARKER = re.compile(rb'\xff[^\0\xff\xd0-\xd7]')  # what ends the data of a JPEG's scan
-_PADDING = 3  # bytes: the last one of a JPEG's data, and what cameras may put behind it
+_PADDING = 9  # bytes: the last one of a JPEG's data, and eight that cameras may put behind it
 
 
 def find_encoding(name: str) -> Encoding:
@@ -182,8 +182,16 @@ class _Parts(io.BytesIO):
     left: list[bytes] | None = None
 
     def divide(self, progressive: bool) -> None:
-        """Give what is read from now on in parts; the header has been read."""
-        data, scan = self.getvalue(), self.tell()
+        """
+        Give what is read from now on in parts; the header has been read.
+
+        :raises OSError: when there are other bytes among its segments.
+        """
+        data, scan, at = self.getvalue(), self.tell(), 2
+        while at < scan and data[at] == 0xff:  # one segment after the other, or filled up
+            at += 1 if data[at + 1] == 0xff else 2 + int.from_bytes(data[at + 2:at + 4])
+        if at != scan:
+            raise OSError('its header is damaged')
         found = _MARKER.search(data, scan)
         end = found.start() if found else len(data)
         kept = max(scan, len(data[:end].rstrip(b'\0\xff')) - _PADDING)

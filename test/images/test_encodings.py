@@ -111,7 +111,8 @@ def test_a_jpeg_that_holds_every_pixel_is_read_whatever_stands_around_them():
                 data[:tables[0]] + data[tables[1]:]]  # Motion JPEG: the usual tables
             for changed in (data, body, body + b'\xff', body + bytes(99), data + b'behind',
                             body + bytes(3) + data[-2:], body + b'\xff\xff' + data[-2:],
-                            body + b'\xff\xfe\0\5hey' + data[-2:], *others):
+                            body + b'\xff\xfe\0\5hey' + data[-2:],
+                            body + b'padding.' + data[-2:], *others):
                 np.testing.assert_array_equal(decompress(changed, 'jpeg'), expected)
 
 
@@ -124,7 +125,8 @@ def test_a_jpeg_that_lacks_pixels_or_holds_others_is_damaged():
         for changed in (data[:at] + random.bytes(500) + data[at + 500:], data[:at],
                         data[:at] + random.bytes(300) + data[at:], data[:at] + data[at + 600:],
                         data[:at] + bytes(600) + data[at + 600:], data[:at] + data[-2:],
-                        data[:at] + bytes(len(data) - at)):
+                        data[:at] + bytes(len(data) - at),
+                        data[:begin - 14] + random.bytes(99) + data[begin - 14:]):
             with pytest.raises(ImageError, match='damaged compressed picture'):
                 decompress(changed, 'jpeg')
 
