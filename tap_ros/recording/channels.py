@@ -117,16 +117,17 @@ def _fields(channel: Channel, data: memoryview) -> dict[str, Any]:
                 value = raw[number][-1]
                 known[key] = value if kind == 'uint32' else (
                     bytes(value) if kind == 'uint8[]' else str(value, 'utf-8'))
-        time = read_protobuf(raw[1][-1]) if 1 in raw else None
-        return known | {'timestamp': time and {
-            name: time.get(number, [0])[-1] for number, name in ((1, 'sec'), (2, 'nanosec'))}}
+        if 1 in raw:
+            time = read_protobuf(raw[1][-1])
+            known['timestamp'] = {'sec': time.get(1, [0])[-1], 'nanosec': time.get(2, [0])[-1]}
+        return known
     kind = f'foxglove_msgs/msg/{name}' if name else channel.type_name
     _register()
     if channel.encoding == 'ros1':
         data = typestore().ros1_to_cdr(data, kind)
     message = vars(decode(kind, data))
-    time = message.get('timestamp')
-    return message | {'timestamp': time and {'sec': time.sec, 'nanosec': time.nanosec}}
+    stamp = message.get('timestamp')
+    return message | {'timestamp': stamp and {'sec': stamp.sec, 'nanosec': stamp.nanosec}}
 
 
 @cache

@@ -127,7 +127,7 @@ def test_a_jpeg_that_lacks_pixels_or_holds_others_is_damaged():
                         data[:at] + bytes(600) + data[at + 600:], data[:at] + data[-2:],
                         data[:at] + bytes(len(data) - at),
                         data[:begin - 14] + random.bytes(99) + data[begin - 14:]):
-            with pytest.raises(ImageError, match='damaged compressed picture'):
+            with pytest.raises(ImageError, match='damaged|cannot be used'):
                 decompress(changed, 'jpeg')
 
 
