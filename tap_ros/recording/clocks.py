@@ -17,22 +17,13 @@ import numpy as np
 from tap_ros.messages.stamps import PROOF
 from tap_ros.recording.columns import Track
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.jumps import (
-    APART_NS,
-    level_change,
-    set_places,
-    settle,
-    windows,
-    without_bogus,
-)
+from tap_ros.recording.jumps import APART_NS, settle, windows
+from tap_ros.recording.log_times import how_set, one_log
 from tap_ros.text import escaped
 
-NOMINAL_NS = 10**8  # between frames of which neither stamps nor log times tell anything
 _OVERTAKEN_NS = 10**8  # a frame may be logged so long before the mark that precedes it
-_UNEVEN_NS = 5 * 10**9  # what is about a picture may be logged so much later
-_FEW, _RARE = 3, 0.05  # messages of a topic, or the share of them, that are wrong by themselves
+_ANSWER_NS = 5 * 10**9  # what is about a picture may be logged so much later
 _BEHIND_NS = 35 * 10**7  # only a camera is late; what else is behind it has another clock
-_NEAR = 20  # messages around a place where another topic saw that the clock was set
 _AROUND, _SMOOTH = 9, 15  # messages that tell how far two clocks are apart
 _STREAMS = ('frame', 'twist', 'joint', 'arm', 'object')
 _ANSWERS = ('mask', 'object', 'twist')  # may have the stamp of the picture that they are about
@@ -53,7 +44,7 @@ def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str],
     said: list[str] = []
     called = {name: f'topic {escaped(topics.get(name, name))}' for name in tracks}
     called['arm'] = called['joint']
-    tracks = _one_log(_moving_log(dict(tracks), said), said)
+    tracks = one_log(dict(tracks), said)
     before, anew = tracks['frame'], _anew(tracks['mark'], gaps)
     tracks['frame'] = frame = _frames(before, anew, called['frame'], said)
     if frame.stamp is not before.stamp:
@@ -71,123 +62,6 @@ def put_right(tracks: dict[str, Track], source: str, topics: dict[str, str],
 def _by_log(track: Track) -> Track:
     """Return messages sorted by log time."""
     return track.take(np.argsort(track.log, kind='stable'))
-
-
-def _moving_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
-    """Let log times that stand still go on as stamps do, or as pictures were written."""
-    frame = tracks['frame']
-    if len(frame) <= PROOF or (np.diff(frame.log) == 0).mean() <= 0.5:
-        return tracks
-    moves = (np.diff(frame.stamp) > 0).all()
-    times = frame.stamp if moves else np.arange(len(frame)) * NOMINAL_NS
-    said.append('log times stand still; ' + ('stamps count' if moves else
-                                             'the order of writing counts'))
-    return {name: replace(track, log=np.interp(
-        track.order, frame.order, times - times[0]).astype(np.int64) + times[0])
-        for name, track in tracks.items()}
-
-
-def _one_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
-    """Let log times, and stamps that were set with them, go on where the recorder's clock was."""
-    found: list[int] = []
-    _one_by_one(tracks, said)
-    for name in sorted(_STREAMS, key=lambda name: -len(tracks[name])):  # the densest sees it best
-        for i, amount in reversed(set_places(tracks[name].log)):
-            before, place = tracks[name].order[i - 1:i + 1].tolist()
-            if any(_went_on(track, before, place, amount) for track in tracks.values()):
-                continue
-            free = [change for track in tracks.values() if not _followed(track, place, amount)
-                    and (change := _offset_change(track, place)) is not None]
-            amount = -int(np.median(free)) if free else amount
-            found.append(amount)
-            tracks = {key: _set(track, place, amount) for key, track in tracks.items()}
-    if found:
-        said.append('the clock of the recorder ' + _how_set(found))
-    return tracks
-
-
-def _one_by_one(tracks: dict[str, Track], said: list[str]) -> None:
-    """Let single log times that cannot be right go on from those before, in their topic or all."""
-    order = np.argsort(np.concatenate([track.order for track in tracks.values()]))
-    logs = np.concatenate([track.log for track in tracks.values()])
-    logs[order] = without_bogus(logs[order])
-    edges = np.cumsum([len(track) for track in tracks.values()])
-    wrong = 0
-    for (name, track), every in zip(list(tracks.items()), np.split(logs, edges[:-1])):
-        if np.count_nonzero(every != track.log) > max(_FEW, len(track) * _RARE):
-            every = track.log  # all of this topic is written later than others
-        log = without_bogus(every)
-        count = int((log != track.log).sum())
-        if count:
-            wrong += count
-            tracks[name] = replace(track, log=log)
-    if wrong:
-        said.append(f'{wrong} of {len(logs)} log times cannot be right; those messages stay in '
-                    'the order in which they were written')
-
-
-def _how_set(jumps: Sequence[int]) -> str:
-    """Put in words how often a clock was set, and by how much."""
-    words = []
-    for way, sizes in (('back', [-a for a in jumps if a < 0]),
-                       ('forward', [a for a in jumps if a > 0])):
-        if sizes:
-            often = f' {len(sizes)} times, by up to' if len(sizes) > 1 else ' by'
-            words.append(f'set {way}{often} {max(sizes) / 1e9:.2f} s')
-    return f'was {" and ".join(words)}; messages go on in the order in which they were written'
-
-
-def _place(track: Track, times: np.ndarray, place: int, amount: int) -> int:
-    """Return the first message that a clock stamped after it was set, near a place in the log."""
-    i = int(np.searchsorted(track.order, place))
-    first = max(i - _NEAR, 0)
-    steps = np.diff(times[first:i + _NEAR])
-    if not len(steps):
-        return i
-    unlike = np.abs(steps - np.median(steps) - amount)
-    own = int(np.argmin(unlike))
-    jumps = steps[own] < 0 if amount < 0 else steps[own] > amount / 2
-    return first + own + 1 if jumps and unlike[own] < abs(amount) / 2 else i
-
-
-def _went_on(track: Track, before: int, place: int, amount: int) -> bool:
-    """Tell whether log times of a topic show that the clock was not set before a place."""
-    first, i = np.searchsorted(track.order, (before, place)).tolist()
-    if not 1 < first <= i < len(track) - 1:
-        return False
-    steps = np.diff(track.log[max(i - _NEAR, 0):i + _NEAR]) * np.sign(amount)
-    usual = np.median(np.abs(steps))
-    pause = np.diff(track.log[first - 1:i + 1]).max() - usual
-    return bool(pause < abs(amount) / 2 > usual and (
-        steps - usual * np.sign(amount)).max() < abs(amount) / 2)
-
-
-def _offset_change(track: Track, place: int) -> float | None:
-    """Return by how much stamps go ahead of log times at a place; None if nothing tells."""
-    rows = np.flatnonzero(track.stamp != 0)
-    i = int(np.searchsorted(track.order[rows], place))
-    if not 0 < i < len(rows):
-        return None
-    near = rows[max(i - _AROUND, 0):i + _AROUND] if len(rows) > 4 * PROOF else rows[i - 1:i + 1]
-    return level_change((track.stamp - track.log)[near], int(np.searchsorted(near, rows[i])))[0]
-
-
-def _followed(track: Track, place: int, amount: int) -> bool:
-    """Tell whether stamps were set together with log times, as far as one can see."""
-    change = _offset_change(track, place)
-    return change is None or abs(change) < abs(amount) / 2 or change * amount > 0
-
-
-def _set(track: Track, place: int, amount: int) -> Track:
-    """Return messages whose clock was not set by an amount at a place."""
-    if not len(track):
-        return track
-    rows = np.arange(len(track))
-    log = np.where(rows >= _place(track, track.log, place, amount), track.log - amount, track.log)
-    if not _followed(track, place, amount):
-        return replace(track, log=log)
-    behind = (rows >= _place(track, track.stamp, place, amount)) & (track.stamp != 0)
-    return replace(track, log=log, stamp=np.where(behind, track.stamp - amount, track.stamp))
 
 
 def _anew(mark: Track, gaps: np.ndarray) -> Anew:
@@ -221,9 +95,8 @@ def _frames(frame: Track, anew: Anew, called: str, said: list[str]) -> Track:
     """Return the frames, those sent again left out, with stamps that increase."""
     if len(frame) < 2:
         return frame
-    by_log = replace(frame, stamp=_increasing(frame.log))
     if not frame.stamp.any():  # it has none
-        return by_log
+        return replace(frame, stamp=_increasing(frame.log))
     same = np.append(False, (np.diff(frame.stamp) == 0) & (frame.stamp[1:] != 0))
     again = same & np.append(False, np.diff(frame.picked()[:, 0]) == 0)
     if again.any() and (same == again).all() and np.ptp(frame.stamp):
@@ -256,7 +129,7 @@ def _say_settled(jumps: Sequence[int], bogus: int, count: int, called: str,
                  said: list[str]) -> None:
     """Say what was wrong with the stamps of a topic."""
     if jumps:
-        said.append(f'{called}: its clock {_how_set(jumps)}')
+        said.append(f'{called}: its clock {how_set(jumps)}')
     if bogus:
         said.append(f'{called}: {bogus} of {count} stamps cannot be right (zero, repeated or far '
                     'from all around); log times take their place')
@@ -305,7 +178,7 @@ def _restamped(track: Track, before: Track, after: Track) -> Track:
     found = order[np.clip(rank[len(stamps):] - 1, first, np.maximum(last - 1, first)).clip(
         max=len(order) - 1)]
     later = track.log - after.log[found]
-    known = (last > first) & (later < _UNEVEN_NS) & (later > -_OVERTAKEN_NS)
+    known = (last > first) & (later < _ANSWER_NS) & (later > -_OVERTAKEN_NS)
     return replace(track, stamp=np.where(known, after.stamp[found], track.stamp))
 
 

@@ -56,7 +56,7 @@ def set_places(times: np.ndarray) -> list[tuple[int, int]]:
     if not len(steps):
         return []
     period = np.median(steps)
-    least = max(LEAST_NS, 4 * np.median(np.abs(steps - period)))
+    least = max(LEAST_NS, 4 * np.quantile(np.abs(steps - period), 0.75))
     stands = np.append(False, steps[:-1] == 0) | np.append(steps[1:] == 0, False)
     rough = (steps <= 0) & (np.abs(steps - period) > least) & ~((steps == 0) & stands)
     found: list[tuple[int, int]] = []
@@ -186,7 +186,7 @@ def _jumps(stamp: np.ndarray, log: np.ndarray,
     if not len(steps):
         return shift, []
     period = np.median(steps)
-    least = np.minimum(*(max(LEAST_NS, 4 * np.median(np.abs(one))) for one in (
+    least = np.minimum(*(max(LEAST_NS, 4 * np.quantile(np.abs(one), 0.75)) for one in (
         steps - period, moves)))
     forward = (moves > APART_NS) & ahead
     rough = (steps <= 0) & (np.maximum(np.abs(steps - period), np.abs(moves)) > least)

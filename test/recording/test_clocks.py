@@ -103,6 +103,19 @@ def log_stands(bag, random):
     bag.log[:] = bag.log[0]
 
 
+def both(first, second):
+    def spoil(bag, random):
+        first(bag, random)
+        second(bag, random)
+    return spoil
+
+
+def answering(bag, random):
+    """Stamp commands as the pictures that they answer."""
+    commands = bag.rows('twist')
+    bag.stamp[commands] = bag.stamp[bag.rows('frame')[bag.number[commands].astype(int)]]
+
+
 DEFECTS = {  # how, and what the warnings name
     'camera back': (set_clock(CAMERA, -1), '/cam.* back'),
     'camera forward': (set_clock(CAMERA, 1, least=1), '/cam.* forward'),
@@ -142,6 +155,16 @@ DEFECTS = {  # how, and what the warnings name
         stamped('joint', lambda s, _: s // SECOND * SECOND), '/joint_states'),
     'joints without': (stamped('joint', lambda s, _: 0 * s), None),
     'log stands still': (log_stands, 'log times stand still')}
+
+
+DEFECTS |= {
+    'wrong, then back': (both(wrong(), set_clock(CAMERA, -1, least=1)), '/cam.* back(.|\n)* 1 of'),
+    'camera back, then all': (both(set_clock(CAMERA, -1, least=1), set_clock(
+        ALL, -1, logs=True, least=1)), 'recorder.* back'),
+    'replugged, commands answer': (both(restarted, answering), '/cam.* back'),
+    'frozen, commands answer': (both(DEFECTS['frozen'][0], answering), '/cam.*repeated'),
+    'commands without, camera back': (both(
+        set_clock(CAMERA, -1, least=1), stamped('twist', lambda s, _: 0 * s)), '/cam.* back')}
 
 
 @pytest.mark.parametrize('defect', DEFECTS)
@@ -213,6 +236,15 @@ def swap(bag, random):
     bag.stamp[rows[at]], bag.stamp[rows[at + 1]] = bag.stamp[rows[at + 1]], bag.stamp[rows[at]]
 
 
+def written(bag, key):
+    """Return messages in the order of a key, but their times."""
+    order = np.argsort(key, kind='stable')
+    found = bag.spoilt(lambda *_: None, None)
+    for name in ('name', 'log', 'stamp', 'number'):
+        setattr(found, name, getattr(bag, name)[order])
+    return found
+
+
 @pytest.mark.filterwarnings('error')
 def test_good_recordings_stay_as_they_are():
     for seed in range(60):
@@ -221,6 +253,15 @@ def test_good_recordings_stay_as_they_are():
             {'jitter': 0.4, 'lost': 0.2}, {'latency': (0.01, 0.3)}, {'latency': (0.2, 0.6)}, {},
             {'joints': False, 'frames': 5}, {'pause': 0.5, 'jitter': 0.4}][seed % 6]))
         assert_untouched(simulated(random, seed % 2, [0.1, 0.7, 1, 3, 10][seed % 5]))
+        late = record(random, 20)  # answers that take long, in the order in which they came
+        answering(late, random)
+        late.log[late.rows('twist')] += 12 * SECOND // 10
+        assert_untouched(written(late, late.log))
+        assert_untouched(written(late, late.log + SECOND * (late.name == 'frame')))
+        assert_untouched(written(late, np.unique(late.name, return_inverse=True)[1]))
+        late.log += random.integers(0, SECOND // 25, len(late.log))
+        late.stamp[late.rows('joint')[::2]] -= SECOND // 20  # of another driver
+        assert_untouched(late)
         burst = record(random, 20)
         burst.log = np.maximum.accumulate(burst.log // SECOND * SECOND + SECOND
                                           + np.arange(len(burst.log)))
