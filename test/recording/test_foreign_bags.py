@@ -202,8 +202,8 @@ def test_marks_cut_episodes_and_frames_between_them_are_left_out(tmp_path):
               mark(3, 1, 'success', log=12.9), camera(3, log=13), camera(4, log=14),
               mark(4, 0, log=14.2), camera(5, log=15), mark(5, 1, 'failure', log=15)],
              [[1, 2, 3], [4, 5]], ['success', 'failure']),
-            ([mark(1, 0), camera(1), camera(2), camera(3), camera(4, log=3.1), command(4, 9),
-              mark(3, 1, 'success', log=3.2), camera(5, log=3.4)],  # stamped beyond the end
+            ([mark(1, 0), *(camera(1 + n / 10, n + 1) for n in range(4)), command(1.3, 9),
+              mark(1.2, 1, 'success', log=1.31), camera(1.4, 5)],  # stamped beyond the end
              [[1, 2, 3]], ['success']))):
         found, _ = read(record(tmp_path / str(number), messages))
         assert shown(found) == expected and [e.outcome for e in found] == outcomes
