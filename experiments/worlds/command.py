@@ -82,7 +82,9 @@ def run(args):
         cv2.imwrite(str(folder / 'bottlenecks.png'), grid(drawn)[..., ::-1])
         strips += drawn[:1]
         write_marks(folder, training[:MARKED], args.seed)
-        rows += [{'task': name, **row} for row in score(training[:MARKED], held_out, args.seed)]
+        # Of keyframes all are held out that are not marked.
+        rows += [{'task': name, **row} for row in score(
+            training[:MARKED], training[MARKED:] + held_out, args.seed)]
     rows += average(train_all(folders, args.methods, args.seeds, args.runs, args.engine))
     out = Path(args.out)
     write_atomically(out / 'worlds.json', '[' + ',\n'.join(map(json.dumps, rows)) + ']\n')

@@ -3,6 +3,7 @@
 """Keyframes of foreign demonstrations, and how often they are the true bottleneck."""
 
 import json
+from pathlib import Path
 
 from experiments.worlds import command, keyframes
 from made_episodes import move_squares, write_bag
@@ -45,6 +46,12 @@ def test_scores_are_shares_of_the_demonstrations_with_their_intervals():
     page = command.page(rows + command.average(runs))
     assert '| a b | 16, 2.0 of the bottleneck | 14% (14 to 14), 29% | 100% (91 to 100)' in page
     assert '2 seeds' in page and '50% (0 to 100), 75%' in page
+
+
+def test_the_page_is_made_from_the_data():
+    results = Path(__file__).parents[2] / 'docs' / 'results'
+    rows = json.loads((results / 'worlds.json').read_text())
+    assert command.page(rows) == (results / 'worlds.md').read_text()
 
 
 def test_bottlenecks_are_read_by_their_stamps(tmp_path):
