@@ -13,7 +13,14 @@ from typing import Literal, NamedTuple
 
 import cv2
 from experiments.pages import render
-from experiments.worlds.trained import METHODS, place_marks, SETTINGS, train_all, write_marks
+from experiments.worlds.trained import (
+    held_out_of,
+    METHODS,
+    place_marks,
+    SETTINGS,
+    train_all,
+    write_marks,
+)
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
@@ -26,14 +33,13 @@ from tap_ros.options import Flag, Folder
 from tap_ros.prediction.marks import read_marks
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
-from tap_ros.training.split import split_episodes
 
 Method = Literal['fix', 'over time', 'relative', 'progress', 'marks']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
          'metaworld/window-open-v3', 'metaworld/drawer-open-v3',
          'metaworld/button-press-topdown-v3', 'ogbench/button', 'ogbench/cube', 'ogbench/drawer',
          'ogbench/window')
-MARKED = 12  # demonstrations
+MARKED, HELD_OUT = 12, 40  # demonstrations of each task
 STRIPS = 6  # demonstrations that are drawn, of each task
 
 
@@ -43,7 +49,7 @@ class Options:
     Options of the command.
 
     :param tasks: world/task each.
-    :param episodes: demonstrations of each task.
+    :param episodes: demonstrations of each task to train on; others are held out.
     :param image_size: width and height in pixels, as recorded.
     :param seed: of the first demonstration.
     :param methods: that are trained on each task, beside keyframes, which need no training.
@@ -74,10 +80,12 @@ def run(args):
         world, _, task = name.partition('/')
         folders[name] = folder = Path(args.bags, world, task)
         if not args.results_only:
-            collect(folder, CollectConfig(
-                world=world, task=task, episodes=args.episodes, seed=args.seed,
-                image_size=args.image_size, episodes_per_file=10), args.engine)
-        training, held_out = read(folder)
+            for bag, episodes, seed in ((folder, args.episodes, args.seed),
+                                        (held_out_of(folder), HELD_OUT, args.seed + 10 ** 6)):
+                collect(bag, CollectConfig(
+                    world=world, task=task, episodes=episodes, seed=seed,
+                    image_size=args.image_size, episodes_per_file=10), args.engine)
+        training, held_out = map(read, (folder, held_out_of(folder)))
         drawn = [strip(one) for one in held_out[:STRIPS]]
         cv2.imwrite(str(folder / 'bottlenecks.png'), grid(drawn)[..., ::-1])
         strips += drawn[:1]
@@ -106,7 +114,7 @@ def read(folder):
     """
     Read a bag and its true bottlenecks.
 
-    :return: two lists of Demonstrations, those that are trained on and those that are held out.
+    :return: list of Demonstrations.
     :raises ConfigError: if they are not known.
     """
     path = Path(folder, BOTTLENECKS_FILE)
@@ -114,9 +122,7 @@ def read(folder):
         raise ConfigError(f'{path}: is not there; collect it by a world that knows bottlenecks')
     store = open_recordings([folder], reading=Reading(size=SETTINGS['size']))
     truth = read_marks(path, store).episodes
-    return [[Demonstration(store[i].frames, truth[i][0], store[i].stamps, i)
-             for i in part.tolist() if i in truth]
-            for part in split_episodes(store, SETTINGS['test_fraction'])]
+    return [Demonstration(store[i].frames, truth[i][0], store[i].stamps, i) for i in sorted(truth)]
 
 
 def strip(one):
@@ -189,8 +195,6 @@ def page(rows):
         line[row['method']] = (f"{hit['value']:.0%} ({100 * hit['low']:.0f} to "
                                f"{100 * hit['high']:.0f}), {near['value']:.0%}")
     keyframes, trained = (pd.DataFrame(list(lines.values())) for lines in tables)
-    counts = sorted({row['n'] for row in rows})
-    return render('worlds/templates/worlds.md.j2', marked=MARKED,
-                  n=' to '.join(map(str, dict.fromkeys((counts[0], counts[-1])))),
+    return render('worlds/templates/worlds.md.j2', n=rows[0]['n'], marked=MARKED,
                   seeds=rows[-1].get('seeds', 0), steps=SETTINGS['steps'],
                   batch=SETTINGS['batch_size'], keyframes=keyframes, trained=trained)

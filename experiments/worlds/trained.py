@@ -20,8 +20,12 @@ METHODS = {
     'progress': {},
     'marks': {'selection': 'marks', 'progress_margin': 0.0},
 }
-SETTINGS = {'steps': 400, 'batch_size': 8, 'size': 64, 'threads': 1, 'save_every': 10 ** 6,
-            'test_fraction': 0.3}
+SETTINGS = {'steps': 400, 'batch_size': 8, 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
+
+
+def held_out_of(folder):
+    """Return the folder of the bag whose demonstrations are held out."""
+    return Path(f'{folder}-held-out')
 
 
 def place_marks(demonstrations, seed):
@@ -73,7 +77,6 @@ def train_and_score(folder, method, seed, out):
     from tap_ros.prediction.predictor import load_network
     from tap_ros.recording.bags import reading_like
     from tap_ros.recording.cache import open_recordings
-    from tap_ros.training.split import split_episodes
     from tap_ros.training.train import train
     import torch
     path = Path(out, 'hits.json')
@@ -83,14 +86,15 @@ def train_and_score(folder, method, seed, out):
     marks = {'marks': str(Path(folder, MARKS))} if method == 'marks' else {}
     Path(out).mkdir(parents=True, exist_ok=True)
     with open(Path(out, 'log.txt'), 'a') as log, redirect_stderr(log):
-        weights = train(folder, out, seed=seed, **SETTINGS, **METHODS[method], **marks)
+        weights = train(folder, out, seed=seed, held_out=(str(held_out_of(folder)),),
+                        **SETTINGS, **METHODS[method], **marks)
     network, training = load_network(weights)
-    store = open_recordings([folder], reading=reading_like(training, [folder], ''))
-    _, episodes = split_episodes(store, SETTINGS['test_fraction'])
-    truth = read_marks(Path(folder, BOTTLENECKS_FILE), store).episodes
-    known = np.array([i for i in episodes if int(i) in truth])
+    bag = held_out_of(folder)
+    store = open_recordings([bag], reading=reading_like(training, [bag]))
+    truth = read_marks(bag / BOTTLENECKS_FILE, store).episodes
+    known = sorted(truth)
     matched = evaluate(network, store, known)['prediction'].match_step
-    windows = [truth[int(i)][0] for i in known]
+    windows = [truth[i][0] for i in known]
     scores = {name: [int(first - beside <= t <= last + beside)
                      for t, (first, last) in zip(matched, windows)]
               for name, beside in (('hit', 0), ('near', 1))}

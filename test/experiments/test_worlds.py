@@ -62,6 +62,6 @@ def test_bottlenecks_are_read_by_their_stamps(tmp_path):
     stamps = [list(episode.stamps / 1e9) for episode in iter_episodes(tmp_path / 'bag')]
     (tmp_path / 'bag' / 'bottlenecks.json').write_text(json.dumps(
         {'marks': [{'recording': '.', 'episode': 1, 'stamps': [[stamps[1][2], stamps[1][4]]]}]}))
-    found, = sum(command.read(tmp_path / 'bag'), [])
+    found, = command.read(tmp_path / 'bag')
     assert len(found.frames) == 7 and (found.window, found.number) == ((2, 4), 1)
     assert found.frames.shape[1:] == (64, 64, 3)
