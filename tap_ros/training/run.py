@@ -142,6 +142,9 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
             if not len(parts[0]):
                 raise RecordingError('recordings: all that --held-out leaves is too short to '
                                      'train on; name others')
+            if config.held_out and not len(parts[1]):
+                raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
+                                     'by itself; name whole bags, not files of a split one')
             warn_if_few(parts[1])
             torch.manual_seed(config.seed)
             this = Run(config, kind, device, store, *parts, processes, progress,

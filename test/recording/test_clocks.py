@@ -8,8 +8,6 @@ with the undamaged one.
 """
 
 import re
-import time
-import warnings
 
 from made_bags import camera, read
 from made_bags import record as record_bag
@@ -302,20 +300,6 @@ def test_a_clock_that_is_set_where_a_recorder_splits_its_bag_cuts_nothing(size):
         assert len(told) == 1 and f'back by {size:.2f} s' in told[0]
         files[1].source = 'a/other.mcap'
         assert len(runs_of(files)) == 2
-
-
-def test_a_long_recording_takes_well_under_a_second():
-    random = np.random.default_rng(0)
-    good = record(random, 30, 2, 10_000)
-    good.rate = 30
-    for bag in (good, good.spoilt(set_clock(CAMERA, -1), random),
-                good.spoilt(set_clock(ALL, -1, logs=True), random)):
-        parts, _, _ = join([bag.columns()])
-        begin = time.process_time()
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore')
-            clocks.put_right(parts, 'bag', {}, np.empty((0, 2), np.int64))
-        assert time.process_time() - begin < 1
 
 
 def test_bags_are_read_so_with_the_cache_and_a_rate(tmp_path):

@@ -10,7 +10,7 @@ import signal
 
 import pytest
 from tap_ros.cli import main
-from tap_ros.errors import ConfigError, StorageError, WeightsError
+from tap_ros.errors import ConfigError, RecordingError, StorageError, WeightsError
 from tap_ros.files import only_writer
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
@@ -136,3 +136,15 @@ def test_learning_rate_rises_and_falls_and_the_average_moves_fast_at_first():
             state.network.weight.copy_(before + 1)
         state.update_average(decay)
         assert torch.allclose(state.average.weight, before + (1 - stays), atol=1e-6)
+
+
+def test_what_is_held_out_must_hold_episodes_by_itself(tmp_path):
+    shutil.copytree(SAMPLE, tmp_path / 'bag')
+    first = next((tmp_path / 'bag').glob('*.mcap'))
+    shutil.copy(first, first.with_name('bag_1.mcap'))
+    first.rename(first.with_name('bag_0.mcap'))
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    parts = sorted((tmp_path / 'bag').glob('*.mcap'))
+    with pytest.raises(RecordingError, match='name whole bags'):
+        train(replace(CONFIG, recordings=(str(tmp_path / 'bag'),), held_out=(str(parts[1]),),
+                      out=str(tmp_path / 'run')), progress=False)
