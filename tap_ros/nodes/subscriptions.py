@@ -21,6 +21,7 @@ from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE_TYPE, TOPICS
 from tap_ros.text import escaped, listing
 
 OURS = NODE_MODULES.keys() - {'sim_node'}  # nodes whose pictures are no camera's
+UNKNOWN = '_NODE_NAME_UNKNOWN_'  # of a publisher that was discovered before its node
 ADAPT_PERIOD = 0.5  # s between two comparisons with what is offered
 
 
@@ -130,7 +131,7 @@ def why_silent(node: Node, topic: str, message_type: type | None) -> str:
     if here and (not kind or kind in here):
         return ''
     offered = {name: {one.topic_type for one in node.get_publishers_info_by_topic(name)
-                      if one.node_name not in {node.get_name(), *OURS}}
+                      if one.node_name not in {node.get_name(), UNKNOWN, *OURS}}
                for name, _ in node.get_topic_names_and_types() if name != topic}
     if here:
         why = f'what is published there is {listing(sorted(here))}; expected {kind}'
