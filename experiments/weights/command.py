@@ -7,7 +7,6 @@ from pathlib import Path
 import shlex
 from typing import Annotated
 
-from experiments.weights.card import ship
 from sim_bridge.collect import collect, CollectConfig
 from tap_ros.options import Flag, Folder, one_of
 from tap_ros.training.recipes import RECIPES
@@ -76,6 +75,8 @@ def run(args):
 
     :param args: Options.
     """
+    from experiments.weights.card import ship  # with torch, which neither help nor list need
+
     for name in args.only or SHIPPED:
         print('\n'.join(commands(name, args.bags, args.runs)), flush=True)
         if args.list:

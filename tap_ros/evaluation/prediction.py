@@ -316,7 +316,8 @@ def run(args: Options) -> None:
     scores = evaluate(network, store, episodes, goal_picture=args.goal_picture, filled=filled)
     sources = {(store[i].object_source or 'unknown').replace('_', ' ')
                for i in episodes if store[i].object_names}
-    print(f'{len(episodes)} episodes, goal picture: {args.goal_picture}; l1 on [0, 1]; '
+    count = f'{len(episodes)} episode{"s" if len(episodes) > 1 else ""}'
+    print(f'{count}, goal picture: {args.goal_picture}; l1 on [0, 1]; '
           + ''.join(f'object positions: {source}; ' for source in sorted(sources))
           + 'in brackets 95% intervals over the episodes')
     warn_if_few(episodes)

@@ -25,6 +25,8 @@ class NodeProcesses:
     """
     Processes of nodes, ended with the with-block; each logs into a file of its own.
 
+    SIGTERM and SIGHUP, as of a terminal that is closed, leave the block, too.
+
     :param log_folder: folder of the logs, made if it is not there.
     """
 
@@ -86,6 +88,9 @@ class NodeProcesses:
         return said
 
     def __enter__(self) -> Self:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) is signal.SIG_DFL:  # nohup ignores SIGHUP: so do we
+                signal.signal(number, lambda number, _: sys.exit(128 + number))
         return self
 
     def __exit__(self, *_: object) -> None:
