@@ -8,6 +8,7 @@ that x is to the right and y away from the camera, which stands opposite the rob
 """
 
 from dataclasses import replace
+from difflib import get_close_matches
 from typing import Any
 import warnings
 
@@ -179,7 +180,10 @@ def make_env(task: str) -> tuple[Any, Any]:
             'world metaworld: Meta-World is not installed; type `pip install --no-deps -r '
             'requirements-worlds.txt` in the folder of tap_ros') from error
     if task not in ALL_V3_ENVIRONMENTS:
-        raise SceneError(f'task {task!r} is unknown; valid: {", ".join(ALL_V3_ENVIRONMENTS)}')
+        near = get_close_matches(task, ALL_V3_ENVIRONMENTS, 1)
+        meant = f'did you mean {near[0]!r}? ' if near else ''
+        raise SceneError(
+            f'task {task!r} is unknown; {meant}valid: {", ".join(ALL_V3_ENVIRONMENTS)}')
     # Meta-World 3.1 writes rows of 11 numbers; MuJoCo 4 has 12.
     setattr(sawyer_xyz_env.SawyerMocapBase, 'reset_mocap_welds', _reset_mocap_welds)  # noqa: B010
     env = ALL_V3_ENVIRONMENTS[task]()

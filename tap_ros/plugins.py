@@ -6,7 +6,7 @@ Parts that can be replaced by name: those of this package, and those that other 
 Another package adds one by an entry point, without a fork:
 
     [project.entry-points.'tap_ros.arms']
-    xarm7 = 'my_package.xarm7:XArm7'
+    xarm7 = 'my_package.xarm7:XARM7'
 """
 
 from difflib import get_close_matches

@@ -97,7 +97,7 @@ class NodeProcesses:
         """End all nodes, politely first."""
         running = [p for p in self._processes.values() if p.poll() is None]
         for process in running:
-            process.send_signal(signal.SIGINT)
+            process.terminate()  # a shell ignores SIGINT for jobs in the background
         for process in running:
             try:
                 process.wait(15)
