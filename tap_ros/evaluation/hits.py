@@ -33,8 +33,8 @@ def score_hits(store: EpisodeStore, marks: Marks, episodes: Sequence[int] | np.n
     rows = [row for row, i in enumerate(episodes) if int(i) in marks.episodes]
     if not rows:
         raise ConfigError(
-            'marks: none of the episodes that are scored is marked; mark some of them, in the order '
-            f'of the recordings from 0: {listing(episodes)}; or give --all')
+            'marks: none of the episodes that are scored is marked; mark some of them, in the '
+            f'order of the recordings from 0: {listing(episodes)}; or give --all')
     learned = training.get('marks') or {}
     preferences = [Preference.from_json(one) for one in learned.get('preferences', [])[:1]]
     names = ['prediction', *['preference alone'] * len(preferences), 'slowest', 'middle']
