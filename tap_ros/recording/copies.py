@@ -10,6 +10,8 @@ from contextlib import closing
 from multiprocessing.util import Finalize
 import os
 from pathlib import Path
+import re
+import shlex
 import shutil
 import sqlite3
 import tempfile
@@ -18,9 +20,14 @@ from tap_ros.errors import RecordingError
 from tap_ros.text import escaped
 import zstandard
 
-PACKED = '.zstd'  # behind the name of a file that rosbag2 compressed as a whole
+PACKED = '.zstd', '.zst'  # behind the name of a file that was compressed as a whole
 _MOST = 8  # copies kept at once
 copies: dict[tuple[object, ...], Path] = {}  # by the file's path, size and times
+_NOT_OURS = {  # by how a file begins: what it is, and the command that makes it readable
+    b'\x1f\x8b': ('packed by gzip', 'gzip -dk {}'), b'BZh': ('packed by bzip2', 'bzip2 -dk {}'),
+    b'\xfd7zXZ': ('packed by xz', 'xz -dk {}'), b'\4"M\x18': ('packed by lz4', 'lz4 -dk {}'),
+    b'PK\3\4': ('a zip archive', 'unzip {}'),
+    b'version https://git-lfs': ('what Git LFS left in place of the file', 'git lfs pull')}
 
 
 def readable(path: Path) -> Path:
@@ -44,6 +51,26 @@ def readable(path: Path) -> Path:
     return copies[key]
 
 
+def unpacked_name(path: Path) -> str:
+    """Return the name of a file without the ending of what compressed it."""
+    return path.stem if path.suffix in PACKED else path.name
+
+
+def what_else(path: Path) -> str:
+    """Return why a file cannot be read as it is, and the command that helps; '' if unknown."""
+    try:
+        with open(path, 'rb') as stream:
+            start = stream.read(32)
+    except OSError:
+        return ''
+    what, command = next((told for magic, told in _NOT_OURS.items() if start.startswith(magic)),
+                         ('', ''))
+    if 'packed' in what and re.search(r'[.](tar[.]\w+|tgz)$', path.name):
+        command = 'tar -xf {}'
+    place = shlex.quote(escaped(path, 400))
+    return what and f'it is {what}; type `{command.format(place)}`'
+
+
 def sqlite_logs(path: Path) -> list[Path]:
     """Return the files beside one of sqlite3 that hold a part of what was written to it."""
     logs = [path.with_name(path.name + end) for end in ('-wal', '-journal')]
@@ -54,7 +81,7 @@ def _copy(path: Path, beside: list[Path], is_packed: bool) -> Path:
     """Make a copy in a folder of its own, which is named after this process."""
     try:
         folder = Path(tempfile.mkdtemp(prefix=f'tap_ros_{os.getpid()}_'))
-        copy = folder / path.name.removesuffix(PACKED)
+        copy = folder / unpacked_name(path)
         for log in beside:
             shutil.copyfile(log, folder / log.name)
         with open(path, 'rb') as stream, open(copy, 'wb') as out:

@@ -12,7 +12,7 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.errors import RecordingError
 from tap_ros.messages.topics import COMPRESSED_TYPE
 from tap_ros.recording.channels import Channel, is_packets, packet, PICTURES
-from tap_ros.recording.copies import PACKED
+from tap_ros.recording.copies import PACKED, unpacked_name
 from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.metadata import bag_files, FILE_NAME, natural
 from tap_ros.recording.other_bags import Ros1File, SqliteFile
@@ -22,6 +22,7 @@ import zstandard
 VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
 _BAGS = {b'SQLite format 3\0': SqliteFile, b'#ROSBAG V2.0': Ros1File}  # by how a file begins
 _ENDINGS = ('.db3', '.bag')
+_THEORA = 'theora_image_transport/msg/Packet'
 _MOST_FILES = 10000  # of a folder that are looked at
 
 
@@ -53,6 +54,9 @@ def explain(channels: Iterable[Channel], files: Sequence[Path]) -> str:
     for channel in channels:
         if is_packets(channel):
             return explain_video(channel.topic, files)
+        if channel.type_name == _THEORA:
+            return (f'topic {escaped(channel.topic)} holds packets of Theora, which are not read; '
+                    'record the topic of its raw or compressed pictures')
     other = sorted({channel.encoding for channel in channels} - {'cdr'})
     pictures = [f'foxglove.{name}' for name in PICTURES]
     return f'its messages are encoded as {listing(other)}; only those of ROS are read, and ' \
@@ -111,8 +115,8 @@ def _bag(path: Path) -> list[Path] | None:
     """Return the files of a bag that rosbags reads, in playing order; None for anything else."""
     if path.is_file():
         return [path] if _start(path).startswith(tuple(_BAGS)) else None
-    named = {file.name.removesuffix(PACKED): file for end in _ENDINGS
-             for kind in (end + PACKED, end) for file in path.glob(f'*{kind}')}
+    named = {unpacked_name(file): file for ending in _ENDINGS for end in (*PACKED, '')
+             for file in path.glob(f'*{ending}{end}')}
     found = [file for file in sorted(named.values(), key=natural)
              if _start(file).startswith(tuple(_BAGS))]
     if not any(path.glob('*.mcap*')):

@@ -32,8 +32,9 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.errors import RecordingError
+from tap_ros.messages.topics import IMAGE
 from tap_ros.recording.channels import Channel, converted, DAMAGE
-from tap_ros.recording.copies import readable
+from tap_ros.recording.copies import readable, what_else
 from tap_ros.recording.damage import FAR, Loss
 from tap_ros.text import escaped
 import zstandard
@@ -122,7 +123,8 @@ class McapFile:
                     channel.convert(data, log))
             except DAMAGE as error:
                 self.losses.append(Loss(f'damaged message: {escaped(error)}',
-                                        f'topic {escaped(channel.topic)}', None, log, log))
+                                        f'topic {escaped(channel.topic)}', None, log, log,
+                                        channel.type_name not in IMAGE.types))
         self._conclude(wanted)
         self._is_read = True
 
@@ -369,8 +371,9 @@ def _bytes_of(path: str | Path) -> mmap.mmap:
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
     if data[:len(MAGIC)] != MAGIC:
-        raise RecordingError(f'{path}: not an MCAP file: it starts with {data[:8].hex(" ")}, '
-                             f'not {MAGIC.hex(" ")}')
+        why = what_else(Path(path)) or (
+            f'not an MCAP file: it starts with {data[:8].hex(" ")}, not {MAGIC.hex(" ")}')
+        raise RecordingError(f'{path}: {why}')
     return data
 
 

@@ -148,12 +148,22 @@ def check_schema(type_name: str, text: str) -> None:
         if len(text) <= _MAX_SCHEMA:
             types = get_types_from_msg(text.replace('\r\n', '\n'), type_name)
     known = typestore().fielddefs
+    if not _references(types) <= known.keys() | types.keys():
+        return  # what it says is no definition
     for name, (_, theirs) in types.items():
         ours = list(known[name][1]) if name in known else list(theirs)
         if list(theirs) != ours[:len(theirs)]:  # one that is cut off says nothing else
             theirs, ours = (', '.join(field for field, _ in fields) for fields in (theirs, ours))
             raise RecordingError(
                 f'message type {name}: recorded with the fields {theirs}; expected {ours}')
+
+
+def _references(types: dict[str, Any]) -> set[str]:
+    """Return the types that the fields of definitions name."""
+    parts = [part for _, fields in types.values() for _, part in fields]
+    return {detail for kind, detail in (
+        detail[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, detail)
+        for kind, detail in parts) if kind == Nodetype.NAME}
 
 
 def _look_up(type_name: str) -> None:
@@ -174,11 +184,7 @@ def _look_up(type_name: str) -> None:
             found |= get_types_from_msg(path.read_text(), name)
         except _UNREADABLE as error:
             raise RecordingError(f'message type {name}: {path} cannot be read') from error
-        for _, (kind, detail) in found[name][1]:
-            if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-                kind, detail = detail[0]
-            if kind == Nodetype.NAME:
-                waiting.append(detail)
+        waiting += _references({name: found[name]})
     if found:
         store.register(found)
 

@@ -18,7 +18,7 @@ from typing import Any
 from tap_ros.errors import RecordingError
 from tap_ros.files import write_atomically
 from tap_ros.plugins import names
-from tap_ros.recording.copies import PACKED
+from tap_ros.recording.copies import PACKED, unpacked_name
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
 from tap_ros.text import escaped, listing
 import yaml
@@ -103,8 +103,8 @@ def natural(path: Path) -> list[int | str]:
 
 def files_by_number(folder: str | Path) -> list[Path]:
     """Return the .mcap files of a folder in the order of the numbers in their names."""
-    found = {path.name.removesuffix(PACKED): path for kind in ('*.mcap' + PACKED, '*.mcap')
-             for path in Path(folder).glob(kind)}
+    found = {unpacked_name(path): path for end in (*PACKED, '')
+             for path in Path(folder).glob(f'*.mcap{end}')}
     return sorted(found.values(), key=natural)
 
 
@@ -145,7 +145,7 @@ def bag_files(folder: str | Path) -> list[Path]:
             f'{path}: the bag is stored as {escaped(storage, 40)}; mcap and sqlite3 are read; '
             'make one of these with ros2 bag convert where its storage is installed')
     files = [folder / Path(name).name for name in paths]
-    files = [file if _is_file(file) else file.with_suffix('') if file.suffix == PACKED else file
+    files = [file if _is_file(file) else file.with_suffix('') if file.suffix in PACKED else file
              for file in files]  # some were unpacked since
     missing = [file.name for file in files if not _is_file(file)]
     if missing:

@@ -43,7 +43,9 @@ class OtherBag(McapFile):
         try:
             self._describe(readable(Path(path)))
         except (OSError, sqlite3.Error, struct.error, LookupError, ValueError) as error:
-            raise RecordingError(f'{escaped(path)}: cannot be read: {escaped(error)}') from error
+            way = '; copy it again' if isinstance(error, sqlite3.DatabaseError) else ''
+            raise RecordingError(
+                f'{escaped(path)}: cannot be read: {escaped(error)}{way}') from error
 
     def _blocks(self) -> Iterator[list[Found]]:
         for found in self._messages():

@@ -3,7 +3,9 @@
 """Bags of other storages and messages are read as ours; for what is no bag a command is told."""
 
 import base64
+import bz2
 from contextlib import closing
+import gzip
 import json
 from pathlib import Path
 import shlex
@@ -226,8 +228,8 @@ def test_pictures_of_foxglove_are_read_however_they_are_encoded(encoding, name, 
     episode, = iter_episodes(write_mcap(tmp_path / 'a.mcap', messages))
     np.testing.assert_array_equal(episode.frames, [pixels for *_, pixels in sent])
     assert episode.stamps.tolist() == [t * SECOND for t in range(1, 5)]
-    both = [messages[0], ('/cam', *camera(2, sent[1][2])[1:], '', 'cdr'), *messages[2:],
-            ('/cam', *messages[0][1:2], b'\xff', 5 * SECOND, '', encoding)]
+    both = [messages[0], ('/cam', *camera(2, sent[1][2])[1:], '', 'cdr'), messages[2],
+            ('/cam', *messages[0][1:2], b'\xff', 7 * SECOND // 2, '', encoding), messages[3]]
     with pytest.warns(RecordingWarning, match='/cam: 1 message cannot be used'):
         episode, = iter_episodes(write_mcap(tmp_path / 'b.mcap', both))
     np.testing.assert_array_equal(episode.frames, [pixels for *_, pixels in sent])
@@ -295,6 +297,49 @@ def test_other_encodings_are_named_instead_of_a_topic_to_choose(tmp_path):
     with pytest.raises(RecordingError, match='encoded as flatbuffer; only those of ROS') as error:
         list(iter_episodes(path))
     assert '--image-topic' not in str(error.value)
+
+
+def test_what_is_no_bag_but_will_be_one_is_told_with_the_command(tmp_path, capsys):
+    whole = write_mcap(tmp_path / 'whole.mcap', [(*camera(t), '', 'cdr') for t in (1, 2)])
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / 'bag_0.mcap.zst').write_bytes(zstandard.compress(whole.read_bytes()))
+    assert [len(episode) for episode in iter_episodes(tmp_path / 'bag')] == [2]
+    for name, data, command in (
+            ('a b.mcap.gz', gzip.compress(whole.read_bytes()), "gzip -dk '{}'"),
+            ('a.tar.gz', gzip.compress(b''), 'tar -xf {}'),
+            ('a.bag.bz2', bz2.compress(b'#ROSBAG'), 'bzip2 -dk {}'),
+            ('a.zip', b'PK\3\4', 'unzip {}'), *(
+                (name, b'version https://git-lfs.github.com/spec/v1\n', 'git lfs pull')
+                for name in ('a.mcap', 'a.db3', 'a.hdf5'))):
+        (tmp_path / name).write_bytes(data)
+        assert main(['inspect', str(tmp_path / name)]) == 1
+        assert f'type `{command.format(tmp_path / name)}`' in capsys.readouterr().err
+
+
+def files_of(pictures):
+    """Return pictures as JPEG files in the three ways in which h5py gives rows of bytes."""
+    data = [cv2.imencode('.jpg', picture)[1].tobytes() for picture in pictures]
+    rows = np.empty(len(data), object)
+    rows[:] = [np.frombuffer(each, np.uint8) for each in data]
+    return np.array(data, f'S{max(map(len, data))}'), np.array(
+        data, f'V{max(map(len, data))}'), rows
+
+
+def test_cameras_whose_arrays_end_alike_are_told_apart(tmp_path, capsys, monkeypatch):
+    pictures = np.random.default_rng(0).integers(0, 256, (4, 8, 12, 3), np.uint8)
+    cameras = dict(zip(('base_camera', 'cam_2', 'hand'), files_of(pictures)))
+    tree = {f'traj_{i}': {'obs': {name: {'rgb': files, 'depth': np.ones((4, 8, 12, 1))}
+                                  for name, files in cameras.items()}} for i in range(2)}
+    monkeypatch.setitem(sys.modules, 'h5py', SimpleNamespace(File=lambda path, mode: tree))
+    words = ['import-arrays', str(tmp_path / 'in.h5'), '--out', str(tmp_path / 'bag')]
+    assert main(words) == 1
+    names = [f'obs/{name}/rgb' for name in cameras]
+    assert f'--camera: expected one of {", ".join(names)}' in capsys.readouterr().err
+    for number, name in enumerate(names):
+        assert main([*words[:3], str(tmp_path / str(number)), '--camera', name]) == 0
+        for episode in (found := list(iter_episodes(tmp_path / str(number)))):
+            assert abs(episode.frames.mean() - pictures.mean()) < 5
+        assert [len(episode) for episode in found] == [4, 4]
 
 
 @pytest.mark.parametrize('name', ['h5py', 'zarr'])

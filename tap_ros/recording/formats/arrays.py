@@ -3,20 +3,25 @@
 """
 Import pictures that stand as arrays in HDF5 files (ALOHA, robomimic) or zarr stores.
 
-An array of pictures is (N, H, W, 3 or 4), (N, 3, H, W), or (N, bytes) of JPEG files. Its last name
-is the camera; arrays of one camera in several groups, such as data/demo_7/obs, are an episode
-each, and so is each file. meta/episode_ends, as of diffusion policy, cuts an array into episodes.
+An array of pictures is (N, H, W, 3 or 4), (N, 3, H, W), or of N JPEG or PNG files, whose bytes may
+be padded. Its last name is the camera, or all names where several end alike, as base_camera/rgb and
+hand_camera/rgb; arrays of one camera in several groups with a number, such as data/demo_7/obs, are
+an episode each, and so is each file. meta/episode_ends, as of diffusion policy, cuts an array into
+episodes.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+import re
 from typing import Annotated, Any
 
 import numpy as np
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.encodings import decompress
 from tap_ros.options import default_text
+from tap_ros.recording.copies import what_else
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
 from tap_ros.recording.metadata import natural
@@ -77,6 +82,8 @@ def run(args: Options) -> None:
 def _open(path: Path) -> Any:
     """Open a file or store: a tree of groups, which act as dicts, and arrays."""
     name = 'zarr' if path.is_dir() or path.suffix == '.zip' else 'h5py'
+    if name == 'h5py' and (why := what_else(path)):
+        raise RecordingError(why)
     try:
         if name == 'zarr':
             import zarr  # type: ignore[import-not-found]
@@ -91,7 +98,11 @@ def _episodes(root: Any, camera: str) -> Iterator[Any]:
     """Yield the arrays of pictures of each episode of a camera."""
     arrays = dict(_arrays(root))
     found = {name: array for name, array in arrays.items() if _holds_pictures(array)}
-    cameras = sorted({name.rpartition('/')[2] for name in found}, key=str)
+    keys = {name: _camera(name) for name in found}
+    short = Counter(key.rpartition('/')[2] for key in set(keys.values()))
+    called = {name: last if short[last := key.rpartition('/')[2]] == 1 else key
+              for name, key in keys.items()}
+    cameras = sorted(set(called.values()))
     if not cameras:
         raise ValueError('it holds no array of pictures')
     if camera not in cameras and (camera or len(cameras) > 1):
@@ -99,10 +110,17 @@ def _episodes(root: Any, camera: str) -> Iterator[Any]:
     chosen = camera or cameras[0]
     ends = arrays.get('meta/episode_ends')
     for name in sorted(found, key=lambda name: natural(Path(name))):
-        if name.rpartition('/')[2] == chosen:
+        if called[name] == chosen:
             cuts = [0, *(np.asarray(ends[:]).tolist() if ends is not None else [len(found[name])])]
             for begin, end in zip(cuts, cuts[1:]):
                 yield found[name][begin:end]
+
+
+def _camera(name: str) -> str:
+    """Return the path of an array without the groups whose number tells an episode."""
+    *groups, last = name.split('/')
+    return '/'.join([*(group for group in groups if 'cam' in group or not re.search(
+        r'\d$', group)), last])
 
 
 def _arrays(group: Any, above: str = '') -> Iterator[tuple[str, Any]]:
@@ -116,15 +134,17 @@ def _arrays(group: Any, above: str = '') -> Iterator[tuple[str, Any]]:
 
 def _holds_pictures(array: Any) -> bool:
     """Tell whether an array is of pictures."""
-    if len(array.shape) == 2 and array.dtype == np.uint8 and len(array):
-        return bytes(array[0][:3]) == b'\xff\xd8\xff'
+    if len(array.shape) in (1, 2) and array.dtype.kind in 'uSVO' and len(array):
+        first = array[0]
+        is_file = isinstance(first, bytes | np.void) or getattr(first, 'dtype', None) == np.uint8
+        return is_file and bytes(first).startswith((b'\xff\xd8\xff', b'\x89PNG'))
     return len(array.shape) == 4 and (array.shape[1] == 3 or array.shape[3] in (3, 4))
 
 
 def _picture(values: Any) -> np.ndarray:
-    """Return a picture, uint8 (H, W, 3), of a JPEG with zeros behind it, or of pixels."""
-    if values.ndim == 1:
-        return decompress(bytes(values), 'jpeg')
+    """Return a picture, uint8 (H, W, 3), of a file with zeros behind it, or of pixels."""
+    if np.ndim(values) < 2:
+        return decompress(bytes(values), 'unknown')
     if values.dtype.kind == 'f' and values.max() <= 1:
         values = values * 255
     pixels = np.asarray(values).round().clip(0, 255).astype(np.uint8)

@@ -24,6 +24,7 @@ from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
+from tap_ros.recording.copies import what_else
 from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
 from tap_ros.recording.formats.pictures import (
     DAMAGE,
@@ -325,4 +326,5 @@ def _read_parquet(path: Path) -> Any:
     try:
         return parquet.ParquetFile(path).read()
     except (OSError, pyarrow.ArrowException) as error:
-        raise RecordingError(f'{escaped(path)}: cannot be read: {escaped(error, 200)}') from error
+        why = what_else(path) or f'cannot be read: {escaped(error, 200)}'
+        raise RecordingError(f'{escaped(path)}: {why}') from error

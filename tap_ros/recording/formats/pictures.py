@@ -24,6 +24,7 @@ from tap_ros.files import only_writer, storage_errors
 from tap_ros.images.crop import Crop
 from tap_ros.options import default_text, Folder, Topic
 from tap_ros.recording.bags import find_bags
+from tap_ros.recording.copies import what_else
 from tap_ros.recording.damage import describe, Loss
 from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.foreign import video_packets, VIDEOS
@@ -238,6 +239,8 @@ def video_frames(path: Path) -> Iterator[tuple[float, np.ndarray]]:
     """
     if not path.is_file():
         raise RecordingError(f'{escaped(path)} is not there')
+    if why := what_else(path):
+        raise RecordingError(f'{escaped(path)}: {why}')
     capture, last = cv2.VideoCapture(str(path)), -1.0
     good, frame = capture.read()
     if good:
