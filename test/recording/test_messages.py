@@ -146,7 +146,8 @@ def test_a_schema_with_comments_is_accepted_and_another_is_not():
     with pytest.raises(RecordingError, match='ObjectState: recorded .* name, u, pose;'):
         check_schema(name, text.replace('float64 v\n', ''))
     # A recorder that does not find a definition writes nothing, or half of it.
-    for half in ('', 'this is } none', 'Lost lost\n' + text, 'Ärger\n', 'float64 x\n' * 10**6, '=' * 80, 'MSG: a/b'):
+    for half in ('', 'this is } none', 'Lost lost\n' + text, 'Ärger\n', 'float64 x\n' * 10**6,
+                 '=' * 80, 'MSG: a/b'):
         check_schema(name, half)
     for kind in (name, 'sensor_msgs/msg/Image', 'sensor_msgs/msg/JointState'):
         for length in range(0, len(text := schema_text(kind)), 3):
