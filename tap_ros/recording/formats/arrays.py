@@ -4,10 +4,10 @@
 Import pictures that stand as arrays in HDF5 files (ALOHA, robomimic) or zarr stores.
 
 An array of pictures is (N, H, W, 3 or 4), (N, 3, H, W), or of N JPEG or PNG files, whose bytes may
-be padded. Its last name is the camera, or all names where several end alike, as base_camera/rgb and
-hand_camera/rgb; arrays of one camera in several groups with a number, such as data/demo_7/obs, are
-an episode each, and so is each file. meta/episode_ends, as of diffusion policy, cuts an array into
-episodes.
+be padded. Its last name is the camera, or all names where several end alike, as base_camera/rgb
+and hand_camera/rgb; arrays of one camera in several groups with a number, such as data/demo_7/obs,
+are an episode each, and so is each file. meta/episode_ends, as of diffusion policy, cuts an array
+into episodes.
 """
 
 from collections import Counter
