@@ -75,12 +75,12 @@ def run(args):
 
     :param args: Options.
     """
-    from experiments.weights.card import ship  # with torch, which neither help nor list need
-
     for name in args.only or SHIPPED:
         print('\n'.join(commands(name, args.bags, args.runs)), flush=True)
         if args.list:
             continue
+        from experiments.weights.card import ship  # with torch, which a list does not need
+
         found = collections(name, args.bags)
         for folder, options in found.items():
             collect(folder, CollectConfig(**options))
