@@ -22,11 +22,10 @@ from tap_ros.recording.damage import FAR, seconds
 from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
-from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, Span
+from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, Span, WALL_NS
 from tap_ros.robots.arm import get_arm
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
-_WALL_NS = 10**18  # 2001: clocks of simulations, and those since a start, show less
 _LOOKED_AT = 4096  # messages looked at together
 _LEAST_PAUSE = 0.5  # s, between two demonstrations
 
@@ -99,7 +98,7 @@ def runs_of(parts: Iterable[Columns]) -> list[list[Columns]]:
         oldest = min((int(log.min()) for log in logs.values()), default=FAR)
         first = int(logs['frame'].min()) if 'frame' in logs else FAR
         back = oldest < newest - MAX_JITTER_NS or first < shown - MIN_MATCH_NS
-        if not runs or back and not (newest > _WALL_NS and _is_next(runs[-1][-1], part)):
+        if not runs or back and not (newest > WALL_NS and _is_next(runs[-1][-1], part)):
             runs.append([])
         runs[-1].append(part)
         newest = max((int(log.max()) for log in logs.values()), default=-FAR)

@@ -24,6 +24,7 @@ from tap_ros.text import escaped
 _OVERTAKEN_NS = 10**8  # a frame may be logged so long before the mark that precedes it
 _ANSWER_NS = 5 * 10**9  # what is about a picture may be logged so much later
 _BEHIND_NS = 35 * 10**7  # only a camera is late; what else is behind it has another clock
+_MANY = 10  # messages of one stamp, of which no driver sends so many together
 _AROUND, _SMOOTH = 9, 15  # messages that tell how far two clocks are apart
 _STREAMS = ('frame', 'twist', 'joint', 'arm', 'object')
 _ANSWERS = ('mask', 'object', 'twist')  # may have the stamp of the picture that they are about
@@ -144,14 +145,18 @@ def _stamped(name: str, track: Track, frame: Track, anew: Anew, called: str,
     newest = np.maximum(np.searchsorted(shown.log, track.log, 'right') - 1, 0)
     by_log = track.log + (shown.stamp - shown.log)[newest]
     repeats = (np.diff(track.stamp) == 0) & (track.stamp[1:] != 0)
-    if len(track) > PROOF and name != 'object' and repeats.mean() > 0.5:
+    if len(track) > PROOF and name != 'object' and repeats.any():
         values = track.picked()
         differ = repeats & ~np.isclose(values[1:], values[:-1], equal_nan=True).all(1)
         if differ.mean() > 0.5:  # they are not the same ones, sent again
             said.append(f'{called}: {int(repeats.sum())} of {len(track)} stamps are repeated; log '
                         'times are taken')
             return replace(track, stamp=by_log)
+        if name in ('joint', 'arm'):
+            track = _going_on(track, repeats, differ, called, said)
     zero = track.stamp == 0
+    if zero.all() and name in ('joint', 'arm'):
+        return replace(track, stamp=by_log)
     if zero.any():  # a command answers a frame
         track = replace(track, stamp=np.where(
             zero, by_log if name in ('joint', 'arm') else shown.stamp[newest], track.stamp))
@@ -161,6 +166,26 @@ def _stamped(name: str, track: Track, frame: Track, anew: Anew, called: str,
         return replace(track, stamp=by_log)
     _say_settled(settled.jumps, settled.bogus, len(track), called, said)
     return track if settled.stamp is track.stamp else replace(track, stamp=settled.stamp)
+
+
+def _going_on(track: Track, repeats: np.ndarray, differ: np.ndarray, called: str,
+              said: list[str]) -> Track:
+    """
+    Return states whose stamps go on, by log time, where they stand still for many messages.
+
+    :param repeats: (N - 1,) bool: which messages have the stamp of the one before.
+    :param differ: (N - 1,) bool: those of them that have other values.
+    """
+    again = np.append(False, repeats)
+    first = np.maximum.accumulate(np.where(again, 0, np.arange(len(track))))
+    many = (np.bincount(first) > _MANY) & (np.bincount(first, np.append(False, differ)) > PROOF)
+    stands = again & many[first]
+    if not stands.any():
+        return track
+    said.append(f'{called}: {int(stands.sum())} of {len(track)} stamps are repeated; log times '
+                'take their place')
+    since = track.log - track.log[first]
+    return replace(track, stamp=np.where(stands, track.stamp[first] + since, track.stamp))
 
 
 def _restamped(track: Track, before: Track, after: Track) -> Track:

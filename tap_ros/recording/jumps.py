@@ -23,6 +23,7 @@ _FEW = 3  # messages in a row may be wrong; more of them are a clock that was se
 _BOGUS_NS = 5 * 10**8  # a message is wrong by more
 _EDGE_NS = 5 * 10**9  # likewise the first or the last ones: they may be late, or old
 _OFTEN_NS = 10 * 10**9  # no clock is set so often, three times in a row
+_PAUSE_NS = 5 * 10**8  # of a camera, in which its clock may be set back unseen
 _SURE = 2.5  # times the spread of messages
 
 
@@ -115,7 +116,8 @@ def settle(stamp: np.ndarray, log: np.ndarray, valid: np.ndarray,
     offset = stamp - log
     steps, moves = np.diff(stamp[rows]), np.diff(offset[rows])
     ahead = forward and _comparable(steps, moves)
-    odd = (steps < 0) | ((moves > APART_NS) & ahead)
+    odd = (steps < 0) | ((moves > APART_NS) & ahead) | (
+        ahead & _back_in_pause(stamp[rows], offset[rows]))
     out = Settled(stamp, bogus=len(stamp) - len(rows))
     if not odd.any() and not out.bogus:
         return out
@@ -145,6 +147,26 @@ def _comparable(steps: np.ndarray, moves: np.ndarray) -> bool:
     usual = usual[np.argsort(moves[usual])[_FEW:]]  # the clock of the log may be set, too
     passed, logged = steps[usual].sum(), (steps - moves)[usual].sum()
     return bool(abs(passed - logged) <= 0.1 * passed + APART_NS)
+
+
+def _back_in_pause(stamp: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """
+    Tell between which messages (N - 1,) a clock was set back by less than they pause.
+
+    Stamps are behind the log from there on, and for longer than what waits to be written.
+
+    :param stamp, offset: (N,) int64, ns: stamps and how far they are ahead of the log.
+    """
+    steps = np.diff(stamp)
+    found = np.diff(offset) < -APART_NS
+    if found.any():
+        found &= steps > max(_PAUSE_NS, 4 * np.median(steps))
+    for i in (np.flatnonzero(found) + 1).tolist():
+        before, after = offset[max(i - _LONG, 0):i], offset[i:i + _LONG]
+        change = int(after.max() - before.min())
+        found[i - 1] = min(len(before), len(after)) > _FEW and change < -APART_NS and (
+            max(np.ptp(before), np.ptp(after)) < -change / 2)
+    return found
 
 
 def _bogus(times: np.ndarray, values: np.ndarray, least: int = _BOGUS_NS,
@@ -190,7 +212,8 @@ def _jumps(stamp: np.ndarray, log: np.ndarray,
         steps - period, moves)))
     forward = (moves > APART_NS) & ahead
     rough = (steps <= 0) & (np.maximum(np.abs(steps - period), np.abs(moves)) > least)
-    places = np.flatnonzero(forward | rough) + 1
+    paused = _back_in_pause(stamp, offset) & ahead
+    places = np.flatnonzero(forward | rough | paused) + 1
     stamp, offset = stamp.copy(), offset.copy()
     for i in places.tolist():
         end = _end(places, moves, i, len(stamp))
@@ -198,6 +221,8 @@ def _jumps(stamp: np.ndarray, log: np.ndarray,
         if forward[i - 1]:
             gain = offset[i:i + _AROUND][:end - i].min() - offset[max(i - _LONG, 0):i].max()
             jumped = gain > APART_NS
+        elif paused[i - 1]:
+            jumped = True
         else:
             steady, narrow = _by_cadence(stamp, i, end)
             if narrow < spread and abs(steady - change) < 4 * (spread + narrow):

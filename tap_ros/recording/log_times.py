@@ -31,8 +31,10 @@ def one_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
     for name in sorted(_STREAMS, key=lambda name: -len(tracks[name])):  # the densest sees it best
         for i, amount in reversed(set_places(tracks[name].log)):
             before, place = tracks[name].order[i - 1:i + 1].tolist()
-            if any(_went_on(track, before, place, amount) for track in tracks.values()):
+            if any(_went_on(track, before, place, amount) and not _moved_along(
+                    track, tracks[name], place, amount) for track in tracks.values()):
                 continue
+            place = _first_behind(tracks, (before, place), int(tracks[name].log[i - 1]), amount)
             free = [change for track in tracks.values() if not _followed(track, place, amount)
                     and (change := _offset_change(track, place)) is not None]
             amount = -int(np.median(free)) if free else amount
@@ -111,6 +113,36 @@ def _went_on(track: Track, before: int, place: int, amount: int) -> bool:
     pause = np.diff(track.log[first - 1:i + 1]).max() - usual
     return bool(pause < abs(amount) / 2 > usual and (
         steps - usual * np.sign(amount)).max() < abs(amount) / 2)
+
+
+def _moved_along(track: Track, dense: Track, place: int, amount: int) -> bool:
+    """
+    Tell whether log times of two topics were set together, by what is written near each other.
+
+    Where the clock was set in a pause of a camera, its own log times show no more than a shorter
+    or a longer pause.
+    """
+    i = int(np.searchsorted(track.order, place))
+    beside = np.searchsorted(dense.order, track.order[max(i - _NEAR, 0):i + _NEAR])
+    apart = track.log[max(i - _NEAR, 0):i + _NEAR] - dense.log[np.minimum(beside, len(dense) - 1)]
+    before, after = np.split(apart, [min(i, _NEAR)])
+    return bool(abs(np.median(after) - np.median(before)) < abs(amount) / 2)
+
+
+def _first_behind(tracks: dict[str, Track], between: tuple[int, int], log: int,
+                  amount: int) -> int:
+    """
+    Return the place of the first message of any topic that was logged after a clock was set.
+
+    :param between: places of the messages of one topic before and behind it.
+    :param log: log time of that before it.
+    """
+    first = between[1]
+    for track in tracks.values():
+        rows = slice(*np.searchsorted(track.order, between, 'right'))
+        moved = (track.log[rows] - log) * np.sign(amount) > abs(amount) / 2
+        first = min([first, *track.order[rows][moved].tolist()])
+    return first
 
 
 def _offset_change(track: Track, place: int) -> float | None:

@@ -97,6 +97,20 @@ def standing(stamps, random):
     return stamps
 
 
+def half(stamps, _):
+    return np.minimum(stamps, stamps[len(stamps) // 2])
+
+
+def camera_waits(bag, random):
+    """Write pictures up to a second late, several at once, with their commands."""
+    for name in (*CAMERA, 'mask', 'twist'):
+        rows = bag.rows(name)
+        bag.log[rows] = bag.log[rows] // SECOND * SECOND + SECOND + np.arange(len(rows)) * 2000
+    order = np.argsort(bag.log, kind='stable')
+    for name in ('name', 'log', 'stamp', 'number'):
+        setattr(bag, name, getattr(bag, name)[order])
+
+
 def log_stands(bag, random):
     bag.log[:] = bag.log[0]
 
@@ -151,6 +165,8 @@ DEFECTS = {  # how, and what the warnings name
     'pairs': (stamped('frame', lambda s, _: s[np.arange(len(s)) // 2 * 2]), '/cam.*repeated'),
     'joints of whole seconds': (
         stamped('joint', lambda s, _: s // SECOND * SECOND), '/joint_states'),
+    'joints stand from the middle': (stamped('joint', half), '/joint_states.*repeated'),
+    'camera waits to be written': (camera_waits, None),
     'joints without': (stamped('joint', lambda s, _: 0 * s), None),
     'log stands still': (log_stands, 'log times stand still')}
 
@@ -279,6 +295,26 @@ def test_a_camera_of_another_rate_is_told_once_it_is_far_off():
     assert found == numbers and len(told) == 1 and '/cmd: the clock of' in told[0]
     wrong = (read_table.actions != table.actions).any(1)
     assert not wrong[:20].any() and not wrong[-300:].any()  # little at first, and then mended
+
+
+@pytest.mark.parametrize('pause', [3, 6])
+def test_a_clock_that_is_set_back_in_a_pause_joins_no_demonstrations(pause):
+    for seed, size in enumerate((1, 1.5, 2.5, 5, 5.5, 60, 3600)):
+        for stamps, logs in ((1, 1), (1, 0), (0, 1)):
+            random = np.random.default_rng(seed)
+            good = record(random, 10, frames=25, pause=pause)
+            numbers, table, _ = good.read(gap=2.5)
+            bad = good.spoilt(lambda *_: None, random)
+            before, after = bad.rows('frame')[len(numbers[0]) - 1:][:2]
+            place = random.integers(before + 1, after, endpoint=True)
+            bad.stamp[place:] -= int(size * SECOND) * stamps
+            bad.log[place:] -= int(size * SECOND) * logs
+            bad_numbers, found, told = bad.read(gap=2.5)
+            assert bad_numbers == numbers, (size, stamps, logs, told)
+            assert (found.actions != table.actions).any(1).sum() <= 1
+            np.testing.assert_allclose(found.grippers, table.grippers, atol=0.1)
+            assert ' back by ' in told[0], told
+            assert len(told) == len({text.split(':')[1] for text in told})  # one a topic
 
 
 @pytest.mark.parametrize('size', [0.25, 1, 10, 3600])
