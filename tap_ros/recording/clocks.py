@@ -1,12 +1,12 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Times of recorded messages, put right where they cannot be what they claim to be.
+Correct stamps and log times of recorded messages where they are wrong.
 
-Only the order of writing is always true. Log times are of one clock, the recorder's, which may be
-set; stamps of each topic are of the clock of its driver, which may jump, stand still or be
-another one than the camera's. Each message is kept, and somebody is told. Times that are right
-stay as they are.
+Only the order in which messages were written is always right. Log times come from one clock, the
+recorder's, which may be set. Stamps come from the clock of each topic's driver, which may jump,
+stand still or differ from the camera's. Every message is kept, each correction gives a warning
+that names the topic, and times that are right are not changed.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,7 +66,16 @@ def _by_log(track: Track) -> Track:
 
 
 def _anew(mark: Track, gaps: np.ndarray) -> Anew:
-    """Return what tells where the clock of messages begins anew as that of the marks does."""
+    """
+    Return a function of a Track that tells where its clock begins anew between two episodes.
+
+    As that of a simulation does when it is reset. Such a jump is right, and the stamps of the
+    marks around it, which jump alike, show that it is.
+
+    :param mark: the marks of episodes.
+    :param gaps: (G, 2) as damage.gaps: where marks may be lost.
+    :return: Track -> ((N,) rows before places, (N,) rows behind them) -> (N,) bool.
+    """
     def distance(stamp: np.ndarray, log: np.ndarray, k: np.ndarray) -> np.ndarray:
         went_on = stamp + mark.log[k] - log
         near = np.clip(mark.stamp[k], np.minimum(stamp, went_on), np.maximum(stamp, went_on))
@@ -116,7 +125,7 @@ def _frames(frame: Track, anew: Anew, called: str, said: list[str]) -> Track:
 
 
 def _unstamped(track: Track) -> np.ndarray:
-    """Tell which messages (N,) have no stamp among others; a clock may also begin at zero."""
+    """Tell which (N,) stamps of zero mean that there is none, and not a clock that begins."""
     zero = track.stamp == 0
     rows = np.flatnonzero(~zero)
     if not zero.any() or not len(rows):
@@ -208,7 +217,7 @@ def _restamped(track: Track, before: Track, after: Track) -> Track:
 
 
 def _marked(mark: Track, before: Track, after: Track) -> Track:
-    """Return marks whose clock was set where that of the frames was, as far as one can see."""
+    """Return marks moved with the frames next to them, where that brings both closer."""
     if not len(mark) or not len(after):
         return mark
     moved = after.stamp - before.stamp[np.searchsorted(before.order, after.order)]
@@ -254,8 +263,8 @@ def _apart(track: Track, frame: Track, name: str) -> np.ndarray:
     """
     Return (N,) int64 ns by which the clock of each message is ahead of the camera's, 0: alike.
 
-    A message that was written between two frames is expected between their stamps. What has the
-    stamp of a frame, however late, is of its clock.
+    A message that was written between two frames is expected to have a stamp between theirs.
+    Messages that repeat stamps of frames are of the camera's clock, however late they are.
 
     :param name: marks of an episode's start precede frames, those of its end follow; commands
         answer them.
@@ -295,7 +304,7 @@ def _apart(track: Track, frame: Track, name: str) -> np.ndarray:
 
 
 def _marks_apart(mark: Track, frame: Track, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the same as _apart for marks, which are told one by one."""
+    """Return the same as _apart for marks: too few for a median, each is judged by itself."""
     start, sides = mark.index == 0, []
     for own, other in ((after, before), (before, after)):
         rows = np.where(start, own, other)

@@ -1,12 +1,12 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Where a clock jumped, told from arrays of times in the order in which messages were written.
+Find where a clock jumped, from arrays of times in the order in which messages were written.
 
-A clock is compared with two others: the log, which knows of pauses but may be late, and the
-cadence of the messages themselves, which knows of no pause but is steady. A jump is a change of
-the level between a few messages before a place and a few behind it, against the spread there.
-Messages that are late and overtake each other change no level.
+A clock is compared with the log, which shows pauses but may be late, and with the usual period of
+the messages, which is steady but shows no pauses. A clock jumped where the median difference of a
+few messages before a place and that of a few behind it are further apart than these scatter.
+Messages that are late, or overtake each other, do not move the median.
 """
 
 from collections.abc import Callable

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Log times: those of one recorder, whose clock may be set, stand still or be wrong for once."""
+"""Correct log times: the recorder's clock may be set, stand still, or be wrong for a moment."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -57,21 +57,21 @@ def how_set(jumps: Sequence[int]) -> str:
 
 
 def _moving_log(tracks: dict[str, Track], said: list[str]) -> dict[str, Track]:
-    """Let log times that stand still go on as stamps do, or as pictures were written."""
+    """Replace log times that stand still by stamps, or else by ten pictures a second."""
     frame = tracks['frame']
     if len(frame) <= PROOF or (np.diff(frame.log) == 0).mean() <= 0.5:
         return tracks
     moves = (np.diff(frame.stamp) > 0).all()
     times = frame.stamp if moves else np.arange(len(frame)) * NOMINAL_NS
-    said.append('log times stand still; ' + ('stamps count' if moves else
-                                             'the order of writing counts'))
+    said.append('log times stand still; ' + (
+        'stamps take their place' if moves else 'messages are read in the order of writing'))
     return {name: replace(track, log=np.interp(
         track.order, frame.order, times - times[0]).astype(np.int64) + times[0])
         for name, track in tracks.items()}
 
 
 def _one_by_one(tracks: dict[str, Track], said: list[str]) -> None:
-    """Let single log times that cannot be right go on from those before, in their topic or all."""
+    """Replace single log times that are far from all around, in their topic or in the file."""
     order = np.argsort(np.concatenate([track.order for track in tracks.values()]))
     logs = np.concatenate([track.log for track in tracks.values()])
     logs[order] = without_bogus(logs[order], _UNEVEN_NS)
@@ -104,7 +104,7 @@ def _place(track: Track, times: np.ndarray, place: int, amount: int) -> int:
 
 
 def _went_on(track: Track, before: int, place: int, amount: int) -> bool:
-    """Tell whether log times of a topic show that the clock was not set before a place."""
+    """Tell whether a topic's log times pass a place in small steps, as if no clock was set."""
     first, i = np.searchsorted(track.order, (before, place)).tolist()
     if not 1 < first <= i < len(track) - 1:
         return False
