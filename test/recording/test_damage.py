@@ -262,3 +262,9 @@ def test_files_that_unpack_to_what_no_recording_holds_are_refused_in_time(tmp_pa
         assert (tmp_path / 'a.mcap').stat().st_size < 10**5
         with pytest.raises(RecordingError, match=f'a.mcap: .*chunk .*{words}'):
             open_recordings(tmp_path)
+
+
+def test_a_name_that_metadata_cannot_hold_is_refused(tmp_path):
+    with pytest.raises(RecordingError, match=r'\\udcff.*UTF-8'):
+        FileWriter(tmp_path / 'a\udcff.mcap')
+    assert not list(tmp_path.iterdir())
