@@ -48,7 +48,7 @@ class FileWriter:
         self.path = Path(path)
         self._name = name or self.path.name
         if self._name != self._name.encode(errors='replace').decode():
-            raise RecordingError(f'{escaped(self.path)}: metadata.yaml holds names in UTF-8 alone, '
+            raise RecordingError(f'{escaped(self.path)}: metadata.yaml holds names in UTF-8, '
                                  'which this is not; take another')
         try:
             self._stream = open(self.path, 'xb')
