@@ -146,7 +146,8 @@ def assign(spans: Sequence[Span], track: 'Track') -> np.ndarray:
         [(s.start_log, s.end_log, s.start_stamp, s.end_stamp) for s in spans],
         np.int64).reshape(-1, 4).T
     best = np.full(len(log), -1)
-    told = start_stamp[0] > WALL_NS and (np.diff(start_stamp) > 0).all()
+    told = start_stamp[0] > WALL_NS and (np.diff(start_stamp) > 0).all() and (
+        (end_stamp < FAR) | (end_log == FAR)).all()
     best_distance = np.full(len(log), (_LATE_NS if told else MAX_JITTER_NS) + 1)
     inside = np.searchsorted(start_log, log, 'right') - 1
     for shift in (0, 1, -1):
