@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
 from tap_ros.prediction.marks import chance, features_of, Marks
 from tap_ros.prediction.preference import FEATURES, Preference
 from tap_ros.recording.cache import EpisodeStore
-from tap_ros.text import listing
 from tap_ros.training.robot_mask import trained_robot_mask
 
 _SPEED = FEATURES.index('speed')
@@ -22,19 +20,14 @@ def score_hits(store: EpisodeStore, marks: Marks, episodes: Sequence[int] | np.n
     """
     Say in which share of the marked episodes a frame is a marked one, or at most one beside it.
 
-    :param marks: of some of the episodes at least; of several in an episode any counts.
+    :param marks: of at least one of the episodes; of several in an episode any counts.
     :param episodes: (N,) indices of episodes.
     :param matched: (N,), the frames that the predictions match.
     :param training: of the weights; tells the preference, where one was learned.
     :return: of the prediction, the preference alone (its largest w between start and goal), the
         slowest frame, the middle one, and a random one: the shares of hits and of near ones.
-    :raises ConfigError: if none of the episodes is marked.
     """
     rows = [row for row, i in enumerate(episodes) if int(i) in marks.episodes]
-    if not rows:
-        raise ConfigError(
-            'marks: none of the episodes that are scored is marked; mark some of them, in the '
-            f'order of the recordings from 0: {listing(episodes)}; or give --all')
     learned = training.get('marks') or {}
     preferences = [Preference.from_json(one) for one in learned.get('preferences', [])[:1]]
     names = ['prediction', *['preference alone'] * len(preferences), 'slowest', 'middle']

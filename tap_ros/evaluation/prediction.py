@@ -42,6 +42,7 @@ from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_fil
 from tap_ros.prediction.warp import WarpedMaps
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.text import listing
 from tap_ros.training.inpainted import fill, Filled, with_masks
 from tap_ros.training.robot_mask import trained_robot_mask
 from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few
@@ -312,6 +313,11 @@ def run(args: Options) -> None:
     if not len(episodes):
         raise ConfigError('recordings: no episode of them was held out from training; '
                           'give more of them, or --all')
+    marks = read_marks(args.marks, store) if args.marks else None
+    if marks and not set(marks.episodes) & set(episodes.tolist()):
+        raise ConfigError(
+            'marks: none of the episodes that are scored is marked; mark some of them, in the '
+            f'order of the recordings from 0: {listing(episodes)}; or give --all')
     filled = fill(store, robot_mask)
     scores = evaluate(network, store, episodes, goal_picture=args.goal_picture, filled=filled)
     sources = {(store[i].object_source or 'unknown').replace('_', ' ')
@@ -331,8 +337,7 @@ def run(args: Options) -> None:
     about: dict[str, Any] = {method: value.summary() | {'intervals': {
         name: interval[1:] for name, interval in value.intervals().items()}}
         for method, value in scores.items()}
-    if args.marks:
-        marks = read_marks(args.marks, store)
+    if marks:
         hits = score_hits(store, marks, episodes, scores['prediction'].match_step, training)
         print_hits(hits, len(set(marks.episodes) & set(episodes.tolist())))
         about['marks'] = hits

@@ -235,6 +235,10 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     with pytest.raises(ConfigError, match='--all'):
         run(parse(Options, common))
     marks = tmp_path / 'marks.json'
+    marks.write_text('{"marks": []}')
+    with pytest.raises(ConfigError, match='marked; .* from 0: 0, 1, 2'):
+        run(parse(Options, [*common, '--all', '--marks', str(marks)]))
+    assert 'prediction' not in capsys.readouterr().out, 'nothing is scored before'
     write_marks(marks, open_recordings([bag], progress=False), [bag], {0: [(2, 4)], 2: [(7, 7)]})
     with pytest.warns(RecordingWarning, match='3 episodes are'):
         run(parse(Options, [*common, '--all', '--samples', '3', '--marks', str(marks), '--out',
