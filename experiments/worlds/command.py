@@ -173,11 +173,12 @@ def average(rows):
     found = []
     for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
         same = [row for row in rows if (row['task'], row['method']) == (task, method)]
-        found.append({'task': task, 'method': method, 'n': len(same[0]['hit']),
-                      'seeds': len(same), **{
-                          key: Interval(*map(float, mean_interval(np.mean(
-                              [row[key] for row in same], axis=0))))._asdict()
-                          for key in ('hit', 'near')}})
+        line = {'task': task, 'method': method, 'n': len(same[0]['hit']), 'seeds': len(same)}
+        for key in ('hit', 'near'):
+            shares = np.mean([row[key] for row in same], axis=0)
+            interval = share_interval(shares > 0) if len(same) == 1 else mean_interval(shares)
+            line[key] = Interval(*map(float, interval))._asdict()
+        found.append(line)
     return found
 
 
@@ -196,5 +197,5 @@ def page(rows):
                                f"{100 * hit['high']:.0f}), {near['value']:.0%}")
     keyframes, trained = (pd.DataFrame(list(lines.values())) for lines in tables)
     return render('worlds/templates/worlds.md.j2', n=rows[0]['n'], marked=MARKED,
-                  seeds=rows[-1].get('seeds', 0), steps=SETTINGS['steps'],
+                  held_out=rows[-1]['n'], seeds=rows[-1].get('seeds', 0), steps=SETTINGS['steps'],
                   batch=SETTINGS['batch_size'], keyframes=keyframes, trained=trained)
