@@ -7,6 +7,7 @@ Modules beside this file (made_episodes, lively) can be imported by every test.
 """
 
 import os
+import signal
 
 from hypothesis import HealthCheck, settings
 import pytest
@@ -17,6 +18,8 @@ os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 if 'PYTEST_XDIST_WORKER' in os.environ:  # workers share the cores
     os.environ.setdefault('OMP_NUM_THREADS', '1')
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a script
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # tests and what they start need it
 # How fast examples come says nothing, as other tests run beside these.
 settings.register_profile(
     'tap_ros', deadline=None, suppress_health_check=[HealthCheck.too_slow])
