@@ -30,7 +30,7 @@ from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
 from tap_ros.files import write_atomically
 from tap_ros.images.drawing import grid
 from tap_ros.options import Flag, Folder
-from tap_ros.prediction.marks import read_marks
+from tap_ros.prediction.marks import chance, read_marks
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
 
@@ -163,9 +163,8 @@ def score(marked, held_out, seed=0):
 
 def _random(demonstrations, beside):
     """Return how often any frame between start and goal hits."""
-    return mean_interval([
-        np.mean([first - beside <= t <= last + beside for t in range(1, len(frames) - 1)])
-        for frames, (first, last), *_ in demonstrations])
+    return mean_interval([chance(window, len(frames), beside)
+                          for frames, window, *_ in demonstrations])
 
 
 def average(rows):
