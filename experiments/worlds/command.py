@@ -141,7 +141,7 @@ def score(marked, held_out, seed=0):
     :return: list of dicts: method, hit and near (at most a frame beside the bottleneck), each
         with value, low and high, n, and the mean frames of bottlenecks and demonstrations.
     """
-    from experiments.worlds import keyframes
+    from tap_ros.evaluation import keyframes
     methods = {
         'middle': keyframes.middle, 'slowest': keyframes.slowest, 'UVD-like': keyframes.uvd,
         f'{len(marked)} marks': keyframes.from_marks(

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from tap_ros.evaluation import keyframes
 from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
 from tap_ros.prediction.marks import chance, features_of, Marks
-from tap_ros.prediction.preference import FEATURES, Preference
+from tap_ros.prediction.preference import Preference
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.robot_mask import trained_robot_mask
-
-_SPEED = FEATURES.index('speed')
 
 
 def score_hits(store: EpisodeStore, marks: Marks, episodes: Sequence[int] | np.ndarray,
@@ -30,12 +29,15 @@ def score_hits(store: EpisodeStore, marks: Marks, episodes: Sequence[int] | np.n
     rows = [row for row, i in enumerate(episodes) if int(i) in marks.episodes]
     learned = training.get('marks') or {}
     preferences = [Preference.from_json(one) for one in learned.get('preferences', [])[:1]]
-    names = ['prediction', *['preference alone'] * len(preferences), 'slowest', 'middle']
+    names = ['prediction', *['preference alone'] * len(preferences), 'slowest', 'middle',
+             'UVD-like']
     chosen: dict[str, list[int]] = {name: [] for name in names}
     for row in rows:
-        features = features_of(store, int(episodes[row]), trained_robot_mask(training)[0])
-        frames = [int(matched[row]), *(one.best(features) for one in preferences),
-                  1 + int(features[1:-1, _SPEED].argmin()), (len(features) - 1) // 2]
+        i = int(episodes[row])
+        features = features_of(store, i, trained_robot_mask(training)[0])
+        frames = [int(matched[row]), *(one.best(features) for one in preferences), *(
+            choose(store.frames(i)) for choose in (
+                keyframes.slowest, keyframes.middle, keyframes.uvd))]
         for name, frame in zip(names, frames, strict=True):
             chosen[name].append(frame)
     windows = [marks.episodes[int(episodes[row])] for row in rows]

@@ -5,11 +5,12 @@
 import json
 from pathlib import Path
 
-from experiments.worlds import command, keyframes
+from experiments.worlds import command
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
+from tap_ros.evaluation import keyframes
 from tap_ros.recording.reader import iter_episodes
 
 

@@ -6,6 +6,8 @@ Keyframes of a demonstration that need no training, or a few marks only.
 Each takes pictures, uint8 (T, H, W, 3) from start to goal, and returns a frame between them.
 """
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from tap_ros.prediction.preference import describe, learn_preference
 
@@ -13,12 +15,12 @@ ASIDE = 0.1  # share of the way in pictures that slowest stays away from start a
 SMOOTH = np.ones(3) / 3
 
 
-def middle(frames):
+def middle(frames: np.ndarray) -> int:
     """Return the frame in the middle of the time."""
     return (len(frames) - 1) // 2
 
 
-def slowest(frames):
+def slowest(frames: np.ndarray) -> int:
     """
     Return the frame where the pictures change least, neither at the start nor at the goal.
 
@@ -34,7 +36,7 @@ def slowest(frames):
     return int(np.where((start < least) | (goal < least), np.inf, speed).argmin())
 
 
-def uvd(frames):
+def uvd(frames: np.ndarray) -> int:
     """
     Return the last subgoal before the goal, as the Universal Visual Decomposer finds it.
 
@@ -49,7 +51,8 @@ def uvd(frames):
     return int(falls.max(initial=-1)) + 1
 
 
-def from_marks(marked, marks):
+def from_marks(marked: Sequence[np.ndarray],
+               marks: Sequence[int]) -> Callable[[np.ndarray], int]:
     """
     Learn a time preference from marks; see preference.Preference.
 
@@ -60,7 +63,7 @@ def from_marks(marked, marks):
     return lambda frames: preference.best(describe(frames))
 
 
-def _distances(frames, end):
+def _distances(frames: np.ndarray, end: int) -> np.ndarray:
     """Return the l1 distances (T,) to the frame at an end, in pixel values."""
     pictures = frames.astype(np.float32)
-    return np.abs(pictures - pictures[end]).mean((1, 2, 3))
+    return np.asarray(np.abs(pictures - pictures[end]).mean((1, 2, 3)))
