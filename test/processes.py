@@ -6,7 +6,6 @@ import os
 from pathlib import Path
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -232,11 +231,3 @@ class LocalNode:
 def page_address(process):
     """Return where the page of an explorer_node is."""
     return re.search(r'ready: open (http://\S+)', process.wait_for('ready').text)[1]
-
-
-def http_status(port, target, *headers):
-    """Return the status of the answer to raw bytes; None where the connection is just closed."""
-    with socket.create_connection(('127.0.0.1', port), 10.0) as connection:
-        connection.sendall(b'\r\n'.join([b'GET ' + target + b' HTTP/1.1', *headers, b'', b'']))
-        answer = b''.join(iter(lambda: connection.recv(4096), b''))
-    return int(answer.split(None, 2)[1]) if answer else None

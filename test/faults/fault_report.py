@@ -27,10 +27,10 @@ HEAD = """\
 # Faults
 
 Each row is a fault that was injected into real nodes, processes of their own that talk over DDS,
-or into real files. *Held*: trials in which what must happen did happen. Numbers are the worst of
-all trials unless said otherwise. `make faults` (about five hours) makes this page and
+or into a disk. *Held*: trials in which what must happen did happen. Numbers are the worst of all
+trials unless said otherwise. `make faults` (about four hours) makes this page and
 [faults.json](faults.json), which has each row's machine, date and commit; `python -m pytest -m
-fault` tries each fault a few times.
+fault` tries each fault a few times. Damaged recordings and weights are in `make test`.
 
 | injected | must happen | held | seen |
 | --- | --- | ---: | --- |
@@ -158,7 +158,7 @@ def _line(injected, promise, rows):
     seen = ' / '.join(f'{figure:.3g}' if isinstance(figure, float) else figure
                       for figure in figures)
     parts = [f'{seen} {rows[0]["what"]}'.strip() if figures else '',
-             *(row['why_not'] for row in rows), *dict.fromkeys(row['note'] for row in rows)]
+             *(row['why_not'] for row in rows)]
     words = '; '.join(filter(None, parts)).replace('|', '\\|').replace('<', '\\<')
     share = f'{held} of {tried}'
     return f'| {injected} | {promise} | {share if held == tried else f"**{share}**"} | {words} |\n'

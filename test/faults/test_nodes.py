@@ -1,30 +1,26 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes that are started wrongly or ended at any moment, forged text, latecomers, an hour."""
+"""Nodes that are started wrongly or ended at any moment, forged text, an hour."""
 
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 import re
 import signal
 import time
 
 from driven import first_pictures, goal_fields, objects_message, predict_fields
-from fault_files import describe_exit
 from fault_report import fault
 import numpy as np
-from processes import Client, http_status, Newest, NodeProcess, page_address, until
+from processes import NodeProcess, until
 import pytest
 from sensor_msgs.msg import Image
-from tap_msgs.msg import Episode, ObjectStates, Subgoal
+from tap_msgs.msg import Episode, ObjectStates
 from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
-from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
-from websockets.sync.client import connect
+from tap_ros.nodes.topics import STREAM, to_stamp
 
 pytestmark = pytest.mark.ros
 
 END_S = 10.0
-JOIN_S = 5.0
 WARM_UP = 0.15  # share of the time that the slope of memory leaves out
 GOALS_PER_HOUR = 500  # about what fits; the share of them is the share of the hour
 MOST_MB_PER_HOUR = 20.0
@@ -37,8 +33,8 @@ NAMES = (f'red\n{FORGED}', f'\x1b[31m{FORGED}\x1b[0m', f'a\r{FORGED}', f'a\x85{F
 
 @pytest.mark.parametrize('name', ('sim_node', 'predictor_node', 'visual_mpc_node',
                                   'recorder_node'))
-@fault('a node is started and ended at any moment', f'ends within {END_S:g} s, exit code 0 (or '
-       'by the signal, while Python imports), no traceback', 200,
+@fault('a node is started and ended at any moment', f'ends within {END_S:g} s, exit code 0 (130 '
+       'or the signal while Python imports, 1 of a recorder of nothing), no traceback', 200,
        's until it had ended')
 def test_start_stop(trials, tmp_path, name):
     random = np.random.default_rng(0)
@@ -82,7 +78,7 @@ def test_start_stop(trials, tmp_path, name):
                 assert 'Traceback' not in text, f'a traceback after {number.name}'
                 # A recorder that nobody sends anything has failed.
                 assert code == int('nothing was recorded' in text), (
-                    f'{describe_exit(code)} after {number.name}: {process.last_line()}')
+                    f'exit code {code} after {number.name}: {process.last_line()}')
     trials.note = f'{early} by the signal'
 
 
@@ -110,41 +106,6 @@ def test_parameters(trials, tmp_path, given):
                 f'{name}: {parameter} is not named')
             assert 'Traceback' not in process.text, f'{name}: a traceback'
         process.end(signal.SIGINT)
-
-
-@fault('malformed addresses, headers and commands to the explorer, surrogates in them',
-       'refused (HTTP 4xx, or an error that says what is expected) or closed; the page is served '
-       'and commands are taken after it', 1000)
-def test_explorer_requests(trials, tmp_path):
-    random = np.random.default_rng(0)
-    targets = (b'/', b'/socket', b'//[', b'/?token=%ED%A0%80', b'/socket?token=\xff', b'http://[',
-               b'/%00', b'/\xf0\x9f', b'*', b'/..;/')
-    headers = (b'localhost', b'[', b'[::1', b'\xff', b'evil.example', b'localhost:99999999', b'')
-    texts = ('{"do": "\\ud800"}', '{"do": "reset", "task": "\\udfff", "seed": 1}', '\x00', '[[[',
-             '{"do": "move", "name": "\\ud83d", "u": 1, "v": 1e999}', '{"do": null}')
-    process = NodeProcess('explorer_node', tmp_path / 'explorer.log', {'port': 0})
-    try:
-        url = page_address(process)
-        port = int(url.split(':')[2].strip('/'))
-
-        with connect(url.replace('http', 'ws') + 'socket', max_size=2**24) as browser:
-            for trial in trials:
-                with trials.one():
-                    target, host, origin = (
-                        bytes(random.choice(each)) for each in (targets, headers, (
-                            b'', b'http://[', b'null', b'http://[::1', b'\xed\xa0\x80')))
-                    if trial % 2:
-                        target += random.bytes(4).translate(None, b' \r\n\t')
-                    found = http_status(port, target, b'Host: ' + host, *(
-                        [b'Origin: ' + origin] if origin else []))
-                    assert found is None or found == 200 or 400 <= found < 500, (
-                        f'{target} of {host}, {origin}: {found}')
-                    browser.send(texts[trial % len(texts)])
-                    while '"kind": "error"' not in str(browser.recv(10.0)):
-                        pass
-                    assert http_status(port, b'/', b'Host: localhost') == 200, 'the page is gone'
-    finally:
-        process.end()
 
 
 @fault('newlines and control characters in names', 'logs and answers show them escaped, in one '
@@ -198,32 +159,9 @@ def is_forged(text):
                for line in text.replace('\t', ' ').split('\n'))
 
 
-@fault('subscribers that come late', 'picture, goal picture and subgoal come within '
-       f'{JOIN_S:g} s', 100, 's until all three were there')
-def test_late_joiners(rig, trials):
-    rig.need('predictor_node', sim='lock-step')
-    for trial in trials:
-        if trial % 10 == 0:
-            rig.reset(trial)
-            deadline = time.monotonic() + 10  # what a prediction needs may be on its way
-            while time.monotonic() < deadline:
-                with suppress(TapError):
-                    rig.client.predict()
-                    break
-                time.sleep(0.1)
-        begin = time.monotonic()
-        with trials.one(), Client('late') as node:
-            topics = [Newest(node, Image, 'camera/image_raw', STREAM),
-                      Newest(node, Image, 'goal/image', LATCHED),
-                      Newest(node, Subgoal, 'subgoal', LATCHED)]
-            for newest in topics:
-                newest.wait(JOIN_S)
-            trials.measured(time.monotonic() - begin)
-
-
 @fault('an hour of goals, predictions, resets and recording', 'each goal ends as it should; no '
        f'node grows by more than {MOST_MB_PER_HOUR:g} MB an hour', GOALS_PER_HOUR,
-       'MB/h by which the node that grows most grows')
+       'MB/h, the node that grows most')
 def test_soak(rig, trials, tmp_path):
     rig.need('visual_mpc_node', 'predictor_node', sim='real')
     rig.start('recorder_node', folder=tmp_path / 'bag').wait_for('ready')

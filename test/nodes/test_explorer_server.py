@@ -4,7 +4,7 @@
 
 from contextlib import contextmanager, ExitStack
 import http.client
-from itertools import count
+from itertools import count, product
 import json
 import math
 import socket
@@ -124,6 +124,25 @@ def test_foreign_pages_and_foreign_names_that_lead_here_are_refused():
         for host in ('localhost', '127.9.9.9', '[::1]'):
             assert get(server, Host=f'{host}:{server.port}')[0] == 200
     assert not any(map(is_loopback, ('0.0.0.0', '192.168.0.1', 'localhost.evil.example', '')))
+
+
+def status(server, target, *headers):
+    """Return the status of the answer to raw bytes; None where the connection is just closed."""
+    with socket.create_connection(('127.0.0.1', server.port), 10.0) as connection:
+        connection.sendall(b'\r\n'.join([b'GET ' + target + b' HTTP/1.1', *headers, b'', b'']))
+        answer = b''.join(iter(lambda: connection.recv(4096), b''))
+    return int(answer.split(None, 2)[1]) if answer else None
+
+
+def test_malformed_addresses_and_headers_are_refused_and_the_page_is_served_after_them():
+    with serving() as server:
+        for target, host, origin in product(
+                (b'/', b'//[', b'/?token=%ED%A0%80', b'/socket?token=\xff', b'http://[', b'*'),
+                (b'localhost', b'[::1', b'\xff', b'localhost:99999999', b''),
+                (b'http://[', b'null', b'\xed\xa0\x80')):
+            found = status(server, target, b'Host: ' + host, b'Origin: ' + origin)
+            assert found is None or 400 <= found < 500, (target, host, origin)
+        assert status(server, b'/', b'Host: localhost') == 200
 
 
 def test_a_token_is_asked_for_by_page_and_socket_and_stands_in_the_address():

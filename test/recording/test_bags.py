@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of a bag: found, written by a recorder that may be killed, described by metadata."""
 
+from itertools import pairwise
 import os
 import signal
 import subprocess
@@ -126,6 +127,14 @@ def test_metadata_that_cannot_be_used_is_named_in_one_line(bag):
             (begin + 'relative_file_paths: ["a\\0b\\e[2J\\n"]', 'not')):
         path.write_text(text)
         with pytest.raises(RecordingError, match=f'metadata.yaml.*{words}') as caught:
+            open_recordings(bag)
+        assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
+    laughs = ''.join(f'{to}: &{to} [{", ".join([f"*{of}"] * 9)}]\n'
+                     for of, to in pairwise('abcdefghij'))
+    for text in ('', 'null', '[]', '&a [*a]', '\0' * 100, '[' * 200_000, '{a: ' * 200_000,
+                 'a: &a [x]\n' + laughs, '!!python/object/apply:os.system [true]'):
+        path.write_text(text)
+        with pytest.raises(RecordingError, match='metadata.yaml') as caught:
             open_recordings(bag)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
 

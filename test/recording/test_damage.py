@@ -20,6 +20,7 @@ from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.damage import describe, Loss
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.file_writer import FileWriter
+from tap_ros.recording.messages import schema_text
 from tap_ros.recording.reader import iter_episodes
 from tap_ros.recording.writer import EpisodeWriter
 import zstandard
@@ -262,6 +263,17 @@ def test_files_that_unpack_to_what_no_recording_holds_are_refused_in_time(tmp_pa
         assert (tmp_path / 'a.mcap').stat().st_size < 10**5
         with pytest.raises(RecordingError, match=f'a.mcap: .*chunk .*{words}'):
             open_recordings(tmp_path)
+    with open(tmp_path / 'a.mcap', 'wb') as out:  # some kilobytes
+        writer = Writer(out, chunk_size=2**26, index_types=IndexType.NONE,
+                        compression=CompressionType.ZSTD)
+        writer.start('ros2')
+        schema = writer.register_schema(IMAGE, 'ros2msg', schema_text(IMAGE).encode())
+        channel = writer.register_channel('/camera/image_raw', 'cdr', schema)
+        for _ in range(300_000):
+            writer.add_message(channel, 1, bytes(8), 1)
+        writer.finish()
+    with pytest.raises(RecordingError, match='a.mcap'):
+        open_recordings(tmp_path)
 
 
 def test_a_name_that_metadata_cannot_hold_is_refused(tmp_path):
