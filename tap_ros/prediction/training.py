@@ -65,6 +65,9 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
 def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
     """Make the networks of a run, what they are trained on and how."""
     config, store, processes, device = this.config, this.store, this.processes, this.device
+    if config.patience and not len(this.held_out):
+        raise ConfigError('patience: nothing is held out to see improvement by; give --held-out, '
+                          'a --test-fraction above 0, or leave --patience out')
     network = PredictorNetwork(network_config(config, store.image_size))
     if config.initial_weights and not this.checkpoint.exists():
         _begin_with(network, config.initial_weights)
@@ -98,7 +101,7 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
         state, partial(_batches, store, frames, filled, this.training, config, processes,
                        preference=preference), step,
         partial(_score, this, state, frames, filled, preference, autocast),
-        (config.learning_rate, config.discriminator_rate), about)
+        (config.learning_rate, config.discriminator_rate), about, config.patience)
 
 
 def _learn(this: run.Run) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
@@ -198,17 +201,20 @@ def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames
         return make_batch(this.store, episodes, sampling, frames, filled=filled,
                           preference=preference).to(this.device)
 
-    scores, pictures, losses, fractions = {}, {}, [], []
+    scores, pictures, losses, copied, fractions = {}, {}, [], [], []
     for i in range(0, len(held_out), 64):
         part = batch(held_out[i:i + 64])
         prediction, match = matched(state.average, part, config, autocast)
-        frame = part.targets[torch.arange(len(match), device=match.device), match]
+        frame = to_float(part.targets[torch.arange(len(match), device=match.device), match])
         image = part.visible(prediction.image[:, None])[:, 0]
-        losses.append(l1_error(image, to_float(frame)).cpu())
+        losses.append(l1_error(image, frame).cpu())
+        copied.append(l1_error(to_float(part.measured), frame[:, None]).amin(1).cpu())
         fractions.append((part.times.gather(1, match[:, None]) / part.end)[:, 0].cpu())
     if losses:
         shares = torch.cat(fractions)
-        scores = {'loss': torch.cat(losses).mean().item(), 'match_fraction': shares.mean().item(),
+        loss = torch.cat(losses).mean()
+        scores = {'loss': loss.item(), 'relative': (loss / torch.cat(copied).mean()).item(),
+                  'match_fraction': shares.mean().item(),
                   'match_fraction_std': shares.std(correction=0).item()}
     for name, episodes in (('training', this.training), ('held_out', held_out)):
         if len(episodes):
@@ -295,7 +301,8 @@ def _begin_with(network: PredictorNetwork, weights: str) -> None:
         mine, others = asdict(network.config), asdict(other.config)
         raise ConfigError(f'initial_weights: {weights} are for another network: ' + ', '.join(
             f'{name} {others[name]!r} instead of {mine[name]!r}'
-            for name in mine if mine[name] != others[name]))
+            for name in mine if mine[name] != others[name])
+            + '; leave these options out, or begin with other weights')
     network.load_state_dict(other.state_dict())
 
 

@@ -146,7 +146,8 @@ class NetworkSettings:
     :param latent_size: length of z, for the methods that have it.
     :param video_frames: the recognition network sees the video at so many moments; the paper: all.
     :param initial_weights: begin with these instead of fresh ones: a file, or the name of shipped
-        weights; to learn another task from few episodes. The network must have the same shape.
+        weights; to learn another task from few episodes. Width, decoder, skips, new pixels and
+        the size of the pictures are then those of the weights.
     """
 
     new_pixels: bool = False
@@ -167,11 +168,15 @@ class PredictorOptimizer(OptimizerSettings):
     :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 on a GPU, and on a CPU
         that has instructions for it. The choice stays for the whole run.
     :param compile: use torch.compile; slow to start, results differ in the last digits.
+    :param patience: end after so many steps without a smaller error of the held-out episodes,
+        relative to copying at the frame that is matched, and keep the weights that had the
+        smallest; 0: go on to the last step.
     """
 
     discriminator_rate: float = 2e-4
     precision: Precision = 'auto'
     compile: bool = False
+    patience: int = 0
 
 
 _RANGES = {
@@ -180,7 +185,8 @@ _RANGES = {
     'kl_weight': (0, math.inf), 'free_nats': (0, math.inf), 'kl_warmup': (0, 0.5),
     'posterior_std': (0.01, 1), 'margin': (0, math.inf), 'num_targets': (0, math.inf),
     'min_crop': (1e-6, 1), 'start_crop': (0, 0.9), 'brightness': (0, 0.9), 'fill_context': (0, 1),
-    'base_width': (1, math.inf), 'latent_size': (1, math.inf), 'video_frames': (1, math.inf)}
+    'base_width': (1, math.inf), 'latent_size': (1, math.inf), 'video_frames': (1, math.inf),
+    'patience': (0, math.inf)}
 
 
 # Of the bases the last has its fields first.

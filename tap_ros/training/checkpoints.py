@@ -8,7 +8,7 @@ Batches and augmentation are drawn from (seed, step), so that there are no rando
 
 from collections.abc import Callable, Mapping
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import json
 import math
 from pathlib import Path
@@ -40,6 +40,8 @@ class TrainingState(Generic[Trained]):
     :param step: number of steps done.
     :param seconds: time they took, over all sessions.
     :param precision: what the networks run in, 'float32' or 'bfloat16'; '': nothing was chosen.
+    :param best: the average where its score was smallest, a state dict; empty: none was noted.
+    :param best_score: that score; best_step: steps done then.
     """
 
     network: Trained
@@ -49,6 +51,15 @@ class TrainingState(Generic[Trained]):
     step: int = 0
     seconds: float = 0.0
     precision: str = ''
+    best: dict[str, torch.Tensor] = field(default_factory=dict)
+    best_score: float = math.inf
+    best_step: int = 0
+
+    def note(self, score: float) -> None:
+        """Keep the average if its score is the smallest so far."""
+        if score < self.best_score:
+            self.best_score, self.best_step = score, self.step
+            self.best = {name: value.clone() for name, value in self.average.state_dict().items()}
 
     def set_rates(self, steps: int, warmup: int, *highest: float) -> None:
         """
@@ -121,11 +132,13 @@ def save_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     tensors = {f'network.{name}': value for name, value in state.network.state_dict().items()}
     tensors |= {f'average.{name}': value for name, value in state.average.state_dict().items()}
     tensors |= {f'helpers.{name}': value for name, value in state.helpers.state_dict().items()}
+    tensors |= {f'best.{name}': value for name, value in state.best.items()}
     for k, optimizer in enumerate(state.optimizers):
         for i, values in optimizer.state_dict()['state'].items():
             tensors |= {f'optimizer.{k}.{i}.{name}': value for name, value in values.items()}
     save_tensors(path, tensors, {
         'kind': 'checkpoint', 'step': state.step, 'seconds': state.seconds,
+        **({'best': [state.best_score, state.best_step]} if state.best else {}),
         'precision': state.precision, 'settings': settings, 'data_hash': data_hash})
 
 
@@ -167,6 +180,7 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
                            f'({escaped(error)}); {_REMEDY}') from error
     state.step, state.seconds = about['step'], about['seconds']
     state.precision = about.get('precision', '')
+    state.best_score, state.best_step = about.get('best', (math.inf, 0))
 
 
 def _put_back(state: TrainingState[Any], tensors: Mapping[str, torch.Tensor]) -> None:
@@ -175,6 +189,8 @@ def _put_back(state: TrainingState[Any], tensors: Mapping[str, torch.Tensor]) ->
                            ('helpers.', state.helpers)):
         module.load_state_dict({name[len(prefix):]: value for name, value in tensors.items()
                                 if name.startswith(prefix)})
+    state.best = {name: tensors[f'best.{name}'].clone() for name in state.average.state_dict()
+                  if f'best.{name}' in tensors}
     for k, optimizer in enumerate(state.optimizers):
         for i, weight in enumerate(optimizer.param_groups[0]['params']):
             for name in [name for name in tensors if name.startswith(f'optimizer.{k}.{i}.')]:

@@ -93,6 +93,8 @@ class Course(Generic[Trained, Item]):
     :param score: makes the scores of the averaged network and pictures (H, W, 3), both by name.
     :param rates: of each optimizer, the learning rate at its highest.
     :param about: what else the weights file tells of the run; what JSON can hold.
+    :param patience: steps after which the run ends if the score 'relative', of the held-out
+        episodes, has not become smaller; the weights are then those with the smallest. 0: never.
     """
 
     state: TrainingState[Trained]
@@ -101,6 +103,21 @@ class Course(Generic[Trained, Item]):
     score: Callable[[], tuple[Numbers, Mapping[str, np.ndarray]]]
     rates: tuple[float, ...]
     about: Mapping[str, Any] = field(default_factory=dict)
+    patience: int = 0
+
+    @property
+    def patient(self) -> bool:
+        """Whether there is hope yet that the score becomes smaller."""
+        return not self.patience or self.state.step - self.state.best_step < self.patience
+
+    def keep_the_best(self, last: int) -> None:
+        """Score five times in its patience; at the end take the best weights."""
+        state = self.state
+        if self.patience and (
+                state.step % max(1, self.patience // 5) == 0 or state.step == last):
+            state.note(self.score()[0]['relative'])
+            if state.best and (not self.patient or state.step == last):
+                state.average.load_state_dict(state.best)
 
 
 def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
@@ -179,7 +196,8 @@ def _train(run: Run, course: Course[Trained, Item], last: int, deadline: float,
     curves = SummaryWriter(config.out, purge_step=state.step) if run.processes.first else None
     with _first_interrupt() as interrupted, curves or nullcontext(), bar:
         began = time.monotonic() - state.seconds
-        for step, item in enumerate(course.batches(state.step, last), start=state.step):
+        batches = course.batches(state.step, last) if course.patient else ()
+        for step, item in enumerate(batches, start=state.step):
             state.set_rates(config.steps, config.warmup, *course.rates)
             numbers = course.step(item)
             state.update_average(config.average_decay)
@@ -194,8 +212,11 @@ def _train(run: Run, course: Course[Trained, Item], last: int, deadline: float,
                 bar.set_postfix({name: f'{shown[name]:.4f}' for name in list(shown)[:2]})
             if after_step is not None:
                 after_step(state.step)
+            if curves is not None:
+                course.keep_the_best(config.steps)
             stopped = run.processes.agree(
-                interrupted.is_set() or time.monotonic() > deadline, run.device)
+                interrupted.is_set() or time.monotonic() > deadline or not course.patient,
+                run.device)
             if curves is not None and (
                     state.step % config.save_every == 0 or state.step == last or stopped):
                 state.seconds = time.monotonic() - began
@@ -255,6 +276,7 @@ def _report(run: Run, course: Course[Trained, Item], curves: SummaryWriter) -> N
     about = {
         **({'precision': state.precision} if state.precision else {}),
         'steps': state.step, 'seconds': round(state.seconds, 1), 'seed': run.config.seed,
+        **({'best_step': state.best_step} if course.patience else {}),
         'data_hash': store.data_hash,
         'camera_size': list(store.camera_size) if store.camera_size else None,
         'episodes': len(run.training), 'held_out': len(run.held_out),

@@ -15,6 +15,7 @@ from tap_ros.errors import ConfigError, TapError
 from tap_ros.recording.reading import Reading
 from tap_ros.training.recipes import DEFAULT, find_recipe, Model, Recipe, RECIPES
 from tap_ros.training.settings import TrainOptions
+from tap_ros.weights import find_predictor
 
 Options = TypeVar('Options', bound=TrainOptions)
 
@@ -41,7 +42,7 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
     :param recipe: its name in training/recipes.py; by default that of the task that the
         recordings name, else push2's.
     :param settings: other settings than the recipe's: fields of TrainingConfig, or of
-        ForwardTrainingConfig.
+        ForwardTrainingConfig. Initial weights bring the network's shape and the pictures' size.
     :return: path of the weights file.
     :raises ConfigError: for a model, recipe or setting that is unknown or cannot be trained with.
     :raises TapError: for recordings that cannot be used, a damaged checkpoint, a full disk.
@@ -60,11 +61,30 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
                               + (f'; did you mean {near[0]!r}?' if near else ''))
     if isinstance(settings.get('held_out'), str | Path):
         settings['held_out'] = (str(settings['held_out']),)
-    if 'marks' in settings:
-        settings['marks'] = str(settings['marks'])
+    for name in settings.keys() & {'marks', 'initial_weights'}:
+        settings[name] = str(settings[name])
+    settings = {**shape_of(settings.get('initial_weights', '')), **settings}
     chosen = find_recipe(model, recipe or recipe_of(model, bags, settings))
     return Path(function(config_class(recordings=bags, out=str(out or f'runs/{model}'), **{
         **_chosen_settings(chosen, settings), **settings})))
+
+
+def shape_of(weights: str | Path) -> dict[str, Any]:
+    """
+    Return the settings that make a network of the shape that weights of a predictor have.
+
+    :param weights: file, or name of shipped ones.
+    :return: dict; empty for '', and where nothing can be read, which the training will say.
+    """
+    if not weights:
+        return {}
+    with suppress(TapError):
+        from tap_ros.training.weights import load_weights  # here: torch takes seconds to import
+        config = {'decoder': 'separate', 'skips': False,  # as files that do not tell have them
+                  **load_weights(find_predictor(weights), 'predictor')[0]}
+        return {'size': config['image_size'], **{name: config[name] for name in (
+            'base_width', 'new_pixels', 'decoder', 'skips')}}
+    return {}
 
 
 def recipe_of(model: str, recordings: Sequence[str], settings: Mapping[str, Any]) -> str:
@@ -98,8 +118,10 @@ def with_recipe(model: Model, args: Options) -> Options:
     given = settings_of(args)
     if not given['recordings']:
         raise ConfigError('missing: BAG; name the recordings, or see --help')
-    chosen = find_recipe(model, args.recipe or recipe_of(model, given['recordings'], given))
-    wanted = _chosen_settings(chosen, given)
+    shape = shape_of(given.get('initial_weights', ''))
+    reading = given | {'size': given['size'] or shape.get('size', 0)}
+    chosen = find_recipe(model, args.recipe or recipe_of(model, given['recordings'], reading))
+    wanted = {**_chosen_settings(chosen, given), **shape}
     changed: dict[str, Any] = {
         name: replace(part, **{key: wanted[key] for key in asdict(part).keys() & wanted})
         for name, part in vars(args).items() if name != 'recipe'}

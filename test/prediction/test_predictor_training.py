@@ -79,7 +79,7 @@ def test_every_kind_of_method_learns(config, values):
     assert losses[1] < losses[0]
 
 
-def test_a_training_can_begin_with_the_weights_of_another(config, tmp_path):
+def test_a_training_can_begin_with_the_weights_of_another(config, tmp_path, capsys):
     first = train(config, stop_at=1, progress=False)
     tuned = replace(config, out=str(tmp_path / 'tuned'), initial_weights=first, seed=1,
                     learning_rate=1e-12, steps=2)
@@ -90,6 +90,14 @@ def test_a_training_can_begin_with_the_weights_of_another(config, tmp_path):
     with pytest.raises(ConfigError, match='base_width 4 instead of 8'):
         train(other, progress=False)
     assert not (Path(other.out) / 'checkpoint.safetensors').exists()
+    # A recipe takes their shape and size; what is asked for beside it is refused as above.
+    few = ['train', 'predictor', *config.recordings, '--initial-weights', first, '--steps', '1',
+           '--batch-size', '2', '--recipe', 'stack2', '--threads', '1', '--test-fraction', '0']
+    assert main([*few, '--out', str(tmp_path / 'few')]) == 0
+    shape = load_network(tmp_path / 'few' / 'predictor.safetensors')[0].config
+    assert shape == load_network(first)[0].config
+    assert main([*few, '--new-pixels', '--out', str(tmp_path / 'wrong')]) == 1
+    assert 'new_pixels False instead of True' in capsys.readouterr().err
     Path(first).unlink()  # once begun, it goes on without them
     train(tuned, progress=False)
 

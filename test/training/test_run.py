@@ -3,6 +3,7 @@
 """Laws of every training run: whatever ends it, it goes on to the same result."""
 
 from dataclasses import replace
+import json
 from pathlib import Path
 import resource
 import shutil
@@ -119,6 +120,35 @@ def test_a_run_of_other_settings_or_of_another_process_is_not_continued(half):
         train(replace(half, learning_rate=0.1), progress=False)
     with only_writer(half.out), pytest.raises(StorageError, match='another process'):
         train(half, progress=False)
+
+
+def test_patience_keeps_the_best_weights_and_ends_when_none_better_come(tmp_path, monkeypatch):
+    scores = {1: 3.0, 2: 1.0, 3: 2.0, 4: 2.0, 5: 0.5}
+    monkeypatch.setattr('tap_ros.prediction.training._score', lambda this, state, *_: (
+        {'relative': scores.get(state.step, 1.0)}, {}))
+    patient = replace(CONFIG, patience=2, steps=9, save_every=1)
+    held = {}
+    for name, stops in (('whole', (9,)), ('parts', (1, 2, 3, 9, 9))):
+        config = replace(patient, out=str(tmp_path / name))
+        for stop in stops:
+            def note(step, config=config):
+                if step > 1:
+                    held[step] = load_average(config)
+
+            train(config, stop_at=stop, progress=False, after_step=note)
+        about = json.loads(Path(config.out, 'run.json').read_text())
+        assert (about['steps'], about['best_step']) == (4, 2)
+        shipped = load_tensors(Path(config.out, 'predictor.safetensors'))[0]
+        assert all(shipped[name].equal(value) for name, value in held[3].items())
+        assert not shipped['head.0.weight'].equal(held[4]['head.0.weight'])
+    with pytest.raises(ConfigError, match='patience'):
+        train(replace(patient, out=str(tmp_path / 'none'), test_fraction=0), progress=False)
+
+
+def load_average(config):
+    """Return the averaged weights of the checkpoint before this step."""
+    tensors = load_tensors(Path(config.out, 'checkpoint.safetensors'))[0]
+    return {name[8:]: value for name, value in tensors.items() if name.startswith('average.')}
 
 
 def test_learning_rate_rises_and_falls_and_the_average_moves_fast_at_first():
