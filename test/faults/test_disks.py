@@ -21,6 +21,7 @@ from tap_ros.recording.writer import EpisodeWriter, write_metadata
 from tap_ros.training.weights import load_tensors, save_weights
 
 TIMEOUT_S = 180.0
+FULL = 'the disk is full while recordings are collected or weights trained'
 CLEAR = 'one line that says so, exit code not 0; finished files can be read'
 
 
@@ -58,8 +59,7 @@ def run_on_full_disk(*words):
     return time.monotonic() - begin
 
 
-@fault('the disk is full while recordings are collected', CLEAR, 20, 's until it ended (median)',
-       statistics.median)
+@fault(FULL, CLEAR, 20, 's until it ended (median)', statistics.median)
 def test_disk_full_collect(trials, tmp_path):
     random = np.random.default_rng(0)
     for trial in trials:
@@ -91,8 +91,7 @@ def read_bag(folder):
         return list(iter_episodes(folder)), told
 
 
-@fault('the disk is full while weights are trained', CLEAR, 20, 's until it ended (median)',
-       statistics.median)
+@fault(FULL, CLEAR, 20, 's until it ended (median)', statistics.median)
 def test_disk_full_train(trials, tmp_path):
     random = np.random.default_rng(0)
     source = tmp_path / 'source'
