@@ -48,8 +48,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                     'tap_ros.planning.forward_training_config'),
     }),
     'evaluate': ('score trained weights', {
-        'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.prediction'),
-        'forward': ('score a forward model on recordings', 'tap_ros.evaluation.forward'),
+        'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.command:prediction'),
+        'forward': ('score a forward model on recordings', 'tap_ros.evaluation.command:forward'),
         'planning': ('push or stack objects and score where they end (Table 2)',
                      'experiments.planning.command'),
     }),

@@ -9,9 +9,10 @@ from experiments.pages import interval, render
 import numpy as np
 import pandas as pd
 from tap_ros.evaluation.intervals import mean_interval
-from tap_ros.evaluation.prediction import evaluate, write_pictures
+from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.samples import SAMPLES, score_samples
 from tap_ros.evaluation.shown import SHOWN
+from tap_ros.evaluation.strips import write_strips
 from tap_ros.files import write_atomically
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
@@ -58,7 +59,7 @@ def ship(name, task, run, fresh, out, commands):
     samples = sample_facts(network, store, episodes) if network.config.latent_size else None
     good = found(first)
     shown = [*np.flatnonzero(good)[:PICTURED], *np.flatnonzero(~good)[:PICTURED]]
-    write_pictures(file.with_suffix('.png'), network, store, shown, 'last')
+    write_strips(file.with_suffix('.png'), network, store, shown, 'last')
     card = file.with_suffix('.md')
     *collect, again, train = commands
     write_atomically(card, render(

@@ -3,16 +3,15 @@
 """The command `python -m tap_ros evaluate forward`: how well object maps are carried."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 import shlex
 from typing import Any
 
 import numpy as np
 from tap_ros.errors import ConfigError
+from tap_ros.evaluation.command import Forward
 from tap_ros.evaluation.intervals import mean_interval
 from tap_ros.files import write_rows
-from tap_ros.options import Bags, Folder, ShippedFile, Topic
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
 from tap_ros.recording.bags import reading_like
@@ -28,30 +27,7 @@ METHODS = {'map_error': 'forward_model', 'nothing_moves': 'nothing',
 FILE = 'forward_model.json'
 
 
-@dataclass(frozen=True)
-class Options:
-    """
-    Options of the command.
-
-    Pictures are filled behind the robot as the weights' training was.
-
-    :param recordings: bag folders with object pixels; each is scored on its own.
-    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
-    :param weights: of a forward model.
-    :param test_fraction: share of the episodes that training held out, by seed; 1: all.
-    :param device: cpu or cuda.
-    :param out: write forward_model.json there.
-    """
-
-    recordings: Bags
-    image_topic: Topic = ''
-    weights: ShippedFile = str(FORWARD_MODEL)
-    test_fraction: float = TEST_FRACTION
-    device: str = 'cpu'
-    out: Folder = ''
-
-
-def run(args: Options) -> None:
+def run(args: Forward) -> None:
     """
     Print a table, and write what --out asks for.
 

@@ -1,55 +1,79 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether predictions show marked frames, beside what needs no training to choose a frame."""
+"""Whether predictions show marked frames, beside what chooses a frame without predicting."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from tap_ros.evaluation import keyframes
 from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
-from tap_ros.prediction.marks import chance, features_of, Marks
+from tap_ros.evaluation.keyframes import middle, slowest, uvd
+from tap_ros.prediction.marks import chance, features_of, Mark, Marks
+from tap_ros.prediction.nearest_keyframe import halfway, l1_distance
 from tap_ros.prediction.preference import Preference
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.robot_mask import trained_robot_mask
 
 
-def score_hits(store: EpisodeStore, marks: Marks, episodes: Sequence[int] | np.ndarray,
+def score_hits(store: EpisodeStore, marks: Marks, episodes: np.ndarray, others: np.ndarray,
                matched: np.ndarray, training: Mapping[str, Any]) -> dict[str, list[Interval]]:
     """
     Say in which share of the marked episodes a frame is a marked one, or at most one beside it.
 
     :param marks: of at least one of the episodes; of several in an episode any counts.
     :param episodes: (N,) indices of episodes.
+    :param others: of demonstrations to be compared with, as a rule those trained on.
     :param matched: (N,), the frames that the predictions match.
     :param training: of the weights; tells the preference, where one was learned.
     :return: of the prediction, the preference alone (its largest w between start and goal), the
-        slowest frame, the middle one, and a random one: the shares of hits and of near ones.
+        nearest demonstration (see nearest_frame), keyframes and a random frame: the shares of
+        hits and of near ones.
     """
     rows = [row for row, i in enumerate(episodes) if int(i) in marks.episodes]
-    learned = training.get('marks') or {}
-    preferences = [Preference.from_json(one) for one in learned.get('preferences', [])[:1]]
-    names = ['prediction', *['preference alone'] * len(preferences), 'slowest', 'middle',
-             'UVD-like']
-    chosen: dict[str, list[int]] = {name: [] for name in names}
-    for row in rows:
-        i = int(episodes[row])
-        features = features_of(store, i, trained_robot_mask(training)[0])
-        frames = [int(matched[row]), *(one.best(features) for one in preferences), *(
-            choose(store.frames(i)) for choose in (
-                keyframes.slowest, keyframes.middle, keyframes.uvd))]
-        for name, frame in zip(names, frames, strict=True):
-            chosen[name].append(frame)
-    windows = [marks.episodes[int(episodes[row])] for row in rows]
-    lengths = [int(store.lengths[episodes[row]]) for row in rows]
+    scored = [int(episodes[row]) for row in rows]
+    frames = {'prediction': [int(matched[row]) for row in rows]}
+    for one in (training.get('marks') or {}).get('preferences', [])[:1]:
+        preference, robot_mask = Preference.from_json(one), trained_robot_mask(training)[0]
+        frames['preference alone'] = [
+            preference.best(features_of(store, i, robot_mask)) for i in scored]
+    if set(others.tolist()) - set(scored[:1]):
+        frames['nearest demonstration'] = [
+            nearest_frame(store, i, others.tolist(), marks) for i in scored]
+    keyframes: dict[str, Callable[[np.ndarray], int]] = {
+        'slowest': slowest, 'middle': middle, 'UVD-like': uvd}
+    for name, choose in keyframes.items():
+        frames[name] = [choose(store.frames(i)) for i in scored]
+    windows = [marks.episodes[i] for i in scored]
     result = {name: [share_interval([
-        any(first - off <= frame <= last + off for first, last in window)
-        for frame, window in zip(frames, windows)]) for off in (0, 1)]
-        for name, frames in chosen.items()}
+        is_hit(window, frame, off) for frame, window in zip(each, windows)]) for off in (0, 1)]
+        for name, each in frames.items()}
     result['random'] = [mean_interval([
-        min(1.0, sum(chance(mark, length, off) for mark in window))
-        for length, window in zip(lengths, windows)]) for off in (0, 1)]
+        min(1.0, sum(chance(mark, int(store.lengths[i]), off) for mark in window))
+        for i, window in zip(scored, windows)]) for off in (0, 1)]
     return result
+
+
+def is_hit(window: Sequence[Mark], frame: int, off: int = 0) -> bool:
+    """Say whether a frame is within one of the marks of its episode, or so many beside it."""
+    return any(first - off <= frame <= last + off for first, last in window)
+
+
+def nearest_frame(store: EpisodeStore, i: int, others: Sequence[int], marks: Marks) -> int:
+    """
+    Return the frame of an episode that is nearest to the keyframe of another demonstration.
+
+    :param others: the one whose start and goal pictures are nearest is taken: of those with
+        marks, and its keyframe is its last mark; where none has, of all, and its keyframe is the
+        one half way, as nearest_keyframe shows it. The episode itself does not count.
+    """
+    others = [j for j in others if j != i]
+    marked = [j for j in others if j in marks.episodes]
+    frames = store.frames(i)
+    like = min(marked or others, key=lambda j: l1_distance(
+        store.frames(j)[[0, -1]], frames[[0, -1]]))
+    shown = store.frames(like)
+    at = sum(marks.episodes[like][-1]) // 2 if marked else halfway(shown, len(shown) - 1)
+    return min(range(1, len(frames) - 1), key=lambda t: l1_distance(frames[t], shown[at]))
 
 
 def print_hits(hits: Mapping[str, Sequence[Interval]], count: int) -> None:
@@ -57,5 +81,5 @@ def print_hits(hits: Mapping[str, Sequence[Interval]], count: int) -> None:
     print(f'the matched frame is a marked one, or within one frame of it, in {count} marked '
           'episodes:')
     for name, intervals in hits.items():
-        print(f'{name:20s}' + ''.join(
+        print(f'{name:22s}' + ''.join(
             f'{f"{one.value:.0%} ({one.low:.0%}, {one.high:.0%})":>20s}' for one in intervals))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.evaluation.bottleneck import context_pixels
+from tap_ros.evaluation.command import SAMPLES
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
     from tap_ros.training.inpainted import Filled
 
-SAMPLES = 100  # of the paper's last row of Table 1
 NEAR = 6.0  # px
 
 

@@ -6,20 +6,23 @@ from dataclasses import replace
 from itertools import product
 import json
 
+import cv2
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
+from tap_ros.evaluation import command
 from tap_ros.evaluation.bottleneck import (
     bottleneck_scores,
     bottleneck_share,
     MIN_MOTION,
 )
-from tap_ros.evaluation.prediction import evaluate, Options, run, verdict
+from tap_ros.evaluation.hits import nearest_frame
+from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
 from tap_ros.options import parse
-from tap_ros.prediction.marks import write_marks
+from tap_ros.prediction.marks import Marks, write_marks
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.recording.cache import open_recordings
@@ -133,8 +136,8 @@ def test_leaving_out_and_copying_cost_all_of_a_changed_pixel():
 
 
 def test_a_verdict_is_of_the_matched_frame_and_memorised_is_said():
-    def scored(errors, copied):
-        return replace(blank, min_l1=np.array(errors), copying=np.array(copied))
+    def scored(errors, copied, times=2):
+        return replace(blank, min_l1=np.tile(errors, times), copying=np.tile(copied, times))
 
     blank = evaluate(Pasting(), EPISODES, range(3))['prediction']
     frames = [episode.frames.astype(float) / 255 for episode in EPISODES]
@@ -146,6 +149,18 @@ def test_a_verdict_is_of_the_matched_frame_and_memorised_is_said():
     assert 'not told from' in verdict(scored([0.1, 0.4, 0.2], [0.2, 0.3, 0.2]), None)[0]
     assert len(verdict(good, good)) == 2
     assert verdict(bad, good)[2].startswith('memorised')
+    few = scored([0.1, 0.2, 0.1], [0.3, 0.3, 0.2], times=1)
+    assert 'too few' in verdict(few, None)[0] and len(verdict(few, good)) == 2
+
+
+def test_the_nearest_demonstration_is_another_one_and_a_marked_one_where_there_is():
+    same = [move_squares([[6, 6], [24, 16]], [[12, 10], [27, 7]], length=length)
+            for length in (9, 9, 17)]
+    store = Store([*same, move_squares([[8, 8], [20, 16]], [[14, 12], [25, 10]])])
+    for marked, others, frame in (({}, [0, 3], 8), ({}, [0, 2], 8), ({0: [(2, 2)]}, [0, 3], 4),
+                                  ({0: [(2, 2)], 1: [(3, 5)]}, [1], 8), ({2: [(4, 4)]}, [2, 1], 8),
+                                  ({2: [(1, 1)], 0: [(5, 7)]}, [0, 2, 3], 12)):
+        assert nearest_frame(store, 2, others, Marks(marked, '')) == pytest.approx(frame, abs=2)
 
 
 def test_copying_matches_the_frame_beside_it_and_is_no_bottleneck():
@@ -224,6 +239,10 @@ def test_the_best_of_more_samples_is_never_worse_and_of_one_is_what_evaluate_mea
     assert np.isnan(more.spread_px).all()
 
 
+def score(words):
+    command.prediction(parse(command.Prediction, words))
+
+
 @pytest.mark.parametrize('options', [
     {}, {'latent_size': 8}, {'num_context': 1, 'new_pixels': True}])
 def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
@@ -233,20 +252,22 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     save_weights(weights, made, 'predictor', made.config, {'settings': {'test_fraction': 0.0}})
     common = ['--weights', str(weights), '--recordings', str(bag)]
     with pytest.raises(ConfigError, match='--all'):
-        run(parse(Options, common))
+        score(common)
     marks = tmp_path / 'marks.json'
     marks.write_text('{"marks": []}')
     with pytest.raises(ConfigError, match='marked; .* from 0: 0, 1, 2'):
-        run(parse(Options, [*common, '--all', '--marks', str(marks)]))
+        score([*common, '--all', '--marks', str(marks)])
     assert 'prediction' not in capsys.readouterr().out, 'nothing is scored before'
     write_marks(marks, open_recordings([bag], progress=False), [bag], {0: [(2, 4)], 2: [(7, 7)]})
     with pytest.warns(RecordingWarning, match='3 episodes are'):
-        run(parse(Options, [*common, '--all', '--samples', '3', '--marks', str(marks), '--out',
-                            str(tmp_path / 'out')]))
+        score([*common, '--all', '--samples', '3', '--marks', str(marks), '--out',
+               str(tmp_path / 'out')])
     shown = capsys.readouterr().out
     assert 'positions: unknown' in shown and 'in 2 marked episodes' in shown
     scores = json.loads((tmp_path / 'out' / 'scores.json').read_text())['scores']
     hits = scores.pop('marks')
+    assert set(hits) == {'prediction', 'nearest demonstration', 'slowest', 'middle', 'UVD-like',
+                         'random'}
     assert hits['middle'][0][0] == hits['middle'][1][0] == 0.5
     assert hits['random'][0][0] == pytest.approx((3 / 7 + 1 / 7) / 2)
     assert hits['random'][1][0] == pytest.approx((5 / 7 + 2 / 7) / 2)
@@ -258,13 +279,15 @@ def test_the_command_scores_what_training_held_out(tmp_path, capsys, options):
     assert scores['prediction']['episodes'] == 3
     low, high = scores['prediction']['intervals']['min_l1']
     assert low <= scores['prediction']['min_l1'] <= high
-    assert (tmp_path / 'out' / 'pictures.png').stat().st_size > 0
+    sheet = cv2.imread(str(tmp_path / 'out' / 'pictures.png'))
+    panels = 6 - ('num_context' in options) + ('new_pixels' not in options)
+    assert sheet.shape == (20 + 3 * 130 - 2, panels * 130 - 2, 3)
 
 
 def test_another_predictor_is_scored_by_what_it_shows_and_its_maps(tmp_path, capsys):
     bag, out = write_bag(tmp_path / 'bag', EPISODES), tmp_path / 'out'
-    run(parse(Options, ['--weights', f'nearest_keyframe:{bag}', '--recordings', str(bag), '--all',
-                        '--goal-picture', 'last', '--out', str(out)]))
+    score(['--weights', f'nearest_keyframe:{bag}', '--recordings', str(bag), '--all',
+           '--goal-picture', 'last', '--out', str(out)])
     scores = json.loads((out / 'scores.json').read_text())['scores']
     assert scores['prediction']['min_l1'] < 1e-6  # it has seen these episodes
     assert scores['prediction']['bottleneck_median'] < scores['copy-goal']['bottleneck_median'] / 2

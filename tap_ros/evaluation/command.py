@@ -1,0 +1,77 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""The commands `python -m tap_ros evaluate prediction` and `evaluate forward`: their options."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from tap_ros.options import Bags, File, Flag, Folder, ShippedFile, Topic
+from tap_ros.training.split import TEST_FRACTION
+from tap_ros.weights import FORWARD_MODEL, PREDICTORS
+from tyro import conf
+
+SAMPLES = 100  # of the paper's last row of Table 1
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """
+    Options of `python -m tap_ros evaluate prediction`.
+
+    :param recordings: bag folders, folders of bag folders, or .mcap files; read as those of the
+        training were.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param all: take every episode, not only those that training held out.
+    :param goal_picture: the episode's last frame, or the goal's own picture where reached, with
+        the arm elsewhere.
+    :param samples: how many to draw of weights with z.
+    :param marks: file of marks (see `mark`) that the matched frames are compared with.
+    :param out: write scores.json and pictures.png there.
+    """
+
+    weights: Annotated[str, conf.arg(
+        metavar='FILE',
+        help=f'of a predictor: a file, or shipped ones: {", ".join(PREDICTORS)}; or another '
+             'predictor, such as nearest_keyframe:bags/push2, which then has seen those bags.')]
+    recordings: Bags
+    image_topic: Topic = ''
+    all: Flag = False
+    goal_picture: Literal['last', 'recorded'] = 'recorded'
+    samples: int = SAMPLES
+    marks: File = ''
+    out: Folder = ''
+
+
+@dataclass(frozen=True)
+class Forward:
+    """
+    Options of `python -m tap_ros evaluate forward`.
+
+    Pictures are filled behind the robot as the weights' training was.
+
+    :param recordings: bag folders; each is scored on its own: by object pixels, else by pictures.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param weights: of a forward model.
+    :param test_fraction: share of the episodes that training held out, by seed; 1: all.
+    :param device: cpu or cuda.
+    :param out: write forward_model.json there.
+    """
+
+    recordings: Bags
+    image_topic: Topic = ''
+    weights: ShippedFile = str(FORWARD_MODEL)
+    test_fraction: float = TEST_FRACTION
+    device: str = 'cpu'
+    out: Folder = ''
+
+
+def prediction(args: Prediction) -> None:
+    """Score a predictor, see report.run."""
+    from tap_ros.evaluation import report  # torch takes seconds to import
+    report.run(args)
+
+
+def forward(args: Forward) -> None:
+    """Score a forward model, see forward.run."""
+    from tap_ros.evaluation import forward
+    forward.run(args)
