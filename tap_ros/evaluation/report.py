@@ -78,8 +78,8 @@ def run(args: Prediction) -> None:
     _print_table(scores)
     seen = None
     if len(kept) and not args.all and training.get('data_hash') == store.data_hash:
-        seen = evaluate(network, store, kept[:max(len(episodes), _SEEN)], goal_picture=args.goal_picture,
-                        filled=filled)['prediction']
+        seen = evaluate(network, store, kept[:max(len(episodes), _SEEN)],
+                        goal_picture=args.goal_picture, filled=filled)['prediction']
     words = verdict(scores['prediction'], seen)
     if seen is None and not args.all:
         words.append('training episodes: they are not among these recordings, so nothing tells '
