@@ -121,11 +121,16 @@ class Crop:
         """
         left, top, width, height = self.window(size)
         new = self.cut_size(size)
-        if (left, top, *new) == (0, 0, *size):
+        if (height, width) == new == tuple(size):
             return pixels
         moved = resize_pixels(
             np.asarray(pixels, np.float64) - (left, top), (height, width), new)
         return moved.astype(np.asarray(pixels).dtype)
+
+
+def is_halved(side: int) -> bool:
+    """Say whether a side can be halved until 4 or 6 pixels are left, and has 16 at least."""
+    return side >= 16 and side // (side & -side) in (1, 3)
 
 
 def check_trainable(size: Sequence[int], network: str) -> None:
@@ -134,14 +139,14 @@ def check_trainable(size: Sequence[int], network: str) -> None:
 
     :param size: (height, width) after cutting.
     :param network: what errors call it.
-    :raises ConfigError: unless they are square, and a side is a power of two from 16 on.
+    :raises ConfigError: unless they are square, and networks can halve a side, see is_halved.
     """
     height, width = size
-    if height != width or width < 16 or width & (width - 1):
+    if height != width or not is_halved(width):
         raise ConfigError(
             f'recordings: pictures are {width}x{height} pixels; {network} needs square ones whose '
-            'side is a power of two from 16 on, such as 64; say which part is used and how large '
-            'it becomes, for example --crop centre --size 64')
+            'side is a power of two or three times one, from 16 on, such as 64 or 96; say which '
+            'part is used and how large it becomes, for example --crop centre --size 64')
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,11 @@ CPU `channels_last` is the faster one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 import math
 
 from tap_ros.errors import check_fields, ConfigError
+from tap_ros.images.crop import is_halved
 from tap_ros.prediction.methods import Decoder
 from tap_ros.prediction.warp import combine, warp
 from tap_ros.training.weights import LATER
@@ -25,7 +27,8 @@ class PredictorConfig:
     """
     The shape of a predictor; saved in its weights file.
 
-    :param image_size: pixels on each side, a power of two from 16 on; the paper has 64.
+    :param image_size: pixels on each side, a power of two or three times one, from 16 on; the
+        paper has 64.
     :param base_width: channels of the first block; they double at each following one. Paper: 32.
     :param num_context: pictures that the prediction is conditioned on: 2 is start and goal.
     :param code_size: length of the vector between encoder and decoders.
@@ -56,9 +59,9 @@ class PredictorConfig:
             'latent_size': (0, 2 ** 13), 'flow_scale': (1e-6, 2 ** 16)})
         if self.skips and self.decoder != 'shared':
             raise ConfigError("skips: they go with decoder 'shared'; appendix C has none")
-        if self.image_size < 16 or self.image_size & (self.image_size - 1):
-            raise ConfigError(f'image_size: expected a power of two from 16 on, such as 64, '
-                              f'got {self.image_size}')
+        if not is_halved(self.image_size):
+            raise ConfigError(f'image_size: expected a power of two or three times one, from 16 '
+                              f'on, such as 64 or 96, got {self.image_size}')
         # Beyond this a network takes many gigabytes; it is a wrong number rather than a wish.
         if self.image_size * self.base_width > 2 ** 15:
             raise ConfigError(f'image_size times base_width: expected at most {2 ** 15}, got '
@@ -68,6 +71,11 @@ class PredictorConfig:
     def widths(self) -> tuple[int, ...]:
         """Channels from the finest block to the coarsest: (32, 64, 128, 256) in the paper."""
         return tuple(self.base_width * 2 ** i for i in range(int(math.log2(self.image_size)) - 2))
+
+    @property
+    def coarsest(self) -> int:
+        """Pixels a side after the coarsest block: 4 as in the paper, or 6."""
+        return self.image_size >> len(self.widths)
 
 
 @dataclass(frozen=True)
@@ -105,7 +113,8 @@ def encoder(in_channels: int, widths: tuple[int, ...]) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def decoder(in_features: int, widths: tuple[int, ...], out_channels: int) -> nn.Sequential:
+def decoder(in_features: int, widths: tuple[int, ...], out_channels: int,
+            coarsest: int = 4) -> nn.Sequential:
     """
     Build a decoder: transposed convolution to 4x4, then upsampling-5x5 convolutions (appendix C).
 
@@ -114,7 +123,8 @@ def decoder(in_features: int, widths: tuple[int, ...], out_channels: int) -> nn.
     """
     width = widths[-1]
     layers: list[nn.Module] = [
-        nn.ConvTranspose2d(in_features, width, 4, bias=False), nn.BatchNorm2d(width), nn.ReLU()]
+        nn.ConvTranspose2d(in_features, width, coarsest, bias=False), nn.BatchNorm2d(width),
+        nn.ReLU()]
     for narrower in widths[-2::-1]:
         layers += [nn.Upsample(scale_factor=2, mode='bilinear', align_corners=False),
                    nn.Conv2d(width, narrower, 5, padding=2, bias=False),
@@ -148,15 +158,16 @@ class SharedDecoder(nn.Module):
     :param widths: channels of the blocks, fine to coarse.
     :param outputs: channels of each output.
     :param pictures: of how many pictures the skips are; 0: there are none.
+    :param coarsest: pixels a side of the first block.
     """
 
     def __init__(self, in_features: int, widths: Sequence[int], outputs: Sequence[int],
-                 pictures: int = 0) -> None:
+                 pictures: int = 0, coarsest: int = 4) -> None:
         super().__init__()
         steps = list(zip(widths[:0:-1], widths[-2::-1]))  # channels (in, out), coarse to fine
         self.outputs = list(outputs)
         self.start = nn.Sequential(
-            nn.ConvTranspose2d(in_features, widths[-1], 4, bias=False),
+            nn.ConvTranspose2d(in_features, widths[-1], coarsest, bias=False),
             nn.BatchNorm2d(widths[-1]), nn.ReLU())
         self.blocks = nn.ModuleList(nn.Sequential(
             nn.Conv2d(wider, narrower, 3, padding=1, bias=False),
@@ -218,16 +229,17 @@ class PredictorNetwork(nn.Module):
         self.head = nn.Sequential(
             nn.Conv2d(C * widths[-1], widths[-1], 3, padding=1),
             nn.ReLU(),
-            nn.Conv2d(widths[-1], config.code_size, 4))
+            nn.Conv2d(widths[-1], config.code_size, config.coarsest))
         if config.decoder == 'shared':
             self.shared_decoder = SharedDecoder(
                 features, widths, (2 * C, C + config.new_pixels, 3 * config.new_pixels),
-                C if config.skips else 0)
+                C if config.skips else 0, config.coarsest)
             flow = self.shared_decoder.end.weight
         else:
-            self.flow_decoder = decoder(features, widths, 2 * C)
-            self.mask_decoder = decoder(features, widths, C + config.new_pixels)
-            self.pixel_decoder = decoder(features, widths, 3) if config.new_pixels else None
+            build = partial(decoder, features, widths, coarsest=config.coarsest)
+            self.flow_decoder = build(2 * C)
+            self.mask_decoder = build(C + config.new_pixels)
+            self.pixel_decoder = build(3) if config.new_pixels else None
             flow = self.flow_decoder[-1].get_parameter('weight')
         self.apply(initialise)
         # Training starts from copying: flow near 0.

@@ -31,7 +31,7 @@ class Discriminator(nn.Module):
     def __init__(self, config: PredictorConfig, num_times: int) -> None:
         super().__init__()
         self.encoder = encoder(3 * (config.num_context + 1), config.widths)
-        self.head = _head(config.widths[-1], num_times)
+        self.head = _head(config, num_times)
         self.apply(initialise)
 
     def forward(self, context: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
@@ -46,10 +46,11 @@ class Discriminator(nn.Module):
         return self.head(self.encoder(pictures)).flatten(1).float()
 
 
-def _head(width: int, outputs: int) -> nn.Sequential:
+def _head(config: PredictorConfig, outputs: int) -> nn.Sequential:
     """Build what makes (B, outputs, 1, 1) of the encoder's last block."""
-    return nn.Sequential(
-        nn.Conv2d(width, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, outputs, 4))
+    width = config.widths[-1]
+    return nn.Sequential(nn.Conv2d(width, width, 3, padding=1), nn.ReLU(),
+                         nn.Conv2d(width, outputs, config.coarsest))
 
 
 def smoothed_labels(step: torch.Tensor, other_step: torch.Tensor) -> torch.Tensor:
@@ -107,7 +108,7 @@ class Recognition(nn.Module):
             raise ConfigError('latent_size: a recognition network needs at least 1, got '
                               f'{config.latent_size}; the paper has 32')
         self.encoder = encoder(3 * num_images, config.widths)
-        self.head = _head(config.widths[-1], 2 * config.latent_size)
+        self.head = _head(config, 2 * config.latent_size)
         self.apply(initialise)
         with torch.no_grad():
             self.head[-1].get_parameter('bias')[config.latent_size:] = 2 * math.log(initial_std)

@@ -39,7 +39,7 @@ def test_blocks_have_the_sizes_of_appendix_c():
 
 @EVERY
 def test_outputs_have_the_promised_shapes_and_fresh_weights_hardly_move_anything(config):
-    for S, new_pixels in ((32, True), (64, False)):
+    for S, new_pixels in ((48, True), (64, False)):
         config = replace(config, image_size=S, new_pixels=new_pixels)
         answer = PredictorNetwork(config)(contexts(3, config))
         assert answer.image.shape == (3, 3, S, S)
@@ -109,7 +109,7 @@ def test_one_pixel_reaches_the_outputs_past_the_code_by_skips_alone(config):
 
 
 def test_impossible_shapes_are_refused_by_name():
-    for name, value in (('image_size', 48), ('image_size', 8), ('image_size', 0),
+    for name, value in (('image_size', 40), ('image_size', 8), ('image_size', 0),
                         ('base_width', 0), ('latent_size', -1), ('decoder', 'none'),
                         ('skips', True)):
         with pytest.raises(ConfigError, match=name):

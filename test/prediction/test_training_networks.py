@@ -51,8 +51,8 @@ def test_only_the_discriminator_of_the_chosen_time_learns():
 
 
 def test_every_weight_and_every_picture_matters():
-    config = PredictorConfig(image_size=64, base_width=4, num_context=1, latent_size=8)
-    pictures = draw(4, 2, 3, 64, 64).tanh().requires_grad_()
+    config = PredictorConfig(image_size=48, base_width=4, num_context=1, latent_size=8)
+    pictures = draw(4, 2, 3, 48, 48).tanh().requires_grad_()
     judge, recognition = Discriminator(config, 38), Recognition(config, 2)
     assert judge.encoder[0].in_channels == recognition.encoder[0].in_channels == 6  # appendix C
     logits = judge(pictures[:, :1], pictures[:, 1])
