@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calls and goals with a time-out, of a node that another thread spins."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent import futures
+from dataclasses import dataclass
+from queue import SimpleQueue
 import threading
 import time
 from typing import Any, Self, TYPE_CHECKING, TypeVar
@@ -24,6 +26,8 @@ Found = TypeVar('Found')
 
 NEWBORN_S = 0.7  # until others have heard of a node that has just started
 POLL_S = 0.05  # between two looks at whether a server still lives
+ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_CANCELED: 'cancelled',
+        GoalStatus.STATUS_ABORTED: 'aborted'}
 
 
 class CallError(TapError):
@@ -188,6 +192,75 @@ def wait_for_result(handle: 'ClientGoalHandle', timeout_s: float,
     if answer.status == GoalStatus.STATUS_UNKNOWN:
         raise CallError('the action server does not know the goal; was it started anew?')
     return answer.status, answer.result
+
+
+@dataclass(frozen=True)
+class ReachResult:
+    """
+    How a goal ended.
+
+    :param end: 'succeeded' (also when the budget was spent), 'cancelled' or 'aborted'.
+    :param success: whether the goal was reached.
+    :param message: why not, or what was reached.
+    :param steps: commands sent.
+    :param expected_distance: px, mean over the objects, at the end.
+    """
+
+    end: str
+    success: bool
+    message: str
+    steps: int
+    expected_distance: float
+
+
+class Reaching:
+    """
+    A goal that the planner pursues; iterate over it for feedback until it ends.
+
+    A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px) and planning_ms.
+
+    :ivar handle: rclpy's handle of the goal.
+    """
+
+    def __init__(self, handle: 'ClientGoalHandle', feedback: 'SimpleQueue[Any]',
+                 deadline: float, server: 'Liveness') -> None:
+        self.handle = handle
+        self._feedback, self._deadline, self._server = feedback, deadline, server
+        self._result: ReachResult | Exception = CallError('reach_goal: ended without a result')
+        self._thread = threading.Thread(target=self._wait, name='reaching', daemon=True)
+        self._thread.start()
+
+    def __iter__(self) -> Iterator[Any]:
+        yield from iter(self._feedback.get, None)
+        self._feedback.put(None)
+        self.result()  # raises what has ended it
+
+    def cancel(self) -> None:
+        """Ask for the end of the goal; result tells when it has come."""
+        cancel_goal(self.handle)
+
+    def result(self) -> ReachResult:
+        """
+        Wait for the end.
+
+        :raises CallError: when the planner ends before, or takes longer than it was given; then
+            the goal is cancelled.
+        """
+        self._thread.join()
+        if isinstance(self._result, Exception):
+            raise self._result
+        return self._result
+
+    def _wait(self) -> None:
+        try:
+            status, result = wait_for_result(
+                self.handle, max(self._deadline - time.monotonic(), 0.0), self._server)
+            self._result = ReachResult(
+                ENDS.get(status, 'aborted'), result.success, result.message, result.steps,
+                result.expected_distance)
+        except Exception as error:
+            self._result = error
+        self._feedback.put(None)
 
 
 def _named(server: 'Liveness | None') -> str:

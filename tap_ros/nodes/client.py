@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nodes as one plain class: arrays in, arrays out, no rclpy to know."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from queue import SimpleQueue
 import threading
 import time
 from typing import Any, Self, TYPE_CHECKING
 
-from action_msgs.msg import GoalStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import numpy as np
@@ -33,7 +32,7 @@ from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoals
-from tap_ros.nodes.calls import call, CallError, cancel_goal, send_goal, Spinner, wait_for_result
+from tap_ros.nodes.calls import call, CallError, Reaching, send_goal, Spinner
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
@@ -42,7 +41,6 @@ from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.text import escaped
 
 if TYPE_CHECKING:
-    from rclpy.action.client import ClientGoalHandle
     from tap_ros.messages.subgoals import Subgoal
 
 SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offers it
@@ -57,8 +55,6 @@ SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offer
     'change': (ChangeState, 'predictor_node/change_state', 'predictor_node')}
 READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'recorder_node': 'record'}
 PLANNER = 'visual_mpc_node'
-ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_CANCELED: 'cancelled',
-        GoalStatus.STATUS_ABORTED: 'aborted'}
 VIEWS = {'camera': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
          'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
 NOWHERE = (0, 0, 0, 0, 0, 0, 1)  # a pose that says nothing
@@ -81,75 +77,6 @@ class View:
     pixels: np.ndarray
     positions: np.ndarray
     stamp_ns: int
-
-
-@dataclass(frozen=True)
-class ReachResult:
-    """
-    How a goal ended.
-
-    :param end: 'succeeded' (also when the budget was spent), 'cancelled' or 'aborted'.
-    :param success: whether the goal was reached.
-    :param message: why not, or what was reached.
-    :param steps: commands sent.
-    :param expected_distance: px, mean over the objects, at the end.
-    """
-
-    end: str
-    success: bool
-    message: str
-    steps: int
-    expected_distance: float
-
-
-class Reaching:
-    """
-    A goal that the planner pursues; iterate over it for feedback until it ends.
-
-    A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px) and planning_ms.
-
-    :ivar handle: rclpy's handle of the goal.
-    """
-
-    def __init__(self, handle: 'ClientGoalHandle', feedback: 'SimpleQueue[Any]',
-                 deadline: float, server: Liveness) -> None:
-        self.handle = handle
-        self._feedback, self._deadline, self._server = feedback, deadline, server
-        self._result: ReachResult | Exception = CallError('reach_goal: ended without a result')
-        self._thread = threading.Thread(target=self._wait, name='reaching', daemon=True)
-        self._thread.start()
-
-    def __iter__(self) -> Iterator[ReachGoal.Feedback]:
-        yield from iter(self._feedback.get, None)
-        self._feedback.put(None)
-        self.result()  # raises what has ended it
-
-    def cancel(self) -> None:
-        """Ask for the end of the goal; result tells when it has come."""
-        cancel_goal(self.handle)
-
-    def result(self) -> ReachResult:
-        """
-        Wait for the end.
-
-        :raises CallError: when the planner ends before, or takes longer than it was given; then
-            the goal is cancelled.
-        """
-        self._thread.join()
-        if isinstance(self._result, Exception):
-            raise self._result
-        return self._result
-
-    def _wait(self) -> None:
-        try:
-            status, result = wait_for_result(
-                self.handle, max(self._deadline - time.monotonic(), 0.0), self._server)
-            self._result = ReachResult(
-                ENDS.get(status, 'aborted'), result.success, result.message, result.steps,
-                result.expected_distance)
-        except Exception as error:
-            self._result = error
-        self._feedback.put(None)
 
 
 class Client:

@@ -9,7 +9,7 @@ enclose its stamp, and that is nearest in the log.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 import warnings
 
@@ -19,7 +19,7 @@ from tap_ros.messages.stamps import MAX_GAP
 from tap_ros.recording.clocks import put_right
 from tap_ros.recording.columns import Columns, join, NAMES, Track
 from tap_ros.recording.damage import FAR, seconds
-from tap_ros.recording.episode import Episode, RecordingWarning
+from tap_ros.recording.episode import EpisodeTable, RecordingWarning
 from tap_ros.recording.metadata import ArmMount
 from tap_ros.recording.reading import AS_RECORDED, Reading
 from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, Span, WALL_NS
@@ -27,66 +27,6 @@ from tap_ros.robots.arm import get_arm
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
 _LOOKED_AT = 4096  # messages looked at together
-_LEAST_PAUSE = 0.5  # s, between two demonstrations
-
-
-@dataclass(frozen=True)
-class EpisodeTable:
-    """The episodes of files that follow each other; F frames in E episodes, K objects at most."""
-
-    parts: Sequence[Columns]  # one a file
-    starts: np.ndarray  # (E + 1,) int64: episode i has the rows starts[i] to starts[i + 1]
-    spans: list[Span]  # E
-    places: dict[str, tuple[np.ndarray, np.ndarray]]  # of 'frame' and 'mask' (F,), and of 'goal'
-    # and 'goal_mask' (E,): index into parts, and into their pictures, -1 for none; int64
-    stamps: np.ndarray  # (F,) int64
-    logs: np.ndarray  # (F,) int64: when frames were recorded
-    actions: np.ndarray  # (F, 4) float32
-    grippers: np.ndarray  # (F, 4) float32
-    objects: np.ndarray  # (F, K, 9) float64: u, v, pose
-    names: list[tuple[str, ...]]  # E: source of the objects, then theirs
-    goal_objects: np.ndarray  # (E, K, 9) float64
-
-    def __len__(self) -> int:
-        return len(self.spans)
-
-    def pictures(self, name: str, rows: slice) -> np.ndarray | None:
-        """Return pictures, a view unless they are in two files; None where one is lacking."""
-        file, row = (places[rows] for places in self.places[name])
-        if (row < 0).any():
-            return None
-        runs = np.flatnonzero((np.diff(row) != 1) | (np.diff(file) != 0)) + 1
-        pieces = [self.parts[f[0]].pictures[name][r[0]:r[-1] + 1]
-                  for f, r in zip(np.split(file, runs), np.split(row, runs), strict=True)]
-        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
-
-    def frames(self, i: int) -> np.ndarray:
-        """Return the frames of episode i, (T, H, W, 3) uint8."""
-        frames = self.pictures('frame', slice(self.starts[i], self.starts[i + 1]))
-        assert frames is not None
-        return frames
-
-    def has_masks(self, i: int) -> bool:
-        """Return whether every frame of episode i has a robot mask."""
-        return bool((self.places['mask'][1][self.starts[i]:self.starts[i + 1]] >= 0).all())
-
-    def episode(self, i: int) -> Episode:
-        """Return episode i."""
-        rows, (source, *names) = slice(self.starts[i], self.starts[i + 1]), self.names[i]
-        objects, goals = self.objects[rows, :len(names)], self.goal_objects[i, :len(names)]
-        goal_frame, goal_mask = (
-            self.pictures(name, slice(i, i + 1)) for name in ('goal', 'goal_mask'))
-        span = self.spans[i]
-        with np.errstate(over='ignore'):  # absurd pixels become infinite
-            pixels, goal_pixels = (a[..., :2].astype(np.float32) for a in (objects, goals))
-        return Episode(
-            frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
-            grippers=self.grippers[rows], object_names=tuple(names), object_source=source,
-            object_pixels=pixels, object_poses=objects[..., 2:],
-            goal_frame=None if goal_frame is None else goal_frame[0], goal_pixels=goal_pixels,
-            goal_poses=goals[:, 2:], task=span.task, seed=span.seed, outcome=span.outcome or '',
-            robot_masks=self.pictures('mask', rows),
-            goal_mask=None if goal_mask is None else goal_mask[0])
 
 
 def runs_of(parts: Iterable[Columns]) -> list[list[Columns]]:
@@ -133,9 +73,7 @@ def assemble(parts: Sequence[Columns], arm: ArmMount,
     tracks['twist'] = _without_stops(tracks['twist'])
     tracks = put_right(tracks, parts[0].source, parts[0].topics, gaps)
     frame = tracks['frame']
-    if not marks and reading.gap:
-        _propose_gap(frame.stamp, reading, parts[0].source)
-    spans = read_spans(frame, tracks['mark'], marks, gaps, reading)
+    spans = read_spans(frame, tracks['mark'], marks, gaps, reading, parts[0].source)
     owner = _owner(spans, frame, gaps, parts)
     order = np.lexsort((frame.stamp, owner))
     frame, owner = frame.take(order[owner[order] >= 0]), owner[order[owner[order] >= 0]]
@@ -226,26 +164,6 @@ class _Clock:
         at, found = np.concatenate(times), np.concatenate(rows)
         order = np.lexsort((found, at))
         return at[order], found[order]
-
-
-def _propose_gap(stamps: np.ndarray, reading: Reading, source: str) -> None:
-    """Say which gap tells demonstrations apart, where the pauses between them are other ones."""
-    steps = np.sort(np.diff(stamps)) / 1e9
-    steps = steps[steps > 0]
-    longer = steps[1:] >= max(_LEAST_PAUSE, 5 * np.median(steps)) if len(steps) else np.empty(0)
-    if not longer.any():
-        return
-    ratios = np.where(longer, steps[1:] / steps[:-1], 0)
-    last = int(ratios.argmax())  # the step before the widest hole in their histogram
-    pauses, count = steps[last + 1:], int((steps > reading.gap).sum())
-    if ratios[last] < 2 or len(pauses) == count or len(pauses) > len(steps) // 3:
-        return
-    how = (f'they are cut at {count} pauses of more than {reading.gap:g} s' if count else
-           f'none pauses for {reading.gap:g} s')
-    warnings.warn(
-        f'{source}: no marks tell demonstrations apart, {how} (--gap); between its pictures are '
-        f'{len(pauses)} pauses of {pauses[0]:.1f} to {pauses[-1]:.1f} s: --gap '
-        f'{np.sqrt(steps[last] * pauses[0]):.2g} cuts there', RecordingWarning, stacklevel=4)
 
 
 def _gaps(parts: Sequence[Columns]) -> np.ndarray:

@@ -28,11 +28,11 @@ import numpy as np
 from safetensors import safe_open, SafetensorError
 from safetensors.numpy import save_file
 from tap_ros.errors import RecordingError
-from tap_ros.recording.align import assemble, EpisodeTable, runs_of
+from tap_ros.recording.align import assemble, runs_of
 from tap_ros.recording.bags import check_sizes, find_bags, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
 from tap_ros.recording.copies import copies, sqlite_logs
-from tap_ros.recording.episode import Episode
+from tap_ros.recording.episode import Episode, EpisodeTable
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
 from tap_ros.recording.topic_choice import find_topics, list_paths

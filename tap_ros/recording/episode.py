@@ -7,11 +7,17 @@ T frames of H x W pixels, K objects. Actions and states follow the control contr
 dx, dy, dz in metres per control period and the gripper opening, 0 closed to 1 open.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.errors import ImageError, RecordingError
 from tap_ros.images.pixels import check_mask
+
+if TYPE_CHECKING:
+    from tap_ros.recording.columns import Columns
+    from tap_ros.recording.spans import Span
 
 OUTCOMES = ('success', 'failure', 'interrupted', '')
 
@@ -90,3 +96,62 @@ def check_episode(episode: Episode) -> None:
     if episode.outcome not in OUTCOMES:
         raise RecordingError(
             f'Episode.outcome: expected one of {OUTCOMES}, got {episode.outcome!r}')
+
+
+@dataclass(frozen=True)
+class EpisodeTable:
+    """The episodes of files that follow each other; F frames in E episodes, K objects at most."""
+
+    parts: Sequence['Columns']  # one a file
+    starts: np.ndarray  # (E + 1,) int64: episode i has the rows starts[i] to starts[i + 1]
+    spans: 'list[Span]'  # E
+    places: dict[str, tuple[np.ndarray, np.ndarray]]  # of 'frame' and 'mask' (F,), and of 'goal'
+    # and 'goal_mask' (E,): index into parts, and into their pictures, -1 for none; int64
+    stamps: np.ndarray  # (F,) int64
+    logs: np.ndarray  # (F,) int64: when frames were recorded
+    actions: np.ndarray  # (F, 4) float32
+    grippers: np.ndarray  # (F, 4) float32
+    objects: np.ndarray  # (F, K, 9) float64: u, v, pose
+    names: list[tuple[str, ...]]  # E: source of the objects, then theirs
+    goal_objects: np.ndarray  # (E, K, 9) float64
+
+    def __len__(self) -> int:
+        return len(self.spans)
+
+    def pictures(self, name: str, rows: slice) -> np.ndarray | None:
+        """Return pictures, a view unless they are in two files; None where one is lacking."""
+        file, row = (places[rows] for places in self.places[name])
+        if (row < 0).any():
+            return None
+        runs = np.flatnonzero((np.diff(row) != 1) | (np.diff(file) != 0)) + 1
+        pieces = [self.parts[f[0]].pictures[name][r[0]:r[-1] + 1]
+                  for f, r in zip(np.split(file, runs), np.split(row, runs), strict=True)]
+        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
+
+    def frames(self, i: int) -> np.ndarray:
+        """Return the frames of episode i, (T, H, W, 3) uint8."""
+        frames = self.pictures('frame', slice(self.starts[i], self.starts[i + 1]))
+        assert frames is not None
+        return frames
+
+    def has_masks(self, i: int) -> bool:
+        """Return whether every frame of episode i has a robot mask."""
+        return bool((self.places['mask'][1][self.starts[i]:self.starts[i + 1]] >= 0).all())
+
+    def episode(self, i: int) -> Episode:
+        """Return episode i."""
+        rows, (source, *names) = slice(self.starts[i], self.starts[i + 1]), self.names[i]
+        objects, goals = self.objects[rows, :len(names)], self.goal_objects[i, :len(names)]
+        goal_frame, goal_mask = (
+            self.pictures(name, slice(i, i + 1)) for name in ('goal', 'goal_mask'))
+        span = self.spans[i]
+        with np.errstate(over='ignore'):  # absurd pixels become infinite
+            pixels, goal_pixels = (a[..., :2].astype(np.float32) for a in (objects, goals))
+        return Episode(
+            frames=self.frames(i), stamps=self.stamps[rows], actions=self.actions[rows],
+            grippers=self.grippers[rows], object_names=tuple(names), object_source=source,
+            object_pixels=pixels, object_poses=objects[..., 2:],
+            goal_frame=None if goal_frame is None else goal_frame[0], goal_pixels=goal_pixels,
+            goal_poses=goals[:, 2:], task=span.task, seed=span.seed, outcome=span.outcome or '',
+            robot_masks=self.pictures('mask', rows),
+            goal_mask=None if goal_mask is None else goal_mask[0])

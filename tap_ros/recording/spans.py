@@ -17,9 +17,11 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+import warnings
 
 import numpy as np
 from tap_ros.recording.damage import FAR
+from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.reading import Reading
 
 if TYPE_CHECKING:
@@ -29,6 +31,7 @@ Mark = tuple[str, int, str]  # task, seed, outcome
 
 MAX_JITTER_NS = 500 * 10**6  # messages may be logged so much before or after the mark they follow
 _LATE_NS = 5 * 10**9  # likewise where stamps alone tell episodes apart, as no clock begins anew
+_LEAST_PAUSE = 0.5  # s, between two demonstrations
 WALL_NS = 10**18  # 2001: clocks of simulations, and those since a start, show less
 
 
@@ -46,7 +49,7 @@ class Span:
 
 
 def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.ndarray,
-               reading: Reading) -> list[Span]:
+               reading: Reading, source: str) -> list[Span]:
     """
     Read the marks: a list of spans in the order of the log.
 
@@ -55,7 +58,10 @@ def read_spans(frame: 'Track', mark: 'Track', marks: Sequence[Mark], gaps: np.nd
     :param gaps: (G, 2) as damage.gaps.
     :param reading: Reading; without marks, a longer pause than its gap between two frames begins
         an episode; without pauses, longer episodes than it says are cut into equal parts.
+    :param source: what warnings call the recording.
     """
+    if not marks and reading.gap:
+        _propose_gap(frame.stamp, reading, source)
     places = gaps[np.argsort(gaps[:, 0], kind='stable')].tolist()
     spans = _marked(mark, marks, places) if marks else _unmarked(
         frame.log, frame.stamp, int(reading.gap * 1e9), int(reading.episode_seconds * 1e9))
@@ -127,6 +133,26 @@ def _unmarked(log: np.ndarray, stamps: np.ndarray, pause: int, longest: int) -> 
              for first, end in zip(edges, edges[1:]) if end > first] or [Span()]
     spans[0].start_log, spans[-1].end_log = -FAR, FAR
     return spans
+
+
+def _propose_gap(stamps: np.ndarray, reading: Reading, source: str) -> None:
+    """Say which gap tells demonstrations apart, where the pauses between them are other ones."""
+    steps = np.sort(np.diff(stamps)) / 1e9
+    steps = steps[steps > 0]
+    longer = steps[1:] >= max(_LEAST_PAUSE, 5 * np.median(steps)) if len(steps) else np.empty(0)
+    if not longer.any():
+        return
+    ratios = np.where(longer, steps[1:] / steps[:-1], 0)
+    last = int(ratios.argmax())  # the step before the widest hole in their histogram
+    pauses, count = steps[last + 1:], int((steps > reading.gap).sum())
+    if ratios[last] < 2 or len(pauses) == count or len(pauses) > len(steps) // 3:
+        return
+    how = (f'they are cut at {count} pauses of more than {reading.gap:g} s' if count else
+           f'none pauses for {reading.gap:g} s')
+    warnings.warn(
+        f'{source}: no marks tell demonstrations apart, {how} (--gap); between its pictures are '
+        f'{len(pauses)} pauses of {pauses[0]:.1f} to {pauses[-1]:.1f} s: --gap '
+        f'{np.sqrt(steps[last] * pauses[0]):.2g} cuts there', RecordingWarning, stacklevel=4)
 
 
 def _cut(span: Span, gaps: list[list[int]]) -> Iterator[Span]:

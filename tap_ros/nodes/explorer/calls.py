@@ -10,8 +10,8 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from tap_ros.errors import TapError
-from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.client import Client, Reaching
+from tap_ros.nodes.calls import CallError, Reaching
+from tap_ros.nodes.client import Client
 from tap_ros.nodes.services import internal_error, log_error
 from tap_ros.text import escaped
 from tap_ros.weights import PREDICTORS
