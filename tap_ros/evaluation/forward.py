@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The command `python -m tap_ros evaluate forward`: how well object maps are carried."""
+"""What the command `python -m tap_ros evaluate forward` does: how well it is told what comes."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.command import Forward
-from tap_ros.evaluation.intervals import mean_interval
+from tap_ros.evaluation.intervals import against_copying, mean_interval
 from tap_ros.files import write_rows
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.planning.forward_scores import measure_maps, MOVED_PIXELS
+from tap_ros.planning.forward_scores import measure_maps, measure_pictures, MOVED_PIXELS
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.inpainted import FilledStore, with_masks
@@ -22,8 +22,20 @@ from tap_ros.training.split import split_episodes, TEST_FRACTION
 from tap_ros.training.weights import load_weights
 from tap_ros.weights import FORWARD_MODEL
 
-METHODS = {'map_error': 'forward_model', 'nothing_moves': 'nothing',
-           'true_simulator': 'true_simulator'}
+# Of a measurement its metric and its method.
+METHODS = {'map_error': ('map_error_px', 'forward_model'),
+           'nothing_moves': ('map_error_px', 'nothing'),
+           'true_simulator': ('map_error_px', 'true_simulator'),
+           'picture': ('picture_l1', 'forward_model'), 'copying': ('picture_l1', 'copying'),
+           'changed_picture': ('changed_l1', 'forward_model'),
+           'changed_copying': ('changed_l1', 'copying')}
+COPYING = {'picture': 'copying', 'changed_picture': 'changed_copying'}
+MEANING = {
+    'map_error_px': f'px from the expected pixel, of objects that moved more than '
+                    f'{MOVED_PIXELS:.0f} px; maps begin at the true pixels',
+    'picture_l1': 'error of the predicted picture on [0, 1], and of the picture begun with; no '
+                  'object pixels tell of motion',
+    'changed_l1': 'the same over the pixels that changed since then'}
 FILE = 'forward_model.json'
 
 
@@ -51,19 +63,23 @@ def run(args: Forward) -> None:
             store, robot_mask, filling=fill_from_past)
         measured = measure_maps(model, filled, held_out)
         if not measured:
-            raise ConfigError(f'{recording}: no held-out episode of 16 frames or more has object '
-                              'pixels that move; give more of them, or --test-fraction 1')
+            measured = measure_pictures(model, filled, held_out)
+        if not measured:
+            raise ConfigError(f'{recording}: no held-out episode of two frames or more; give more '
+                              'of them, or --test-fraction 1')
         words = ['python', '-m', 'tap_ros', 'evaluate', 'forward', '--recordings', recording]
         for option, value, usual in (('--weights', args.weights, str(FORWARD_MODEL)),
                                      ('--test-fraction', args.test_fraction, TEST_FRACTION)):
             words += [option, str(value)] if value != usual else []
         command = shlex.join(words)
         rows += make_rows(Path(recording).name, measured, store.data_hash, command)
-    print(f'error of the expected pixel, px, for objects that moved more than {MOVED_PIXELS:.0f} '
-          'px; maps begin at the true pixels; in brackets 95% intervals over the objects')
+    for metric in dict.fromkeys(row['metric'] for row in rows):
+        print(f'{metric}: {MEANING[metric]}')
+    print('in brackets 95% intervals, then of how many objects or episodes')
     for row in rows:
-        print(f'{row["task"]:12s} step {row["step"]:2d}  {row["method"]:16s}{row["value"]:6.2f} '
-              f'({row["ci_low"]:.2f}, {row["ci_high"]:.2f}), {row["n"]} objects')
+        print(f'{row["task"]:12s} step {row["step"]:2d}  {row["metric"]:13s}{row["method"]:15s}'
+              f'{row["value"]:8.4f} ({row["ci_low"]:.4f}, {row["ci_high"]:.4f}), {row["n"]}'
+              f'  {row.get("verdict", "")}')
     if args.out:
         write_rows(Path(args.out, FILE), rows)
 
@@ -73,15 +89,23 @@ def make_rows(task: str, measured: Mapping[int, Mapping[str, np.ndarray]], data_
     """
     Turn measurements into rows.
 
-    :param task: name of the recording; measured: of measure_maps; data_hash: of the recording.
-    :return: list of dicts: task, method, metric, step, value, ci_low, ci_high (px), n, data_hash,
-        command.
+    :param task: name of the recording; data_hash: of the recording.
+    :param measured: of measure_maps or measure_pictures.
+    :return: list of dicts: task, method, metric, step, value, ci_low, ci_high, n, data_hash,
+        command; of predicted pictures verdict, which compares them with copying.
     """
     rows = []
     for step, parts in measured.items():
-        for name, method in METHODS.items():
-            value, low, high = (round(x, 4) for x in mean_interval(parts[name]))
-            rows.append({'task': task, 'method': method, 'metric': 'map_error_px', 'step': step,
-                         'value': value, 'ci_low': low, 'ci_high': high, 'n': len(parts[name]),
+        for name, values in parts.items():
+            metric, method = METHODS[name]
+            known = values[np.isfinite(values)]
+            if not len(known):
+                continue
+            value, low, high = (round(x, 4) for x in mean_interval(known))
+            rows.append({'task': task, 'method': method, 'metric': metric, 'step': step,
+                         'value': value, 'ci_low': low, 'ci_high': high, 'n': len(known),
                          'data_hash': data_hash, 'command': command})
+            if name in COPYING:
+                copied = parts[COPYING[name]][np.isfinite(values)]
+                rows[-1]['verdict'] = against_copying(known, copied)[0]
     return rows

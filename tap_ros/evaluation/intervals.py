@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike
+from tap_ros.training.split import FEW
 
 RESAMPLES = 2000
 _DRAWN = 2 ** 22  # numbers drawn at once, to bound memory
@@ -78,3 +79,16 @@ def share_interval(successes: ArrayLike) -> Interval:
     values = np.asarray(successes, float)
     found = stats.binomtest(round(values.sum()), len(values)).proportion_ci(method='wilson')
     return Interval(float(values.mean()), float(found.low), float(found.high))
+
+
+def against_copying(errors: np.ndarray, copied: np.ndarray) -> tuple[str, Interval]:
+    """
+    Compare errors of episodes (N,) with those of copying an input instead (N,).
+
+    :return: in words which is better, where that can be told; and the ratio of their means.
+    """
+    ratio = bootstrap(lambda ours, theirs: ours.mean(-1) / theirs.mean(-1), errors, copied)
+    if len(errors) < FEW:
+        return 'too few to tell from copying', ratio
+    return ('better than copying' if ratio.high < 1 else 'worse than copying' if ratio.low > 1
+            else 'not told from copying'), ratio

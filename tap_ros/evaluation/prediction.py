@@ -19,7 +19,7 @@ from tap_ros.evaluation.bottleneck import (
     THRESHOLDS,
     VISIBLE,
 )
-from tap_ros.evaluation.intervals import bootstrap, Interval, mean_interval
+from tap_ros.evaluation.intervals import against_copying, bootstrap, Interval, mean_interval
 from tap_ros.evaluation.samples import draw_latents
 from tap_ros.evaluation.shown import SHOWN, ShownScorer
 from tap_ros.images.pixels import to_float
@@ -31,7 +31,6 @@ from tap_ros.prediction.protocol import Predictor, Question
 from tap_ros.prediction.warp import WarpedMaps
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.training.inpainted import Filled
-from tap_ros.training.split import FEW
 import torch
 
 METHODS = ('prediction', 'copy-start', 'copy-goal')
@@ -220,12 +219,9 @@ def verdict(held_out: EpisodeScores, training: EpisodeScores | None) -> list[str
     for name, scores in (('held-out episodes', held_out), ('training episodes', training)):
         if scores is None:
             continue
-        ratio = bootstrap(lambda errors, copied: errors.mean(-1) / copied.mean(-1),
-                          scores.min_l1, scores.copying)
-        words.append('too few to tell from copying' if len(scores.min_l1) < FEW
-                     else 'better than copying' if ratio.high < 1
-                     else 'worse than copying' if ratio.low > 1 else 'not told from copying')
-        lines.append(f'{name}, at the matched frame: {words[-1]}; error '
+        word, ratio = against_copying(scores.min_l1, scores.copying)
+        words.append(word)
+        lines.append(f'{name}, at the matched frame: {word}; error '
                      f'{scores.min_l1.mean():.4f}, copying {scores.copying.mean():.4f}: '
                      f'{ratio.value:.2f} times ({ratio.low:.2f}, {ratio.high:.2f})')
     if words[0] in ('worse than copying', 'not told from copying') and words[1:] == [

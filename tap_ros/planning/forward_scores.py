@@ -1,12 +1,13 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""How far the forward model's object maps are from where the objects went."""
+"""How far the forward model's object maps, or its pictures, are from what happened."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from tap_ros.images.pixels import to_float
+from tap_ros.planning.forward_loss import make_windows, MOTION_THRESHOLD
 from tap_ros.planning.forward_model import LearnedForwardModel
 import torch
 
@@ -15,6 +16,15 @@ if TYPE_CHECKING:
 
 SCORED_STEPS = (1, 5, 10, 15)
 MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than this by then
+
+
+def held_out_scores(model: LearnedForwardModel, store: 'Episodes',
+                    episodes: np.ndarray) -> dict[str, float]:
+    """Return what a training tells: map_errors, without object pixels picture_errors."""
+    return map_errors(model, store, episodes) or {
+        f'{name}_l1_{t}': float(np.nanmean(values))
+        for t, measured in measure_pictures(model, store, episodes).items()
+        for name, values in measured.items() if np.isfinite(values).any()}
 
 
 def map_errors(model: LearnedForwardModel, store: 'Episodes', episodes: Iterable[int],
@@ -78,3 +88,47 @@ def measure_maps(model: LearnedForwardModel, store: 'Episodes', episodes: Iterab
         if found.size:
             measured[t] = dict(zip(('map_error', 'true_simulator', 'nothing_moves'), found))
     return measured
+
+
+@torch.no_grad()
+def measure_pictures(model: LearnedForwardModel, store: 'Episodes', episodes: np.ndarray,
+                     stride: int = 8) -> dict[int, dict[str, np.ndarray]]:
+    """
+    Measure predicted pictures against what was seen, beside copying the picture begun with.
+
+    The arm is drawn where the commands lead it. What the model's robot mask hides does not count.
+
+    :param episodes: int64, indices to score; those shorter than the longest window are left out.
+    :param stride: frames from one window's start to the next.
+    :return: dict from steps t to dicts of arrays (N,), l1 errors on [0, 1], means over the
+        windows of each episode: `picture` and `copying` over all pixels; `changed_picture` and
+        `changed_copying` over those that changed since the window began, NaN where none did.
+    """
+    lengths = np.asarray(store.lengths)[episodes]
+    steps = [t for t in SCORED_STEPS if t < lengths.max(initial=0)]
+    found: list[np.ndarray] = []  # (steps, 4) of an episode
+    for i, length in zip(episodes.tolist(), lengths.tolist()):
+        starts = range(0, length - steps[-1], stride)
+        count = len(starts)
+        if not count:
+            continue
+        windows = make_windows(
+            store, [i] * count, starts, steps[-1], model.homography.cpu(), np.zeros(count, bool),
+            [0] * count, model.config.robot_mask).to(model.homography.device)
+        first, gripper = windows.images[:, 0], windows.grippers[:, 0]
+        scene, flow = model.look(first, model.draw_arm(gripper)[:, 3:]), model.still(count)
+        rows = []
+        for t in range(1, steps[-1] + 1):
+            flow, gripper, _ = model.advance(
+                scene.features, flow, gripper, windows.actions[:, t - 1])
+            if t in steps:
+                seen = windows.images[:, t]
+                counts = ~windows.hidden[:, t, 0]
+                changed = counts & ((seen - first).abs().mean(1) > MOTION_THRESHOLD)
+                predicted, _ = model.picture(scene, flow, model.draw_arm(gripper))
+                errors = [(picture - seen).abs().mean(1) / 2 for picture in (predicted, first)]
+                rows.append([float(error[where].mean()) for where in (counts, changed)
+                             for error in errors])
+        found.append(np.array(rows))
+    names = ('picture', 'copying', 'changed_picture', 'changed_copying')
+    return {t: dict(zip(names, np.stack(found)[:, n].T)) for n, t in enumerate(steps) if found}

@@ -15,7 +15,7 @@ from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_uint8
 from tap_ros.planning.forward_loss import draw_arm_like, draw_windows, forward_loss, Windows
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
-from tap_ros.planning.forward_scores import map_errors
+from tap_ros.planning.forward_scores import held_out_scores
 from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig
 from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.recording.cache import EpisodeStore
@@ -59,7 +59,7 @@ def _prepare(this: run.Run) -> run.Course[LearnedForwardModel, Item]:
 
     def score() -> tuple[run.Numbers, Mapping[str, np.ndarray]]:
         parts = {'training': training, 'held_out': this.held_out}
-        return map_errors(state.average, episodes, this.held_out), {
+        return held_out_scores(state.average, episodes, this.held_out), {
             name: sample_grid(state.average, episodes, part, config)
             for name, part in parts.items() if len(part)}
 
