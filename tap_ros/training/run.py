@@ -150,7 +150,7 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
     with joined(device) as processes:
         progress = progress and processes.first
         reading = reading_of(config)
-        paths = _paths(config)
+        paths = paths_of(config)
         check_first_picture(paths, reading, f'the {kind.replace("_", " ")}')
         store = open_recordings(paths, progress=progress, reading=reading)
         with _run_folder(config.out) if processes.first else nullcontext():
@@ -178,7 +178,7 @@ def _data_hash(store: EpisodeStore, marks: str) -> str:
     return hashlib.sha256(store.data_hash.encode() + Path(marks).read_bytes()).hexdigest()
 
 
-def _paths(config: Any) -> list[str]:
+def paths_of(config: Any) -> list[str]:
     """Return the recordings, and of those held out what is not among them."""
     def files(path: str) -> set[Path]:
         return {file.resolve() for bag in find_bags(path) for file in bag}

@@ -124,7 +124,7 @@ def with_recipe(model: Model, args: Options) -> Options:
     wanted = {**_chosen_settings(chosen, given), **shape}
     changed: dict[str, Any] = {
         name: replace(part, **{key: wanted[key] for key in asdict(part).keys() & wanted})
-        for name, part in vars(args).items() if name != 'recipe'}
+        for name, part in vars(args).items() if not isinstance(part, str | bool)}
     return replace(args, **changed)
 
 
@@ -135,7 +135,7 @@ def _chosen_settings(recipe: Recipe, given: Mapping[str, Any]) -> Mapping[str, A
 
 def settings_of(args: TrainOptions) -> dict[str, Any]:
     """Return the settings of all parts of a command's options, by name."""
-    return {name: value for key, part in vars(args).items() if key != 'recipe'
+    return {name: value for part in vars(args).values() if not isinstance(part, str | bool)
             for name, value in asdict(part).items()}
 
 
