@@ -7,9 +7,11 @@ Everything random is drawn from (seed, step), so that a run that was interrupted
 same result.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+import sys
 
 import numpy as np
+from tap_ros.errors import RecordingError
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_uint8
@@ -19,12 +21,14 @@ from tap_ros.planning.forward_scores import held_out_scores
 from tap_ros.planning.forward_training_config import DEFAULTS, ForwardTrainingConfig
 from tap_ros.planning.table import fit_arm, fit_table
 from tap_ros.recording.cache import EpisodeStore
+from tap_ros.recording.reading import Reading
 from tap_ros.training import run
 from tap_ros.training.inpainted import Episodes, FilledStore
 from tap_ros.training.robot_mask import fill_from_past
 import torch
 
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
+MOST_MISSED = 3 / 64  # of the picture's side, by which the arm may be beside its fit
 Item = tuple[Windows, set[int]]  # of a step: windows, and which of their pictures are compared
 
 
@@ -74,17 +78,44 @@ def model_config(config: ForwardTrainingConfig, store: EpisodeStore,
     :param store: EpisodeStore; training: indices of its training episodes.
     :return: ForwardModelConfig.
     :raises ConfigError: if the pictures are not square, or of a size that it cannot have.
-    :raises RecordingError: if gripper positions are missing.
+    :raises RecordingError: if gripper positions are missing, or the arm is not where they say.
     """
     check_trainable(store.image_size, 'the forward model')
     chosen = training[np.linspace(0, len(training) - 1, FITTED_EPISODES).astype(int)]
     episodes = [store[int(i)] for i in np.unique(chosen)]
-    arm = fit_arm(episodes)
+    arm, missed = fit_arm(episodes)
+    print(f'the arm is seen {missed:.1f} px from where its gripper positions put it (median)',
+          file=sys.stderr)
+    if missed > MOST_MISSED * store.image_size[0]:
+        raise RecordingError(
+            f'recordings: the arm is seen {missed:.1f} px from where its gripper positions put '
+            f'it, more than {MOST_MISSED * store.image_size[0]:.0f}; the camera must not move, '
+            'nor anything but the arm and what it pushes; see that /joint_states are of this '
+            'robot and stamped by the same clock, or record robot masks (robot_mask_node)')
+    table = (cut_projection(config.projection, store, config)[:, [0, 1, 3]] if config.projection
+             else fit_table(episodes, arm))
     return ForwardModelConfig(
-        table=tuple(fit_table(episodes, arm).ravel().tolist()), arm=tuple(arm.ravel().tolist()),
+        table=tuple(table.ravel().tolist()), arm=tuple(arm.ravel().tolist()),
         image_size=store.image_size[0], width=config.width, features=config.features,
         robot_mask=config.robot_mask, crop=config.crop, crop_size=config.size,
         camera_size=store.camera_size or (0, 0))
+
+
+def cut_projection(projection: Sequence[float], store: EpisodeStore,
+                   reading: Reading) -> np.ndarray:
+    """
+    Make a camera's projection into that of its pictures after cutting and scaling.
+
+    :param projection: 12 numbers, row-major, K [R | t]: the robot's metres to the camera's pixels.
+    :return: (3, 4) float64, its last entry 1.
+    """
+    size = store.camera_size or store.image_size
+    corners = np.array([[0, 0], [size[1] - 1, size[0] - 1]], float)
+    low, high = reading.cut.pixels(corners, size)
+    scale = (high - low) / (corners[1] - corners[0])
+    matrix = np.reshape(projection, (3, 4)).astype(float)
+    matrix[:2] = scale[:, None] * matrix[:2] + low[:, None] * matrix[2]
+    return matrix / matrix[2, 3]
 
 
 def draw_step(config: ForwardTrainingConfig, store: Episodes, training: np.ndarray, step: int,

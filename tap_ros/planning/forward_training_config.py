@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from functools import partial
 import math
 
+from tap_ros.errors import ConfigError
 from tap_ros.recording.reading import Reading
 from tap_ros.training.robot_mask import RobotMask
 from tap_ros.training.settings import (
@@ -35,6 +36,9 @@ class ForwardSettings(OptimizerSettings):
     :param robot_mask: what the recordings' robot masks take out of the pictures: 'none'; the arm
         with its shadow ('arm'); the hand, too ('all'). What was seen there free last takes its
         place in the picture that is looked at; no error counts there.
+    :param projection: of the camera, K [R | t], 12 numbers row by row, from metres of the robot,
+        z = 0 on the table, to pixels of the camera. It tells where the table is; without it the
+        objects' recorded places do, or else the arm.
     """
 
     steps: int = 5000
@@ -51,6 +55,7 @@ class ForwardSettings(OptimizerSettings):
     features: int = 8
     augment: bool = True
     robot_mask: RobotMask = 'none'
+    projection: tuple[float, ...] = ()
 
 
 # Of the bases the last has its fields first.
@@ -63,6 +68,9 @@ class ForwardTrainingConfig(ForwardSettings, Reading, RunSettings):
         super().__post_init__()
         check_settings(self, {'grow': (0, 1), **dict.fromkeys(
             ('horizon', 'pictures', 'width', 'features'), (1, math.inf))})
+        if len(self.projection) not in (0, 12) or self.projection and not self.projection[-1]:
+            raise ConfigError('projection: expected 12 numbers, the last one not 0, got '
+                              f'{len(self.projection)}')
 
 
 # What settings were before they existed.

@@ -63,20 +63,22 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
         settings['held_out'] = (str(settings['held_out']),)
     for name in settings.keys() & {'marks', 'initial_weights'}:
         settings[name] = str(settings[name])
-    settings = {**shape_of(settings.get('initial_weights', '')), **settings}
+    settings = {**shape_of(model, settings), **settings}
     chosen = find_recipe(model, recipe or recipe_of(model, bags, settings))
     return Path(function(config_class(recordings=bags, out=str(out or f'runs/{model}'), **{
         **_chosen_settings(chosen, settings), **settings})))
 
 
-def shape_of(weights: str | Path) -> dict[str, Any]:
+def shape_of(model: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Return the settings that make a network of the shape that weights of a predictor have.
+    Return the settings that make a network of the shape that the initial weights have.
 
-    :param weights: file, or name of shipped ones.
-    :return: dict; empty for '', and where nothing can be read, which the training will say.
+    :param model: 'predictor' or 'forward'; settings: of the training.
+    :return: dict; empty without them, for another model than a predictor, and where nothing can
+        be read, which the training will say.
     """
-    if not weights:
+    weights = settings.get('initial_weights')
+    if model != 'predictor' or not weights:
         return {}
     with suppress(TapError):
         from tap_ros.training.weights import load_weights  # here: torch takes seconds to import
@@ -118,7 +120,7 @@ def with_recipe(model: Model, args: Options) -> Options:
     given = settings_of(args)
     if not given['recordings']:
         raise ConfigError('missing: BAG; name the recordings, or see --help')
-    shape = shape_of(given.get('initial_weights', ''))
+    shape = shape_of(model, given)
     reading = given | {'size': given['size'] or shape.get('size', 0)}
     chosen = find_recipe(model, args.recipe or recipe_of(model, given['recordings'], reading))
     wanted = {**_chosen_settings(chosen, given), **shape}

@@ -9,10 +9,10 @@ from made_episodes import cover, write_bag
 import numpy as np
 import pytest
 from safetensors.torch import load_file
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.planning.forward_loss import forward_loss, make_windows
 from tap_ros.planning.forward_model import ForwardModelConfig, LearnedForwardModel
-from tap_ros.planning.forward_training import draw_step, train
+from tap_ros.planning.forward_training import draw_step, model_config, train
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.planning.table import project
 from tap_ros.recording.cache import open_recordings
@@ -71,6 +71,23 @@ def test_the_loss_is_that_of_the_chosen_pictures_and_what_moves_costs_a_little(m
     assert forward_loss(model, batch, {1}, config)[1]['moving'] == pytest.approx(0, abs=1e-6)
     even = forward_loss(model, batch, {4}, replace(config, motion_factor=0.0))[1]['picture']
     assert even < last['picture']
+
+
+def test_the_table_is_where_a_given_camera_sees_it_and_the_arm_must_be_where_it_says():
+    store = Store(map(make_episode, range(8)))
+    config = ForwardTrainingConfig(recordings=('x',), out='x', crop='4,2,24', size=16,
+                                   projection=(*ARM[:2], 3.0, *ARM[3:]))
+    made = model_config(config, store, np.arange(8))
+    points = torch.tensor([[0.1, -0.2], [0.0, 0.1]], dtype=torch.float64)
+    table = torch.tensor(made.table, dtype=torch.float64).view(3, 3)
+    np.testing.assert_allclose(project(table, points), config.cut.pixels(project(
+        HOMOGRAPHY.double(), points).numpy(), (32, 32)), atol=1e-6)
+    for episode in store:
+        episode.grippers[:] = np.random.default_rng(0).permutation(episode.grippers)
+    with pytest.raises(RecordingError, match='px from where its gripper positions'):
+        model_config(config, store, np.arange(8))
+    with pytest.raises(ConfigError, match='projection: expected 12 numbers'):
+        replace(config, projection=(1.0,))
 
 
 class Store(list):

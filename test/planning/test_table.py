@@ -31,7 +31,8 @@ def test_fit_recovers_a_camera_despite_outliers():
 
 def test_arm_camera_and_table_are_found_in_recordings():
     episodes = [make_episode(seed) for seed in range(40)]
-    arm = fit_arm(episodes)
+    arm, missed = fit_arm(episodes)
+    assert missed < 1.5
     points = torch.tensor([[-0.3, -0.2, 0], [0.3, 0.1, 0], [0, 0, 0]], dtype=torch.float64)
     true = project(torch.tensor(ARM, dtype=torch.float64).view(3, 4), points)
     assert (project(torch.from_numpy(arm), points) - true).abs().max() < 1.5
