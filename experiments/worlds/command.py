@@ -34,7 +34,7 @@ from tap_ros.prediction.marks import chance, read_marks
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
 
-Method = Literal['fix', 'over time', 'relative', 'progress', 'marks']
+Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'fix to marks']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
          'metaworld/window-open-v3', 'metaworld/drawer-open-v3',
          'metaworld/button-press-topdown-v3', 'ogbench/button', 'ogbench/cube', 'ogbench/drawer',

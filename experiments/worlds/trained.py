@@ -18,7 +18,9 @@ METHODS = {
     'over time': {'selection': 'absolute'},
     'relative': {'selection': 'relative', 'progress_margin': 0.0},
     'progress': {},
+    'still': {'selection': 'still', 'progress_margin': 0.0},
     'marks': {'selection': 'marks', 'progress_margin': 0.0},
+    'fix to marks': {'loss': 'fix', 'selection': 'marks', 'progress_margin': 0.0},
 }
 SETTINGS = {'steps': 400, 'batch_size': 8, 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
 
@@ -83,7 +85,7 @@ def train_and_score(folder, method, seed, out):
     if path.exists():
         return json.loads(path.read_text())
     torch.set_num_threads(1)
-    marks = {'marks': str(Path(folder, MARKS))} if method == 'marks' else {}
+    marks = {'marks': str(Path(folder, MARKS))} if 'marks' in method else {}
     Path(out).mkdir(parents=True, exist_ok=True)
     with open(Path(out, 'log.txt'), 'a') as log, redirect_stderr(log):
         weights = train(folder, out, seed=seed, held_out=(str(held_out_of(folder)),),

@@ -15,7 +15,7 @@ A recording is a path from the folder of the file; its episodes count from 0. St
 of the camera's messages: one a mark, in order of time, or [first, last] of a mark that lasts.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import hashlib
 import json
@@ -155,7 +155,7 @@ def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[st
 
 
 def features_of(store: 'EpisodeStore', i: int, robot_mask: RobotMask) -> np.ndarray:
-    """Describe the frames of an episode, (T, 14), without the pixels that a robot mask hides."""
+    """Describe the frames of an episode, (T, 20), without the pixels that a robot mask hides."""
     episode = store[i]
     return describe(episode.frames, None if robot_mask == 'none' or episode.robot_masks is None
                     else hidden_pixels(episode.robot_masks, robot_mask))
@@ -173,14 +173,21 @@ class Learned:
     preferences: Sequence[Preference]
     about: Sequence[Mapping[str, Any]]
 
-    def over(self, store: 'EpisodeStore', robot_mask: RobotMask) -> list[np.ndarray]:
-        """Return w, float32 (levels, T), of every episode; 1 in those too short for targets."""
-        found = [np.ones((len(self.preferences), T), np.float32) for T in store.lengths]
-        for i, w in enumerate(found):
-            if w.shape[1] >= LEAST_FRAMES:
-                features = features_of(store, i, robot_mask)
-                w[:] = [preference(features) for preference in self.preferences]
-        return found
+
+def prefer(store: 'EpisodeStore', preferences: Sequence[Callable[[np.ndarray], np.ndarray]],
+           robot_mask: RobotMask) -> list[np.ndarray]:
+    """
+    Compute preferences w(t) in every episode.
+
+    :param preferences: of each level of recursion a function of features (T, 20) to w (T,).
+    :return: w of each episode, float32 (levels, T); 1 in those too short for targets.
+    """
+    found = [np.ones((len(preferences), T), np.float32) for T in store.lengths]
+    for i, w in enumerate(found):
+        if w.shape[1] >= LEAST_FRAMES:
+            features = features_of(store, i, robot_mask)
+            w[:] = [preference(features) for preference in preferences]
+    return found
 
 
 def learn_marks(store: 'EpisodeStore', marks: Marks, training: np.ndarray, levels: int,

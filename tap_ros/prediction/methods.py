@@ -11,12 +11,12 @@ from tap_ros.errors import ConfigError
 Mode = Literal['bidirectional', 'forward']
 MODES = get_args(Mode)
 Loss = Literal['fix', 'min', 'genmin']
-Selection = Literal['absolute', 'relative', 'progress', 'marks']
+Selection = Literal['absolute', 'relative', 'progress', 'still', 'marks']
 Latent = Literal['none', 'vae']
 Decoder = Literal['separate', 'shared']
 
 _NAME = re.compile(r'(?P<loss>fix|min|genmin)(?P<number>\d+(\.\d+)?)?'
-                   r'(?P<model>-wo-gan|-vae-gan|-vae)?(\+(?P<selection>relative|progress|marks))?')
+                   r'(?P<model>-wo-gan|-vae-gan|-vae)?(\+(?P<selection>relative|progress|still|marks))?')
 # Settings of earlier versions, and the value at which they did nothing.
 _GONE = {'bell_edge': 2 / 3, 'changed_weight': 0.0, 'match_temperature': 0.0, 'match_share': 0.5,
          'flow_scale': 16.0, 'max_frames': 0, 'pretrain_steps': 0}
@@ -28,7 +28,7 @@ def method_fields(name: str) -> dict[str, Any]:
 
     As in the paper's tables, fix, min and genmin alone are trained with l1 and GAN; -wo-gan is l1
     only, -vae the CVAE without GAN (Eq. 9), -vae-gan both (Eq. 10). A number is the fraction of
-    fix or the beta of genmin. +relative, +progress and +marks are not in the paper.
+    fix or the beta of genmin. +relative, +progress, +still and +marks are not in the paper.
 
     :param name: for example 'fix0.25', 'genmin4', 'genmin-vae-gan', 'genmin-wo-gan+relative'.
     :return: dict of loss, selection, gan, latent, fraction and beta.
@@ -36,10 +36,11 @@ def method_fields(name: str) -> dict[str, Any]:
     """
     found = _NAME.fullmatch(name)
     if not found or found['loss'] == 'min' and found['number'] or (
-            found['loss'] != 'genmin' and found['selection']):
+            found['selection'] and found['loss'] != 'genmin' and (
+                found['loss'], found['selection']) != ('fix', 'marks')):
         raise ConfigError(f'method {name!r} is unknown; expected fix, fix<fraction>, min, genmin '
                           'or genmin<beta>, each with -wo-gan, -vae or -vae-gan, and genmin with '
-                          '+relative, +progress or +marks')
+                          '+relative, +progress, +still or +marks, fix with +marks')
     loss, model, number = found['loss'], found['model'], found['number']
     return {'loss': loss, 'selection': found['selection'] or 'absolute',
             'gan': model in (None, '-vae-gan'),
@@ -58,7 +59,8 @@ def method_name(loss: str, selection: str, gan: bool, latent: str, fraction: flo
     number = {'fix': '' if fraction == 0.5 else f'{fraction:g}',
               'genmin': '' if beta is None else f'{beta:g}'}.get(loss, '')
     model = '-vae' + '-gan' * gan if latent == 'vae' else '-wo-gan' * (not gan)
-    chosen = f'+{selection}' if loss == 'genmin' and selection != 'absolute' else ''
+    chosen = f'+{selection}' if selection == 'marks' or (
+        loss == 'genmin' and selection != 'absolute') else ''
     return f'{loss}{number}{model}{chosen}'
 
 

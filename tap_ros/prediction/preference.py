@@ -1,11 +1,12 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-A time preference w(t) of Eq. 5 that is learned from a few marked demonstrations.
+Time preferences w(t) of Eq. 5 that are not functions of the time alone.
 
-w(t) is a softmax over the frames of a demonstration, of a linear function of seven features and
-their squares. The features are what every sequence of pictures has: where a frame is in time and
-on the way from start to goal, how fast the pictures change there, and whether that slows down.
+One is learned from a few marked demonstrations: a softmax over the frames of a demonstration, of a
+linear function of ten features and their squares. The features are what every sequence of pictures
+has: where a frame is in time and on the way from start to goal, how fast the pictures change
+there, whether that slows down, and where in the picture. The other one, `still`, needs no marks.
 """
 
 from collections.abc import Sequence
@@ -17,12 +18,14 @@ import numpy as np
 from tap_ros.errors import ConfigError
 
 FEATURES = ('time', 'progress', 'distance to both', 'speed', 'distance to start',
-            'distance to goal', 'change of speed')
+            'distance to goal', 'change of speed', 'column of motion', 'row of motion',
+            'motion to change')
 FLOOR = math.exp(-4)  # the least w of a frame, as a share of the largest of its demonstration
 RIDGE = 0.1  # price of the squared weights, in nats; the features have variance 1
 SPREAD = (0.25, 0.5, 0.25)  # a mark is off by a frame as often as not
 LEAST_FRAMES = 3
 WINDOW = 4  # frames, before and after, between which speed changes
+BESIDE = 2  # frames, before and after, whose motion has one place
 
 
 def describe(frames: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray:
@@ -30,11 +33,12 @@ def describe(frames: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray
     Compute the features of each frame; brightness and contrast of the camera change none of them.
 
     Distances are l1, speed is the distance to the frames beside. Progress is (d_0 - d_T) / (d_0 +
-    d_T), with d_0 and d_T the distances to start and goal.
+    d_T), with d_0 and d_T the distances to start and goal. Motion is where squared differences of
+    frames have their centre, in shares of the picture; change, where those of start and goal do.
 
     :param frames: uint8 (T, H, W, 3), T at least 3: start, what lies between, goal.
     :param hidden: bool (T, H, W), pixels that do not count, such as the robot's; None: none.
-    :return: float64 (T, 14): FEATURES, then their squares.
+    :return: float64 (T, 20): FEATURES, then their squares.
     :raises ConfigError: for fewer frames.
     """
     T = len(frames)
@@ -42,14 +46,19 @@ def describe(frames: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray
         raise ConfigError(f'a demonstration of {T} frames; expected at least {LEAST_FRAMES}')
     pictures = frames.astype(np.float32)
 
-    def distance(a: int, b: int) -> float:
+    def difference(a: int, b: int) -> tuple[np.ndarray, float]:
+        """Return how much pixels (H, W) differ, 0 where hidden, and the mean of the others."""
         gap = np.abs(pictures[a] - pictures[b]).mean(-1)
-        if hidden is not None:
-            gap = gap[~(hidden[a] | hidden[b])]
-        return float(gap.mean()) if gap.size else 0.0
+        if hidden is None:
+            return gap, float(gap.mean())
+        seen = ~(hidden[a] | hidden[b])
+        return np.where(seen, gap, 0), float(gap[seen].mean()) if seen.any() else 0.0
 
-    start, goal = (np.array([distance(end, t) for t in range(T)]) for end in (0, T - 1))
-    moves = np.array([distance(t, t + 1) for t in range(T - 1)])
+    start, goal = (np.array([difference(end, t)[1] for t in range(T)]) for end in (0, T - 1))
+    moving, moves = map(np.array, zip(*(difference(t, t + 1) for t in range(T - 1))))
+    places = np.array([_centre((moving[max(0, t - BESIDE):t + BESIDE] ** 2).sum(0))
+                       for t in range(T)])
+    away = np.linalg.norm(places - _centre(difference(0, T - 1)[0] ** 2), axis=1)
     speed = (np.append(moves[:1], moves) + np.append(moves, moves[-1:])) / 2
     usual, largest = max(speed.mean(), 1e-6), max(start.max(), goal.max(), 1e-6)
     nearer = np.minimum(start, goal)
@@ -60,8 +69,22 @@ def describe(frames: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray
         np.arange(T) / (T - 1), (start - goal) / np.maximum(start + goal, 1e-6),
         nearer / max(nearer.max(), 1e-6), np.convolve(log_speed, np.ones(3) / 3, 'valid'),
         start / largest, goal / largest,
-        np.log((after + 0.1 * usual) / (before + 0.1 * usual))], 1)
+        np.log((after + 0.1 * usual) / (before + 0.1 * usual)), *places.T, away], 1)
     return np.concatenate([found, found ** 2], 1)
+
+
+def still(features: np.ndarray) -> np.ndarray:
+    """
+    Prefer frames in which little moves, as hands hesitate where it matters.
+
+    w(t) is the bell over time, see losses.bell_preference, over the speed.
+
+    :param features: (T, 20), as describe returns them.
+    :return: w (T,), 1 at most.
+    """
+    time, speed = features[:, FEATURES.index('time')], features[:, FEATURES.index('speed')]
+    w = (2 / 3) ** (2 * time - 1) ** 2 / (np.exp(speed) + 0.2)
+    return np.asarray(w / w.max())
 
 
 @dataclass(frozen=True)
@@ -69,9 +92,9 @@ class Preference:
     """
     A learned w(t).
 
-    :param weights: (14,), of the features with their mean taken off, in their deviations.
-    :param mean: (14,), of the features in the demonstrations that were marked.
-    :param deviation: (14,), likewise.
+    :param weights: (20,), of the features with their mean taken off, in their deviations.
+    :param mean: (20,), of the features in the demonstrations that were marked.
+    :param deviation: (20,), likewise.
     """
 
     weights: np.ndarray
@@ -79,7 +102,7 @@ class Preference:
     deviation: np.ndarray
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
-        """Return w (T,), FLOOR to 1, of the frames of a demonstration with features (T, 14)."""
+        """Return w (T,), FLOOR to 1, of the frames of a demonstration with features (T, 20)."""
         logits = self._logits(features)
         return np.maximum(np.exp(logits - logits.max()), FLOOR)
 
@@ -122,7 +145,7 @@ def learn_preference(features: Sequence[np.ndarray], marks: Sequence[int]) -> Pr
     Minimises sum_n (-sum_k SPREAD_k log softmax(x_n a)_{m_n + k}) + RIDGE |a|^2, which is convex,
     by Newton's method.
 
-    :param features: of N demonstrations, (T, 14) each.
+    :param features: of N demonstrations, (T, 20) each.
     :param marks: N, the frame that is marked in each.
     :return: Preference.
     :raises ConfigError: without marks, or for one outside of its demonstration.
@@ -174,6 +197,14 @@ def leave_one_out(features: Sequence[np.ndarray], marks: Sequence[int],
     found = [learn_preference(without(features, i), without(marks, i)).best(features[i])
              for i in range(len(marks))]
     return np.abs(np.array(found) - marks) <= tolerance
+
+
+def _centre(mass: np.ndarray) -> np.ndarray:
+    """Return column and row of the centre of mass (H, W), 0 to 1; the middle of none."""
+    total = mass.sum()
+    at = [(mass.sum(axis) @ (np.arange(n) + 0.5)) / (total * n) if total else 0.5
+          for axis, n in enumerate(mass.shape[::-1])]
+    return np.array(at)
 
 
 def _softmax(logits: np.ndarray) -> tuple[np.ndarray, float]:

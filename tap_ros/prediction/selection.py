@@ -29,8 +29,8 @@ def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor]
     """
     if config.loss == 'min':
         return error
-    if config.selection == 'marks':
-        assert batch.preference is not None, 'learned before the training'
+    if config.selection in ('marks', 'still'):
+        assert batch.preference is not None, 'made before the training'
         return losses.relative_to_copying(error, copy_error(), batch.preference[:, 0])
     preference = (losses.linear_preference(batch.times, batch.end, config.beta) if config.forward
                   else losses.bell_preference(batch.times, batch.first, batch.last))
@@ -92,9 +92,12 @@ class Targets:
             the batch's own.
         :return: int64 (B,), indices into T.
         """
-        if self.config.loss == 'fix':
-            return torch.zeros_like(self.rows)  # the batch begins with the fixed frame
         batch = batch or self.batch
+        if self.config.only_fraction is not None:
+            return torch.zeros_like(self.rows)  # the batch begins with the fixed frame
+        if self.config.loss == 'fix':  # at the frame of the largest w
+            assert batch.preference is not None, 'made before the training'
+            return batch.preference[:, 0].masked_fill(~batch.valid, -1).argmax(1)
         error = self.errors(image.detach()[:, None])[:, 0]
         return losses.match_step(selection_errors(
             error, lambda: self.errors(context.detach()), batch, self.config), batch.valid)

@@ -17,7 +17,7 @@ from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.batches import Augmentation, Batch, episode_order, make_batch, Sampling
 from tap_ros.prediction.losses import l1_error
-from tap_ros.prediction.marks import learn_marks, read_marks, tell
+from tap_ros.prediction.marks import learn_marks, prefer, read_marks, tell
 from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import (
@@ -28,6 +28,7 @@ from tap_ros.prediction.objective import (
     predictor_loss,
 )
 from tap_ros.prediction.predictor import load_network
+from tap_ros.prediction.preference import still
 from tap_ros.prediction.selection import Targets
 from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
 from tap_ros.prediction.training_networks import Discriminator, Recognition
@@ -107,6 +108,8 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
 def _learn(this: run.Run) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
     """Return w of the frames of every episode, and what the weights file tells of the marks."""
     config, store = this.config, this.store
+    if config.selection == 'still':
+        return prefer(store, [still] * config.recursion, config.robot_mask), {}
     if not config.marks:
         return None, {}
     marks = read_marks(config.marks, store)
@@ -114,7 +117,7 @@ def _learn(this: run.Run) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
                           config.robot_mask)
     if this.processes.first:
         tell(learned.about)
-    return learned.over(store, config.robot_mask), {'marks': {
+    return prefer(store, learned.preferences, config.robot_mask), {'marks': {
         'sha256': marks.digest, 'levels': learned.about,
         'preferences': [preference.to_json() for preference in learned.preferences]}}
 

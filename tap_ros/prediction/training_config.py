@@ -39,7 +39,8 @@ class ObjectiveSettings:
     :param selection: which error chooses the target of genmin: the 'absolute' one, divided by the
         preference over time, as in the paper; the one 'relative' to copying an input; the
         absolute one with the preference over the 'progress' that pictures show (losses.py); or
-        the relative one with the preference learned from 'marks'.
+        the relative one with a preference for frames that are 'still', or learned from 'marks'.
+        fix with marks has its target at the frame of the largest preference.
     :param marks: JSON file of demonstrations whose bottleneck a person has marked, see `mark`.
     :param gan: add the GAN's terms (Eq. 7).
     :param latent: 'vae' adds z (Eq. 9, with a GAN Eq. 10).
@@ -91,7 +92,7 @@ class ObjectiveSettings:
     @property
     def only_fraction(self) -> float | None:
         """The share of an episode at which its only target is, None for all targets."""
-        return self.fraction if self.loss == 'fix' else None
+        return self.fraction if self.loss == 'fix' and not self.marks else None
 
     @property
     def forward(self) -> bool:
@@ -207,8 +208,9 @@ class TrainingConfig(PredictorOptimizer, NetworkSettings, DataSettings, Objectiv
                 (self.forward and self.loss == 'genmin' and self.selection == 'progress',
                  'selection: progress needs a goal picture; with mode forward choose absolute'),
                 ((self.selection == 'marks') != bool(self.marks) or (
-                    self.marks and self.loss != 'genmin'),
-                 'marks: they go with loss genmin and selection marks; give both options or none'),
+                    self.marks and self.loss == 'min'),
+                 'marks: they go with loss genmin or fix and selection marks; give both options '
+                 'or none'),
                 (self.recursion > 1 and self.loss == 'fix',
                  'recursion: the targets of Eq. 3 follow the match; expected 1 with loss fix'),
                 (self.posterior == 'frame' and (

@@ -52,12 +52,18 @@ def make_batch(B=4, T=6, padded=0, seed=0):
 
 
 def test_each_loss_is_the_error_at_the_frame_that_it_chooses():
-    batch = make_batch(B=8, padded=2)
+    w = torch.rand(8, 1, 6, generator=torch.Generator().manual_seed(0))
+    batch = replace(make_batch(B=8, padded=2), preference=w)
     image = to_float(batch.context).mean(1)
     errors = l1_error(image[:, None], to_float(batch.targets))[:, :4]  # the rest is padding
+    copied = l1_error(to_float(batch.context)[:, :, None], to_float(batch.targets)[:, None])
+    still = (errors / (copied.amin(1) * w[:, 0])[:, :4]).argmin(1)
     preferred = (errors / bell_preference(batch.times, batch.first, batch.last)[:, :4]).argmin(1)
     for settings, match in (({'loss': 'min'}, errors.argmin(1)),  # Eq. 2
                             ({'loss': 'fix'}, torch.zeros(8, dtype=torch.int64)),  # Eq. 1
+                            ({'loss': 'fix', 'selection': 'marks', 'marks': 'x'},
+                             w[:, 0, :4].argmax(1)),
+                            ({'selection': 'still'}, still),
                             ({'selection': 'absolute'}, preferred)):  # Eq. 5
         outcome = predictor_loss(showing(image), batch, None, replace(CONFIG, **settings))
         assert outcome.match.equal(match), settings

@@ -16,6 +16,7 @@ from tap_ros.prediction.preference import (
     Preference,
     RIDGE,
     SPREAD,
+    still,
 )
 
 CALM = FEATURES.index('speed')
@@ -70,19 +71,26 @@ def test_what_is_learned_is_the_least_of_the_loss(marked):
     least, rng = loss(learned.weights), np.random.default_rng(0)
     for size in (1e-3, 0.1, 3.0):
         for _ in range(20):
-            assert loss(learned.weights + size * rng.standard_normal(14)) > least
+            assert loss(learned.weights + size * rng.standard_normal(20)) > least
 
 
 def test_features_are_bounded_squared_and_the_same_for_a_darker_camera():
     frames, pause = demonstration(5)
     found = describe(frames)
-    assert found.shape == (24, 14) and np.isfinite(found).all()
-    np.testing.assert_array_equal(found[:, 7:], found[:, :7] ** 2)
+    assert found.shape == (24, 20) and np.isfinite(found).all()
+    np.testing.assert_array_equal(found[:, 10:], found[:, :10] ** 2)
     assert found[:, [0, 2, 4, 5]].min() >= 0 and found[:, [0, 2, 4, 5]].max() == 1
     assert found[[0, -1], 1].tolist() == [-1, 1]
     assert abs(found[:, CALM].argmin() - pause) <= 1
     np.testing.assert_allclose(describe(frames // 2 + 10), found, atol=0.05)
     assert np.isfinite(describe(np.zeros((3, 8, 8, 3), np.uint8))).all()  # nothing ever moves
+
+
+def test_still_prefers_the_pause():
+    for seed in range(8):
+        frames, pause = demonstration(seed)
+        w = still(describe(frames))
+        assert abs(w.argmax() - pause) <= 1 and w.max() == 1 and w.min() > 0
 
 
 def test_what_is_hidden_changes_nothing():
@@ -101,8 +109,8 @@ def test_it_is_kept_as_plain_numbers_and_anything_else_is_refused(marked):
     values = json.loads(json.dumps(learned.to_json()))
     np.testing.assert_array_equal(Preference.from_json(values)(features[0]), learned(features[0]))
     for wrong in (None, [], {}, {**values, 'more': [1]}, {**values, 'mean': 'x'},
-                  {**values, 'mean': [0.0] * 13}, {**values, 'weights': [float('nan')] * 14},
-                  {**values, 'deviation': [0.0] * 14}):
+                  {**values, 'mean': [0.0] * 14}, {**values, 'weights': [float('nan')] * 20},
+                  {**values, 'deviation': [0.0] * 20}):
         with pytest.raises(ConfigError, match='preference: expected'):
             Preference.from_json(wrong)
     for call, said in ((lambda: learn_preference([], []), 'no demonstration is marked'),
