@@ -34,7 +34,7 @@ from tqdm import tqdm
 
 EPISODE_SPACING_NS = 60 * 10**9  # stamps of episode i start here, times i + 1
 SETTINGS_FILE = 'collection.json'
-BOTTLENECKS_FILE = 'bottlenecks.json'  # as tap_ros/prediction/marks.py reads it
+BOTTLENECKS_FILE = 'bottlenecks.json'  # as tap_ros/recording/marks.py reads it
 TABLE = 'mujoco_table'
 MIN_FRAMES, MAX_FRAMES = 10, 1000  # of the longest episode
 

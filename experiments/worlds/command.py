@@ -30,8 +30,9 @@ from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
 from tap_ros.files import write_atomically
 from tap_ros.images.drawing import grid
 from tap_ros.options import Flag, Folder
-from tap_ros.prediction.marks import chance, read_marks
+from tap_ros.prediction.marks import chance
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import read_marks
 from tap_ros.recording.reading import Reading
 
 Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'fix to marks']

@@ -30,7 +30,8 @@ STRIPS = 8  # held-out demonstrations that are drawn
 _FOUND = {'relative': 'what copying the start or the goal shows worst',
           'progress': 'what looks about half way from the start to the goal',
           'absolute': "what is predicted with the least error, the paper's method",
-          'fix': 'the middle of the time', 'marks': 'what is marked'}
+          'fix': 'the middle of the time', 'marks': 'what is marked',
+          'still': 'where pictures change least between start and goal'}
 _STYLE = ('body { font: 15px/1.5 sans-serif; margin: 1rem auto; max-width: 60rem; '
           'padding: 0 1rem; } img { max-width: 100%; } pre { background: #eee; '
           'padding: .5rem; white-space: pre-wrap; } td { padding-right: 2rem; text-align: left; }')
@@ -112,10 +113,10 @@ def _try(args: Options, configs: Mapping[str, TrainingConfig]) -> tuple[
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.evaluation.strips import draw_strips
     from tap_ros.images.drawing import png_bytes
-    from tap_ros.prediction.marks import read_marks
     from tap_ros.prediction.predictor import load_network
     from tap_ros.prediction.training import train
     from tap_ros.recording.cache import open_recordings
+    from tap_ros.recording.marks import read_marks
     from tap_ros.training.inpainted import fill, with_masks
     from tap_ros.training.run import paths_of
     from tap_ros.training.split import split_episodes, warn_if_few

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
 from tap_ros.evaluation.keyframes import middle, slowest, uvd
-from tap_ros.prediction.marks import chance, features_of, Mark, Marks
+from tap_ros.prediction.marks import chance, features_of
 from tap_ros.prediction.nearest_keyframe import halfway, l1_distance
 from tap_ros.prediction.preference import Preference
 from tap_ros.recording.cache import EpisodeStore
+from tap_ros.recording.marks import Mark, Marks
 from tap_ros.training.robot_mask import trained_robot_mask
 
 

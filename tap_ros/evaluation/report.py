@@ -16,12 +16,12 @@ from tap_ros.evaluation.prediction import EpisodeScores, evaluate, verdict
 from tap_ros.evaluation.samples import SampleScores, score_samples
 from tap_ros.evaluation.strips import write_strips
 from tap_ros.files import write_atomically
-from tap_ros.prediction.marks import read_marks
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
 from tap_ros.recording.bags import reading_like
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import read_marks
 from tap_ros.text import listing
 from tap_ros.training.inpainted import fill, with_masks
 from tap_ros.training.robot_mask import trained_robot_mask

@@ -16,10 +16,10 @@ from tap_ros.images.drawing import enlarge, GAP, grid, overlay, png_bytes
 from tap_ros.images.pixels import to_uint8
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
-from tap_ros.prediction.marks import Mark, Marks
 from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.protocol import Predictor
 from tap_ros.recording.cache import EpisodeStore
+from tap_ros.recording.marks import Mark, Marks
 from tap_ros.training.inpainted import Filled
 import torch
 

@@ -20,9 +20,10 @@ import cv2
 import numpy as np
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.options import File
-from tap_ros.prediction.marks import features_of, Mark, read_marks, write_marks
+from tap_ros.prediction.marks import features_of
 from tap_ros.prediction.preference import learn_preference, LEAST_FRAMES
 from tap_ros.recording.cache import EpisodeStore, open_recordings
+from tap_ros.recording.marks import Mark, read_marks, write_marks
 from tap_ros.recording.reading import reading_of
 from tap_ros.recording.reading_options import ReadingOptions
 from tap_ros.text import escaped

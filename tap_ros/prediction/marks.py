@@ -1,33 +1,14 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Marks: the moments of a few demonstrations that a person takes for the bottleneck.
+"""What is learned from marks of the bottleneck (recording/marks.py), and how good it is."""
 
-They lie in a small JSON file, beside the recordings as a rule; `python -m tap_ros mark` writes it,
-and so can a person:
-
-    {"marks": [
-    {"recording": "door", "episode": 0, "stamps": [13.25]},
-    {"recording": "door", "episode": 7, "stamps": [[58.5, 59.0]]}
-    ]}
-
-A recording is a path from the folder of the file; its episodes count from 0. Stamps are seconds,
-of the camera's messages: one a mark, in order of time, or [first, last] of a mark that lasts.
-"""
-
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-import hashlib
-import json
-from math import isfinite
-import os
-from pathlib import Path
 import sys
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 from tap_ros.errors import ConfigError
-from tap_ros.files import write_atomically
 from tap_ros.prediction.preference import (
     describe,
     learn_preference,
@@ -35,123 +16,11 @@ from tap_ros.prediction.preference import (
     leave_one_out,
     Preference,
 )
-from tap_ros.text import escaped
+from tap_ros.recording.marks import Mark, Marks
 from tap_ros.training.robot_mask import hidden_pixels, RobotMask
 
 if TYPE_CHECKING:
     from tap_ros.recording.cache import EpisodeStore
-
-Mark = tuple[int, int]  # its first and its last frame
-
-
-@dataclass(frozen=True)
-class Marks:
-    """
-    Marks of episodes of an EpisodeStore.
-
-    :param episodes: index of an episode: its marks, in order of time.
-    :param digest: SHA-256 of the file that they come from.
-    """
-
-    episodes: Mapping[int, Sequence[Mark]]
-    digest: str
-
-
-def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
-    """
-    Read a file of marks.
-
-    :raises ConfigError: for a file that cannot be read, and for marks of other recordings, of
-        episodes that there are not, and outside of their episode; it names the mark.
-    """
-    name = escaped(path)
-    try:
-        data = Path(path).read_bytes()
-        entries = json.loads(data)['marks']
-        found = [(entry['recording'], entry['episode'], entry['stamps']) for entry in entries]
-    except OSError as error:
-        raise ConfigError(
-            f'{name}: {error.strerror}; make it by `python -m tap_ros mark`') from error
-    except (LookupError, TypeError, ValueError) as error:
-        raise ConfigError(f'{name}: is no file of marks; expected {{"marks": [{{"recording": '
-                          '"door", "episode": 0, "stamps": [13.25]}]}, with seconds') from error
-    episodes: dict[int, Sequence[Mark]] = {}
-    for number, (recording, episode, stamps) in enumerate(found, start=1):
-        try:
-            i = _episode(store, Path(path).parent, recording, episode)
-            if i in episodes:
-                raise ValueError('its episode is marked above; put all its stamps in one entry')
-            episodes[i] = _frames(store[i].stamps, stamps)
-        except (TypeError, ValueError) as error:
-            raise ConfigError(f'{name}: mark {number} (recording {escaped(recording, 60)}, episode'
-                              f' {escaped(episode, 20)}): {error}') from error
-    return Marks(episodes, hashlib.sha256(data).hexdigest())
-
-
-def _episode(store: 'EpisodeStore', folder: Path, recording: str, episode: int) -> int:
-    """Find an episode by its place and number; ValueError says what is wrong."""
-    inside = _inside(store, folder / recording)
-    if not inside:
-        raise ValueError('the recording is none of those that are read; name one by its path from '
-                         f'{escaped(folder)}, or give it, too')
-    if isinstance(episode, bool) or not 0 <= episode < len(inside):
-        raise ValueError(f'there is no such episode; expected 0 to {len(inside) - 1}')
-    return inside[episode]
-
-
-def _frames(stamps: np.ndarray, seconds: Sequence[Any]) -> Sequence[Mark]:
-    """Turn seconds into frames between the first one and the last; ValueError says what not."""
-    if not isinstance(seconds, list) or not seconds:
-        raise ValueError('expected stamps as a list of seconds, such as [13.25]')
-    marks = []
-    for one in seconds:
-        ends = one if isinstance(one, list) else [one, one]
-        if len(ends) != 2 or not all(isfinite(end) for end in ends):
-            raise ValueError('expected a stamp as seconds, or [first, last]')
-        first, last = (int(np.abs(stamps - round(end * 10 ** 9)).argmin()) for end in ends)
-        half = np.diff(stamps).max() / 2e9
-        begin, end = stamps[0] / 1e9, stamps[-1] / 1e9
-        if not begin - half <= ends[0] <= ends[1] <= end + half:
-            raise ValueError(f'stamp {escaped(json.dumps(one))} is outside; the episode goes from '
-                             f'{begin:.3f} to {end:.3f} s')
-        first, last = max(first, 1), min(last, len(stamps) - 2)
-        if first > last:
-            raise ValueError(f'stamp {escaped(json.dumps(one))} is that of the start or the goal '
-                             'picture; mark a moment between them')
-        marks.append((first, last))
-    if any(a[1] >= b[0] for a, b in zip(marks, marks[1:])):
-        raise ValueError('expected the stamps in order of time, of different frames')
-    return marks
-
-
-def _inside(store: 'EpisodeStore', place: Path) -> list[int]:
-    """Return the episodes that are recorded in a file or folder."""
-    place = place.resolve()
-    return [i for i in range(len(store))
-            if place in ((file := store.source(i).resolve()), *file.parents)]
-
-
-def write_marks(path: str | Path, store: 'EpisodeStore', recordings: Iterable[str | Path],
-                episodes: Mapping[int, Sequence[Mark]]) -> None:
-    """
-    Write a file of marks in one step, a mark a line.
-
-    :param recordings: paths of the store.
-    :param episodes: as in Marks.
-    :raises StorageError: when it cannot be written; an existing file is then what it was.
-    """
-    folder = Path(path).resolve().parent
-    numbers: dict[int, tuple[str, int]] = {}
-    for recording in recordings:
-        for number, i in enumerate(_inside(store, Path(recording))):
-            numbers.setdefault(i, (os.path.relpath(Path(recording).resolve(), folder), number))
-    lines = []
-    for i, marks in sorted(episodes.items()):
-        seconds = [[round(store[i].stamps[t] / 1e9, 6) for t in mark] for mark in marks]
-        recording, number = numbers[i]
-        lines.append(json.dumps({'recording': recording, 'episode': number, 'stamps': [
-            first if first == last else [first, last] for first, last in seconds]}))
-    write_atomically(path, '{"marks": [\n' + ',\n'.join(lines) + '\n]}\n')
 
 
 def features_of(store: 'EpisodeStore', i: int, robot_mask: RobotMask) -> np.ndarray:

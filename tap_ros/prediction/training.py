@@ -17,7 +17,7 @@ from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.batches import Augmentation, Batch, episode_order, make_batch, Sampling
 from tap_ros.prediction.losses import l1_error
-from tap_ros.prediction.marks import learn_marks, prefer, read_marks, tell
+from tap_ros.prediction.marks import learn_marks, prefer, tell
 from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import (
@@ -33,6 +33,7 @@ from tap_ros.prediction.selection import Targets
 from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
 from tap_ros.prediction.training_networks import Discriminator, Recognition
 from tap_ros.recording.cache import EpisodeStore
+from tap_ros.recording.marks import read_marks
 from tap_ros.training import run
 from tap_ros.training.checkpoints import TrainingState
 from tap_ros.training.devices import (

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from tap_ros.cli import main, read
 from tap_ros.evaluation.choose import _decide, Candidate
-from tap_ros.prediction.marks import write_marks
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import write_marks
 from tap_ros.training.train import settings_of
 
 TINY = ['--steps', '2', '--base-width', '4', '--threads', '1', '--no-flip', '--margin', '1',

@@ -22,11 +22,11 @@ from tap_ros.evaluation.prediction import evaluate, verdict
 from tap_ros.evaluation.samples import score_samples
 from tap_ros.images.pixels import to_float
 from tap_ros.options import parse
-from tap_ros.prediction.marks import Marks, write_marks
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.warp import combine, one_hot_maps, warp
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
+from tap_ros.recording.marks import Marks, write_marks
 from tap_ros.training.weights import save_weights
 import torch
 

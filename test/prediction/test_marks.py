@@ -15,13 +15,14 @@ from tap_ros.cli import main
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.mark_command import make_server, Marking
-from tap_ros.prediction.marks import chance, learn_marks, read_marks, write_marks
+from tap_ros.prediction.marks import chance, learn_marks
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.objective import Networks, predictor_loss
 from tap_ros.prediction.preference import FLOOR, Preference
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import read_marks, write_marks
 from tap_ros.training.weights import load_weights
 import torch
 
