@@ -1,15 +1,18 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Pushes as actions, where they lead in the true simulator, and which order of them is best."""
+"""Pushes as actions, where they lead in the true simulator, in which order, and when."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import permutations
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from sim_bridge.tasks.tasks import moves, straight
 from sim_bridge.world.table import divided, OBJECT_QPOS_START, ramp_controls, SUBSTEPS, Table
 from tap_ros.contract import LIFTED, LOW, WORKSPACE_HIGH, WORKSPACE_LOW
+
+if TYPE_CHECKING:
+    from sim_bridge.tasks.push import Expert
 
 MAX_PUSH_STEPS = 24  # longest macro action, in control periods
 UPRIGHT = 0.9  # cosine, an object that is tilted more than this is about to topple
@@ -18,6 +21,13 @@ SAMPLES = 10
 ANGLE_STD, OFFSET_STD, OVERSHOOT_STD = 0.25, 0.015, 0.02  # rad, m, m
 SPEED, TRAVEL_SPEED = 0.05, 0.08  # m per control period
 TILT_COST = 0.2  # m, of an object that topples
+SHARES = {'early': (0.2, 0.35), 'middle': (0.4, 0.6), 'late': (0.7, 0.85)}  # of the episode
+# Control periods that things take, about:
+PUSH = 14  # a push, from wherever the gripper is,
+GAP = 9  # of these until the object is touched,
+AGAIN = 3  # on average, pushes that have to be repeated
+RETURN = 6  # to leave an object and come back to it
+DETOUR = 16  # a push is interrupted once for so many
 
 
 class Push(NamedTuple):
@@ -132,3 +142,54 @@ def best_push(table: Table, moment: Moment, goals: np.ndarray, k: int,
     missing = missing + TILT_COST * ~upright
     best = int(missing.sum(1).argmin())
     return moments[best], float(missing[best].sum())
+
+
+def draw_share(timing: str, rng: np.random.Generator) -> float:
+    """
+    Draw when the bottleneck is to come.
+
+    :param timing: one of TIMINGS but 'natural'; 'mixed': any of the others.
+    :return: share of the episode, 0..1.
+    """
+    if timing == 'mixed':
+        timing = str(rng.choice(list(SHARES)))
+    return float(rng.uniform(*SHARES[timing]))
+
+
+def timed_plans(expert: 'Expert', share: float, num_frames: int,
+                rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """
+    Yield plans after which the bottleneck has come at a share of the episode.
+
+    :param share: of draw_share.
+    :param num_frames: at most.
+    :return: iterator of (n, 4) actions, each to be carried out before the next is asked for.
+    """
+    count = expert.num_objects
+    before = (count * PUSH + AGAIN) * share - (PUSH + GAP / 2)
+    waiting = min(before / (1 - share), num_frames - count * PUSH)
+    plan = expert.wander(max(int(round(waiting)), int(rng.integers(1, 3))))
+    done, detours = 0, list[int]()  # control periods so far, and of the interruptions to come
+    stage: int | None = None  # the object that is pushed now
+    while plan is not None:
+        yield plan
+        done += len(plan)
+        if detours:
+            yield (plan := expert.wander(detours.pop()))
+            done += len(plan)
+        todo = expert.undone()
+        if stage not in todo:  # the next one
+            stage = expert.next_object()
+            if stage is not None and count - len(todo) == 1:
+                detours = _detours(done, share, count, num_frames)
+        part = 1 / (1 + len(detours))
+        plan = expert.plan(num_frames - 1 - done, stage, part)
+
+
+def _detours(done: int, share: float, count: int, num_frames: int) -> list[int]:
+    """Return for how long the second push is interrupted, once or several times."""
+    spare = min((done + GAP / 2) / share, num_frames) - done - (count - 1) * PUSH
+    if spare < RETURN:
+        return []
+    times = max(int(round(spare / DETOUR)), 1)
+    return [max(int(spare / times) - RETURN, 1)] * times

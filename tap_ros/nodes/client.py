@@ -130,8 +130,11 @@ class Client:
     def is_ready(self, name: str) -> bool:
         """Tell whether a node ('predictor_node', ...) is ready, or one of SERVICES is offered."""
         if name == PLANNER:
+            self._liveness(PLANNER)  # its heart is heard from now on
             return bool(self._planner().server_is_ready())
-        return bool(self._service(READY.get(name, name)).service_is_ready())
+        service = READY.get(name, name)
+        self._liveness(SERVICES[service][2])
+        return bool(self._service(service).service_is_ready())
 
     def wait_until_ready(self, *names: str, timeout_s: float = 90.0) -> None:
         """

@@ -216,3 +216,16 @@ def test_between_two_rounds_a_command_is_sent(mpc):
             assert isinstance(answer, Command)
             reach.sent()
         assert len(asked) == len(set(asked)) > 1
+
+
+def test_a_later_round_spends_half_of_what_was_left_when_it_began(mpc):
+    reach, asked = Reach(mpc, ReachConfig(12, switch='half', rounds=2), 3), []
+    for t in range(12):
+        answer = reach.step(look(t))
+        if isinstance(answer, Aim):
+            asked.append(t)
+            reach.head_for([Target(START + 4), GOAL])
+            answer = reach.step(look(t))
+        assert isinstance(answer, Command)
+        reach.sent()
+    assert asked == [0, 6] and reach.switches == [6, 9]

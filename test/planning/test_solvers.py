@@ -10,6 +10,7 @@ from tap_ros.planning.protocols import Problem, SearchConfig
 from tap_ros.planning.solvers.cem import cem
 from tap_ros.planning.solvers.icem import coloured_root, icem
 from tap_ros.plugins import load_plugin, names
+from tap_ros.search import cross_entropy
 
 TARGET = np.array([0.3, -0.7, 0.2])
 solvers = pytest.mark.parametrize('solver', [
@@ -95,3 +96,11 @@ def test_icem_moves_on_in_one_direction():
     assert (steps[:, 1:] * steps[:, :-1]).mean() > 0.4  # a displacement tells of the next one
     assert abs(np.prod(steps, axis=2).mean()) < 0.1  # but x nothing of y
     np.testing.assert_allclose(coloured_root(moves, 0.0), np.eye(moves), atol=1e-12)
+
+
+def test_a_cost_of_minus_infinity_ends_the_search_with_its_sample():
+    asked = []
+    best, costs = cross_entropy(
+        lambda elites: np.arange(5.0), lambda samples: asked.append(1) or np.array(
+            [4, np.nan, -np.inf if len(asked) == 2 else 2, 3, 0]), num_iterations=9, num_elites=3)
+    assert len(asked) == 2 and best.tolist() == [2, 4, 4] and costs.tolist() == [-np.inf, 0, 0]

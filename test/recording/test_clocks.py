@@ -276,6 +276,10 @@ def test_good_recordings_stay_as_they_are():
         late.log += random.integers(0, SECOND // 25, len(late.log))
         late.stamp[late.rows('joint')[::2]] -= SECOND // 20  # of another driver
         assert_untouched(late)
+        paired = record(random, 20)  # now and then a driver sends two states of one stamp
+        joints = paired.rows('joint')[:-2]
+        paired.stamp[joints[1::3]] = paired.stamp[joints[::3]][:len(joints[1::3])]
+        assert_untouched(paired)
         burst = record(random, 20)
         burst.log = np.maximum.accumulate(burst.log // SECOND * SECOND + SECOND
                                           + np.arange(len(burst.log)))

@@ -5,24 +5,20 @@
 from collections.abc import Callable
 
 import numpy as np
-from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
-from tap_msgs.srv import PredictSubgoal
 from tap_ros.errors import PlanningError
 from tap_ros.messages.images import decode_image, is_empty
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoals, Subgoal
-from tap_ros.nodes.calls import call
-from tap_ros.nodes.heartbeat import Liveness
+from tap_ros.nodes.client import Client
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.robot_view import RobotView
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
-from tap_ros.nodes.topics import goal_topics, LATCHED, SERVICE_QOS, to_stamp
+from tap_ros.nodes.topics import goal_topics, LATCHED, to_stamp
 from tap_ros.planning.reach import Seen
-from tap_ros.text import escaped
 
 MASK_TIMEOUT = 0.1  # s that the robot mask of a goal picture may come after it
 
@@ -98,46 +94,29 @@ class GoalSource:
         return True
 
 
-class SubgoalClient:
+def ask_subgoals(client: Client, inputs: PlannerInputs, request: ReachGoal.Goal, seen: Seen,
+                 goal: np.ndarray, goal_pixels: np.ndarray, timeout_s: float,
+                 give_up: Callable[[], bool]) -> list[Subgoal]:
     """
-    Client of predict_subgoal.
+    Return the Subgoals of all samples, their objects in the order in which they are seen.
 
-    :param inputs: PlannerInputs, whose pictures are sent cut and scaled as the planner sees them:
-        so the maps of the answer are in its pixels, whatever the predictor makes of a camera's.
-    :param callback_group: of its callbacks, which have to run while a goal is executed.
+    Pictures are sent cut and scaled as the planner sees them: so the maps of the answer are in its
+    pixels, whatever the predictor makes of a camera's.
+
+    :param request: says how many samples and levels, and the seed.
+    :param seen: the start.
+    :param goal: picture, uint8 (H, W, 3); goal_pixels: (K, 2) of the objects of `seen`.
+    :param timeout_s: most seconds to wait; give_up: asked whether to stop waiting.
+    :raises TapError: when there is no answer, or a refusal.
     """
-
-    def __init__(self, node: Node, inputs: PlannerInputs,
-                 callback_group: CallbackGroup) -> None:
-        self._inputs = inputs
-        self._client = node.create_client(PredictSubgoal, 'predict_subgoal',
-                                          qos_profile=SERVICE_QOS, callback_group=callback_group)
-        self._alive = Liveness(node, 'predictor_node', callback_group=callback_group)
-
-    def ask(self, request: ReachGoal.Goal, seen: Seen, goal: np.ndarray,
-            goal_pixels: np.ndarray, timeout_s: float,
-            give_up: Callable[[], bool]) -> list[Subgoal]:
-        """
-        Return the Subgoals of all samples, their objects in the order in which they are seen.
-
-        :param request: says how many samples and levels, and the seed.
-        :param seen: the start.
-        :param goal: picture, uint8 (H, W, 3); goal_pixels: (K, 2) of the objects of `seen`.
-        :param timeout_s: most seconds to wait; give_up: asked whether to stop waiting.
-        :raises TapError: when there is no answer, or a refusal.
-        """
-        stamp, frame_id = to_stamp(seen.stamp_ns), self._inputs.frame_id
-        assert seen.pixels is not None
-        objects, goal_objects = (encode_objects(
-            seen.names, pixels, np.full((len(pixels), 7), np.nan), stamp, frame_id,
-            ObjectStates.SOURCE_TRACKED) for pixels in (seen.pixels, goal_pixels))
-        response = call(self._client, PredictSubgoal.Request(
-            start=encode_image(seen.image, stamp, frame_id),
-            goal=encode_image(self._inputs.cut(goal, 'goal'), stamp, frame_id),
-            start_objects=objects, goal_objects=goal_objects,
-            num_samples=request.num_samples, recursion_depth=request.recursion_depth,
-            seed=request.seed), timeout_s, give_up, self._alive)
-        if not response.success:
-            raise PlanningError(f'service {self._client.service_name}: '
-                                f'{escaped(response.message, 1000)}')
-        return decode_subgoals(response, seen.names, seen.image.shape[:2])
+    stamp, frame_id = to_stamp(seen.stamp_ns), inputs.frame_id
+    assert seen.pixels is not None
+    objects, goal_objects = (encode_objects(
+        seen.names, pixels, np.full((len(pixels), 7), np.nan), stamp, frame_id,
+        ObjectStates.SOURCE_TRACKED) for pixels in (seen.pixels, goal_pixels))
+    response = client.call(
+        'predict', timeout_s, give_up, start=encode_image(seen.image, stamp, frame_id),
+        goal=encode_image(inputs.cut(goal, 'goal'), stamp, frame_id),
+        start_objects=objects, goal_objects=goal_objects, num_samples=request.num_samples,
+        recursion_depth=request.recursion_depth, seed=request.seed)
+    return decode_subgoals(response, seen.names, seen.image.shape[:2])

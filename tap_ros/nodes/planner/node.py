@@ -24,10 +24,11 @@ from tap_ros.messages.objects import match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.nodes.calls import CallError
+from tap_ros.nodes.client import Client
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.lifecycle import LifecycleBase
 from tap_ros.nodes.planner.arm import ArmCommander
-from tap_ros.nodes.planner.goals import GoalSource, SubgoalClient
+from tap_ros.nodes.planner.goals import ask_subgoals, GoalSource
 from tap_ros.nodes.planner.plan_view import draw_plan
 from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.planner.settings import (
@@ -96,7 +97,8 @@ class VisualMpcNode(LifecycleBase):
         self._overlay = self.create_publisher(Image, 'plan/overlay', STREAM)
         self._distance = self.create_publisher(Float64, 'plan/distance', STREAM)
         group = ReentrantCallbackGroup()  # answers and cancels arrive while a goal is executed
-        self._subgoals = SubgoalClient(self, self._inputs, group)
+        self._client = Client(node=self)
+        self._client.is_ready('predict')  # it looks for the predictor, and hears its heart
         self._server = ActionServer(
             self, ReachGoal, 'reach_goal', self._execute, callback_group=group,
             goal_callback=self._on_goal, cancel_callback=self._on_cancel,
@@ -278,8 +280,9 @@ class VisualMpcNode(LifecycleBase):
             return targets_by([], goal_pixels)
         begin = time.perf_counter()
         try:
-            found = self._subgoals.ask(request, seen, picture, goal_pixels,
-                                       self.params['predictor_timeout'], give_up)
+            found = ask_subgoals(
+                self._client, self._inputs, request, seen, picture, goal_pixels,
+                self.params['predictor_timeout'], give_up)
         except CallError:
             self._go_on(handle)
             raise
