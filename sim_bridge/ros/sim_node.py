@@ -3,19 +3,22 @@
 """The simulator as a ROS node: camera, objects and clock out, twist commands in."""
 
 from collections.abc import Callable
+from importlib.util import find_spec
 import math
 import sys
 import time
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Twist, TwistStamped
 import numpy as np
+from numpy.typing import ArrayLike
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from sim_bridge.ros.publishers import ScenePublishers
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
-from sim_bridge.world_protocol import ability, make_world, Observation, World
+from sim_bridge.world_protocol import ability, make_world, Observation, RunState, World
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode
@@ -54,7 +57,7 @@ class SimNode(Node):
     the arm stands still.
     A zero twist without a stamp means stop in both modes and lets no time pass. Whoever sends a
     command that is not carried out learns it from arm/refused.
-    Paused: commands are refused, and what came before or meanwhile is not made up for.
+    Paused or stopped: commands are refused, and what came before or meanwhile is not made up for.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -75,7 +78,8 @@ class SimNode(Node):
         self._goal_ns = 0  # stamp of the newest goal
         self._num_steps = 0
         self._in_episode = False
-        self._paused, self._played_at = False, 0.0  # when it was let go on, monotonic time
+        self.state = RunState.PLAYING
+        self._played_at = 0.0  # monotonic time at which it was set so
         self._diagnostics = Diagnostics(
             self, {'arm/delta_twist_cmds': math.inf, 'gripper/command': math.inf})
         self._topics = ScenePublishers(self, self._sim, self.params['observer'])
@@ -94,6 +98,9 @@ class SimNode(Node):
                                    (StepScene, 'sim/step', self._on_step),
                                    (SetBool, 'sim/pause', self._on_pause)):
             self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
+        if find_spec('simulation_interfaces') is not None:  # no wheel has it
+            from sim_bridge.ros.standard_services import StandardServices
+            StandardServices(self)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         if self.params['lock_step']:
             mode = 'lock-step'
@@ -163,7 +170,7 @@ class SimNode(Node):
 
     def _refuse_paused(self, info: dict[str, Any]) -> str:
         """Say why a command that came now cannot be used; an empty string if it can."""
-        if self._paused:
+        if self.state is not RunState.PLAYING:
             return 'the simulation is paused; call sim/pause with data false'
         if reception_time(info) < self._played_at:
             return 'it came while the simulation was paused'
@@ -193,7 +200,7 @@ class SimNode(Node):
         return ''
 
     def _on_timer(self) -> None:
-        if not self._paused:
+        if self.state is RunState.PLAYING:
             move, self._twist = self._twist, None
             if move is None or time.monotonic() > self._valid_until:
                 move = np.zeros(3)
@@ -224,24 +231,69 @@ class SimNode(Node):
         if periods > MAX_PERIODS:
             response.message = (
                 f'num_periods is {periods}; expected 1 to {MAX_PERIODS}, call more often')
-        elif not (self._paused or self.params['lock_step']):
+        elif self.state is RunState.PLAYING and not self.params['lock_step']:
             response.message = (
                 'time passes by itself; pause with sim/pause first, or start with lock_step')
         else:
             for _ in range(periods):
-                self._step(np.zeros(3))  # in which the arm stands still
+                self.wait_period()
             response.success = True
             response.message = f'{periods} control periods passed'
-        response.stamp = to_stamp(self._stamp_ns)
+        response.stamp = self.stamp
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        if request.data != self._paused:  # what was commanded and is not done yet is forgotten
-            self._twist, self._opening = None, self._done_opening
-            self._paused, self._played_at = request.data, time.monotonic()
+        self.set_state(RunState.PAUSED if request.data else RunState.PLAYING)
         response.success = True
         response.message = 'paused' if request.data else 'running'
         return response
+
+    # What all services are made of
+
+    @property
+    def sim(self) -> World:
+        """Return the world of the present scene."""
+        return self._sim
+
+    @property
+    def stamp(self) -> Time:
+        """Return the stamp of the newest picture."""
+        return to_stamp(self._stamp_ns)
+
+    def set_state(self, state: RunState) -> None:
+        """Let time pass or not; what was commanded before and is not done yet is forgotten."""
+        if state is not self.state:
+            self._twist = None
+            self._opening = self._done_opening
+            self._played_at = time.monotonic() if state is RunState.PLAYING else math.inf
+            self.state = state
+
+    def wait_period(self) -> None:
+        """Let one control period pass in which the arm stands still."""
+        self._leave_start()
+        self._step(np.zeros(3))
+
+    def _leave_start(self) -> None:
+        """Note that the first scene is no longer at its start, which is what stopped says."""
+        if self.state is RunState.STOPPED:
+            self.state = RunState.PAUSED
+
+    def restart(self) -> None:
+        """Start the first scene again, as when the node was started."""
+        state = self.state
+        self._reset(self.params['task'], self.params['seed'], False)
+        self.state = state  # stopped stays stopped: it is the first scene
+
+    def repeat(self) -> None:
+        """Start the present scene again."""
+        self._reset(self._sim.task_name, self._seed, self._hide_arm)
+
+    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike) -> None:
+        """Put an object elsewhere (see Simulator.put_object) and publish what is seen then."""
+        ability(self._sim, 'put_object')(name, pose, velocity)
+        self._leave_start()
+        self._stamp_ns += 1  # pictures are told apart by their stamps
+        self._publish(self._sim.observe())
 
     # Simulation
 
@@ -261,13 +313,14 @@ class SimNode(Node):
         if sim is not self._sim:
             self._sim.close()
         self._sim, self._hide_arm, self._seed = sim, hide_arm, seed
+        self._leave_start()
         self._opening, self._done_opening, self._twist = 0.0, 0.0, None
         self._stamp_ns += PERIOD_NS
         self._reset_ns = self._stamp_ns
         self._num_steps = 0
         self._in_episode = True
         self._publish_episode(Episode.START, '')
-        self._topics.frames(sim, to_stamp(self._stamp_ns))
+        self._topics.frames(sim, self.stamp)
         self._publish_goal()
         self._publish(observation)
 
@@ -292,7 +345,7 @@ class SimNode(Node):
     def _publish(self, observation: Observation) -> None:
         if self._hide_arm:
             observation = self._sim.observe(hide_arm=True)
-        self._topics.moment(self._sim, observation, to_stamp(self._stamp_ns))
+        self._topics.moment(self._sim, observation, self.stamp)
 
     def _publish_goal(self) -> None:
         # Goals are told apart by their stamps, also where no time has passed between them.
