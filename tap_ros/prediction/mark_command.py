@@ -23,7 +23,7 @@ from tap_ros.options import File
 from tap_ros.prediction.marks import features_of
 from tap_ros.prediction.preference import learn_preference, LEAST_FRAMES
 from tap_ros.recording.cache import EpisodeStore, open_recordings
-from tap_ros.recording.marks import Mark, read_marks, write_marks
+from tap_ros.recording.marks import beside, Mark, read_marks, write_marks
 from tap_ros.recording.reading import reading_of
 from tap_ros.recording.reading_options import ReadingOptions
 from tap_ros.text import escaped
@@ -218,8 +218,7 @@ def run(args: Options) -> None:
 
     :raises TapError: for recordings or marks that cannot be used.
     """
-    first = Path(args.recordings[0]).resolve()
-    path = Path(args.marks) if args.marks else first.with_name(f'{first.name}.marks.json')
+    path = Path(args.marks) if args.marks else beside(args.recordings[0])
     store = open_recordings(args.recordings, reading=reading_of(args.reading))
     server = make_server(Marking(store, args.recordings, path), args.port)
     print(f'open http://{_HOST}:{server.server_port} in a browser; marks go to {escaped(path)}; '

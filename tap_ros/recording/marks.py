@@ -48,6 +48,12 @@ class Marks:
     digest: str
 
 
+def beside(recording: str | Path) -> Path:
+    """Return where the marks of a recording are as a rule."""
+    place = Path(recording).resolve()
+    return place.with_name(f'{place.name}.marks.json')
+
+
 def read_marks(path: str | Path, store: 'EpisodeStore') -> Marks:
     """
     Read a file of marks.

@@ -10,13 +10,16 @@ import shutil
 import cv2
 from made_episodes import write_bag
 import numpy as np
+import pandas
 import pyarrow
 from pyarrow import parquet
 import pyarrow.compute
 import pytest
 from tap_ros.cli import main
+from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.formats import lerobot_export
 from tap_ros.recording.formats.lerobot import ACTION, CAMERA, OBJECTS, STATE
+from tap_ros.recording.marks import beside, read_marks, write_marks
 from tap_ros.recording.reader import iter_episodes
 
 
@@ -63,6 +66,27 @@ def test_what_is_exported_comes_back(exported, truth, tmp_path, capsys):
             old.object_names, old.task, old.seed, old.outcome)
         np.testing.assert_array_equal(np.diff(new.stamps), np.diff(old.stamps))
         assert new.robot_masks is None and new.goal_frame is None
+
+
+def test_marks_are_the_ends_of_subtasks_and_come_back(truth, tmp_path, capsys):
+    bag = write_bag(tmp_path / 'bag', truth[:4])
+    store, marks = open_recordings([bag], progress=False), {0: [(7, 7)], 2: [(3, 3), (9, 12)]}
+    write_marks(beside(bag), store, [bag], marks)
+    folder = export(tmp_path / 'set', truth[:4], '--lossless', '--marks', str(beside(bag)))
+    info = json.loads((folder / 'meta' / 'info.json').read_text())
+    assert info['features']['subtask_index'] == info['features']['task_index']
+    table = pandas.read_parquet(folder / 'meta' / 'subtasks.parquet')
+    assert table.index.name == 'subtask' and table['subtask_index'].tolist() == [0, 1, 2, 3]
+    rows = parquet.read_table(folder / 'data/chunk-000/file-000.parquet').to_pandas()
+    said = [list(dict.fromkeys(table.index[rows[rows.episode_index == i].subtask_index]))
+            for i in range(4)]
+    assert said == [['to mark 1', 'to the goal'], ['not marked'],
+                    ['to mark 1', 'to mark 2', 'to the goal'], ['not marked']]
+    assert main(['import-lerobot', str(folder), '--out', str(tmp_path / 'back')]) == 0
+    assert 'marks where subtasks end, of 2 episodes' in capsys.readouterr().out
+    store = open_recordings([tmp_path / 'back'], progress=False)
+    assert read_marks(beside(tmp_path / 'back'), store).episodes == {
+        0: [(7, 7)], 2: [(3, 3), (10, 10)]}
 
 
 def test_the_statistics_are_those_of_the_numbers(exported, truth):

@@ -3,9 +3,9 @@
 """
 Import a LeRobotDataset of version 2 or 3 as recordings.
 
-Pictures of one camera, and the task as text. Actions, states and objects only of sets that have
-ours: four numbers called dx, dy, dz and opening, and so on; of other robots they would be an arm's
-command with another meaning.
+Pictures of one camera, the task as text, and where subtasks end, as marks. Actions, states and
+objects only of sets that have ours: four numbers called dx, dy, dz and opening, and so on; of
+other robots they would be an arm's command with another meaning.
 
 In such a set meta/info.json describes it, and meta/episodes has a row an episode (v2: a line of
 episodes.jsonl), data a row a frame. Pictures are files in the rows, or videos, of several episodes
@@ -24,6 +24,7 @@ from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
+from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.copies import what_else
 from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
 from tap_ros.recording.formats.pictures import (
@@ -34,6 +35,7 @@ from tap_ros.recording.formats.pictures import (
     video_frames,
     write_bag,
 )
+from tap_ros.recording.marks import beside, write_marks
 from tap_ros.text import escaped, listing
 from tyro import conf
 
@@ -42,6 +44,7 @@ CAMERA = 'observation.images.camera'
 STATE, OBJECTS, ACTION = 'observation.state', 'observation.environment_state', 'action'
 NAMES = {ACTION: ['dx', 'dy', 'dz', 'opening'], STATE: list(GRIPPER_JOINTS)}  # of our numbers
 INDICES = ('frame_index', 'episode_index', 'index', 'task_index')  # columns that all sets have
+SUBTASK = 'subtask_index'  # column of the sets that have meta/subtasks.parquet, too
 SEED, OUTCOME = 'tap_ros/seed', 'tap_ros/outcome'  # columns of ours beside LeRobot's
 _INFO_BYTES = 2**24
 
@@ -69,6 +72,12 @@ def run(args: Options) -> None:
     data = DataSet(args.path, args.camera)
     said = write_bag(args, data.episodes(args.cut), len(data.rows), data.lacking)
     print(f'{said} of {data.camera}')
+    if any(data.marks):
+        path = beside(args.out)
+        write_marks(path, open_recordings([args.out]), [args.out], {
+            i: [(t, t) for t in frames] for i, frames in enumerate(data.marks) if frames})
+        print(f'{escaped(path)}: marks where subtasks end, of '
+              f'{sum(map(bool, data.marks))} episodes')
     if data.unused:
         print(f'not taken: {listing(data.unused)}')
 
@@ -82,6 +91,7 @@ class DataSet:
     :ivar rows: of meta/episodes, dicts in the order of the episodes, in the form of version 3.
     :ivar unused: features that are not taken over.
     :ivar lacking: what could not be used so far.
+    :ivar marks: of each episode so far the last frame of each subtask but the last one.
     :raises RecordingError: when it is none, or damaged.
     :raises ConfigError: for a camera that it has not, or has not alone.
     """
@@ -110,6 +120,7 @@ class DataSet:
                                  f'{self.fps} frames a second; expected v2 or v3')
         self._file: tuple[Path, Any] | None = None  # data file in memory
         self.lacking = Lacking()
+        self.marks: list[list[int]] = []
         self.rows = self._read_rows(count)
         colour = [name for name in cameras if not self._is_depth(name)]
         if camera not in cameras and (camera or len(colour) != 1):
@@ -117,7 +128,7 @@ class DataSet:
                               f'{listing(colour or cameras) or "its cameras, but there are none"}')
         self.camera = camera or colour[0]
         self._objects = self._object_names()
-        taken = {self.camera, 'timestamp', *INDICES, *filter(self._is_ours, NAMES)}
+        taken = {self.camera, 'timestamp', SUBTASK, *INDICES, *filter(self._is_ours, NAMES)}
         if self._objects:
             taken.add(OBJECTS)
         self.unused = sorted(self.features.keys() - taken)
@@ -258,6 +269,10 @@ class DataSet:
         if self._is_ours(STATE):
             known['grippers'] = numbers(STATE, 4)
         outcome, seconds = row.get(OUTCOME, ''), np.arange(len(part)) / self.fps
+        self.marks.append([])
+        if SUBTASK in self.features:
+            ends = np.flatnonzero(np.diff(np.ravel(part[SUBTASK].to_pylist())[kept]))
+            self.marks[-1] = ends[ends > 0].tolist()
         told = np.array(part['timestamp'], float).ravel()
         if (np.abs(told - told[0] - seconds) > 0.5 / self.fps).any() and (np.diff(told) > 0).all():
             seconds = told  # another rate than that of the description

@@ -4,11 +4,11 @@
 Export recordings as a LeRobotDataset v3.0.
 
 What it holds: the camera's pictures, actions, the gripper's state and the pixels of objects where
-every frame knows them, the task, and, in columns of ours, seed and outcome. Goal pictures, poses
-and robot masks have no place there.
+every frame knows them, the task, marks as subtasks, and, in columns of ours, seed and outcome.
+Goal pictures, poses and robot masks have no place there.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 from tap_ros.errors import ConfigError, RecordingError, StorageError
 from tap_ros.files import storage_errors
 from tap_ros.images.drawing import png_bytes
-from tap_ros.options import Bags, Flag, Folder
+from tap_ros.options import Bags, File, Flag, Folder
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.formats.lerobot import (
     ACTION,
@@ -33,7 +33,9 @@ from tap_ros.recording.formats.lerobot import (
     OUTCOME,
     SEED,
     STATE,
+    SUBTASK,
 )
+from tap_ros.recording.marks import Mark, read_marks
 from tap_ros.recording.reading import reading_of
 from tap_ros.recording.reading_options import ReadingOptions
 from tap_ros.robots.arm import DEFAULT_ARM
@@ -45,6 +47,7 @@ FILES_PER_CHUNK = 1000
 _FILE = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
 DATA, VIDEO = f'data/{_FILE}.parquet', f'videos/{{video_key}}/{_FILE}.mp4'
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
+_INDEX = {'dtype': 'int64', 'shape': [1], 'names': None}  # feature of a column of numbers
 _SAMPLED_PIXELS = 2**22  # of all pictures, for their statistics
 
 
@@ -57,10 +60,12 @@ class Options:
     :param out: folder of the data set; must not exist.
     :param lossless: keep pictures as PNG, bit for bit, instead of videos (VP9).
     :param fps: frames a second; 0: as the stamps say, rounded.
+    :param marks: file of marks (see `mark`); each ends a subtask.
     """
 
     recordings: Bags
     out: Folder
+    marks: File = ''
     lossless: Flag = False
     fps: int = 0
     reading: ReadingOptions = ReadingOptions()
@@ -78,11 +83,12 @@ def run(args: Options) -> None:
     if out.exists():
         raise ConfigError(f'--out {escaped(out)}: is there already; name a new folder')
     store = open_recordings(list(args.recordings), reading=reading_of(args.reading))
+    marks = read_marks(args.marks, store).episodes if args.marks else None
     part = out.with_name(out.name + '.part')
     with storage_errors(part):
         shutil.rmtree(part, ignore_errors=True)
         try:
-            features = export(store, part, args.lossless, args.fps)
+            features = export(store, part, args.lossless, args.fps, marks)
             part.rename(out)
         finally:
             shutil.rmtree(part, ignore_errors=True)
@@ -90,8 +96,8 @@ def run(args: Options) -> None:
           f'{", ".join(name for name in features if "." in name or name == ACTION)}')
 
 
-def export(store: EpisodeStore, folder: Path, lossless: bool = False,
-           fps: int = 0) -> dict[str, Any]:
+def export(store: EpisodeStore, folder: Path, lossless: bool = False, fps: int = 0,
+           marks: Mapping[int, Sequence[Mark]] | None = None) -> dict[str, Any]:
     """
     Write a data set.
 
@@ -99,6 +105,7 @@ def export(store: EpisodeStore, folder: Path, lossless: bool = False,
     :param folder: a new one.
     :param lossless: pictures as PNG instead of videos.
     :param fps: frames a second; 0: as the stamps say.
+    :param marks: of episodes; the middle of each is the last frame of a subtask.
     :return: its features, as in info.json.
     :raises RecordingError: when frames lack what LeRobot needs.
     """
@@ -115,10 +122,14 @@ def export(store: EpisodeStore, folder: Path, lossless: bool = False,
         'episode_index': episode, 'index': np.arange(len(frame)),
         'task_index': np.repeat([tasks[store[i].task or 'unknown'] for i in range(len(store))],
                                 store.lengths)}
+    names: dict[str, dict[str, int]] = {'task': tasks}
+    if marks is not None:
+        names['subtask'], numbers[SUBTASK] = _subtasks(store, marks)
     features = _features(store, vectors, lossless, fps)
+    features |= {f'{key}_index': _INDEX for key in names}
     rows = list(tqdm(_write_files(store, folder, numbers, lossless, fps), 'exporting', len(store),
                      unit='episode', delay=1))
-    _write_meta(folder, features, tasks, rows, fps)
+    _write_meta(folder, features, names, rows, fps)
     _write_json(folder / 'meta/stats.json', {
         CAMERA: _picture_summary(store),
         **{name: _summary(values.reshape(len(frame), -1)) for name, values in numbers.items()}})
@@ -159,7 +170,21 @@ def _features(store: EpisodeStore, vectors: dict[str, np.ndarray], lossless: boo
         **{name: {'dtype': 'float32', 'shape': [values.shape[1]], 'names': names[name]}
            for name, values in vectors.items()},
         'timestamp': {'dtype': 'float32', 'shape': [1], 'names': None},
-        **{name: {'dtype': 'int64', 'shape': [1], 'names': None} for name in INDICES}}
+        **dict.fromkeys(INDICES, _INDEX)}
+
+
+def _subtasks(store: EpisodeStore,
+              marks: Mapping[int, Sequence[Mark]]) -> tuple[dict[str, int], np.ndarray]:
+    """Return the numbers of subtasks by name, and that of every frame, int64."""
+    most = max(map(len, marks.values()), default=0)
+    names = [*(f'to mark {k + 1}' for k in range(most)), 'to the goal', 'not marked']
+    found = []
+    for i, T in enumerate(store.lengths.tolist()):
+        ends = [(first + last) // 2 for first, last in marks.get(i, ())]
+        passed = np.searchsorted(ends, np.arange(T))
+        passed[passed == len(ends)] = most if ends else most + 1
+        found.append(passed)
+    return {name: number for number, name in enumerate(names)}, np.concatenate(found)
 
 
 def _write_files(store: EpisodeStore, folder: Path, numbers: dict[str, np.ndarray],
@@ -242,7 +267,7 @@ def _summary(values: np.ndarray) -> dict[str, Any]:
     return {name: each.tolist() for name, each in found.items()} | {'count': [len(values)]}
 
 
-def _write_meta(folder: Path, features: dict[str, Any], tasks: dict[str, int],
+def _write_meta(folder: Path, features: dict[str, Any], names: dict[str, dict[str, int]],
                 rows: list[dict[str, Any]], fps: int) -> None:
     """Write what describes the set."""
     import pyarrow
@@ -250,22 +275,29 @@ def _write_meta(folder: Path, features: dict[str, Any], tasks: dict[str, int],
     _write_json(folder / INFO, {
         'codebase_version': 'v3.0', 'robot_type': DEFAULT_ARM, 'fps': fps,
         'total_episodes': len(rows), 'total_frames': rows[-1]['dataset_to_index'],
-        'total_tasks': len(tasks), 'chunks_size': FILES_PER_CHUNK, 'data_files_size_in_mb': 100,
-        'video_files_size_in_mb': 200, 'splits': {'train': f'0:{len(rows)}'}, 'data_path': DATA,
+        'total_tasks': len(names['task']), 'chunks_size': FILES_PER_CHUNK,
+        'data_files_size_in_mb': 100, 'video_files_size_in_mb': 200,
+        'splits': {'train': f'0:{len(rows)}'}, 'data_path': DATA,
         'video_path': VIDEO if features[CAMERA]['dtype'] == 'video' else None,
         'features': features})
     episodes = folder / 'meta' / 'episodes' / 'chunk-000' / 'file-000.parquet'
     episodes.parent.mkdir(parents=True)
     parquet.write_table(pyarrow.Table.from_pylist(rows), episodes)
-    table = pyarrow.table({'task_index': list(tasks.values()), 'task': list(tasks)})
-    # As pandas writes a table whose index are the tasks: LeRobot reads it with pandas.
-    described = {'index_columns': ['task'], 'column_indexes': [], 'columns': [
-        {'name': 'task_index', 'field_name': 'task_index', 'pandas_type': 'int64',
+    for key, numbers in names.items():
+        _write_names(folder / 'meta' / f'{key}s.parquet', key, numbers)
+
+
+def _write_names(path: Path, key: str, numbers: dict[str, int]) -> None:
+    """Write a table of numbers as pandas does whose index are the names: LeRobot uses pandas."""
+    import pyarrow
+    from pyarrow import parquet
+    table = pyarrow.table({f'{key}_index': list(numbers.values()), key: list(numbers)})
+    described = {'index_columns': [key], 'column_indexes': [], 'columns': [
+        {'name': f'{key}_index', 'field_name': f'{key}_index', 'pandas_type': 'int64',
          'numpy_type': 'int64', 'metadata': None},
-        {'name': 'task', 'field_name': 'task', 'pandas_type': 'unicode', 'numpy_type': 'object',
+        {'name': key, 'field_name': key, 'pandas_type': 'unicode', 'numpy_type': 'object',
          'metadata': None}]}
-    parquet.write_table(table.replace_schema_metadata({'pandas': json.dumps(described)}),
-                        folder / 'meta' / 'tasks.parquet')
+    parquet.write_table(table.replace_schema_metadata({'pandas': json.dumps(described)}), path)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
