@@ -47,9 +47,11 @@ def test_same_seed_same_result_and_another_seed_another(solver):
 
 @solvers
 def test_the_best_proposal_wins_when_nothing_is_better(solver):
-    found = search(SearchConfig(), solver=solver, proposals=np.stack([TARGET + 1, TARGET]))
-    np.testing.assert_array_equal(found.best, TARGET)
-    assert found.cost == 0
+    for iterations in (1, 3):
+        found = search(SearchConfig(num_iterations=iterations), solver=solver,
+                       proposals=np.stack([TARGET + 1, TARGET]))
+        np.testing.assert_array_equal(found.best, TARGET)
+        assert found.cost == 0
 
 
 @solvers
