@@ -12,12 +12,14 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from sim_bridge.ros.sim_node import SimNode
 from sim_bridge.simulator import Simulator
 from std_msgs.msg import Float64
+from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
+from tap_msgs.srv import StepScene
 import tap_ros
 from tap_ros.errors import TapError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError
+from tap_ros.nodes.calls import CallError, wait_for_future
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 
 PERIOD_NS = 250_000_000
@@ -200,8 +202,23 @@ def test_a_paused_simulation_takes_no_commands_but_steps(rig):
     rig.process.wait_for('the simulation is paused')
     refused = rig.refusals.wait(10, lambda m: m.header.stamp == first.header.stamp)
     assert 'paused' in refused.message
-    assert rig.step(1) == to_nanoseconds(first.header.stamp) + PERIOD_NS
-    rig.client.pause(False)
+    after = rig.step(1)
+    assert after == to_nanoseconds(first.header.stamp) + PERIOD_NS
+    # The command comes while one of two requests is carried out, and time passes after both.
+    step = rig.node.create_client(StepScene, 'sim/step')
+    play = rig.node.create_client(SetBool, 'sim/pause')
+    assert step.wait_for_service(10) and play.wait_for_service(10)
+    waiting = [step.call_async(StepScene.Request(num_periods=100))]
+    rig.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > after + PERIOD_NS)
+    waiting += [step.call_async(StepScene.Request(num_periods=100)),
+                play.call_async(SetBool.Request(data=False))]
+    newest = rig.image.wait(
+        30, lambda m: to_nanoseconds(m.header.stamp) > after + 105 * PERIOD_NS)
+    rig.send(x=0.08, stamp=newest.header.stamp)
+    assert all(wait_for_future(future, 60) for future in waiting)
+    assert 'paused' in rig.refusals.wait(
+        20, lambda m: m.header.stamp == newest.header.stamp).message
+    rig.image.wait(10, lambda m: to_nanoseconds(m.header.stamp) == after + 200 * PERIOD_NS)
     rig.act(x=0.01)
 
 
