@@ -27,12 +27,13 @@ from tap_ros.errors import ConfigError, SceneError
 
 ORIGIN = np.array([0.0, 0.65, 0.01])  # m, of our frame in Meta-World's
 TURN = np.array([-1.0, -1.0, 1.0])  # half a turn about the vertical
-CAMERA = Camera(64, 64, tilt=0.6, fovy=42.0, position=(0.0, -0.78, 1.2))  # in our frame
+CAMERA = Camera(64, 64, tilt=0.54, fovy=24.0, position=(0.0, -0.78, 1.2))  # in our frame
 # From the robot's side: what it works at hides little.
-SIDE = replace(CAMERA, tilt=0.87, position=(0.85, 0.5, 0.85), turn=2.1)
-GAIN = 8.0  # of the command over the gap to where the fingertips shall be, 1/m
+SIDE = replace(CAMERA, tilt=0.87, fovy=42.0, position=(0.85, 0.5, 0.85), turn=2.1)
+GAIN = 12.0  # of the command over the gap to where the fingertips shall be, 1/m
 SOLVING_STEPS = 400  # environment steps that the scripted policy has at most
-SETTLING_STEPS = 5  # after the success
+FURTHER_STEPS = 60  # of it after the success, whose bounds are wide
+LEAVING = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.12), (0.0, 0.1, 0.0))  # m, of the open hand, then
 REACH = np.array([[-0.35, 0.45, 0.12], [0.35, 0.8, 0.4]])  # m, in their frame
 
 
@@ -78,9 +79,14 @@ class MetaWorld(GymWorld):
 
     def move(self, target: np.ndarray, opening: float) -> None:
         """Move the fingertips to a place (3,) m of our frame, in one control period."""
-        for _ in range(round(CONTROL_PERIOD / self.env.dt)):
-            gap = (target - self.gripper()[:3]) * TURN
-            self.act(np.append(np.clip(GAIN * gap, -1, 1), 1 - 2 * opening))
+        grip, last = 1 - 2 * opening, round(CONTROL_PERIOD / self.env.dt) - 1
+        for step in range(last + 1):
+            action = np.append(np.clip(GAIN * (target - self.gripper()[:3]) * TURN, -1, 1), grip)
+            if step == last:
+                self.act(action)
+            else:  # without rewards and what is seen, which take more time than the physics
+                self.env.set_xyz_action(action[:3])
+                self.env.do_simulation([grip, -grip], n_frames=self.env.frame_skip)
 
     def act(self, action: np.ndarray) -> None:
         """Take one step of the environment with its own action (4,), each in [-1, 1]."""
@@ -120,19 +126,25 @@ class MetaWorld(GymWorld):
 
     def solve(self) -> None:
         """
-        Let Meta-World's scripted policy act until the environment says that it is solved.
+        Let Meta-World's scripted policy act until it is solved; then the hand lets go and leaves.
 
-        :raises SceneError: if it does not come to that.
+        :raises SceneError: if the environment does not say that it is solved.
         """
-        for _ in range(SOLVING_STEPS):
-            self.act(self.command())
+        for further in (FURTHER_STEPS, 0):  # some scripts do not hold what they have brought
+            for _ in range(SOLVING_STEPS):
+                self.act(self.command())
+                if self.succeeds():
+                    break
+            for _ in range(further):
+                self.act(self.command())
+            place = self.gripper()[:3]
+            for way in np.cumsum(LEAVING, axis=0):
+                self.move(place + way, 1.0)
             if self.succeeds():
-                break
-        else:
-            raise SceneError(f'task {self.task_name}: the scripted policy does not solve this '
-                             'scene; take another seed')
-        for _ in range(SETTLING_STEPS):
-            self.act(np.array([0, 0, 0, 1 - 2 * self.gripper()[3]]))
+                return
+            self.begin(self.seed)
+        raise SceneError(f'task {self.task_name}: the scripted policy does not solve this scene; '
+                         'take another seed')
 
     def demonstrate(self, seed: int, num_frames: int = 0) -> Demonstration:
         """Let the scripted policy act as demonstrations.demonstrate says."""

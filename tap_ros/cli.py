@@ -58,6 +58,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'paper': ("make the paper's prediction results again", 'experiments.paper.command'),
     'worlds': ("collect other simulators' demonstrations and score who finds their bottlenecks",
                'experiments.worlds.command'),
+    'worlds-loop': ("push in another simulator's scenes, by models trained there",
+                    'experiments.worlds.loop'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo.command'),
     'explore': ('see and try all nodes on a page in the browser',

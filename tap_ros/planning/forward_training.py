@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import sys
 
 import numpy as np
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.crop import check_trainable
 from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_uint8
@@ -25,6 +25,7 @@ from tap_ros.recording.reading import Reading
 from tap_ros.training import run
 from tap_ros.training.inpainted import Episodes, FilledStore
 from tap_ros.training.robot_mask import fill_from_past
+from tap_ros.weights import FORWARD_MODEL
 import torch
 
 FITTED_EPISODES = 100  # enough for the homography and the arm's camera
@@ -41,8 +42,10 @@ def train(config: ForwardTrainingConfig, stop_at: int | None = None, progress: b
 def _prepare(this: run.Run) -> run.Course[LearnedForwardModel, Item]:
     """Make the model of a run, what it is trained on and how."""
     config, store, training = this.config, this.store, this.training
-    state = this.begin(LearnedForwardModel(model_config(config, store, training)), {},
-                       lambda settings: {**DEFAULTS, **settings})
+    network = LearnedForwardModel(model_config(config, store, training))
+    if config.initial_weights and not this.checkpoint.exists():
+        _begin_with(network, config.initial_weights)
+    state = this.begin(network, {}, lambda settings: {**DEFAULTS, **settings})
     # The picture that is looked at shows what a node would show; see FreeView.
     episodes: Episodes = store if config.robot_mask == 'none' else FilledStore(
         store, config.robot_mask, this.progress, fill_from_past)
@@ -68,6 +71,17 @@ def _prepare(this: run.Run) -> run.Course[LearnedForwardModel, Item]:
             for name, part in parts.items() if len(part)}
 
     return run.Course(state, batches, step, score, (config.learning_rate,))
+
+
+def _begin_with(network: LearnedForwardModel, weights: str) -> None:
+    """Copy the weights of another training into a fresh network, but for the arm's picture."""
+    path = FORWARD_MODEL if weights == 'push' else weights
+    others = LearnedForwardModel.load(path, precision='float32').state_dict()
+    kept = {name: value for name, value in others.items() if name != 'sprite'}
+    try:
+        network.load_state_dict(kept, strict=False)
+    except RuntimeError as error:  # names the shapes
+        raise ConfigError(f'initial_weights: {path} are for another network: {error}') from error
 
 
 def model_config(config: ForwardTrainingConfig, store: EpisodeStore,

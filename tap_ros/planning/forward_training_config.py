@@ -39,6 +39,8 @@ class ForwardSettings(OptimizerSettings):
     :param projection: of the camera, K [R | t], 12 numbers row by row, from metres of the robot,
         z = 0 on the table, to pixels of the camera. It tells where the table is; without it the
         objects' recorded places do, or else the arm.
+    :param initial_weights: file of a forward model to begin with instead of fresh weights; 'push':
+        the shipped one. Its picture of the arm is not taken over.
     """
 
     steps: int = 5000
@@ -56,6 +58,7 @@ class ForwardSettings(OptimizerSettings):
     augment: bool = True
     robot_mask: RobotMask = 'none'
     projection: tuple[float, ...] = ()
+    initial_weights: str = ''
 
 
 # Of the bases the last has its fields first.

@@ -1,0 +1,280 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The command `python -m tap_ros worlds-loop`: a closed loop that another world judges.
+
+Bags of pushes in Meta-World, a forward model and predictors from them, and the loop of the nodes,
+planning/reach.py, in fresh scenes. What counts is the environment's own signal.
+"""
+
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+import json
+from pathlib import Path
+
+import cv2
+from experiments.pages import render
+from experiments.planning.episode import run_episode
+from experiments.planning.methods import Method
+from experiments.worlds.pushes import collect_pushes, push_about, push_to_goal
+import numpy as np
+import pandas as pd
+from sim_bridge.world_protocol import make_world
+from tap_ros.contract import ACTION_LIMIT, step_budget
+from tap_ros.errors import SceneError
+from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
+from tap_ros.files import write_atomically
+from tap_ros.images.drawing import enlarge, grid
+from tap_ros.options import Flag, Folder
+from tap_ros.planning.mpc_config import FIRST_SCENE, VisualMPCConfig
+from tap_ros.planning.protocols import SearchConfig
+from tap_ros.planning.visual_mpc import VisualMPC
+from tap_ros.prediction.predictor import SubgoalPredictor
+from tap_ros.recording.cache import open_recordings
+from tap_ros.training.train import train
+from tqdm import tqdm
+
+WORLD, IMAGE_SIZE = 'metaworld', 64
+POLICIES = {'random': (push_about, 100_000), 'demonstrations': (push_to_goal, 0)}
+METHODS = ('random', 'straight', 'direct', 'subgoal')
+MARKED, MOVED = 12, 1.0  # demonstrations; px, beyond which an object has begun to move
+FORWARD = {'robot_mask': 'arm', 'initial_weights': 'push', 'batch_size': 8, 'grow': 0.3,
+           'device': 'cpu', 'threads': 1, 'save_every': 200}
+PREDICTOR = {'selection': 'marks', 'progress_margin': 0.0, 'initial_weights': 'push2',
+             'goal_picture': 'recorded', 'robot_mask': 'arm', 'fill_context': 1.0,
+             'batch_size': 8, 'device': 'cpu', 'threads': 1}
+# Half of what is usual, so that a plan takes half the time.
+PLANNER = VisualMPCConfig(SearchConfig(32, 2, 4), proposals=16, recheck=0, threads=1)
+REACHED = 2.0  # px, here about cm: within this, the object is at its goal
+STRIPS = 3  # scenes of each task that are drawn
+SCALE = 2  # of pictures that are drawn
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param tasks: of Meta-World, in which an object slides on the table in view of the camera.
+    :param episodes: of each bag: pushes at random, and demonstrations.
+    :param steps: of the training of the forward model, on the bags of all tasks.
+    :param predictor_steps: of the training of each task's predictor.
+    :param methods: that act in each scene.
+    :param scenes: of each task; those are left out whose goal the script of the environment's
+        authors does not bring about.
+    :param bags: folder of the bags; what was collected is kept, what was interrupted goes on.
+    :param runs: folder of the trainings and of the scenes that were run, likewise.
+    :param out: folder for worlds_loop.json, worlds_loop.md and worlds_loop.png.
+    :param results_only: run no more scenes.
+    """
+
+    tasks: tuple[str, ...] = ('push-v3', 'plate-slide-v3')
+    episodes: int = 60
+    steps: int = 800
+    predictor_steps: int = 400
+    methods: tuple[str, ...] = METHODS
+    scenes: int = 50
+    bags: Folder = 'bags/loop'
+    runs: Folder = 'runs/loop'
+    out: Folder = 'docs/results'
+    results_only: Flag = False
+
+
+def run(args):
+    """Collect, train, run scene by scene all methods, write what came of it."""
+    runs = Path(args.runs)
+    if not args.results_only:
+        weights = make_weights(args)
+        run_scenes(args, weights)
+    write_results(runs, Path(args.out), args)
+
+
+def make_weights(args):
+    """
+    Make bags and trainings, or go on with them.
+
+    :return: dict: 'forward', and of each task a predictor; paths.
+    """
+    bags = {task: Path(args.bags, task) for task in args.tasks}
+    for task, folder in bags.items():
+        for name, (policy, seed) in POLICIES.items():
+            collect_pushes(folder / name, WORLD, task, policy, args.episodes, seed, IMAGE_SIZE)
+    forward = Path(args.runs, 'forward', 'forward_model.safetensors')
+    if not is_trained(forward, args.steps):
+        train([folder / name for folder in bags.values() for name in POLICIES], forward.parent,
+              'forward', steps=args.steps, **FORWARD)
+    weights = {'forward': str(forward)}
+    for task, folder in bags.items():
+        path = Path(args.runs, task, 'predictor.safetensors')
+        if 'subgoal' in args.methods and not is_trained(path, args.predictor_steps):
+            marks = write_marks(folder / 'demonstrations')
+            train(folder / 'demonstrations', path.parent, steps=args.predictor_steps, marks=marks,
+                  **PREDICTOR)
+        weights[task] = str(path)
+    return weights
+
+
+def is_trained(weights, steps):
+    """Say whether a training has come to its end."""
+    about = weights.parent / 'run.json'
+    return weights.exists() and about.exists() and (
+        json.loads(about.read_text()).get('steps') == steps)
+
+
+def write_marks(folder):
+    """
+    Mark a dozen demonstrations where the hand is at the object, each off by at most a frame.
+
+    :param folder: of the bag.
+    :return: path of the file.
+    """
+    store, rng, marks = open_recordings([folder]), np.random.default_rng(0), []
+    for i in range(len(store)):
+        episode = store[i]
+        places = episode.object_pixels[:, 0]
+        way = np.linalg.norm(places - places[0], axis=1)
+        if len(marks) < MARKED and episode.outcome == 'success':
+            t = int((way > MOVED).argmax()) - 1 + int(rng.integers(-1, 2))
+            stamp = float(episode.stamps[np.clip(t, 1, len(way) - 2)]) / 1e9
+            marks.append({'recording': '.', 'episode': i, 'stamps': [stamp]})
+    path = Path(folder, 'marks.json')
+    write_atomically(path, '{"marks": [\n' + ',\n'.join(map(json.dumps, marks)) + '\n]}\n')
+    return path
+
+
+def run_scenes(args, weights):
+    """Run the methods in the scenes that have a goal; what was run is not run again."""
+    with tqdm(total=args.scenes * len(args.tasks), unit='scene') as bar:
+        for task in args.tasks:
+            done, seed = read_rows(args.runs, task), FIRST_SCENE
+            count = 0
+            while count < args.scenes:
+                rows = done.setdefault(seed, {})
+                for method in args.methods:
+                    if method not in rows:
+                        rows[method] = run_scene(
+                            task, method, seed, weights['forward'], weights[task], args.runs)
+                        write_atomically(rows_of(args.runs, task), json.dumps(done) + '\n')
+                solved = all(rows.values())
+                count, seed = count + solved, seed + 1
+                bar.update(solved)
+
+
+def rows_of(runs, task):
+    """Return the file of what came of the scenes of a task."""
+    return Path(runs, task, 'scenes.json')
+
+
+def read_rows(runs, task):
+    """Return rows by seed and method; None where the scene has no goal."""
+    path = rows_of(runs, task)
+    found = json.loads(path.read_text()) if path.exists() else {}
+    return {int(seed): rows for seed, rows in found.items()}
+
+
+class Judged:
+    """A World that notes what the environment says after every step."""
+
+    def __init__(self, world):
+        self.world, self.said = world, []
+
+    def __getattr__(self, name):
+        return getattr(self.world, name)
+
+    def reset(self, seed):
+        """Begin a scene."""
+        self.said = []
+        return self.world.reset(seed)
+
+    def step(self, action):
+        """Act, and note."""
+        seen = self.world.step(action)
+        self.said.append(self.world.succeeds())
+        return seen
+
+
+def run_scene(task, method, seed, forward, predictor, runs):
+    """Run a method in a scene; return what came of it, None if the scene has no goal."""
+    world = _world(task)
+    try:
+        pictures = act(world, method, seed, _planner(forward), predictor)
+    except SceneError:
+        return None
+    start = pictures.pop()
+    if method == 'subgoal' and seed < FIRST_SCENE + STRIPS:
+        cv2.imwrite(str(Path(runs, task, f'strip_{seed}.png')), grid([pictures])[..., ::-1])
+    goal = world.goal().object_poses[0, :3] - world.goal_places()[0]
+    return {'task': task, 'method': method, 'seed': seed, 'ends': bool(world.succeeds()),
+            'ever': any(world.said), 'steps': len(world.said),
+            'goal_cm': round(100 * float(np.linalg.norm(goal)), 2), 'start_cm': start,
+            'final_cm': round(100 * float(world.distances()[0]), 2)}
+
+
+def act(world, method, seed, mpc, predictor):
+    """
+    Act in one scene by one method, for as many control periods as a goal may take.
+
+    :return: list: pictures of start, subgoals, end and goal; last the distance, cm, at the start.
+    """
+    budget = step_budget(1)
+    if method in ('direct', 'subgoal'):
+        predict = _predictor(predictor) if method == 'subgoal' else None
+        ran = run_episode(world, mpc, Method(method), budget, seed, predict, REACHED)
+        frames, distance = ran.frames, ran.distances[0, 0]
+        shown = [frames[0], *(subgoal.image for subgoal in ran.subgoals), frames[-1]]
+    else:
+        first = world.reset(seed)
+        distance, rng = world.distances()[0], np.random.default_rng(seed)
+        actions = push_to_goal(world) if method == 'straight' else (
+            np.append(rng.uniform(-1, 1, 3) * ACTION_LIMIT, 0) for _ in range(budget))
+        last = first
+        for _, action in zip(range(budget), actions):
+            last = world.step(action)
+        shown = [first.image, last.image]
+    return [*(enlarge(image, SCALE) for image in (*shown, world.goal().image)),
+            round(100 * float(distance), 2)]
+
+
+@lru_cache
+def _world(task):
+    return Judged(make_world(WORLD, task, IMAGE_SIZE))
+
+
+@lru_cache
+def _planner(forward):
+    return VisualMPC.load(forward, PLANNER)
+
+
+@lru_cache
+def _predictor(path):
+    return SubgoalPredictor.load(path, 'cpu')
+
+
+def write_results(runs, out, args):
+    """Write all rows, the table and the strips."""
+    rows = [row for task in args.tasks for rows in read_rows(runs, task).values()
+            for row in rows.values() if row]
+    table = pd.DataFrame(summarise(rows))
+    write_atomically(out / 'worlds_loop.json', '[' + ',\n'.join(map(json.dumps, rows)) + ']\n')
+    strips = [path for task in args.tasks for path in sorted(Path(runs, task).glob('strip_*.png'))]
+    pictures = [[cv2.imread(str(path))] for path in strips]
+    cv2.imwrite(str(out / 'worlds_loop.png'), grid(pictures))
+    write_atomically(out / 'worlds_loop.md', render(
+        'worlds/templates/worlds_loop.md.j2', table=table, marked=MARKED, **asdict(args)))
+    print(out / 'worlds_loop.md')
+
+
+def summarise(rows):
+    """Return a line for each task and method: shares and distances with 95% intervals."""
+    found = []
+    for task, method in dict.fromkeys((row['task'], row['method']) for row in rows):
+        same = [row for row in rows if (row['task'], row['method']) == (task, method)]
+        line = {'task': task, 'method': method, 'scenes': len(same)}
+        for name in ('ends', 'ever'):
+            value, low, high = share_interval([row[name] for row in same])
+            line[name] = f'{value:.0%} ({100 * low:.0f} to {100 * high:.0f})'
+        for name in ('start_cm', 'final_cm'):
+            value, low, high = Interval(*mean_interval([row[name] for row in same]))
+            line[name] = f'{value:.1f} ({low:.1f} to {high:.1f})'
+        found.append({**line, 'steps': f'{np.mean([row["steps"] for row in same]):.0f}'})
+    return found
