@@ -257,8 +257,9 @@ def write_results(runs, out, args):
     table = pd.DataFrame(summarise(rows))
     write_atomically(out / 'worlds_loop.json', '[' + ',\n'.join(map(json.dumps, rows)) + ']\n')
     strips = [path for task in args.tasks for path in sorted(Path(runs, task).glob('strip_*.png'))]
-    pictures = [[cv2.imread(str(path))] for path in strips]
-    cv2.imwrite(str(out / 'worlds_loop.png'), grid(pictures))
+    if strips:
+        cv2.imwrite(str(out / 'worlds_loop.png'), grid([[cv2.imread(str(path))]
+                                                        for path in strips]))
     write_atomically(out / 'worlds_loop.md', render(
         'worlds/templates/worlds_loop.md.j2', table=table, marked=MARKED, **asdict(args)))
     print(out / 'worlds_loop.md')

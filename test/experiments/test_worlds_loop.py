@@ -8,8 +8,8 @@ from experiments.worlds import loop
 from experiments.worlds.pushes import collect_pushes, push_to_goal
 import numpy as np
 import pytest
-from tap_ros.prediction.marks import read_marks
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import read_marks
 
 
 def test_pushes_of_meta_world_are_recorded_through_the_world_protocol(tmp_path):
