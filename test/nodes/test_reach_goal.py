@@ -182,7 +182,7 @@ def test_a_planner_with_a_robot_mask_waits_for_masks_and_stops_when_it_is_deacti
     images = loop.node.create_subscription(Image, 'camera/image_raw', answer, STREAM)
     card = Newest(loop.node, String, 'other_node/model_card', LATCHED)
     try:
-        with loop.other_planner(robot_mask='all', image_timeout=1.0):
+        with loop.other_planner(robot_mask='all', image_timeout=3.0):
             states = Lifecycle(loop.node, 'other_node')
             assert stored_digest(FORWARD_MODEL) in card.wait(20).data
             loop.reset()
