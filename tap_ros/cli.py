@@ -60,6 +60,8 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                'experiments.worlds.command'),
     'worlds-loop': ("push in another simulator's scenes, by models trained there",
                     'experiments.worlds.loop'),
+    'few': ('score what predictors learn from few demonstrations, simulated and real',
+            'experiments.few'),
     'weights': ('make the shipped predictors again', 'experiments.weights.command'),
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo.command'),
     'explore': ('see and try all nodes on a page in the browser',

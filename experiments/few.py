@@ -1,0 +1,199 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The command `python -m tap_ros few`: what a predictor learns from few demonstrations.
+
+A curve over their number in a task of Meta-World, and real ones in folds: each demonstration is
+scored by a predictor that has not seen it, nor was stopped by it.
+"""
+
+from dataclasses import dataclass
+import json
+from pathlib import Path
+
+from experiments.pages import render
+from experiments.worlds.command import read
+from experiments.worlds.trained import held_out_of, MARKS, METHODS, SETTINGS, write_marks
+import numpy as np
+import pandas as pd
+from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
+from tap_ros.engines import Engine
+from tap_ros.errors import ConfigError
+from tap_ros.evaluation.intervals import bootstrap, mean_interval
+from tap_ros.evaluation.prediction import evaluate
+from tap_ros.files import write_atomically
+from tap_ros.options import Folder
+from tap_ros.prediction.predictor import load_network
+from tap_ros.recording.bags import reading_like
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.formats import pictures
+from tap_ros.recording.formats.pictures import natural
+from tap_ros.recording.marks import read_marks
+from tap_ros.training.train import train
+import torch
+
+MARKED, HELD_OUT = 10, 40  # demonstrations in Meta-World
+IN_A_FILE = 10
+# What real demonstrations are trained with, beside SETTINGS; two pictures a second, of some
+# minutes each.
+REAL = {**METHODS['relative'], 'rate': 2.0, 'num_targets': 30, 'patience': 150,
+        'initial_weights': 'push2'}
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param real: folder of real demonstrations: a folder each, with a video of each camera; without
+        it those that were scored before stay in the results.
+    :param cameras: names of the videos, without ending, that are used.
+    :param folds: in so many parts real demonstrations are held out, 3 at least.
+    :param task: of Meta-World, for the curve.
+    :param demonstrations: points of the curve.
+    :param seeds: trainings of each point.
+    :param bags: folder of the bags; what is there is kept.
+    :param runs: folder of the trainings, likewise.
+    :param out: folder for few.json and few.md.
+    """
+
+    real: Folder = ''
+    cameras: tuple[str, ...] = ('0', '1')
+    folds: int = 4
+    task: str = 'drawer-open-v3'
+    demonstrations: tuple[int, ...] = (10, 30, 100, 300)
+    seeds: int = 1
+    bags: Folder = 'bags/few'
+    runs: Folder = 'runs/few'
+    out: Folder = 'docs/results'
+
+
+def run(args):
+    """Train and score what is not there yet, and write the results."""
+    torch.set_num_threads(1)
+    file = Path(args.out, 'few.json')
+    before = json.loads(file.read_text()) if file.exists() else {'real': []}
+    found = {'task': args.task, 'curve': curve(args),
+             'real': real(args) if args.real else before['real']}
+    write(found, Path(args.out))
+    print(Path(args.out, 'few.md'))
+
+
+def write(found, folder):
+    """Write few.json and few.md."""
+    parts = ('[' + ',\n'.join(map(json.dumps, value)) + ']' if isinstance(value, list)
+             else json.dumps(value) for value in found.values())
+    write_atomically(folder / 'few.json', '{' + ',\n'.join(
+        f'"{name}": {part}' for name, part in zip(found, parts)) + '}\n')
+    write_atomically(folder / 'few.md', page(found))
+
+
+def curve(args):
+    """Return a dict for each number of demonstrations and seed: scores of every episode."""
+    bag = Path(args.bags, args.task)
+    for folder, episodes, seed in ((bag, max(args.demonstrations), 0),
+                                   (held_out_of(bag), HELD_OUT, 10 ** 6)):
+        collect(folder, CollectConfig(
+            world='metaworld', task=args.task, episodes=episodes, seed=seed, image_size=128,
+            episodes_per_file=IN_A_FILE), Engine())
+    if not (bag / MARKS).exists():
+        write_marks(bag, read(bag)[:MARKED], 0)
+    files = sorted(bag.glob('*.mcap'), key=natural)
+    rows = []
+    for seed in range(args.seeds):
+        for count in args.demonstrations:
+            weights = trained(
+                files[:count // IN_A_FILE], Path(args.runs, f'{args.task}_{count}_{seed}'),
+                seed=seed, held_out=(str(held_out_of(bag)),), marks=str(bag / MARKS),
+                **METHODS['marks'])
+            store, scores = score(weights, [held_out_of(bag)])
+            truth = read_marks(held_out_of(bag) / BOTTLENECKS_FILE, store).episodes
+            beside = [max(first - t, t - last, 0) for t, ((first, last), *_) in zip(
+                scores.match_step, (truth[i] for i in sorted(truth)))]
+            rows.append({'demonstrations': count, 'seed': seed, **errors(scores),
+                         'beside': list(map(int, beside))})
+    return rows
+
+
+def real(args):
+    """Return a dict for each demonstration: the mean scores of its cameras."""
+    folders = sorted({file.parent for file in Path(args.real).rglob('*.mp4')
+                      if file.stem in args.cameras}, key=natural)
+    if len(folders) < args.folds:
+        raise ConfigError(f'--real {args.real}: {len(folders)} folders with videos named '
+                          f'{" or ".join(args.cameras)}, fewer than --folds {args.folds}')
+    bags = [Path(args.bags, 'real', folder.name) for folder in folders]
+    for folder, bag in zip(folders, bags):
+        if not bag.exists():
+            pictures.run(pictures.Options(
+                paths=tuple(str(folder / f'{camera}.mp4') for camera in args.cameras),
+                out=str(bag), crop='centre', size=SETTINGS['size']))
+    rows = []
+    for k in range(args.folds):
+        # One part is scored, the next one says when to stop.
+        scored, stopping = bags[k::args.folds], bags[(k + 1) % args.folds::args.folds]
+        weights = trained([bag for bag in bags if bag not in scored], Path(args.runs, f'real_{k}'),
+                          held_out=tuple(map(str, stopping)), **REAL)
+        for bag in scored:
+            means = {name: round(float(np.mean(values)), 5)
+                     for name, values in errors(score(weights, [bag])[1]).items()}
+            rows.append({'demonstration': bag.name, **means})
+    return rows
+
+
+def trained(recordings, out, **settings):
+    """Return the weights file of a training, which is made if it is not there."""
+    path = out / 'predictor.safetensors'
+    return path if path.exists() else train(recordings, out, **{**SETTINGS, **settings})
+
+
+def score(weights, bags):
+    """Return the store of bags and the EpisodeScores of predictions of all their episodes."""
+    network, training = load_network(weights)
+    store = open_recordings(bags, reading=reading_like(training, bags))
+    return store, evaluate(network, store, range(len(store)))['prediction']
+
+
+def errors(scores):
+    """Return the errors at the matched frame of each episode, of predictions and of copying."""
+    return {'error': np.round(scores.min_l1.astype(float), 5).tolist(),
+            'copying': np.round(scores.copying.astype(float), 5).tolist()}
+
+
+def relative(rows):
+    """Return the Interval of the error relative to copying; rows of the same episodes or one."""
+    error, copying = (np.mean([row[name] for row in rows], axis=0) if isinstance(
+        rows[0][name], list) else np.array([row[name] for row in rows])
+        for name in ('error', 'copying'))
+    return bootstrap(lambda ours, copied: ours.mean(-1) / copied.mean(-1), error, copying)
+
+
+def page(found):
+    """Write the page of the results."""
+    lines = []
+    for count in dict.fromkeys(row['demonstrations'] for row in found['curve']):
+        rows = [row for row in found['curve'] if row['demonstrations'] == count]
+        beside = np.array([row['beside'] for row in rows])
+        hit, near = (mean_interval((beside <= most).mean(0)) for most in (0, 1))
+        lines.append({'demonstrations': count, 'error / copying': _text(relative(rows), 2),
+                      'hits': _percent(hit), 'within a frame': _percent(near)})
+    rows, real = found['real'], {}
+    if rows:
+        ratio = relative(rows)
+        real = {'error': np.mean([row['error'] for row in rows]),
+                'copying': np.mean([row['copying'] for row in rows]), 'ratio': _text(ratio, 2),
+                'won': sum(row['error'] < row['copying'] for row in rows), 'count': len(rows),
+                'verdict': 'better than copying' if ratio.high < 1 else 'worse than copying'
+                if ratio.low > 1 else 'not told from copying'}
+    return render('templates/few.md.j2', task=found['task'], marked=MARKED, held_out=HELD_OUT,
+                  steps=SETTINGS['steps'], batch=SETTINGS['batch_size'],
+                  seeds=1 + max(row['seed'] for row in found['curve']), curve=pd.DataFrame(lines),
+                  patience=REAL['patience'], real=real)
+
+
+def _text(interval, digits):
+    return '{0:.{3}f} ({1:.{3}f} to {2:.{3}f})'.format(*interval, digits)
+
+
+def _percent(interval):
+    return '{:.0f}% ({:.0f} to {:.0f})'.format(*(100 * each for each in interval))
