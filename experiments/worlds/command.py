@@ -34,14 +34,16 @@ from tap_ros.prediction.marks import chance
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.recording.reading import Reading
+from tap_ros.training.recipes import find_recipe
 
 Method = Literal['fix', 'over time', 'relative', 'progress', 'still', 'marks', 'fix to marks']
 TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-insert-side-v3',
          'metaworld/window-open-v3', 'metaworld/drawer-open-v3',
          'metaworld/button-press-topdown-v3', 'ogbench/button', 'ogbench/cube', 'ogbench/drawer',
          'ogbench/window')
-MARKED, HELD_OUT = 12, 40  # demonstrations of each task
+MARKED, HELD_OUT = 10, 40  # demonstrations of each task
 STRIPS = 6  # demonstrations that are drawn, of each task
+FOUND = 0.75, 0.85  # of the demonstrations, exactly or within a frame: a task counts as found
 
 
 @dataclass(frozen=True)
@@ -185,8 +187,11 @@ def average(rows):
 def page(rows):
     """Write the page of the results, a line for each task."""
     shared, tables = {}, [{}, {}]  # of keyframes, and of trainings
+    found, seeds = [{}, {}], {}
     for row in rows:
         trained = 'seeds' in row
+        if trained:
+            seeds[row['method']] = min(row['seeds'], seeds.get(row['method'], row['seeds']))
         if not trained:
             shared[row['task']] = (f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f} of the "
                                    'bottleneck')
@@ -195,7 +200,12 @@ def page(rows):
         hit, near = row['hit'], row['near']
         line[row['method']] = (f"{hit['value']:.0%} ({100 * hit['low']:.0f} to "
                                f"{100 * hit['high']:.0f}), {near['value']:.0%}")
+        found[trained].setdefault(row['method'], []).append(
+            any(value['value'] >= least for value, least in zip((hit, near), FOUND)))
+    for lines, counts in zip(tables, found):
+        lines['found'] = {'task': '**found**', 'frames': ''} | {
+            method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in counts.items()}
     keyframes, trained = (pd.DataFrame(list(lines.values())) for lines in tables)
-    return render('worlds/templates/worlds.md.j2', n=rows[0]['n'], marked=MARKED,
-                  held_out=rows[-1]['n'], seeds=rows[-1].get('seeds', 0), steps=SETTINGS['steps'],
-                  batch=SETTINGS['batch_size'], keyframes=keyframes, trained=trained)
+    return render('worlds/templates/worlds.md.j2', marked=MARKED, held_out=HELD_OUT, seeds=seeds,
+                  settings=find_recipe('predictor', SETTINGS['recipe']).settings,
+                  keyframes=keyframes, trained=trained)

@@ -16,13 +16,13 @@ MARKS = 'marks.json'  # those that a person would have made
 METHODS = {
     'fix': {'loss': 'fix'},
     'over time': {'selection': 'absolute'},
-    'relative': {'selection': 'relative', 'progress_margin': 0.0},
-    'progress': {},
-    'still': {'selection': 'still', 'progress_margin': 0.0},
-    'marks': {'selection': 'marks', 'progress_margin': 0.0},
-    'fix to marks': {'loss': 'fix', 'selection': 'marks', 'progress_margin': 0.0},
+    'relative': {},
+    'progress': {'selection': 'progress', 'progress_margin': 0.5},
+    'still': {'selection': 'still'},
+    'marks': {'selection': 'marks'},
+    'fix to marks': {'loss': 'fix', 'selection': 'marks'},
 }
-SETTINGS = {'steps': 400, 'batch_size': 8, 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
+SETTINGS = {'recipe': 'foreign', 'size': 64, 'threads': 1, 'save_every': 10 ** 6}
 
 
 def held_out_of(folder):

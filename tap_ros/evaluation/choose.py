@@ -159,7 +159,7 @@ def command_of(args: Options, name: str) -> str:
                if key not in ('recordings', 'selection', 'loss', 'marks')
                and value != usual.get(key, '')} | _options(name, given)
     words = ['python', '-m', 'tap_ros', 'train', 'predictor', *given['recordings']]
-    words += ['--recipe', args.recipe] if args.recipe else []
+    words += ['--recipe', recipe]
     for key, value in changed.items():
         option = key.replace('_', '-')
         if isinstance(value, bool):

@@ -65,6 +65,10 @@ RECIPES: dict[str, dict[str, Recipe]] = {
         'pick_place_vae': Recipe(
             {**_GRIPPING, 'selection': 'absolute', 'latent': 'vae', 'margin': 0, 'kl_weight': 2e-5,
              'free_nats': 4.0}, 'pick_place', {'pick_place': {'episodes': 3000}}),
+        # A dozen marked demonstrations, see marks. Pieces without the marked moment teach another
+        # one, and it may be three frames from the goal. As above, gripping hands must be made up.
+        'foreign': Recipe({**_BY_COPYING, 'margin': 1, 'start_crop': 0.0, 'new_pixels': True,
+                           'colour': False, 'brightness': 0.0, 'steps': 400, 'batch_size': 8}),
         # Ten steps, to see whether recordings can be trained on.
         'debug': Recipe({**_TINY, 'base_width': 4, 'precision': 'float32'})},
     'forward': {

@@ -40,7 +40,7 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
     :param out: the run's folder; by default runs/predictor or runs/forward.
     :param model: 'predictor' or 'forward'.
     :param recipe: its name in training/recipes.py; by default that of the task that the
-        recordings name, else push2's.
+        recordings name, else with marks 'foreign', else push2's.
     :param settings: other settings than the recipe's: fields of TrainingConfig, or of
         ForwardTrainingConfig. Initial weights bring the network's shape and the pictures' size.
     :return: path of the weights file.
@@ -93,6 +93,8 @@ def recipe_of(model: str, recordings: Sequence[str], settings: Mapping[str, Any]
     """
     Name the recipe for recordings: that of the task of their first episode, if there is one.
 
+    For others with marks it is 'foreign'.
+
     :param model: 'predictor' or 'forward'.
     :param recordings: paths.
     :param settings: of the training; those of Reading say how they are read.
@@ -107,7 +109,9 @@ def recipe_of(model: str, recordings: Sequence[str], settings: Mapping[str, Any]
                              if field.name in settings})
         check_first_picture(recordings, reading, f'the {model}')
         task = open_recordings(list(recordings), reading=reading)[0].task
-    return task if task in RECIPES[model] else DEFAULT[model]
+    if task in RECIPES[model]:
+        return task
+    return 'foreign' if settings.get('marks') else DEFAULT[model]
 
 
 def with_recipe(model: Model, args: Options) -> Options:

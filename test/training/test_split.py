@@ -11,7 +11,7 @@ import pytest
 from tap_ros.errors import RecordingError
 from tap_ros.planning.forward_training_config import ForwardTrainingConfig
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training.run import _paths
+from tap_ros.training.run import paths_of
 from tap_ros.training.split import split_episodes
 
 
@@ -84,7 +84,7 @@ def test_recordings_that_are_named_are_held_out_wherever_they_are(tmp_path, monk
     monkeypatch.chdir(tmp_path)
 
     def split(recordings, *held_out):
-        paths = _paths(ForwardTrainingConfig(tuple(recordings), 'x', held_out=held_out))
+        paths = paths_of(ForwardTrainingConfig(tuple(recordings), 'x', held_out=held_out))
         store = open_recordings(paths, tmp_path / 'cache', progress=False)
         return [[store[i].seed for i in part]
                 for part in split_episodes(store, 0.3, held_out=held_out)]
