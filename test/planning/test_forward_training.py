@@ -148,6 +148,13 @@ def test_resumed_training_equals_uninterrupted_training(bag, tmp_path):
     assert config == json.loads(json.dumps(asdict(config_for(bag, tmp_path / 'a'))))
     told = load_tensors(resumed)[1]['training']
     assert (told['settings'], told['scores'], told['steps']) == (config, scores, 4)
+    # Another training begins with these weights, but not with their picture of the arm.
+    begins = {'steps': 1, 'learning_rate': 1e-9, 'initial_weights': resumed}
+    begun = load_file(train(config_for(bag, tmp_path / 'c', **begins), progress=False))
+    for name, value in first.items():
+        assert torch.allclose(begun[name], value, atol=1e-6) == (name != 'sprite'), name
+    with pytest.raises(ConfigError, match='for another network'):
+        train(config_for(bag, tmp_path / 'd', width=8, **begins), progress=False)
 
 
 @pytest.fixture(scope='module')
