@@ -22,6 +22,7 @@ from tap_ros.prediction.methods import Selection
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.reading import reading_of
 from tap_ros.training.recipes import find_recipe
+from tap_ros.training.split import FEW
 from tap_ros.training.train import recipe_of, settings_of
 
 TRIAL = {'steps': 400, 'batch_size': 8}  # at most
@@ -125,8 +126,11 @@ def _try(args: Options, configs: Mapping[str, TrainingConfig]) -> tuple[
     marks = read_marks(args.objective.marks, store) if args.objective.marks else None
     known = set(marks.episodes) if marks else set()
     for share in HELD_OUT:
-        kept, held_out = with_masks(store, split_episodes(
+        parts = with_masks(store, split_episodes(
             store, max(share, first.test_fraction), held_out=first.held_out), first.robot_mask)
+        if share > HELD_OUT[0] and len(parts[1]) > len(parts[0]):
+            break  # too few would be left to train on
+        (kept, held_out), fraction = parts, max(share, first.test_fraction)
         if len(known & set(held_out.tolist())) >= len(known) / 3:
             break
     if not len(held_out):
@@ -135,7 +139,7 @@ def _try(args: Options, configs: Mapping[str, TrainingConfig]) -> tuple[
     marked = np.array([i for i in held_out.tolist() if i in known], int)
     goal, filled, tried = 'recorded', fill(store, first.robot_mask), []
     for name, config in configs.items():
-        weights = train(replace(config, test_fraction=max(share, first.test_fraction)))
+        weights = train(replace(config, test_fraction=fraction))
         network, _ = load_network(weights)
         hits = np.zeros(0, bool)
         if marks and len(marked):
@@ -176,6 +180,9 @@ def _decide(tried: Sequence[Candidate]) -> list[str]:
     if not len(tried[0].hits):
         return ['look at the page and choose: no marks are held out that could']
     from tap_ros.evaluation.intervals import share_interval
+    if len(tried[0].hits) < FEW:
+        return [f'look at the page and choose: {len(tried[0].hits)} held-out marks are too few; '
+                'mark more to let them choose']
     best = max(tried, key=lambda one: int(one.hits.sum()))
     low = share_interval(best.hits).low
     near = [one.name for one in tried

@@ -4,12 +4,14 @@
 
 import re
 import shlex
+from typing import get_args
 
 from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.cli import main, read
 from tap_ros.evaluation.choose import _decide, Candidate
+from tap_ros.prediction.methods import Selection
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
 from tap_ros.training.train import settings_of
@@ -27,7 +29,7 @@ def bags(tmp_path_factory):
         for name, seeds in (('training', range(8, 14)), ('held_out', range(14, 20)))]
     store = open_recordings(bags, progress=False)
     marks = folder / 'marks.json'
-    write_marks(marks, store, bags, {i: [(4, 4)] for i in (0, 1, 2, 6, 7, 11)})
+    write_marks(marks, store, bags, {i: [(4, 4)] for i in (0, 1, 2, 6, 7, 8, 9, 11)})
     return *map(str, bags), str(marks)
 
 
@@ -37,9 +39,9 @@ def test_all_selections_are_tried_and_marks_that_are_held_out_choose(bags, tmp_p
     assert main(['train', 'predictor', *options, '--marks', marks, '--choose']) == 0
     said = capsys.readouterr().out
     best = said.split()[0]
-    assert re.search(r'hits most: \d of 3 held-out marks', said)
+    assert re.search(r'hits most: \d of 5 held-out marks', said)
     page = (tmp_path / 'choose.html').read_text()
-    names = ['fix', 'absolute', 'relative', 'progress', 'still', 'marks']
+    names = ['fix', *get_args(Selection)]
     assert best in names and [
         name for name in re.findall('<h2>(.*?)</h2>', page) if name in names] == names
     assert page.count('data:image/png;base64,') == len(names) and 'src="http' not in page
@@ -73,3 +75,5 @@ def test_of_selections_that_differ_by_less_than_chance_it_is_said():
     first, command = _decide(tried(fix=0, relative=9, marks=10))
     assert first.startswith('marks hits most') and first.endswith('not told from: relative')
     assert command == 'train marks'
+    few = [one._replace(hits=one.hits[:4]) for one in tried(fix=0, marks=4)]
+    assert 'too few' in _decide(few)[0] and len(_decide(few)) == 1
