@@ -13,7 +13,7 @@ from pathlib import Path
 
 from experiments.pages import render
 from experiments.worlds.command import read
-from experiments.worlds.trained import held_out_of, MARKS, METHODS, SETTINGS, write_marks
+from experiments.worlds.trained import held_out_of, MARKS, write_marks
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
@@ -34,9 +34,11 @@ import torch
 
 MARKED, HELD_OUT = 10, 40  # demonstrations in Meta-World
 IN_A_FILE = 10
+SETTINGS = {'recipe': 'push2', 'steps': 400, 'batch_size': 8, 'size': 64, 'threads': 1,
+            'progress_margin': 0.0, 'save_every': 10 ** 6}
 # What real demonstrations are trained with, beside SETTINGS; two pictures a second, of some
 # minutes each.
-REAL = {**METHODS['relative'], 'rate': 2.0, 'num_targets': 30, 'patience': 150,
+REAL = {'selection': 'relative', 'rate': 2.0, 'num_targets': 30, 'patience': 150,
         'initial_weights': 'push2'}
 
 
@@ -105,7 +107,7 @@ def curve(args):
             weights = trained(
                 files[:count // IN_A_FILE], Path(args.runs, f'{args.task}_{count}_{seed}'),
                 seed=seed, held_out=(str(held_out_of(bag)),), marks=str(bag / MARKS),
-                **METHODS['marks'])
+                selection='marks')
             store, scores = score(weights, [held_out_of(bag)])
             truth = read_marks(held_out_of(bag) / BOTTLENECKS_FILE, store).episodes
             beside = [max(first - t, t - last, 0) for t, ((first, last), *_) in zip(
