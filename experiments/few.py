@@ -11,15 +11,15 @@ from dataclasses import dataclass
 import json
 from pathlib import Path
 
-from experiments.pages import render
+from experiments.pages import render, share
 from experiments.worlds.command import read
-from experiments.worlds.trained import held_out_of, MARKS, write_marks
+from experiments.worlds.trained import held_out_of, mark, MARKS
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError
-from tap_ros.evaluation.intervals import bootstrap, mean_interval
+from tap_ros.evaluation.intervals import against_copying, mean_interval
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.files import write_atomically
 from tap_ros.options import Folder
@@ -99,15 +99,15 @@ def curve(args):
             world='metaworld', task=args.task, episodes=episodes, seed=seed, image_size=128,
             episodes_per_file=IN_A_FILE), Engine())
     if not (bag / MARKS).exists():
-        write_marks(bag, read(bag)[:MARKED], 0)
+        mark(bag, read(bag)[:MARKED], 0)
     files = sorted(bag.glob('*.mcap'), key=natural)
     rows = []
     for seed in range(args.seeds):
         for count in args.demonstrations:
-            weights = trained(
+            weights = train(
                 files[:count // IN_A_FILE], Path(args.runs, f'{args.task}_{count}_{seed}'),
                 seed=seed, held_out=(str(held_out_of(bag)),), marks=str(bag / MARKS),
-                selection='marks')
+                selection='marks', **SETTINGS)
             store, scores = score(weights, [held_out_of(bag)])
             truth = read_marks(held_out_of(bag) / BOTTLENECKS_FILE, store).episodes
             beside = [max(first - t, t - last, 0) for t, ((first, last), *_) in zip(
@@ -134,19 +134,13 @@ def real(args):
     for k in range(args.folds):
         # One part is scored, the next one says when to stop.
         scored, stopping = bags[k::args.folds], bags[(k + 1) % args.folds::args.folds]
-        weights = trained([bag for bag in bags if bag not in scored], Path(args.runs, f'real_{k}'),
-                          held_out=tuple(map(str, stopping)), **REAL)
+        weights = train([bag for bag in bags if bag not in scored], Path(args.runs, f'real_{k}'),
+                        held_out=tuple(map(str, stopping)), **SETTINGS | REAL)
         for bag in scored:
             means = {name: round(float(np.mean(values)), 5)
                      for name, values in errors(score(weights, [bag])[1]).items()}
             rows.append({'demonstration': bag.name, **means})
     return rows
-
-
-def trained(recordings, out, **settings):
-    """Return the weights file of a training, which is made if it is not there."""
-    path = out / 'predictor.safetensors'
-    return path if path.exists() else train(recordings, out, **{**SETTINGS, **settings})
 
 
 def score(weights, bags):
@@ -163,11 +157,11 @@ def errors(scores):
 
 
 def relative(rows):
-    """Return the Interval of the error relative to copying; rows of the same episodes or one."""
+    """Compare the error with that of copying, see against_copying; a row a seed or an episode."""
     error, copying = (np.mean([row[name] for row in rows], axis=0) if isinstance(
         rows[0][name], list) else np.array([row[name] for row in rows])
         for name in ('error', 'copying'))
-    return bootstrap(lambda ours, copied: ours.mean(-1) / copied.mean(-1), error, copying)
+    return against_copying(error, copying)
 
 
 def page(found):
@@ -177,25 +171,20 @@ def page(found):
         rows = [row for row in found['curve'] if row['demonstrations'] == count]
         beside = np.array([row['beside'] for row in rows])
         hit, near = (mean_interval((beside <= most).mean(0)) for most in (0, 1))
-        lines.append({'demonstrations': count, 'error / copying': _text(relative(rows), 2),
-                      'hits': _percent(hit), 'within a frame': _percent(near)})
+        lines.append({'demonstrations': count, 'error / copying': _text(relative(rows)[1]),
+                      'hits': share(hit), 'within a frame': share(near)})
     rows, real = found['real'], {}
     if rows:
-        ratio = relative(rows)
+        verdict, ratio = relative(rows)
         real = {'error': np.mean([row['error'] for row in rows]),
-                'copying': np.mean([row['copying'] for row in rows]), 'ratio': _text(ratio, 2),
+                'copying': np.mean([row['copying'] for row in rows]), 'ratio': _text(ratio),
                 'won': sum(row['error'] < row['copying'] for row in rows), 'count': len(rows),
-                'verdict': 'better than copying' if ratio.high < 1 else 'worse than copying'
-                if ratio.low > 1 else 'not told from copying'}
+                'verdict': verdict}
     return render('templates/few.md.j2', task=found['task'], marked=MARKED, held_out=HELD_OUT,
                   steps=SETTINGS['steps'], batch=SETTINGS['batch_size'],
                   seeds=1 + max(row['seed'] for row in found['curve']), curve=pd.DataFrame(lines),
                   patience=REAL['patience'], real=real)
 
 
-def _text(interval, digits):
-    return '{0:.{3}f} ({1:.{3}f} to {2:.{3}f})'.format(*interval, digits)
-
-
-def _percent(interval):
-    return '{:.0f}% ({:.0f} to {:.0f})'.format(*(100 * each for each in interval))
+def _text(interval):
+    return '{:.2f} ({:.2f} to {:.2f})'.format(*interval)

@@ -66,6 +66,11 @@ def interval(rows, digits=4, unit=1, sign='', after='', form='{}{} ({} to {})'):
     return parts[0].mask(parts[0].notna(), texts)
 
 
+def share(found):
+    """Write a share and its interval, (value, low, high) from 0 to 1, as '40% (37 to 43)'."""
+    return '{:.0f}% ({:.0f} to {:.0f})'.format(*(100 * each for each in found))
+
+
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent), undefined=StrictUndefined, trim_blocks=True,
     lstrip_blocks=True)

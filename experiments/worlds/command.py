@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import cv2
-from experiments.pages import render
+from experiments.pages import render, share
 from experiments.worlds.trained import (
     held_out_of,
+    mark,
     METHODS,
     place_marks,
     SETTINGS,
     train_all,
-    write_marks,
 )
 import numpy as np
 import pandas as pd
@@ -92,7 +92,7 @@ def run(args):
         drawn = [strip(one) for one in held_out[:STRIPS]]
         cv2.imwrite(str(folder / 'bottlenecks.png'), grid(drawn)[..., ::-1])
         strips += drawn[:1]
-        write_marks(folder, training[:MARKED], args.seed)
+        mark(folder, training[:MARKED], args.seed)
         # Of keyframes all are held out that are not marked.
         rows += [{'task': name, **row} for row in score(
             training[:MARKED], training[MARKED:] + held_out, args.seed)]
@@ -109,7 +109,6 @@ class Demonstration(NamedTuple):
 
     frames: np.ndarray  # (T, H, W, 3) uint8
     window: tuple[int, int]  # first and last frame of the bottleneck
-    stamps: np.ndarray = np.empty(0)  # (T,) int64, ns
     number: int = 0  # in its bag
 
 
@@ -125,7 +124,7 @@ def read(folder):
         raise ConfigError(f'{path}: is not there; collect it by a world that knows bottlenecks')
     store = open_recordings([folder], reading=Reading(size=SETTINGS['size']))
     truth = read_marks(path, store).episodes
-    return [Demonstration(store[i].frames, truth[i][0], store[i].stamps, i) for i in sorted(truth)]
+    return [Demonstration(store[i].frames, truth[i][0], i) for i in sorted(truth)]
 
 
 def strip(one):
@@ -140,7 +139,7 @@ def score(marked, held_out, seed=0):
 
     :param marked: Demonstrations that are marked.
     :param held_out: Demonstrations that are scored.
-    :param seed: of the frame by which each mark is off, as in write_marks.
+    :param seed: of the frame by which each mark is off, as in trained.mark.
     :return: list of dicts: method, hit and near (at most a frame beside the bottleneck), each
         with value, low and high, n, and the mean frames of bottlenecks and demonstrations.
     """
@@ -198,8 +197,7 @@ def page(rows):
         line = tables[trained].setdefault(
             row['task'], {'task': row['task'].replace('/', ' '), 'frames': shared[row['task']]})
         hit, near = row['hit'], row['near']
-        line[row['method']] = (f"{hit['value']:.0%} ({100 * hit['low']:.0f} to "
-                               f"{100 * hit['high']:.0f}), {near['value']:.0%}")
+        line[row['method']] = f"{share(hit.values())}, {near['value']:.0%}"
         found[trained].setdefault(row['method'], []).append(
             any(value['value'] >= least for value, least in zip((hit, near), FOUND)))
     for lines, counts in zip(tables, found):

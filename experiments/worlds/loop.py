@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 
 import cv2
-from experiments.pages import render
+from experiments.pages import render, share
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import Method
 from experiments.worlds.pushes import collect_pushes, push_about, push_to_goal
@@ -22,7 +22,7 @@ import pandas as pd
 from sim_bridge.world_protocol import make_world
 from tap_ros.contract import ACTION_LIMIT, step_budget
 from tap_ros.errors import SceneError
-from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
+from tap_ros.evaluation.intervals import mean_interval, share_interval
 from tap_ros.files import write_atomically
 from tap_ros.images.drawing import enlarge, grid
 from tap_ros.options import Flag, Folder
@@ -31,6 +31,7 @@ from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import write_marks
 from tap_ros.training.train import train
 from tqdm import tqdm
 
@@ -99,46 +100,34 @@ def make_weights(args):
     for task, folder in bags.items():
         for name, (policy, seed) in POLICIES.items():
             collect_pushes(folder / name, WORLD, task, policy, args.episodes, seed, IMAGE_SIZE)
-    forward = Path(args.runs, 'forward', 'forward_model.safetensors')
-    if not is_trained(forward, args.steps):
-        train([folder / name for folder in bags.values() for name in POLICIES], forward.parent,
-              'forward', steps=args.steps, **FORWARD)
-    weights = {'forward': str(forward)}
+    weights = {'forward': str(train(
+        [folder / name for folder in bags.values() for name in POLICIES],
+        Path(args.runs, 'forward'), 'forward', steps=args.steps, **FORWARD))}
     for task, folder in bags.items():
-        path = Path(args.runs, task, 'predictor.safetensors')
-        if 'subgoal' in args.methods and not is_trained(path, args.predictor_steps):
-            marks = write_marks(folder / 'demonstrations')
-            train(folder / 'demonstrations', path.parent, steps=args.predictor_steps, marks=marks,
-                  **PREDICTOR)
-        weights[task] = str(path)
+        weights[task] = '' if 'subgoal' not in args.methods else str(train(
+            folder / 'demonstrations', Path(args.runs, task), steps=args.predictor_steps,
+            marks=mark(folder / 'demonstrations'), **PREDICTOR))
     return weights
 
 
-def is_trained(weights, steps):
-    """Say whether a training has come to its end."""
-    about = weights.parent / 'run.json'
-    return weights.exists() and about.exists() and (
-        json.loads(about.read_text()).get('steps') == steps)
-
-
-def write_marks(folder):
+def mark(folder):
     """
     Mark a dozen demonstrations where the hand is at the object, each off by at most a frame.
 
     :param folder: of the bag.
     :return: path of the file.
     """
-    store, rng, marks = open_recordings([folder]), np.random.default_rng(0), []
+    store, rng, marks = open_recordings([folder]), np.random.default_rng(0), {}
     for i in range(len(store)):
         episode = store[i]
         places = episode.object_pixels[:, 0]
         way = np.linalg.norm(places - places[0], axis=1)
         if len(marks) < MARKED and episode.outcome == 'success':
             t = int((way > MOVED).argmax()) - 1 + int(rng.integers(-1, 2))
-            stamp = float(episode.stamps[np.clip(t, 1, len(way) - 2)]) / 1e9
-            marks.append({'recording': '.', 'episode': i, 'stamps': [stamp]})
+            t = int(np.clip(t, 1, len(way) - 2))
+            marks[i] = [(t, t)]
     path = Path(folder, 'marks.json')
-    write_atomically(path, '{"marks": [\n' + ',\n'.join(map(json.dumps, marks)) + '\n]}\n')
+    write_marks(path, store, [folder], marks)
     return path
 
 
@@ -272,10 +261,9 @@ def summarise(rows):
         same = [row for row in rows if (row['task'], row['method']) == (task, method)]
         line = {'task': task, 'method': method, 'scenes': len(same)}
         for name in ('ends', 'ever'):
-            value, low, high = share_interval([row[name] for row in same])
-            line[name] = f'{value:.0%} ({100 * low:.0f} to {100 * high:.0f})'
+            line[name] = share(share_interval([row[name] for row in same]))
         for name in ('start_cm', 'final_cm'):
-            value, low, high = Interval(*mean_interval([row[name] for row in same]))
+            value, low, high = mean_interval([row[name] for row in same])
             line[name] = f'{value:.1f} ({low:.1f} to {high:.1f})'
         found.append({**line, 'steps': f'{np.mean([row["steps"] for row in same]):.0f}'})
     return found

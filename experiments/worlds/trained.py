@@ -37,17 +37,18 @@ def place_marks(demonstrations, seed):
             for one in demonstrations]
 
 
-def write_marks(folder, demonstrations, seed):
+def mark(folder, demonstrations, seed):
     """
     Mark demonstrations as a person would, see place_marks.
 
     :param folder: of the bag; the file lies in it.
     :param demonstrations: list of command.Demonstrations.
     """
-    lines = [json.dumps({'recording': '.', 'episode': one.number,
-                         'stamps': [float(one.stamps[t]) / 1e9]})
-             for one, t in zip(demonstrations, place_marks(demonstrations, seed))]
-    write_atomically(Path(folder, MARKS), '{"marks": [\n' + ',\n'.join(lines) + '\n]}\n')
+    from tap_ros.recording.cache import open_recordings
+    from tap_ros.recording.marks import write_marks
+    write_marks(Path(folder, MARKS), open_recordings([folder]), [folder], {
+        one.number: [(t, t)]
+        for one, t in zip(demonstrations, place_marks(demonstrations, seed))})
 
 
 def train_all(folders, methods, seeds, out, engine):
@@ -74,6 +75,7 @@ def train_all(folders, methods, seeds, out, engine):
 def train_and_score(folder, method, seed, out):
     """Train a predictor; return which held-out episodes it hits, exactly and within a frame."""
     from sim_bridge.collect import BOTTLENECKS_FILE
+    from tap_ros.evaluation.hits import is_hit
     from tap_ros.evaluation.prediction import evaluate
     from tap_ros.prediction.predictor import load_network
     from tap_ros.recording.bags import reading_like
@@ -96,9 +98,7 @@ def train_and_score(folder, method, seed, out):
     truth = read_marks(bag / BOTTLENECKS_FILE, store).episodes
     known = sorted(truth)
     matched = evaluate(network, store, known)['prediction'].match_step
-    windows = [truth[i][0] for i in known]
-    scores = {name: [int(first - beside <= t <= last + beside)
-                     for t, (first, last) in zip(matched, windows)]
+    scores = {name: [int(is_hit(truth[i], t, beside)) for i, t in zip(known, matched)]
               for name, beside in (('hit', 0), ('near', 1))}
     write_atomically(path, json.dumps(scores) + '\n')
     return scores

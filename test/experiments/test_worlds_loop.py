@@ -28,7 +28,7 @@ def test_pushes_of_meta_world_are_recorded_through_the_world_protocol(tmp_path):
     before = file.stat().st_mtime_ns
     collect_pushes(*whole)
     assert file.stat().st_mtime_ns == before, 'what is there is kept'
-    (marked, (mark,)), = read_marks(loop.write_marks(folder), store).episodes.items()
+    (marked, (mark,)), = read_marks(loop.mark(folder), store).episodes.items()
     assert marked == 0 and way[mark[0] - 1] < 1, 'the hand is at it, it has not yet moved'
 
 

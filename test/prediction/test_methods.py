@@ -86,6 +86,10 @@ def test_without_options_the_sample_is_trained_by_its_tasks_recipe(tmp_path):
     order = read(['train', 'predictor', str(SAMPLE), '--recipe', 'order2', '--steps', '3'])[1]
     assert order.objective.selection == 'relative' and order.optimizer.steps == 3
 
+    marked = read(['train', 'predictor', str(tmp_path), '--marks', 'x'])[1]  # no task of ours
+    assert (marked.objective.selection, marked.data.margin, marked.network.new_pixels) == (
+        'marks', 1, True)
+
     weights = tap_ros.train(SAMPLE, tmp_path / 'run', recipe='debug', steps=2)
     trained = load_tensors(weights)[1]['training']['settings']
     expected = TrainingConfig((str(SAMPLE),), str(tmp_path / 'run'), **{
