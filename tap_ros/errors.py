@@ -58,6 +58,10 @@ class PlanningError(TapError):
     """The planner was given states, maps or goals that cannot be planned with."""
 
 
+class TrackingError(TapError):
+    """Objects cannot be selected in a picture, or followed in it."""
+
+
 def check_fields(config: Any, ranges: Mapping[str, tuple[float, float]]) -> None:
     """
     Raise ConfigError for fields of a dataclass that are none of the choices, or out of range.

@@ -17,7 +17,9 @@ MAX_NAME = 100  # characters
 
 
 def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray,
-                   stamp: Stamp | int, frame_id: str, source: str) -> dict[str, Any]:
+                   stamp: Stamp | int, frame_id: str, source: str,
+                   states: Sequence[str] = (),
+                   confidence: Sequence[float] | np.ndarray = ()) -> dict[str, Any]:
     """
     Return the fields of a tap_msgs/ObjectStates.
 
@@ -27,15 +29,18 @@ def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray,
     :param stamp: of the image that the pixels belong to, a Stamp or ns.
     :param frame_id: frame of the poses.
     :param source: one of the SOURCE_ constants of ObjectStates.
+    :param states: K of its STATE_ constants, or none: all are seen.
+    :param confidence: K, 0 to 1, or none.
     """
-    states = []
+    objects = []
     for name, pixel, pose in zip(names, pixels, poses):
         numbers = [float(value) for value in pose]
-        states.append({
+        objects.append({
             'name': name, 'u': float(pixel[0]), 'v': float(pixel[1]),
             'pose': {'position': dict(zip('xyz', numbers[:3])),
                      'orientation': dict(zip('xyzw', numbers[3:]))}})
-    return {'header': header_fields(stamp, frame_id), 'source': source, 'objects': states}
+    return {'header': header_fields(stamp, frame_id), 'source': source, 'objects': objects,
+            'states': list(states), 'confidence': [float(value) for value in confidence]}
 
 
 def decode_objects(message: Any, name: str,

@@ -41,9 +41,15 @@ geometry_msgs/Pose pose
     'tap_msgs/msg/ObjectStates': """
 string SOURCE_GROUND_TRUTH="ground_truth"
 string SOURCE_TRACKED="tracked"
+string STATE_SEEN="seen"
+string STATE_HIDDEN="hidden"
+string STATE_UNSURE="unsure"
+string STATE_LOST="lost"
 std_msgs/Header header
 string source
 ObjectState[] objects
+string[] states
+float64[] confidence
 """,
     'tap_msgs/msg/Subgoal': """
 std_msgs/Header header
@@ -53,6 +59,12 @@ sensor_msgs/Image[] object_maps
 geometry_msgs/Point[] expected_pixels
 """,
 }
+EARLIER = {  # what recordings of an earlier definition hold
+    'tap_msgs/msg/ObjectStates': ('tap_msgs/msg/EarlierObjectStates', """
+std_msgs/Header header
+string source
+ObjectState[] objects
+""")}
 _MAX_SCHEMA = 2**16  # characters of a recorded definition; the longest in use have some thousands
 _UNREADABLE = (TypesysError, AssertionError, ValueError, LookupError)  # definitions
 _NUMBERS = {'bool': np.bool_, 'byte': np.uint8, 'char': np.uint8}  # else the name is numpy's
@@ -63,7 +75,7 @@ def typestore() -> Typestore:
     """Return rosbags' type store with the types of Jazzy and ours; takes 0.1 s the first time."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict[str, Any] = {}
-    for name, text in DEFINITIONS.items():
+    for name, text in (*DEFINITIONS.items(), *EARLIER.values()):
         types |= get_types_from_msg(text, name)
     store.register(types)
     return store
@@ -100,8 +112,12 @@ def decode(type_name: str, data: bytes | memoryview) -> Any:
             return typestore().deserialize_cdr(data[:end], type_name)
         except SerdeError as error:
             # What rclpy.serialization writes has some bytes too many, where lists are empty.
-            if 'size mismatch' not in str(error) or end == len(data) - 16:
-                raise RecordingError(f'damaged message: {error}') from error
+            if 'size mismatch' in str(error) and end > len(data) - 16:
+                continue
+            if type_name in EARLIER:
+                with suppress(SerdeError):
+                    return typestore().deserialize_cdr(data, EARLIER[type_name][0])
+            raise RecordingError(f'damaged message: {error}') from error
     raise AssertionError('not reached')
 
 
