@@ -41,13 +41,13 @@ geometry_msgs/Pose pose
     'tap_msgs/msg/ObjectStates': """
 string SOURCE_GROUND_TRUTH="ground_truth"
 string SOURCE_TRACKED="tracked"
+std_msgs/Header header
+string source
+ObjectState[] objects
 string STATE_SEEN="seen"
 string STATE_HIDDEN="hidden"
 string STATE_UNSURE="unsure"
 string STATE_LOST="lost"
-std_msgs/Header header
-string source
-ObjectState[] objects
 string[] states
 float64[] confidence
 """,
