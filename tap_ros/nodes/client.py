@@ -25,7 +25,7 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates
-from tap_msgs.srv import PredictSubgoal, ResetScene, SetGoal, StepScene
+from tap_msgs.srv import PredictSubgoal, ResetScene, SelectObjects, SetGoal, StepScene
 from tap_ros.contract import CAMERA_FRAME
 from tap_ros.errors import ConfigError
 from tap_ros.messages.images import decode_image
@@ -49,11 +49,13 @@ SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offer
     'set_goal': (SetGoal, 'sim/set_goal', 'sim_node'),
     'step': (StepScene, 'sim/step', 'sim_node'),
     'pause': (SetBool, 'sim/pause', 'sim_node'),
+    'select': (SelectObjects, 'select_objects', 'tracker_node'),
     'record': (SetBool, 'recorder/record', 'recorder_node'),
     'get': (GetParameters, 'predictor_node/get_parameters', 'predictor_node'),
     'set': (SetParameters, 'predictor_node/set_parameters', 'predictor_node'),
     'change': (ChangeState, 'predictor_node/change_state', 'predictor_node')}
-READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'recorder_node': 'record'}
+READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'tracker_node': 'select',
+         'recorder_node': 'record'}
 PLANNER = 'visual_mpc_node'
 VIEWS = {'camera': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
          'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
