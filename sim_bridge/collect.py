@@ -17,6 +17,8 @@ import time
 from typing import Annotated, Any
 
 import numpy as np
+from sim_bridge.gym_pushes import POLICIES, record_pushes
+from sim_bridge.gym_world import GymWorld
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode, TIMINGS
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
@@ -58,6 +60,9 @@ class CollectConfig:
         late, drawn for each episode.
     :param misses: share of the pushes that are at random, so that objects are hit, grazed and
         missed: what a forward model has to tell apart.
+    :param pushes: goal, random: in a world of others whose object slides, such as push-v3 of
+        metaworld, pushes to its goal or anywhere instead of its expert; all that a forward model
+        learns from is recorded. none: the expert.
     :param look: of the world, see looks.LOOKS.
     :param appearance: of table, light and camera, see looks.CHOICES; 'random' is drawn anew for
         every episode.
@@ -73,6 +78,7 @@ class CollectConfig:
     frames: int = 0
     timing: Annotated[str, one_of(TIMINGS)] = 'natural'
     misses: float = 0.0
+    pushes: Annotated[str, one_of(('none', *POLICIES))] = 'none'
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     appearance: Annotated[str, one_of(CHOICES)] = 'usual'
     arm: Annotated[str, one_of(names('tap_ros.arms'))] = DEFAULT_ARM
@@ -145,7 +151,12 @@ def _check(config: CollectConfig) -> None:
                 if getattr(config, name) != getattr(usual, name)]
         if said:
             raise ConfigError(f'{", ".join(said)}: of world {TABLE}, not of {config.world}')
-        _make(config).close()  # it says what it lacks
+        world = _make(config)  # it says what it lacks
+        world.close()
+        if config.pushes != 'none' and not isinstance(world, GymWorld):
+            raise ConfigError(f'pushes: world {config.world} can be recorded as its expert acts')
+    elif config.pushes != 'none':
+        raise ConfigError(f'pushes: of worlds of others, not of {TABLE}; leave it out')
     elif get_task(config.task).kind != 'push' and (config.misses or config.timing != 'natural'):
         raise ConfigError(f'misses and timing are of tasks of pushing, not of {config.task}')
 
@@ -267,9 +278,13 @@ def _demonstrated(world: World, config: CollectConfig,
     if isinstance(world, Simulator):
         return make_episode(world, *run_episode(
             world, seed, config.frames, config.timing, config.misses), start_ns), None
-    found = ability(world, 'demonstrate')(seed, config.frames)
-    episode = replace(found.episode, stamps=found.episode.stamps + start_ns)
-    return episode, found.bottleneck
+    if config.pushes != 'none':
+        assert isinstance(world, GymWorld)
+        episode, bottleneck = record_pushes(world, seed, config.pushes), None
+    else:
+        found = ability(world, 'demonstrate')(seed, config.frames)
+        episode, bottleneck = found.episode, found.bottleneck
+    return replace(episode, stamps=episode.stamps + start_ns), bottleneck
 
 
 def _note_bottlenecks(folder: Path, found: list[dict[str, Any]]) -> None:

@@ -12,6 +12,10 @@ from sim_bridge.world_protocol import clip_action, Observation
 from tap_ros.contract import CONTROL_PERIOD, WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.errors import SceneError
 
+# m that fingertips stay behind where they shall be; it is made up for. Blocked ones are behind by
+# more, which is forgotten, so that they come back when told to.
+LAG = 0.02
+
 
 class GymWorld(OneCamera, ABC):
     """
@@ -90,8 +94,9 @@ class GymWorld(OneCamera, ABC):
         :param action: (4,) displacement in m and gripper opening, limited as in contract.py.
         :raises SceneError: as check_action does; then nothing moves.
         """
-        action = clip_action(action)
-        self._target = np.clip(self._target + action[:3], WORKSPACE_LOW, WORKSPACE_HIGH)
+        action, hand = clip_action(action), self.gripper()[:3]
+        behind = np.clip(self._target - hand, -LAG, LAG)
+        self._target = np.clip(hand + behind + action[:3], WORKSPACE_LOW, WORKSPACE_HIGH)
         self.move(self._target, float(action[3]))
         self._stamp_ns += round(1e9 * CONTROL_PERIOD)
         return self.observe()

@@ -31,6 +31,7 @@ CAMERA = Camera(64, 64, tilt=0.54, fovy=24.0, position=(0.0, -0.78, 1.2))  # in 
 # From the robot's side: what it works at hides little.
 SIDE = replace(CAMERA, tilt=0.87, fovy=42.0, position=(0.85, 0.5, 0.85), turn=2.1)
 GAIN = 12.0  # of the command over the gap to where the fingertips shall be, 1/m
+LEAD = 0.06  # m, by which what pulls the hand may be ahead of one that is blocked
 SOLVING_STEPS = 400  # environment steps that the scripted policy has at most
 FURTHER_STEPS = 60  # of it after the success, whose bounds are wide
 LEAVING = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.12), (0.0, 0.1, 0.0))  # m, of the open hand, then
@@ -70,17 +71,21 @@ class MetaWorld(GymWorld):
         self._movable = _movable(model)
         self.step_ns, self.scale = round(1e9 * self.env.dt), self.env.action_scale * TURN
         self._seen: np.ndarray = np.empty(0)
+        self._begun = 0  # the seed of the scene
         self._info: dict[str, Any] = {}
 
     def begin(self, seed: int) -> None:
         """Begin the scene of a seed."""
+        self._begun = seed
         self.env.seed(seed)
         self._seen, self._info = self.env.reset(seed=seed)
 
     def move(self, target: np.ndarray, opening: float) -> None:
         """Move the fingertips to a place (3,) m of our frame, in one control period."""
         grip, last = 1 - 2 * opening, round(CONTROL_PERIOD / self.env.dt) - 1
+        pulled, pulling = self.env.data.body('hand').xpos, self.env.data.mocap_pos[0]
         for step in range(last + 1):
+            pulling[:] = np.clip(pulling, pulled - LEAD, pulled + LEAD)
             action = np.append(np.clip(GAIN * (target - self.gripper()[:3]) * TURN, -1, 1), grip)
             if step == last:
                 self.act(action)
@@ -142,7 +147,7 @@ class MetaWorld(GymWorld):
                 self.move(place + way, 1.0)
             if self.succeeds():
                 return
-            self.begin(self.seed)
+            self.begin(self._begun)
         raise SceneError(f'task {self.task_name}: the scripted policy does not solve this scene; '
                          'take another seed')
 

@@ -16,11 +16,13 @@ import cv2
 from experiments.pages import render, share
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import Method
-from experiments.worlds.pushes import collect_pushes, push_about, push_to_goal
 import numpy as np
 import pandas as pd
+from sim_bridge.collect import collect, CollectConfig
+from sim_bridge.gym_pushes import push_to_goal
 from sim_bridge.world_protocol import make_world
 from tap_ros.contract import ACTION_LIMIT, step_budget
+from tap_ros.engines import Engine
 from tap_ros.errors import SceneError
 from tap_ros.evaluation.intervals import mean_interval, share_interval
 from tap_ros.files import write_atomically
@@ -36,7 +38,7 @@ from tap_ros.training.train import train
 from tqdm import tqdm
 
 WORLD, IMAGE_SIZE = 'metaworld', 64
-POLICIES = {'random': (push_about, 100_000), 'demonstrations': (push_to_goal, 0)}
+BAGS = {'random': 100_000, 'goal': 0}  # of pushes; the first seed
 METHODS = ('random', 'straight', 'direct', 'subgoal')
 MARKED, MOVED = 12, 1.0  # demonstrations; px, beyond which an object has begun to move
 FORWARD = {'robot_mask': 'arm', 'initial_weights': 'push', 'batch_size': 8, 'grow': 0.3,
@@ -79,6 +81,7 @@ class Options:
     runs: Folder = 'runs/loop'
     out: Folder = 'docs/results'
     results_only: Flag = False
+    engine: Engine = Engine()
 
 
 def run(args):
@@ -98,15 +101,17 @@ def make_weights(args):
     """
     bags = {task: Path(args.bags, task) for task in args.tasks}
     for task, folder in bags.items():
-        for name, (policy, seed) in POLICIES.items():
-            collect_pushes(folder / name, WORLD, task, policy, args.episodes, seed, IMAGE_SIZE)
+        for pushes, seed in BAGS.items():
+            collect(folder / pushes, CollectConfig(
+                world=WORLD, task=task, episodes=args.episodes, seed=seed, pushes=pushes,
+                image_size=IMAGE_SIZE, episodes_per_file=10), args.engine)
     weights = {'forward': str(train(
-        [folder / name for folder in bags.values() for name in POLICIES],
+        [folder / name for folder in bags.values() for name in BAGS],
         Path(args.runs, 'forward'), 'forward', steps=args.steps, **FORWARD))}
     for task, folder in bags.items():
         weights[task] = '' if 'subgoal' not in args.methods else str(train(
-            folder / 'demonstrations', Path(args.runs, task), steps=args.predictor_steps,
-            marks=mark(folder / 'demonstrations'), **PREDICTOR))
+            folder / 'goal', Path(args.runs, task), steps=args.predictor_steps,
+            marks=mark(folder / 'goal'), **PREDICTOR))
     return weights
 
 

@@ -94,16 +94,18 @@ class NodeProcesses:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End all nodes, politely first."""
-        running = [p for p in self._processes.values() if p.poll() is None]
-        for process in running:
-            process.terminate()  # a shell ignores SIGINT for jobs in the background
-        for process in running:
-            try:
-                process.wait(15)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        """End all nodes, politely first; that started first, which may record, as the last."""
+        processes = list(self._processes.values())
+        for group in (processes[1:], processes[:1]):
+            running = [p for p in group if p.poll() is None]
+            for process in running:
+                process.terminate()  # a shell ignores SIGINT for jobs in the background
+            for process in running:
+                try:
+                    process.wait(15)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
 
     def _log(self, name: str) -> Path:
         return self._folder / f'{name}.log'

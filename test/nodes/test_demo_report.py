@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of the demo's page, table and film."""
+"""The demo in a world of others, and laws of its page, table and film."""
 
 import base64
 from dataclasses import replace
@@ -10,6 +10,7 @@ import re
 import numpy as np
 from PIL import Image, ImageSequence
 import pytest
+from tap_ros.nodes.demo import command
 from tap_ros.nodes.demo.report import (
     FRAME_MS,
     GAP,
@@ -22,6 +23,7 @@ from tap_ros.nodes.demo.report import (
     write_film,
     write_report,
 )
+from tap_ros.recording.reader import iter_episodes
 
 
 @pytest.fixture
@@ -85,3 +87,21 @@ def test_the_film_shows_each_run_to_its_end_and_stops_there(scenes, tmp_path):
     assert np.abs(np.subtract(shown, expected)).max() <= 6
     assert milliseconds == len(scenes) * (3 * FRAME_MS + HOLD_MS)
     assert film.info['loop'] == 0  # for ever
+
+
+@pytest.mark.slow
+def test_real_nodes_push_in_a_world_of_others_that_says_how_it_ended(tmp_path, capsys):
+    pytest.importorskip('metaworld')
+    folder = tmp_path / 'demo'
+    assert command.run(command.Options(
+        scenes=1, tasks=('push-v3',), world='metaworld', robot_mask='arm', step_budget=1,
+        out=str(folder))) == 0
+    said = capsys.readouterr().out
+    assert re.search(r'direct .* in 1 steps.*\n    subgoal .* in 1 steps', said)
+    assert (folder / 'demo.webp').stat().st_size and (folder / 'report.html').stat().st_size
+    episodes = list(iter_episodes(folder / 'recording' / 'push-v3'))[-2:]
+    assert [(len(one), one.task, one.outcome) for one in episodes] == [
+        (2, 'push-v3', 'failure')] * 2
+    for one in episodes:
+        moved = one.grippers[1, :3] - one.grippers[0, :3]
+        np.testing.assert_allclose(moved, one.actions[0, :3], atol=0.02)

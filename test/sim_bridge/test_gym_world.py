@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from sim_bridge.demonstrations import demonstrate, find_bottleneck
+from sim_bridge.gym_pushes import record_pushes
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.world.camera import Camera
 from sim_bridge.world_protocol import make_world
@@ -69,6 +70,21 @@ def test_an_environment_becomes_a_world_in_a_few_lines():
             world.step(bad)
 
 
+class Sagging(Dot):
+    """Ends 4 mm lower than it shall, and never beyond y = 0.1 m."""
+
+    def move(self, target, opening):
+        self.place = np.minimum(target - (0, 0, 0.004), (1, 0.1, 1))
+
+
+def test_what_sags_is_held_and_what_was_blocked_comes_back_at_once():
+    world = Sagging()
+    world.reset(3)
+    heights = [world.step([0, 0.08, 0.02 * (t == 0), 0]).gripper[2] for t in range(20)]
+    np.testing.assert_allclose(heights, 0.016, atol=1e-6)
+    assert world.step([0, -0.08, 0, 0]).gripper[1] < 0.1 - 0.05
+
+
 @pytest.fixture(scope='module')
 def metaworld():
     pytest.importorskip('metaworld')
@@ -85,6 +101,14 @@ def test_meta_world_moves_as_it_is_told_and_repeats_from_its_seed(metaworld):
     again = metaworld.reset(5)
     np.testing.assert_array_equal(again.image, first.image)
     assert not np.array_equal(metaworld.reset(6).image, first.image)
+
+
+def test_a_blocked_hand_comes_back_as_soon_as_it_is_told_to(metaworld):
+    metaworld.reset(5)
+    for _ in range(9):  # beyond where the arm reaches
+        blocked = metaworld.step([0, 0.08, 0, 0]).gripper[1]
+    assert abs(metaworld.step([0, 0.08, 0, 0]).gripper[1] - blocked) < 0.005, 'it is blocked'
+    assert metaworld.step([0, -0.08, 0, 0]).gripper[1] < blocked - 0.04
 
 
 def test_the_goal_of_meta_world_shows_the_object_where_it_shall_be(metaworld):
@@ -142,6 +166,25 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
         with pytest.raises(TapError, match=words):
             collect(tmp_path / 'bad', replace(config, **bad), progress=False)
     assert not (tmp_path / 'bad').exists()
+
+
+def test_pushes_of_a_world_are_recorded_as_a_planner_and_its_model_need_them(
+        metaworld, tmp_path):
+    config = CollectConfig(world='metaworld', task='plate-slide-v3', episodes=1, seed=3,
+                           image_size=32, pushes='goal')
+    collect(tmp_path / 'goal', config, Engine(workers=1), progress=False)
+    pushed, = iter_episodes(tmp_path / 'goal')
+    about = record_pushes(metaworld, 3, 'random')
+    assert (pushed.task, pushed.outcome) == ('plate-slide-v3', 'success')
+    for episode in (pushed, about):
+        assert episode.object_source == 'ground_truth' and episode.robot_masks.any()
+        moved = episode.grippers[1:, :3] - episode.grippers[:-1, :3]
+        assert np.median(np.abs(moved - episode.actions[:-1, :3])) < 0.01, 'as it was told'
+    way = np.linalg.norm(pushed.object_poses[:, 0] - pushed.object_poses[0, 0], axis=1)
+    assert way[:4].max() < 0.01 and way[-1] > 0.1
+    for bad in ({'world': 'mujoco_table', 'task': 'push2'}, {'world': 'ogbench', 'task': 'cube'}):
+        with pytest.raises(TapError, match='pushes: '):
+            collect(tmp_path / 'bad', replace(config, **bad), progress=False)
 
 
 class Slider:

@@ -21,11 +21,12 @@ from typing import Annotated, Any, TYPE_CHECKING
 
 import numpy as np
 from sensor_msgs.msg import Image
+from sim_bridge.collect import TABLE
 from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import get_task, run_episode, task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from tap_msgs.msg import ObjectStates
-from tap_ros.contract import step_budget
+from tap_ros.contract import ROBOT_MASKS, step_budget
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from tap_ros.messages.subgoals import Subgoal
 
 USUAL_TASKS = ('push2', 'order2', 'stack2')
+OTHERS_OBJECTS = 1  # of tasks of other worlds
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 MODES = ('direct', 'subgoal')
 STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
@@ -126,18 +128,19 @@ def push(client: Client, watch: Watch, mode: str, seed: int, step_budget: int,
 
 
 def run_scene(client: Client, watch: Watch, task: str, seed: int, step_budget: int,
-              world: dict[str, str]) -> SceneRuns:
+              world: dict[str, str], gripping: bool) -> SceneRuns:
     """
     Predict a subgoal of one scene; push it in every mode, or show how the expert does it.
 
     :param step_budget: the most steps of a run.
-    :param world: options of the Simulator.
+    :param world: options of the world, of the table those of the Simulator.
+    :param gripping: whether the task needs the gripper; then nothing is pushed.
     :return: SceneRuns.
     """
     runs: dict[str, Run] = {}
     start, goal = client.reset(task, seed)
     subgoal = predict(client)
-    for mode in () if get_task(task).gripping else MODES:
+    for mode in () if gripping else MODES:
         if runs:
             _, goal = client.reset(task, seed)
         begin = time.monotonic()
@@ -148,7 +151,8 @@ def run_scene(client: Client, watch: Watch, task: str, seed: int, step_budget: i
     return SceneRuns(
         task=task, seed=seed, start=start.image, goal=goal.image, start_pixels=start.pixels,
         goal_pixels=goal.pixels, subgoal=subgoal.image, object_maps=subgoal.object_maps,
-        runs=runs, side_goal_pixels=OBSERVER.project(goal.positions),
+        runs=runs,
+        side_goal_pixels=None if 'world' in world else OBSERVER.project(goal.positions),
         expert=() if runs else film_expert(task, seed, world))
 
 
@@ -174,8 +178,11 @@ class Options:
 
     :param scenes: how many of each task.
     :param seed: of the first scene of each task.
-    :param tasks: what is to be done in them; none named: push2, order2 and stack2, or with attach
-        push2.
+    :param world: another world, such as metaworld with the task push-v3; its object is pushed by
+        weights that were trained there.
+    :param predictor: weights, shipped or a file; empty: those of the task.
+    :param forward_model: weights of the planner.
+    :param robot_mask: what is taken out of pictures, as it was in the training of the weights.
     :param look: of the world, see sim_node.
     :param arm: at the table, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
@@ -184,7 +191,13 @@ class Options:
 
     scenes: int = 2
     seed: int = FIRST_SCENE
-    tasks: tuple[Annotated[str, one_of(task_names())], ...] = ()
+    tasks: Annotated[tuple[str, ...], conf.arg(
+        help='what is to be done in them; none named: push2, order2 and stack2, or with attach '
+             f'push2; of the table {", ".join(task_names())}.')] = ()
+    world: Annotated[str, one_of(names('tap_ros.worlds'))] = TABLE
+    predictor: str = ''
+    forward_model: str = 'push'
+    robot_mask: Annotated[str, one_of(ROBOT_MASKS)] = 'none'
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     arm: Annotated[str, one_of(names('tap_ros.arms'))] = DEFAULT_ARM
     step_budget: Annotated[int, conf.arg(
@@ -203,6 +216,8 @@ def run(args: Options) -> int:
     if args.scenes < 1 or args.step_budget < 0:
         raise ConfigError('scenes must be at least 1, and step-budget 0 or more')
     tasks = args.tasks or (USUAL_TASKS[:1] if args.attach else USUAL_TASKS)
+    if args.world != TABLE and not args.tasks:
+        raise ConfigError(f'world {args.world}: name its tasks, as --tasks push-v3')
     if len(set(tasks)) < len(tasks):
         raise ConfigError(f'tasks: {" ".join(tasks)}: name each once')
     folder = new_folder(args.out)
@@ -231,33 +246,44 @@ def run(args: Options) -> int:
 def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
     """Run the scenes of one task with nodes of its own, or with those that run already."""
     with NodeProcesses(folder / 'logs' / task) as processes, Client() as client:
-        watch, world = Watch(client.node), {'look': args.look, 'arm': args.arm}
+        watch, gripping = Watch(client.node), _gripping(args, task)
+        world = {'look': args.look, 'arm': args.arm} if args.world == TABLE else {
+            'world': args.world}
         if args.attach:
             print(f'{task}: waiting for the nodes that run already', flush=True)
             client.wait_until_ready('sim_node', 'predictor_node', *(
-                [] if get_task(task).gripping else ['visual_mpc_node']))
+                [] if gripping else ['visual_mpc_node']))
         else:
             print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
                   flush=True)
             processes.start('recorder_node', folder=folder / 'recording' / task)
-            processes.start('sim_node', lock_step=True, task=task, observer=True, **world)
+            processes.start('sim_node', lock_step=True, task=task, observer=args.world == TABLE,
+                            **world)
             processes.start(
-                'predictor_node', weights=task if task in PREDICTORS else DEFAULT_PREDICTOR)
-            if not get_task(task).gripping:
-                processes.start('visual_mpc_node')
+                'predictor_node', robot_mask=args.robot_mask, weights=args.predictor or (
+                    task if task in PREDICTORS else DEFAULT_PREDICTOR))
+            if not gripping:
+                processes.start('visual_mpc_node', weights=args.forward_model,
+                                robot_mask=args.robot_mask)
             processes.wait_until_ready()
         scenes = []
         for i in range(args.scenes):
             print(f'  scene {args.seed + i} ({i + 1} of {args.scenes})', flush=True)
             scenes.append(run_scene(
-                client, watch, task, args.seed + i, _budget(args, task), world))
+                client, watch, task, args.seed + i, _budget(args, task), world, gripping))
             processes.check()
         return scenes
 
 
+def _gripping(args: Options, task: str) -> bool:
+    """Return whether a task needs the gripper; of other worlds what is pushed is tried alone."""
+    return args.world == TABLE and get_task(task).gripping
+
+
 def _budget(args: Options, task: str) -> int:
     """Return the most steps of one run."""
-    return args.step_budget or step_budget(get_task(task).num_objects)
+    count = get_task(task).num_objects if args.world == TABLE else OTHERS_OBJECTS
+    return args.step_budget or step_budget(count)
 
 
 def new_folder(wanted: str | Path) -> Path:

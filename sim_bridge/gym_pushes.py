@@ -1,26 +1,23 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Bags of pushes in worlds of others, recorded through the World protocol, as the loop acts there.
+Pushes in a GymWorld with one object that slides, as the planner acts there.
 
-Demonstrations bring an object to its goal by straight pushes that vary as a person's do; from them
-a predictor learns. Pushes at random hit, graze and miss it: what a forward model has to tell
+Demonstrations bring the object to its goal by straight pushes that vary as a person's do; from
+them a predictor learns. Pushes at random hit, graze and miss it: what a forward model has to tell
 apart. Where objects are is ground truth, and labelled so.
 """
 
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import numpy as np
-from sim_bridge.collect import EPISODE_SPACING_NS
+from sim_bridge.gym_world import GymWorld
 from sim_bridge.tasks.pushes import Push, push_actions
-from sim_bridge.world_protocol import make_world
 from tap_ros.contract import LIFTED
-from tap_ros.errors import RecordingError, SceneError
+from tap_ros.errors import SceneError
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.writer import count_episodes, EpisodeWriter, write_metadata
-from tqdm import tqdm
 
-EPISODES_PER_FILE = 10
+TRIES = 20  # a scene without a goal is drawn anew
 MOST_PUSHES, RANDOM_PUSHES = 4, 3  # of an episode: of a demonstration, at random
 REACH_LOW, REACH_HIGH = (-0.2, -0.28), (0.2, 0.12)  # m, in view: where to pushes at random lead
 TRAVEL = (0.06, 0.08)  # m per control period, while lifted
@@ -31,7 +28,8 @@ ASIDE = 0.03  # rad and m, standard deviations of what demonstrations are off
 MISS = (0.3, 0.02)  # rad, m, of pushes at random
 
 
-def push_to_goal(world, rng=None):
+def push_to_goal(world: GymWorld,
+                 rng: np.random.Generator | None = None) -> Iterator[np.ndarray]:
     """
     Push the object of a World to its goal, as a script that knows both places.
 
@@ -46,7 +44,7 @@ def push_to_goal(world, rng=None):
         if np.linalg.norm(gap) < NEAR:
             break
         angle, speeds = np.arctan2(gap[1], gap[0]), (PUSHED[1], TRAVEL[1])
-        off = (0.0, 0.0, 0.0)
+        off = np.zeros(3)
         if rng is not None:
             off = rng.normal(0, ASIDE, 3) * (2, 0.2, 0.3)
             speeds = rng.uniform(*PUSHED), rng.uniform(*TRAVEL)
@@ -55,7 +53,7 @@ def push_to_goal(world, rng=None):
     yield np.array([0, 0, LIFTED - world.observe().gripper[2], 0])
 
 
-def push_about(world, rng):
+def push_about(world: GymWorld, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Push towards places at random, and past the object, too; see push_to_goal."""
     for _ in range(RANDOM_PUSHES):
         seen = world.observe()
@@ -67,71 +65,39 @@ def push_about(world, rng):
             seen.gripper, here, goal) * (1, 1, 1, 0)
 
 
-def record(world, seed, policy, start_ns):
-    """
-    Let a policy act in the scene of a seed.
+POLICIES: dict[str, Callable[[GymWorld, np.random.Generator], Iterator[np.ndarray]]] = {
+    'goal': push_to_goal, 'random': push_about}
 
-    :param policy: push_to_goal or push_about.
-    :return: Episode.
-    :raises SceneError: as World.reset does.
+
+def record_pushes(world: GymWorld, seed: int, policy: str) -> Episode:
     """
-    seen = [world.reset(seed)]
+    Push in a scene that is drawn from a seed; where it has no goal, another one is drawn.
+
+    :param policy: one of POLICIES.
+    :return: Episode, with all that training takes.
+    :raises SceneError: if TRIES scenes in a row have no goal.
+    """
+    for attempt in range(TRIES):
+        rng = np.random.default_rng([seed, attempt])
+        try:
+            seen = [world.reset(int(rng.integers(2 ** 31)))]
+            break
+        except SceneError:
+            if attempt == TRIES - 1:
+                raise
     actions = []
-    for action in policy(world, np.random.default_rng(seed)):
+    for action in POLICIES[policy](world, rng):
         actions.append(action)
         seen.append(world.step(action))
     goal = world.goal()
     return Episode(
         frames=np.stack([one.image for one in seen]),
-        stamps=np.array([one.stamp_ns + start_ns for one in seen], np.int64),
+        stamps=np.array([one.stamp_ns for one in seen], np.int64),
         actions=np.array([*actions, np.zeros(4)], np.float32),
         grippers=np.stack([one.gripper for one in seen]),
-        object_names=tuple(seen[0].object_names),
+        object_names=seen[0].object_names,
         object_pixels=np.stack([one.object_pixels for one in seen]),
         object_poses=np.stack([one.object_poses for one in seen]),
         goal_frame=goal.image, goal_pixels=goal.object_pixels, goal_poses=goal.object_poses,
         object_source='ground_truth', task=world.task_name, seed=seed, outcome=world.outcome(),
         robot_masks=np.stack([one.robot_mask for one in seen]), goal_mask=goal.robot_mask)
-
-
-def collect_pushes(folder, world, task, policy, episodes, seed, image_size):
-    """
-    Collect a bag, or go on with one that was interrupted; scenes without a goal are left out.
-
-    :param folder: of the bag.
-    :param world: name of the World; task: of it.
-    :param policy: push_to_goal or push_about.
-    :param seed: of the first episode.
-    """
-    folder, made = Path(folder), None
-    folder.mkdir(parents=True, exist_ok=True)
-    files = range(-(-episodes // EPISODES_PER_FILE))
-    with tqdm(total=episodes, unit='episode', desc=f'{task} {folder.name}') as bar:
-        for number in files:
-            path = folder / f'{folder.name}_{number}.mcap'
-            first = number * EPISODES_PER_FILE
-            wanted = range(first, min(first + EPISODES_PER_FILE, episodes))
-            if not _is_whole(path):
-                made = made or make_world(world, task, image_size)
-                with EpisodeWriter(path, camera_matrix=made.camera_matrix) as writer:
-                    for i in wanted:
-                        try:
-                            writer.write(record(made, seed + i, policy,
-                                                (i + 1) * EPISODE_SPACING_NS))
-                        except SceneError:
-                            continue
-                        finally:
-                            bar.update()
-            else:
-                bar.update(len(wanted))
-    if made is not None:
-        made.close()
-    write_metadata(folder)
-
-
-def _is_whole(path):
-    """Say whether a file is there and can be read."""
-    try:
-        return path.exists() and count_episodes(path) > 0
-    except RecordingError:
-        return False
