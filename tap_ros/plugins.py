@@ -33,6 +33,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         'push2': 'sim_bridge.tasks.push:PUSH2', 'push3': 'sim_bridge.tasks.push:PUSH3',
         'order2': 'sim_bridge.tasks.order:ORDER2', 'order3': 'sim_bridge.tasks.order:ORDER3',
         'stack2': 'sim_bridge.tasks.stack:STACK2', 'stack3': 'sim_bridge.tasks.stack:STACK3'},
+    'tap_ros.trackers': {'carried': 'tap_ros.planning.carried_tracker:CarriedTracker',
+                         'rigid': 'tap_ros.tracking.rigid_tracker:RigidTracker'},
     'tap_ros.worlds': {'metaworld': 'sim_bridge.metaworld:MetaWorld',
                        'mujoco_table': 'sim_bridge.simulator:Simulator',
                        'ogbench': 'sim_bridge.ogbench:OGBench'},

@@ -1,0 +1,81 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Between pixels and the table: the plane of the objects' tops, and that of their middles.
+
+Everything in this folder is done in a working picture, whose longer side has SIDE pixels, whatever
+the camera's size is.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from tap_ros.robots.silhouette import PinholeCamera
+
+SIDE = 256
+TOP, MIDDLE = 0.06, 0.03  # m above the table: what most of a silhouette shows, and its middle
+PIXELS_A_METRE = 160.0  # without calibration, in the working picture
+
+
+class Plane:
+    """
+    The geometry of pictures of one size.
+
+    Places are metres in the frame of the table; without a camera, pixels of the working picture
+    over PIXELS_A_METRE.
+
+    :param camera: PinholeCamera in the frame of the table, or None.
+    :param size: (height, width) of the pictures.
+    :ivar working: (height, width) of the working picture.
+    :ivar top: (3, 3) homography of places of tops to working pixels.
+    """
+
+    def __init__(self, camera: PinholeCamera | None, size: tuple[int, int]) -> None:
+        self.size, self.calibrated = size, camera is not None
+        height, width = size
+        scale = SIDE / max(size)
+        self.working = max(round(height * scale), 1), max(round(width * scale), 1)
+        self._scale = np.array([self.working[1] / width, self.working[0] / height])
+        self.top = self._homography(camera, TOP)
+        self._middle = self._homography(camera, MIDDLE)
+        self._from_top, self._from_middle = np.linalg.inv(self.top), np.linalg.inv(self._middle)
+
+    def _homography(self, camera: PinholeCamera | None, height: float) -> np.ndarray:
+        """Return the homography of a level plane to the working picture."""
+        if camera is None:
+            return np.diag([PIXELS_A_METRE, -PIXELS_A_METRE, 1.0])
+        u, v = np.divide(self.working, camera.size)[::-1]
+        K = np.array([[u, 0, u / 2 - 0.5], [0, v, v / 2 - 0.5], [0, 0, 1]]) @ camera.K
+        seen = np.linalg.inv(camera.pose)[:3]
+        matrix = K @ np.column_stack([seen[:, 0], seen[:, 1], seen[:, 2] * height + seen[:, 3]])
+        return matrix / matrix[2, 2]
+
+    def shrink(self, pixels: ArrayLike) -> np.ndarray:
+        """Return camera pixels (..., 2) in the working picture."""
+        return (np.asarray(pixels, np.float64) + 0.5) * self._scale - 0.5
+
+    def enlarge(self, pixels: ArrayLike) -> np.ndarray:
+        """Return pixels (..., 2) of the working picture in that of the camera."""
+        return (np.asarray(pixels, np.float64) + 0.5) / self._scale - 0.5
+
+    def of_top(self, pixels: ArrayLike) -> np.ndarray:
+        """Return the places (..., 2) of working pixels that show tops."""
+        return project(self._from_top, pixels)
+
+    def of_middle(self, pixels: ArrayLike) -> np.ndarray:
+        """Return the places (..., 2) of working pixels that show the middles of objects."""
+        return project(self._from_middle, pixels)
+
+    def top_pixels(self, places: ArrayLike) -> np.ndarray:
+        """Return the working pixels (..., 2) of places of tops."""
+        return project(self.top, places)
+
+    def middle_pixels(self, places: ArrayLike) -> np.ndarray:
+        """Return the working pixels (..., 2) of the middles of objects at places."""
+        return project(self._middle, places)
+
+
+def project(matrix: np.ndarray, points: ArrayLike) -> np.ndarray:
+    """Map points (..., 2) by a homography (3, 3)."""
+    points = np.asarray(points, np.float64)
+    rays = points @ matrix[:, :2].T + matrix[:, 2]
+    return rays[..., :2] / rays[..., 2:]

@@ -1,0 +1,188 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The tracker of this package: clicked objects, followed as rigid bodies that slide on the table.
+
+No learned weights. Each picture is searched around the last pose of each object; what the robot
+hides stays where it was; what was not found near by is searched everywhere.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.tracking.confidence import probability
+from tap_ros.tracking.picture import Picture
+from tap_ros.tracking.plane import Plane
+from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
+from tap_ros.tracking.registration import register
+from tap_ros.tracking.search import locate
+from tap_ros.tracking.silhouette import clicked, middle, silhouette
+from tap_ros.tracking.template import Matcher, Pose, Template
+
+REACH, TURN = 0.05, 0.5  # m, rad, in one control period
+REST, REST_TURN = 0.012, 0.1  # the same, of what the hand is not near to
+HAND_FAR, HAND_HIGH = 0.22, 0.1  # m: a hand farther off, or higher, moves nothing
+GOOD, GOOD_COST = 0.7, 0.35  # fit of what is believed; cost up to which no other is tried
+NEW_COST, NEW_ANGLE, NEW_SEEN = 0.25, 0.35, 0.85  # from when on the object is cut out anew
+KEYS = 6  # templates of an object, the first among them
+PATIENCE = 2  # pictures in which what should be seen may be missed, before it is lost
+
+
+@dataclass
+class _Object:
+    """What is known of one object."""
+
+    place: np.ndarray  # (2,) m
+    offset: np.ndarray  # (2,) px from the middle on the plane to the middle of the silhouette
+    keys: list[Template]
+    angle: float = 0.0
+    state: str = SEEN
+    age: int = 0  # pictures since it was seen
+    confidence: float = 1.0
+    shown: Template = field(init=False)  # that it was seen by last
+
+    def __post_init__(self) -> None:
+        self.shown = self.keys[0]
+
+    def nearest(self) -> list[Template]:
+        """Return its templates, those of the nearest angle first."""
+        return sorted(self.keys, key=lambda key: abs(_turned(key.angle - self.angle)))
+
+
+class RigidTracker:
+    """
+    A Tracker, see protocols.
+
+    :param camera: PinholeCamera of any size, or None.
+    :param snap: take the middle of the silhouette for the object's, else the click.
+    """
+
+    def __init__(self, camera: PinholeCamera | None = None, snap: bool = True) -> None:
+        self._camera, self._snap = camera, snap
+        self._objects: list[_Object] = []
+        self._gripper: np.ndarray | None = None
+
+    def select(self, view: View, pixels: Sequence[Sequence[float]] | np.ndarray) -> Tracked:
+        """Follow other objects; see Tracker."""
+        plane = Plane(self._camera, view.image.shape[:2])
+        picture = Picture(view, plane)
+        clicks = plane.shrink(np.reshape(pixels, (-1, 2)))
+        objects = []
+        for k, click in enumerate(clicks):
+            name = 'click ' + str(tuple(round(float(x), 1) for x in plane.enlarge(click)))
+            mask = clicked(picture, click, np.delete(clicks, k, 0), name)
+            place = plane.of_middle(middle(mask) if self._snap else click)
+            objects.append(_Object(place, np.zeros(2), [Template(picture, plane, mask, place)]))
+        self._objects, self._plane, self._first = objects, plane, picture
+        self._gripper = view.gripper
+        return self._tracked()
+
+    def update(self, view: View) -> Tracked:
+        """Follow into the next picture; see Tracker."""
+        if not self._objects:
+            return self._tracked()
+        picture = Picture(view, self._plane)
+        hand = None
+        if view.gripper is not None and self._gripper is not None:
+            hand = np.stack([self._gripper, view.gripper])[:, :3]
+        self._gripper = view.gripper
+        for one in self._objects:
+            self._follow(one, picture, hand)
+        return self._tracked()
+
+    def find(self, view: View) -> Tracked:
+        """Find the objects in another picture; see Tracker."""
+        return register(self._first, Picture(view, self._plane), self._plane,
+                        [one.keys for one in self._objects])
+
+    def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
+        """Bring one object into the next picture."""
+        matcher = Matcher(picture, self._plane, self._covered(one, picture))
+        keys, found = one.nearest(), self._search(one, matcher, hand)
+        pose, key = found if found is not None else (None, keys[0])
+        if pose is not None and pose.fit > GOOD:
+            one.place, one.angle, one.age, one.shown = pose.place, pose.angle, 0, key
+            one.state, one.confidence = SEEN, probability(pose.fit, pose.cost, pose.seen)
+            nearest = min(abs(_turned(other.angle - one.angle)) for other in one.keys)
+            if pose.seen > NEW_SEEN and (pose.cost > NEW_COST or nearest > NEW_ANGLE):
+                self._cut_anew(one, picture)
+            return
+        seen = matcher.score(keys[0], one.place[None], np.array([one.angle - keys[0].angle]))[1]
+        one.age += 1
+        one.state = HIDDEN if seen[0] < 0.5 else UNSURE if one.age <= PATIENCE else LOST
+        one.confidence *= 0.8
+
+    def _search(self, one: _Object, matcher: Matcher,
+                hand: np.ndarray | None) -> tuple[Pose, Template] | None:
+        """Return the best pose near by, else anywhere; and the template it was found with."""
+        grown = 1 + 0.5 * min(one.age, 4)
+        reach, turn, push = REACH * grown, TURN * min(grown, 2), None
+        if hand is not None:
+            near = (hand[:, 2] < HAND_HIGH) & (
+                np.linalg.norm(hand[:, :2] - one.place, axis=1) < HAND_FAR)
+            if near.any():
+                push = hand[1, :2] - hand[0, :2]
+            elif one.age == 0:
+                reach, turn = REST, REST_TURN
+        keys = one.nearest()
+
+        def attempt(place: np.ndarray, key: Template) -> tuple[Pose, Template] | None:
+            pose = matcher.refine(key, place, one.angle, reach, turn)
+            return None if pose is None else (pose, key)
+
+        best = attempt(one.place, keys[0])
+        if best is not None and best[0].fit > GOOD and best[0].cost < GOOD_COST:
+            return best
+        others = [(one.place, key) for key in keys[1:2]]
+        if push is not None and np.linalg.norm(push) > 0.01:
+            others.append((one.place + push, keys[0]))
+        for place, key in others:
+            other = attempt(place, key)
+            if other is not None and (best is None or other[0].cost < best[0].cost - 0.03):
+                best = other
+        if one.age >= 1 and not (best is not None and best[0].fit > GOOD):
+            avoid = [other.place for other in self._objects if other is not one]
+            for key in dict.fromkeys([keys[0], one.keys[0], one.keys[-1]]):
+                pose = locate(matcher, key, avoid)
+                if (pose is not None and pose.fit > 0.8
+                        and np.linalg.norm(pose.place - one.place) < 0.08 * (one.age + 1) + 0.03
+                        and (best is None or pose.cost < best[0].cost - 0.1)):
+                    return pose, key
+        return best
+
+    def _covered(self, one: _Object, picture: Picture) -> np.ndarray:
+        """Return what hides an object: the robot, and the others where they are seen."""
+        covered = picture.hidden.astype(np.uint8)
+        for other in self._objects:
+            if other is not one and other.state == SEEN:
+                cv2.fillPoly(covered, [np.rint(self._plane.top_pixels(other.shown.outlined(
+                    other.place, other.angle))).astype(np.int32)], 1)
+        return covered > 0
+
+    def _cut_anew(self, one: _Object, picture: Picture) -> None:
+        """Add a template of the object as it is now: it has turned, and shows other sides."""
+        at, *others = self._plane.middle_pixels([one.place, *(
+            other.place for other in self._objects if other is not one)])
+        mask, _ = silhouette(picture, at, others)
+        beside = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+        if 0.6 < mask.sum() / one.keys[0].area < 1.6 and not (beside & picture.hidden).any():
+            key = Template(picture, self._plane, mask, one.place, one.angle)
+            one.keys = [one.keys[0], *one.keys[1:][2 - KEYS:], key]
+
+    def _tracked(self) -> Tracked:
+        """Return where the objects are."""
+        places = np.array([one.place for one in self._objects]).reshape(-1, 2)
+        return Tracked(
+            self._plane.enlarge(self._plane.middle_pixels(places)) if self._objects else places,
+            tuple(one.state for one in self._objects),
+            np.array([one.confidence for one in self._objects]),
+            tuple(self._plane.enlarge(self._plane.top_pixels(one.shown.outlined(
+                one.place, one.angle))) for one in self._objects))
+
+
+def _turned(angle: float) -> float:
+    """Return an angle between -pi and pi."""
+    return float(np.angle(np.exp(1j * angle)))

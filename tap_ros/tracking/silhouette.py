@@ -1,0 +1,111 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""From a click to the silhouette of an object."""
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from tap_ros.errors import TrackingError
+from tap_ros.tracking.picture import Palette, Picture
+
+RADIUS = 36  # working pixels from a click to where no object reaches
+CORE = 3.5  # px around a click that are the object
+LIKELY, POSSIBLE = 12.0, 6.0  # distance from the table's colours of what may be the object
+LEAST_AREA = 25  # px
+LEAST_CONTRAST = 7.0  # of the object's colours and the table's, for a click to be believed
+_RINGS = (0.75, 1.3)  # of RADIUS, between which the table is seen
+
+
+def silhouette(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray] = (),
+               radius: float = RADIUS) -> tuple[np.ndarray, float]:
+    """
+    Cut out the object around a pixel by GrabCut.
+
+    It begins with colours that are not those of the ring around.
+
+    :param at: (2,) (u, v) in the working picture.
+    :param others: pixels of other objects.
+    :return: (h, w) bool, all False where nothing differs; and how its colours differ from those
+        around it, median.
+    """
+    h, w = picture.size
+    u, v = at
+    x0, x1 = (int(np.clip(u + side * 1.5 * radius, 0, w)) for side in (-1, 1))
+    y0, y1 = (int(np.clip(v + side * 1.5 * radius, 0, h)) for side in (-1, 1))
+    window = np.s_[y0:y1, x0:x1]
+    y, x = np.ogrid[y0:y1, x0:x1]
+    far = np.hypot(x - u, y - v)
+    hidden = picture.hidden[window]
+    inner, outer = radius * _RINGS[0], radius * _RINGS[1]
+    ring = (far > inner) & (far < outer)
+    for clear in (~hidden, *(np.hypot(x - other[0], y - other[1]) > radius * 0.6
+                             for other in others)):
+        if (ring & clear).sum() > 50:
+            ring &= clear
+    empty = np.zeros(picture.size, bool)
+    if not ring.any():
+        return empty, 0.0
+    lab = picture.lab.reshape(3, h, w)[:, y0:y1, x0:x1]
+    around = Palette(lab[:, ring].T)
+    unlike = around.distance(picture)[window]
+    mask = np.full(far.shape, cv2.GC_BGD, np.uint8)
+    near = far < radius
+    mask[near] = cv2.GC_PR_BGD
+    mask[near & (unlike > LIKELY)] = cv2.GC_PR_FGD
+    mask[(far < radius / 3) & (unlike > POSSIBLE)] = cv2.GC_PR_FGD
+    mask[far < CORE] = cv2.GC_FGD
+    mask[hidden] = cv2.GC_BGD
+    for other in others:
+        if np.hypot(other[0] - u, other[1] - v) > 2 * CORE:
+            mask[np.hypot(x - other[0], y - other[1]) < CORE] = cv2.GC_BGD
+    if not (mask & 1).any():
+        return empty, 0.0
+    cv2.setRNGSeed(0)
+    cv2.grabCut(np.ascontiguousarray(picture.image[window]), mask, (0, 0, 0, 0), np.zeros((1, 65)),
+                np.zeros((1, 65)), 3, cv2.GC_INIT_WITH_MASK)
+    found = cv2.morphologyEx(mask & 1, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    count, labels = cv2.connectedComponents(found)
+    if count > 2:
+        inside = labels[(far < 2 * CORE) & (found > 0)]
+        part = np.bincount(inside).argmax() if len(inside) else labels.flat[
+            np.where(found > 0, far, np.inf).argmin()]
+        found = labels == part
+    empty[window] = found
+    if not empty.any():
+        return empty, 0.0
+    return empty, float(np.median(unlike[found > 0]))
+
+
+def clicked(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray],
+            name: str) -> np.ndarray:
+    """
+    Cut out the object under a click, see silhouette.
+
+    :param name: of the click, for the message.
+    :raises TrackingError: for a click outside the picture, on the robot, or on nothing.
+    """
+    h, w = picture.size
+    if not (np.isfinite(at).all() and -0.5 <= at[0] < w - 0.5 and -0.5 <= at[1] < h - 0.5):
+        raise TrackingError(f'{name} is outside the picture; click on an object')
+    if picture.hidden[round(float(at[1])), round(float(at[0]))]:
+        raise TrackingError(f'{name} is on the robot or its shadow; click on an object, or move '
+                            'the robot away first')
+    mask, contrast = silhouette(picture, at, others)
+    if mask.sum() < LEAST_AREA or contrast < LEAST_CONTRAST:
+        raise TrackingError(f'{name} is on nothing that differs from the table around it; click '
+                            'on an object')
+    return mask
+
+
+def outline(mask: np.ndarray) -> np.ndarray:
+    """Return the outer outline (N, 2) of a mask (h, w) in pixels."""
+    found, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL,
+                                cv2.CHAIN_APPROX_TC89_L1)
+    return max(found, key=len)[:, 0].astype(np.float64) if found else np.zeros((0, 2))
+
+
+def middle(mask: np.ndarray) -> np.ndarray:
+    """Return the mean pixel (2,) of a mask (h, w)."""
+    v, u = np.nonzero(mask)
+    return np.array([u.mean(), v.mean()])

@@ -1,0 +1,104 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Laws of following clicked objects, on pictures of one drawn table."""
+
+import cv2
+import numpy as np
+import pytest
+from tap_ros.errors import TrackingError
+from tap_ros.plugins import load_plugin
+from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, UNSURE, View
+
+SIZE = 256
+COLOURS = ((200, 60, 60), (60, 90, 200))  # of the halves of an object
+STARTS = ((80.0, 100.0), (170.0, 150.0))
+
+
+def table(size=SIZE):
+    """Return a picture of a wooden table."""
+    rng = np.random.default_rng(0)
+    grain = cv2.GaussianBlur(rng.normal(0, 30, (SIZE, SIZE)).astype(np.float32), (0, 0), 3)
+    picture = (np.array([150, 120, 80]) + grain[..., None]).clip(0, 255).astype(np.uint8)
+    return cv2.resize(picture, (size, size), interpolation=cv2.INTER_AREA)
+
+
+def draw(places, angles=(0, 0), size=SIZE, robot=None):
+    """Return a View of two bars of two colours; robot: (u0, v0, u1, v1) that it hides."""
+    picture, scale = table(size), size / SIZE
+    for k, ((u, v), angle) in enumerate(zip(places, angles)):
+        along = np.array([np.cos(angle), np.sin(angle)])
+        across = np.array([-along[1], along[0]])
+        for half, colour in zip((-1, 1), COLOURS[::1 if k else -1]):
+            corners = [np.array([u, v]) + half * 14 * i * along + 8 * j * across
+                       for i, j in ((0, -1), (1, -1), (1, 1), (0, 1))]
+            cv2.fillConvexPoly(picture, np.rint((np.array(corners) + 0.5) * scale * 16 - 8).astype(
+                np.int32), colour, cv2.LINE_AA, 4)
+    mask = np.zeros((size, size), np.uint8)
+    if robot is not None:
+        u0, v0, u1, v1 = (round(x * scale) for x in robot)
+        picture[v0:v1, u0:u1], mask[v0:v1, u0:u1] = 40, 255
+    return View(picture, mask)
+
+
+@pytest.fixture
+def tracker():
+    made = load_plugin('tap_ros.trackers', 'rigid')(None)
+    made.select(draw(STARTS), STARTS)
+    return made
+
+
+def test_moved_and_turned_objects_are_followed(tracker):
+    for step in range(8):
+        places = np.array(STARTS) + step * np.array([[4, 2], [-3, 1]])
+        found = tracker.update(draw(places, (0.12 * step, -0.1 * step)))
+    assert found.states == (SEEN, SEEN) and found.confidence.min() > 0.5
+    assert np.abs(found.pixels - places).max() < 1.5
+
+
+def test_what_is_hidden_is_said_to_be_and_found_where_it_comes_out(tracker):
+    robot = (50, 70, 120, 130)
+    for _ in range(3):
+        found = tracker.update(draw(STARTS, robot=robot))
+    assert found.states == (HIDDEN, SEEN)
+    assert found.pixels[0] == pytest.approx(STARTS[0], abs=1.5)
+    moved = ((95.0, 108.0), STARTS[1])
+    for _ in range(3):
+        found = tracker.update(draw(moved, (0.4, 0)))
+    assert found.states == (SEEN, SEEN) and np.abs(found.pixels - moved).max() < 1.5
+
+
+def test_what_is_gone_is_unsure_and_then_lost(tracker):
+    states = [tracker.update(draw(STARTS[1:], (0,))).states for _ in range(5)]
+    assert [UNSURE in one for one in states[:2]] == [True] * 2 and LOST in states[-1]
+
+
+@pytest.mark.parametrize('click', [(300, 20), (85, 60), (20, 220), (np.nan, 3)])
+def test_a_click_on_no_object_is_refused_and_those_before_are_followed(tracker, click):
+    with pytest.raises(TrackingError):
+        tracker.select(draw(STARTS, robot=(70, 40, 100, 80)), [STARTS[0], click])
+    found = tracker.update(draw(STARTS))
+    assert found.states == (SEEN, SEEN) and np.abs(found.pixels - STARTS).max() < 1.5
+
+
+@pytest.mark.parametrize('size', [64, 480])
+def test_pictures_of_any_size_are_followed_and_left_as_they_are(size):
+    tracker, scale = load_plugin('tap_ros.trackers', 'rigid')(None), size / SIZE
+    view = draw(STARTS, size=size)
+    before = view.image.copy()
+    tracker.select(view, (np.array(STARTS) + 0.5) * scale - 0.5)
+    view.image.flags.writeable = False
+    moved = np.array(STARTS) + 5
+    found = tracker.update(draw(moved, size=size))
+    assert np.abs((found.pixels + 0.5) / scale - 0.5 - moved).max() < 2
+    assert (view.image == before).all()
+
+
+def test_objects_are_found_in_a_goal_picture_or_refused(tracker):
+    goal = ((60.0, 200.0), (200.0, 60.0))
+    found = tracker.find(draw(goal, (2.0, -1.0)))
+    assert found.states == (SEEN, SEEN) and np.abs(found.pixels - goal).max() < 2
+    found = tracker.find(draw(goal[:1]))
+    assert LOST in found.states
+    assert np.isnan(found.pixels[found.states.index(LOST)]).all()
+    # the objects are followed on as before
+    assert np.abs(tracker.update(draw(STARTS)).pixels - STARTS).max() < 1.5
