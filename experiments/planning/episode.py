@@ -11,11 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE
-from tap_ros.errors import ConfigError
+from tap_ros.errors import ConfigError, TrackingError
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
+from tap_ros.plugins import load_plugin
+from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.text import listing
+from tap_ros.tracking.protocols import LOST, View
 from tap_ros.training.robot_mask import FreeView, trained_robot_mask
+
+CLICK_ERROR = 1.35  # px, mean distance of a click from the middle of an object
 
 
 @dataclass
@@ -31,6 +37,7 @@ class PlannedEpisode:
     switches: list  # steps at which the second, third ... target began
     tracked: np.ndarray  # (steps + 1, K, 2) pixels that the planner was given
     subgoals: list  # prediction.predictor.Subgoal
+    refused: str  # why nothing was planned: objects that were not found; '' if it was
 
     @property
     def frames(self):
@@ -62,15 +69,22 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     start = seen = simulator.reset(seed)
     goal = simulator.goal()
+    clicked, refused = None, ''
+    if method.tracking == 'rigid':
+        try:
+            clicked = ClickedObjects(simulator, seen, seed)
+            seen, goal = clicked.seen, clicked.find(goal)
+        except TrackingError as error:
+            refused = str(error)
     view = FilledView(getattr(mpc.model, 'robot_mask', 'none'))
     asked = FilledView(shown_mask(predictor) if method.predicted else 'none')
     subgoals = []
     follower = mpc.model if method.tracking == 'carried' else None
     reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, follower,
                                    rounds=method.rounds), seed)
-    observations, distances, actions, times = [seen], [simulator.distances()], [], []
+    observations, distances, actions, times = [start], [simulator.distances()], [], []
     tracked = []
-    while method.base != 'nothing':
+    while method.base != 'nothing' and not refused:
         shown, start_picture = view.see(seen), asked.see(seen).image
         answer = reach.step(as_seen(shown))
         while isinstance(answer, Aim):
@@ -84,16 +98,58 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
         tracked.append(reach.pixels)
         if isinstance(answer, End):
             break
-        seen = simulator.step(answer.plan.action)
+        observations.append(simulator.step(answer.plan.action))
+        seen = observations[-1] if clicked is None else clicked.follow(observations[-1])
         reach.sent()
-        observations.append(seen)
         distances.append(simulator.distances())
         actions.append(answer.plan.action)
         times.append(answer.plan.planning_ms)
     return PlannedEpisode(
         np.array(distances), observations, np.array(actions).reshape(-1, 4), np.array(times),
         goal, reach.targets or [Target(goal.object_pixels)], reach.switches,
-        np.array(tracked or [start.object_pixels]), subgoals)
+        np.array(tracked or [start.object_pixels]), subgoals, refused)
+
+
+class ClickedObjects:
+    """
+    Observations of one episode with tracked pixels in place of the true ones.
+
+    A click on each object in the first picture, CLICK_ERROR beside its true pixel, is all that
+    comes from the simulator.
+
+    :param seen: Observation, the first.
+    :ivar seen: the same with the pixels of the selected objects.
+    """
+
+    def __init__(self, simulator, seen, seed):
+        camera = PinholeCamera(
+            simulator.camera_matrix, seen.image.shape[:2], simulator.camera_pose)
+        self._tracker = load_plugin('tap_ros.trackers', 'rigid')(camera)
+        rng = np.random.default_rng([seed, 0])
+        sigma = CLICK_ERROR / np.sqrt(np.pi / 2)  # of each coordinate
+        clicks = seen.object_pixels + rng.normal(0, sigma, seen.object_pixels.shape)
+        self.seen = self._with(seen, self._tracker.select(_view(seen), clicks))
+
+    def follow(self, seen):
+        """Return an Observation of the next picture with tracked pixels."""
+        return self._with(seen, self._tracker.update(_view(seen)))
+
+    def find(self, goal):
+        """Return the Observation of a goal with the pixels found in it."""
+        found = self._tracker.find(_view(goal))
+        lost = [name for name, state in zip(goal.object_names, found.states) if state == LOST]
+        if lost:
+            raise TrackingError(f'{listing(lost)} not found in the goal picture')
+        return self._with(goal, found)
+
+    @staticmethod
+    def _with(observation, tracked):
+        return replace(observation, object_pixels=tracked.pixels.astype(np.float32))
+
+
+def _view(observation):
+    """Return an Observation as a tracker is shown it."""
+    return View(observation.image, observation.robot_mask, observation.gripper)
 
 
 class FilledView:

@@ -202,8 +202,8 @@ def run_scene(job, seed):
     Run a job on one scene.
 
     :return: dict of seed, final_cm (mean over objects), objects_cm and steps; of pushing also
-        switches, plan_ms (median) and, with carried object pixels, tracking_error_px; of stacking
-        success, first_right, moves and seconds.
+        switches, plan_ms (median) and, without true object pixels, tracking_error_px and why
+        nothing was planned, if so; of stacking success, first_right, moves and seconds.
     :raises PlanningError: if it cannot be planned; the message names task, method and scene.
     """
     begin = time.perf_counter()
@@ -220,8 +220,10 @@ def run_scene(job, seed):
     scene['switches'] = [int(step) for step in run.switches]
     scene['plan_ms'] = (round(float(np.median(run.planning_ms)), 1) if len(run.planning_ms)
                         else None)
-    if job.method.tracking == 'carried':
+    if job.method.tracking != 'ground_truth':
         scene['tracking_error_px'] = round(run.tracking_error(), 3)
+        if run.refused:
+            scene['refused'] = run.refused
     return scene
 
 
