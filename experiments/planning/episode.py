@@ -8,9 +8,12 @@ same.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from tap_ros.contract import GOAL_TOLERANCE
+from sim_bridge.simulator import Simulator
+from sim_bridge.world.looks import LOOKS
+from tap_ros.contract import GOAL_TOLERANCE, ROBOT_MASK_FREE
 from tap_ros.errors import ConfigError, TrackingError
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
@@ -21,7 +24,9 @@ from tap_ros.text import listing
 from tap_ros.tracking.protocols import LOST, View
 from tap_ros.training.robot_mask import FreeView, trained_robot_mask
 
-CLICK_ERROR = 1.35  # px, mean distance of a click from the middle of an object
+CAMERA_SIZE = 256  # px, what objects are followed in
+CLICK_ERROR = 1.35  # px of 64, mean distance of a click from the middle of an object
+CLICKS = 5  # at most
 
 
 @dataclass
@@ -114,42 +119,70 @@ class ClickedObjects:
     """
     Observations of one episode with tracked pixels in place of the true ones.
 
-    A click on each object in the first picture, CLICK_ERROR beside its true pixel, is all that
-    comes from the simulator.
+    A click on each object in the first picture is all that comes from the simulator. The tracker
+    is shown CAMERA_SIZE pixels a side, the networks what they were trained on.
 
+    :param simulator: Simulator, just reset.
     :param seen: Observation, the first.
     :ivar seen: the same with the pixels of the selected objects.
+    :raises TrackingError: when nothing is found where it was clicked.
     """
 
     def __init__(self, simulator, seen, seed):
-        camera = PinholeCamera(
-            simulator.camera_matrix, seen.image.shape[:2], simulator.camera_pose)
-        self._tracker = load_plugin('tap_ros.trackers', 'rigid')(camera)
+        self._simulator = simulator
+        self._camera = _camera(simulator.task_name, next(
+            name for name, look in LOOKS.items() if look is simulator.look))
+        self._scale = CAMERA_SIZE / len(seen.image)
+        self._camera.reset(seed)
+        camera = self._camera
+        self._tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
+            camera.camera_matrix, (CAMERA_SIZE, CAMERA_SIZE), camera.camera_pose))
         rng = np.random.default_rng([seed, 0])
-        sigma = CLICK_ERROR / np.sqrt(np.pi / 2)  # of each coordinate
-        clicks = seen.object_pixels + rng.normal(0, sigma, seen.object_pixels.shape)
-        self.seen = self._with(seen, self._tracker.select(_view(seen), clicks))
+        for i in range(CLICKS):  # who is told that a click is of no use clicks again
+            error = rng.normal(0, CLICK_ERROR / np.sqrt(np.pi / 2), seen.object_pixels.shape)
+            try:
+                view = self._view()
+                clicks = (seen.object_pixels + error + 0.5) * self._scale - 0.5
+                self.seen = self._with(
+                    seen, self._tracker.select(view, _beside(clicks, view.robot_mask)))
+                break
+            except TrackingError:
+                if i == CLICKS - 1:
+                    raise
 
     def follow(self, seen):
-        """Return an Observation of the next picture with tracked pixels."""
-        return self._with(seen, self._tracker.update(_view(seen)))
+        """Return the Observation of now with tracked pixels."""
+        self._camera.data.qpos[:] = self._simulator.data.qpos
+        return self._with(seen, self._tracker.update(self._view()))
 
     def find(self, goal):
-        """Return the Observation of a goal with the pixels found in it."""
-        found = self._tracker.find(_view(goal))
+        """Return the Observation of the goal with the pixels found in it; TrackingError if not."""
+        picture = self._camera.goal()
+        found = self._tracker.find(View(picture.image, picture.robot_mask, picture.gripper))
         lost = [name for name, state in zip(goal.object_names, found.states) if state == LOST]
         if lost:
             raise TrackingError(f'{listing(lost)} not found in the goal picture')
         return self._with(goal, found)
 
-    @staticmethod
-    def _with(observation, tracked):
-        return replace(observation, object_pixels=tracked.pixels.astype(np.float32))
+    def _view(self):
+        picture = self._camera.observe()
+        return View(picture.image, picture.robot_mask, picture.gripper)
+
+    def _with(self, observation, tracked):
+        pixels = (tracked.pixels + 0.5) / self._scale - 0.5
+        return replace(observation, object_pixels=pixels.astype(np.float32))
 
 
-def _view(observation):
-    """Return an Observation as a tracker is shown it."""
-    return View(observation.image, observation.robot_mask, observation.gripper)
+def _beside(clicks, mask):
+    """Return for each click (K, 2) the nearest pixel that the robot does not hide."""
+    free = np.argwhere(mask == ROBOT_MASK_FREE)[:, ::-1]
+    return np.array([free[((free - click) ** 2).sum(1).argmin()] if len(free) else click
+                     for click in clicks])
+
+
+@lru_cache
+def _camera(task, look):
+    return Simulator(task, CAMERA_SIZE, look)
 
 
 class FilledView:

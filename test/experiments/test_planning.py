@@ -144,7 +144,7 @@ def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):
 
 
 def test_the_name_of_a_method_reads_as_that_method():
-    for text in (*BASES, 'true_model', 'genmin:rounds3:carried',
+    for text in (*BASES, 'true_model', 'genmin:rounds3:carried', 'direct:tracked',
                  'fix0.25:recursion2:samples8:carried', 'genmin+progress-r2:recursion2'):
         method = parse_method(text)
         assert parse_method(method.name) == method and method.predicted == (
