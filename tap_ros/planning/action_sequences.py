@@ -38,6 +38,7 @@ FIRST_STD = 0.04  # m per control period, of x and y in the first Gaussian
 PUSH_LIMIT = 0.05  # m per control period, of a displacement while the gripper is low
 PACE = 0.9  # of the limits is used by proposals, so that the search can still add to it
 VERTICAL = 0.06  # m, a change of height beyond which the arm does not move sideways meanwhile
+DOWN = LOW + 0.02  # m; a gripper that is not lifted and higher than this stands upon something
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class SequenceShape:
         Neither low nor lifted, it stands upon something: then it must go up before it can push.
         Where it takes several periods to come down, it passes these heights every time.
         """
-        return int(self.climb_limit >= LIFTED - LOW and LOW + 0.02 < height < LIFTED - 0.03)
+        return int(self.climb_limit >= LIFTED - LOW and DOWN < height < LIFTED - 0.03)
 
     def climbs(self, lifted: np.ndarray, phase: np.ndarray,
                height: float) -> tuple[np.ndarray, np.ndarray]:
@@ -158,13 +159,13 @@ def shift(parameters: np.ndarray) -> np.ndarray:
 
 def landings(actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     """
-    Find where, (N, 2) metres, the gripper comes down: passes LOW + VERTICAL; NaN if it does not.
+    Find where, (N, 2) metres, the gripper comes down: passes DOWN; NaN if it does not.
 
     :param actions: (N, HORIZON, 4); gripper: (4,).
     """
     path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, HORIZON, 3)
     before = path[..., 2] - actions[..., 2]
-    down = (before > LOW + VERTICAL) & (path[..., 2] <= LOW + VERTICAL)
+    down = (before > DOWN) & (path[..., 2] <= DOWN)
     first = down.argmax(1)
     return np.where(down.any(1)[:, None], path[np.arange(len(path)), first, :2], np.nan)
 

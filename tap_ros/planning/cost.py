@@ -13,11 +13,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.table import pixel_points
 import torch
 
 NEAR = 3.0  # px; an object nearer to its goal is finished
+BLOCKED = 0.06  # m around where the 4 cm of the gripper met something; a bar is about as wide
 LAST_WEIGHT = 10.0  # of the horizon's last step, as the authors' planner has; the others have 1
 
 
@@ -27,7 +29,7 @@ class PlanCost:
     The planner's cost; give VisualMPC another one with the same methods to minimise that.
 
     :param unfinished: px, what an object costs more beyond NEAR, less and less within it.
-    :param clearance: m from any object to where the gripper may come down.
+    :param clearance: m from any object to where the gripper may come down; 0: anywhere.
     """
 
     unfinished: float = 0.0
@@ -57,17 +59,24 @@ class PlanCost:
         before = (total - last.sum(1)) * (HORIZON - 1) / max(1, seen - 1)
         return before + LAST_WEIGHT * last.sum(1), last.mean(1)
 
-    def of_landings(self, landings: np.ndarray, objects: np.ndarray) -> np.ndarray:
+    def of_landings(self, landings: np.ndarray, objects: np.ndarray,
+                    blocked: np.ndarray) -> np.ndarray:
         """
         Cost of coming down upon an object, which recordings of good pushes do not show.
 
         :param landings: (N, 2) metres, NaN for none; objects: (K, 2).
-        :return: (N,) pixels: 0, or 100 and 10 for every centimetre that is missing.
+        :param blocked: (B, 2), where the gripper met something; dearer than any push gains.
+        :return: (N,) pixels: 0, or 100 (1000 where blocked) and 10 for every centimetre that is
+            missing.
         """
-        if not self.clearance:
-            return np.zeros(len(landings))
-        gap = np.linalg.norm(landings[:, None] - objects, axis=-1).min(1)  # (N,)
-        return np.where(gap < self.clearance, 100 + 1000 * (self.clearance - gap), 0)
+        costs = np.zeros(len(landings))
+        if self.clearance:
+            held = landings.clip(WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])  # the arm goes no farther
+            for ends, places, room, least in ((landings, objects, self.clearance, 100),
+                                              (held, blocked, BLOCKED, 1000)):
+                gap = np.linalg.norm(ends[:, None] - places, axis=-1).min(1, initial=np.inf)
+                costs += np.where(gap < room, least + 1000 * (room - gap), 0)
+        return costs
 
 
 def distances_to_pixels(maps: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:

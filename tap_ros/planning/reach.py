@@ -229,7 +229,10 @@ class Reach:
         if passed is not None and self._state is not None:
             # The tracker has seen the picture of the Aim, which is yet to be planned from: it
             # goes back to the picture before.
+            memory = self._state.memory
             state = replace(state, round=passed.round + 1, first_step=self.steps,
+                            memory=replace(state.memory, heights=memory.heights,
+                                           blocked=memory.blocked),
                             earlier=(*passed.earlier, *passed.itinerary.targets[:-1]),
                             switches=passed.switches, tracked=self._state.tracked)
         elif config.follower is not None:

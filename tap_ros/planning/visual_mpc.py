@@ -15,7 +15,7 @@ carry the maps, take the one that brings them closest to their goals, execute it
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 import os
 from pathlib import Path
@@ -28,6 +28,7 @@ from tap_ros.contract import LOW
 from tap_ros.errors import PlanningError
 from tap_ros.images.pixels import to_float
 from tap_ros.planning.action_sequences import (
+    DOWN,
     FULL,
     HORIZON,
     landings,
@@ -46,7 +47,19 @@ from tap_ros.plugins import load_plugin
 import torch
 
 WARM_STD = 0.5  # share of the first deviation that a search around the last plan begins with
+SHORT = 0.02  # m; a descent of which more is missing has met something,
+STILL = 0.9  # or of which this share is, where the arm comes down in small steps
+MOVED = 1.0  # px, from where an object was
 RECHECK_STD = 0.01  # m, from the gripper to the places from which elites are judged once more
+
+
+@dataclass(frozen=True)
+class Blocked:
+    """A place at which the gripper was sent down and did not get there."""
+
+    place: np.ndarray  # (2,) m
+    nearest: int  # object
+    pixel: np.ndarray  # (2,), where that object was
 
 
 @dataclass(frozen=True)
@@ -56,12 +69,32 @@ class Memory:
 
     :param count: plans so far.
     :param parameters: (D,) of the last plan, carried on by one control period; elites: (E, D).
+    :param heights: m, of the gripper before the last action, and where that was to bring it.
+    :param blocked: places to keep away from until the object nearest to them has moved.
     """
 
     seed: int = 0
     count: int = 0
     parameters: np.ndarray | None = None
     elites: np.ndarray | None = None
+    heights: tuple[float, float] = (0.0, 0.0)
+    blocked: tuple[Blocked, ...] = ()
+
+    def blocked_now(self, scene: Scene, objects: np.ndarray) -> tuple[Blocked, ...]:
+        """
+        Return the places that are blocked in a scene: those known, and where a descent has ended.
+
+        :param scene: after the last action; objects: (K, 2) m, where the objects are.
+        """
+        pixels, place, height = scene.object_pixels, scene.gripper[:2], scene.gripper[2]
+        known = [one for one in self.blocked if np.linalg.norm(
+            pixels[one.nearest] - one.pixel) <= MOVED]
+        above, below = self.heights
+        descent, missing = above - below, height - below
+        if descent > 0 and height > DOWN and missing > min(SHORT, STILL * descent):
+            nearest = int(np.linalg.norm(objects - place, axis=1).argmin())
+            known.append(Blocked(place, nearest, pixels[nearest]))
+        return tuple(known)
 
 
 @dataclass(frozen=True)
@@ -146,7 +179,9 @@ class VisualMPC:
             torch.from_numpy(gripper)[None].to(table.device), self.config.arm_hidden)
         # search the sequence of least cost
         shape, judge = SequenceShape(limits), partial(self.rollouts.judge, start, maps)
-        found = self._search(shape, judge, gripper, weights @ self._points, goal, memory)
+        here = weights @ self._points
+        blocked = memory.blocked_now(scene, here)
+        found = self._search(shape, judge, gripper, here, goal, replace(memory, blocked=blocked))
         # say where it ends; its first action is the answer
         parameters = np.concatenate([found.best[None], found.elites])
         actions, *elites = shape.actions(parameters, gripper[2])
@@ -155,18 +190,20 @@ class VisualMPC:
         left, *kept = map(shift, parameters)
         return Plan(actions[0], float(end), float(current), milliseconds, actions,
                     np.array(elites), goal.places, found.cost,
-                    Memory(memory.seed, memory.count + 1, left, np.array(kept)))
+                    Memory(memory.seed, memory.count + 1, left, np.array(kept),
+                           (float(gripper[2]), float(gripper[2] + actions[0, 2])), blocked))
 
     def _search(self, shape: SequenceShape, judge: Callable[..., tuple[np.ndarray, np.ndarray]],
                 gripper: np.ndarray, here: np.ndarray, goal: Goal,
                 memory: Memory) -> Solution:
         """Search the parameters of least cost; here: (K, 2) m, where the objects are."""
         config, prices = self.config, self.cost.prices(goal.distances)
+        blocked = np.array([one.place for one in memory.blocked]).reshape(-1, 2)
 
         # mean over where the gripper begins
         def cost(samples: np.ndarray, grippers: np.ndarray = gripper[None]) -> np.ndarray:
             actions = shape.actions(samples, gripper[2])
-            clash = self.cost.of_landings(landings(actions, gripper), here)
+            clash = self.cost.of_landings(landings(actions, gripper), here, blocked)
             costs, _ = judge(prices, actions.repeat(len(grippers), 0),
                              np.tile(grippers, (len(samples), 1)), config.cost_every)
             return costs.reshape(len(samples), -1).mean(1) + clash

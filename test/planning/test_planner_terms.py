@@ -12,6 +12,7 @@ from tap_ros.planning.cost import (
     distances_to_all_pixels,
     distances_to_pixels,
     distances_to_places,
+    PlanCost,
 )
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
@@ -25,6 +26,7 @@ from toy_world import SIZE, to_pixels
 PLAIN = VisualMPCConfig(
     search=SearchConfig(40, 1, 5), proposals=0, recheck=0, unfinished=0.0, clearance=0.0,
     warm_start=False, cost_every=1, batch_size=40, threads=1)
+CAREFUL = replace(PLAIN, clearance=0.1)
 IMAGE = np.zeros((SIZE, SIZE, 3), np.uint8)
 NEW = Memory()
 GRIPPER = np.array([0.0, 0.0, LOW, 0.0], np.float32)
@@ -122,12 +124,38 @@ def dives(actions, _):
 def test_the_gripper_does_not_come_down_upon_an_object(model):
     above = np.append(PLACES[1] + [0.03, 0.0], [LIFTED, 0]).astype(np.float32)
     beside = above + np.float32([0.12, 0, 0, 0])
-    careful = replace(PLAIN, clearance=0.1)
     found = [plan(Puppets(model, dives), config, gripper, GOALS)
-             for gripper in (above, beside) for config in (PLAIN, careful)]
+             for gripper in (above, beside) for config in (PLAIN, CAREFUL)]
     assert [one.action[2] < 0 for one in found] == [True, False, True, True]
     # where there is room it changes nothing
     assert np.array_equal(found[2].actions, found[3].actions) and found[2].cost == found[3].cost
+
+
+def test_where_the_gripper_met_something_it_comes_down_again_once_the_object_has_moved(model):
+    def next_plan(x, z, pixels, memory):
+        gripper = np.array([x, -0.45, z, 0], np.float32)
+        return plan(Puppets(model, dives), CAREFUL, gripper, pixels, memory)
+
+    first = next_plan(0.2, LIFTED, GOALS, NEW)
+    assert first.action[2] < 0 and not first.memory.blocked
+    for resting, met in ((LOW, 0), (0.05, 1)):  # at what height the descent ended
+        rising = next_plan(0.2, resting, GOALS, first.memory)
+        assert len(rising.memory.blocked) == met
+        # back over the place; aside; the nearest object has moved; the other one has
+        nearest = np.linalg.norm(PLACES - [0.2, -0.45], axis=1).argmin()
+        moved = 2.0 * np.eye(2)[:, :, None].repeat(2, 2)
+        for x, pixels, avoided, kept in (
+                (0.2, GOALS, met, met), (0.27, GOALS, 0, met),
+                (0.2, GOALS + moved[nearest], 0, 0), (0.2, GOALS + moved[1 - nearest], met, met)):
+            again = next_plan(x, LIFTED, pixels, rising.memory)
+            assert (again.action[2] >= 0, len(again.memory.blocked)) == (avoided, kept)
+    assert next_plan(0.2, LIFTED, GOALS, NEW).action[2] < 0  # another goal begins anew
+
+
+def test_what_moves_farther_than_the_workspace_comes_down_at_its_edge():
+    blocked, edge = np.array([[0.2, -0.45]]), np.array([[0.2, -0.6], [0.3, -0.6], [0.2, -0.38]])
+    costs = PlanCost(clearance=0.1).of_landings(edge, np.array([[0.0, 0.0]]), blocked)
+    assert costs[0] > 1000 and not costs[1:].any()
 
 
 def sticks(actions, grippers):

@@ -203,6 +203,23 @@ def test_rounds_ask_again_when_the_subgoals_are_passed(mpc):
     assert reach.targets == [first, second, GOAL] and reach.switches == [1, 2]
 
 
+def test_a_later_round_knows_where_the_gripper_met_something(mpc, monkeypatch):
+    plan, known = mpc.plan, []
+
+    def plan_down(scene, goal, memory, limits):
+        known.append(memory.blocked)
+        made = plan(scene, goal, memory, limits)
+        return replace(made, memory=replace(made.memory, heights=(0.13, 0.012)))
+
+    monkeypatch.setattr(mpc, 'plan', plan_down)
+    reach = Reach(mpc, ReachConfig(10, rounds=9), 3)
+    for t in range(3):  # a round each; each time it stands at 0.1 m
+        assert isinstance(reach.step(look(t)), Aim)
+        reach.head_for([Target(START), GOAL])
+        act(reach, t)
+    assert [len(blocked) for blocked in known] == [0, 0, 1]
+
+
 def test_between_two_rounds_a_command_is_sent(mpc):
     for switch, budget in (('reached', 10), ('half', 3)):
         reach, asked = Reach(mpc, ReachConfig(budget, switch=switch, rounds=9), 3), []
