@@ -167,8 +167,8 @@ class Client:
         """
         kind, _, server = SERVICES[service]
         client, request = self._service(service), _message(kind.Request, fields)
-        # While another task's model is compiled, the heart of a busy machine's simulator may stop.
-        watched = None if service == 'reset' else self._liveness(server)
+        # While a task's model is compiled or an outline is cut, the heart of a node may stop.
+        watched = None if service in ('reset', 'select') else self._liveness(server)
         response = call(client, request, timeout_s or self.timeout_s, give_up, watched)
         if not getattr(response, 'success', True):
             reason = getattr(response, 'message', 'the log of its node says why')

@@ -180,6 +180,8 @@ NUMBERS = {'samples': 3, 'levels': 2, 'seed': 1}
 PREDICT, REACH = {'do': 'predict', **NUMBERS}, {'do': 'reach', 'mode': 'direct', **NUMBERS}
 RESET = {'do': 'reset', 'task': 'push2', 'seed': 7}
 MOVE = {'do': 'move', 'name': 'object_0', 'u': 3, 'v': 4.5}
+CUP = {'name': 'cup', 'u': 3, 'v': 4.5}
+SELECT = {'do': 'select', 'objects': [CUP, {**CUP, 'name': 'ring'}]}
 
 
 def at(x, **places):
@@ -205,7 +207,8 @@ def test_distances_are_centimetres_or_pixels_where_a_pose_is_unknown():
 
 
 def test_a_command_reads_as_it_is_meant_and_what_makes_no_sense_is_refused_by_the_fields_name():
-    for command in (PREDICT, REACH, RESET, MOVE, {'do': 'cancel'}, {'do': 'photograph'}):
+    for command in (PREDICT, REACH, RESET, MOVE, SELECT,
+                    *({'do': do} for do in ('cancel', 'photograph', 'propose'))):
         do, fields = parse_command(json.dumps({**command, 'other': 1}).encode())
         assert {'do': do, **fields} == command
     for text in ('', '[]', b'\xff\xfe', '[' * 5000):
@@ -217,7 +220,9 @@ def test_a_command_reads_as_it_is_meant_and_what_makes_no_sense_is_refused_by_th
             (RESET, 'task', (3, 'x' * 101, 'a\nb')),
             (RESET, 'seed', (-1, True, 1e300, large)), (PREDICT, 'levels', (0, 5)),
             (MOVE, 'u', (math.nan, large)), (MOVE, 'v', ('1',)),
-            (MOVE, 'name', ('a\udc80', '\ud83d'))):
+            (MOVE, 'name', ('a\udc80', '\ud83d')),
+            (SELECT, 'objects', (
+                [], [3], [{'name': 'cup', 'u': 3}], [{**CUP, 'u': '3'}], 33 * [CUP]))):
         for value in values:
             with pytest.raises(CommandError, match=name) as refused:
                 parse_command(json.dumps({**command, name: value}))

@@ -10,23 +10,22 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from tap_ros.errors import TapError
+from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
 from tap_ros.nodes.calls import CallError, Reaching
 from tap_ros.nodes.client import Client
 from tap_ros.nodes.services import internal_error, log_error
-from tap_ros.text import escaped
+from tap_ros.text import escaped, listing
 from tap_ros.weights import PREDICTORS
 
 if TYPE_CHECKING:
-    from rclpy.node import Node
     from tap_msgs.action import ReachGoal
-    from tap_msgs.srv import PredictSubgoal
+    from tap_ros.nodes.explorer.node import ExplorerNode
 
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
 END_S = 2.0  # that a cancel may take when the node ends
 WAITING = 8  # commands that may wait; more are refused
 MAX_SAMPLES, MAX_LEVELS = 16, 4  # of the page's sliders; the services allow more
-MAX_NAME = 100  # characters
 LARGEST = 1e6  # of a pixel
 
 
@@ -42,6 +41,7 @@ def _whole(low: int, high: int) -> tuple[str, Callable[[Any], bool]]:
 _TEXT = (f'a text of at most {MAX_NAME} characters that print', lambda value: (
     isinstance(value, str) and len(value) <= MAX_NAME and value.isprintable()))
 _PIXEL = ('a number', lambda value: type(value) in (int, float) and abs(value) < LARGEST)
+_PLACE = {'name': _TEXT, 'u': _PIXEL, 'v': _PIXEL}
 _SEED = _whole(0, 2**62)
 _NUMBERS = {
     'samples': _whole(1, MAX_SAMPLES), 'levels': _whole(1, MAX_LEVELS), 'seed': _SEED}
@@ -51,7 +51,14 @@ COMMANDS: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {  # do: {fi
     'reach': {'mode': ("'direct' or 'subgoal'", lambda value: value in ('direct', 'subgoal')),
               **_NUMBERS},
     'cancel': {},
-    'move': {'name': _TEXT, 'u': _PIXEL, 'v': _PIXEL},  # of an object in the goal picture
+    'select': {'objects': (
+        f'1 to {MAX_OBJECTS} objects, each with name, u and v', lambda value: (
+            isinstance(value, list) and 0 < len(value) <= MAX_OBJECTS and all(
+                isinstance(one, dict) and _PLACE.keys() == one.keys()
+                and all(valid(one[field]) for field, (_, valid) in _PLACE.items())
+                for one in value)))},  # to follow, by a click on each in the camera's picture
+    'propose': {},  # objects to follow
+    'move': _PLACE,  # an object's goal, in the picture where the page drags them
     'photograph': {}}  # take the camera's newest picture as the goal
 
 
@@ -85,20 +92,12 @@ class ExplorerCalls:
     """
     Carries out the commands of browsers, each in a thread of its own; one goal at a time.
 
-    :param node: rclpy Node that another thread spins.
-    :param told: called with a text for people when something has happened; any thread.
-    :param failed: likewise, when something could not be done; and whether by a fault of ours.
-    :param answered: called with a PredictSubgoal.Response, a success.
-    :param photographed: called without arguments; takes the camera's picture as the goal.
+    :param node: that another thread spins; what happens is told it.
     :ivar stage: what the goal in progress is doing, '' without one.
     """
 
-    def __init__(self, node: 'Node', told: Callable[[str], object],
-                 failed: Callable[[str, bool], object],
-                 answered: 'Callable[[PredictSubgoal.Response], object]',
-                 photographed: Callable[[], object]) -> None:
-        self._node, self._told, self._failed = node, told, failed
-        self._answered, self._photographed = answered, photographed
+    def __init__(self, node: 'ExplorerNode') -> None:
+        self._node = node
         self._client = Client(node=node, timeout_s=TIMEOUT_S)
         self._lock = threading.Lock()
         self._waiting = 0
@@ -113,7 +112,7 @@ class ExplorerCalls:
         return self._running
 
     def offered(self, service: str) -> bool:
-        """Return whether the simulator offers a service, 'reset' or 'set_goal'."""
+        """Return whether a node offers a service, such as 'reset', 'set_goal' and 'select'."""
         return self._client.is_ready(service)
 
     def do(self, text: str | bytes) -> None:
@@ -157,12 +156,12 @@ class ExplorerCalls:
         try:
             getattr(self, f'_{do}')(**fields)
         except TapError as error:
-            self._failed(escaped(error, 1000), False)
+            self._node.complain(escaped(error, 1000), False)
         except Exception as error:
             if self._ending:  # the node is being taken down
                 return
             log_error(self._node, do, error)
-            self._failed(internal_error(error), True)
+            self._node.complain(internal_error(error), True)
         finally:
             with self._lock:
                 self._waiting -= 1
@@ -171,28 +170,44 @@ class ExplorerCalls:
 
     def _reset(self, task: str, seed: int) -> None:
         response = self._client.call('reset', give_up=self._is_ending, task=task, seed=seed)
-        self._told(f'reset: {escaped(response.message)}')
+        self._node.tell(f'reset: {escaped(response.message)}')
         if task in PREDICTORS and self._client.is_ready('predict'):
             weights = self._client.weights()
             if weights not in PREDICTORS:
-                self._told(f'the predictor keeps {escaped(weights)}, which may not know {task}')
+                self._node.tell(
+                    f'the predictor keeps {escaped(weights)}, which may not know {task}')
             elif weights != task and not weights.startswith(f'{task}_'):
                 self._client.use_weights(task)
-                self._told(f'the predictor has the weights of {task} now')
+                self._node.tell(f'the predictor has the weights of {task} now')
+
+    def _select(self, objects: list[dict[str, Any]]) -> None:
+        response = self._client.call(
+            'select', give_up=self._is_ending, names=[one['name'] for one in objects],
+            u=[float(one['u']) for one in objects], v=[float(one['v']) for one in objects])
+        self._node.show_selection(response, followed=True)
+        self._node.tell(f'following {listing(one.name for one in response.objects)}')
+
+    def _propose(self) -> None:
+        response = self._client.call('select', give_up=self._is_ending, propose=True)
+        self._node.show_selection(response, followed=False)
+        self._node.tell(f'{len(response.objects)} objects proposed')
 
     def _move(self, name: str, u: float, v: float) -> None:
-        self._client.set_goal({name: (u, v)})
-        self._told(f'goal: {escaped(name)} to pixel {u:.1f}, {v:.1f}')
+        if simulated := self._node.simulated(name, u, v):
+            self._client.set_goal(simulated)
+        else:
+            self._node.place(name, u, v)
+        self._node.tell(f'goal: {escaped(name)} to pixel {u:.1f}, {v:.1f}')
 
     def _photograph(self) -> None:
-        self._photographed()
-        self._told('goal: what the camera sees now')
+        self._node.photograph()
+        self._node.tell('goal: what the camera sees now')
 
     def _predict(self, samples: int, levels: int, seed: int) -> None:
         response = self._client.call('predict', give_up=self._is_ending, num_samples=samples,
                                      recursion_depth=levels, seed=seed)
-        self._answered(response)
-        self._told(f'predicted in {response.model_time_ms:.0f} ms: '
+        self._node.show_answer(response)
+        self._node.tell(f'predicted in {response.model_time_ms:.0f} ms: '
                    f'{escaped(response.message, 300)}')
 
     def _reach(self, mode: str, samples: int, levels: int, seed: int) -> None:
@@ -207,10 +222,10 @@ class ExplorerCalls:
             self._goal = goal
         if self._is_cancelled():  # meanwhile
             goal.cancel()
-        self._told(f'{words}: begun')
+        self._node.tell(f'{words}: begun')
         result = goal.result()
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
-        self._told(f'{words}: {end} ({result.steps} steps)')
+        self._node.tell(f'{words}: {end} ({result.steps} steps)')
 
     def _is_cancelled(self) -> bool:
         return self._cancelled

@@ -51,7 +51,8 @@ def run(args: Options) -> None:
     folder = new_folder(args.logs)
     with NodeProcesses(folder) as processes:
         # In lock-step a scene waits for those who look at it, however slow the machine is.
-        processes.start('sim_node', lock_step=True, task=args.task, seed=args.seed, look=args.look)
+        processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,
+                        look=args.look)
         processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
                         else DEFAULT_PREDICTOR)
         processes.start('visual_mpc_node')
