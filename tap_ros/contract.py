@@ -49,6 +49,7 @@ NODE_MODULES = {
     'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
     'recorder_node': 'tap_ros.nodes.recorder_node',
     'robot_mask_node': 'tap_ros.nodes.robot_mask_node',
+    'tracker_node': 'tap_ros.nodes.tracker_node',
     'explorer_node': 'tap_ros.nodes.explorer.node',
 }
 

@@ -18,6 +18,12 @@ from sim_bridge.world_protocol import ability, Observation, World
 from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, OBSERVER_FRAME, WORLD_FRAME
+from tap_ros.messages.topics import (
+    GOAL_OBJECTS,
+    OBJECTS,
+    TRUE_GOAL_OBJECTS,
+    TRUE_OBJECTS,
+)
 from tap_ros.nodes.ros_messages import (
     encode_camera_info,
     encode_image,
@@ -42,12 +48,15 @@ class ScenePublishers:
     :param node: rclpy Node.
     :param world: World; its arm is described once, for those who come later, too.
     :param observer: publish observer/image_raw, a view from the side, as well.
+    :param tracked: publish objects and goal/objects under truth/: others tell of them.
     """
 
-    def __init__(self, node: Node, world: World, observer: bool) -> None:
+    def __init__(self, node: Node, world: World, observer: bool, tracked: bool) -> None:
         self._newest: dict[str, Any] = {}  # topic -> the message sent last
         streams = STREAMS | ({'observer/image_raw': Image} if observer else {})
-        self._publishers = {topic: node.create_publisher(kind, topic, qos)
+        names = {one.name: true.name for one, true in (
+            (OBJECTS, TRUE_OBJECTS), (GOAL_OBJECTS, TRUE_GOAL_OBJECTS))} if tracked else {}
+        self._publishers = {topic: node.create_publisher(kind, names.get(topic, topic), qos)
                             for kinds, qos in ((streams, STREAM), (GOAL, LATCHED))
                             for topic, kind in kinds.items()}
         self._observer = observer

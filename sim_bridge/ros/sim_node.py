@@ -82,7 +82,8 @@ class SimNode(Node):
         self._played_at = 0.0  # monotonic time at which it was set so
         self._diagnostics = Diagnostics(
             self, {'arm/delta_twist_cmds': math.inf, 'gripper/command': math.inf})
-        self._topics = ScenePublishers(self, self._sim, self.params['observer'])
+        self._topics = ScenePublishers(
+            self, self._sim, self.params['observer'], self.params['objects'] == 'tracked')
         self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
         self._episode = self.create_publisher(Episode, 'episode', STREAM)
         # Subscribed before the twist, so that of two commands sent together it is taken first.
@@ -380,6 +381,10 @@ def declare_parameters(node: Node) -> Parameters:
         'the seed of each scene.', choices=list(CHOICES))
     parameters.declare(
         'observer', False, 'Publish observer/image_raw, a view from the side for people.')
+    parameters.declare(
+        'objects', 'truth', 'Where the objects of all nodes come from: objects and goal/objects '
+        'are the ground truth, or tracker_node\'s, and the truth is on truth/objects and '
+        'truth/goal/objects (tracked).', choices=('truth', 'tracked'))
     parameters.declare(
         'lock_step', False,
         'True: each twist command lets one control period pass, so that runs repeat exactly. '

@@ -62,13 +62,16 @@ GOAL_IMAGE = Topic('goal/image', IMAGE_TYPE, 'goal', latched=True, compressed=Tr
 GOAL_ROBOT_MASK = Topic('goal/robot_mask', IMAGE_TYPE, 'goal_mask', latched=True,
                         compressed=True)
 GOAL_OBJECTS = Topic('goal/objects', 'tap_msgs/msg/ObjectStates', 'goal_object', latched=True)
+# What a simulator knows where the objects are tracked: to measure only.
+TRUE_OBJECTS = Topic(f'truth/{OBJECTS.name}', OBJECTS.type)
+TRUE_GOAL_OBJECTS = Topic(f'truth/{GOAL_OBJECTS.name}', OBJECTS.type, latched=True)
 EPISODE = Topic('episode', 'tap_msgs/msg/Episode', 'mark')
 CLOCK = Topic('clock', 'rosgraph_msgs/msg/Clock')
 MODEL_CARDS = tuple(Topic(f'{node}/model_card', 'std_msgs/msg/String', latched=True)
                     for node in ('predictor_node', 'visual_mpc_node'))
 TOPICS = (
     IMAGE, ROBOT_MASK, CAMERA_INFO, OBJECTS, JOINT_STATES, TWIST, GRIPPER_COMMAND, GOAL_IMAGE,
-    GOAL_ROBOT_MASK, GOAL_OBJECTS, EPISODE, CLOCK,
+    GOAL_ROBOT_MASK, GOAL_OBJECTS, TRUE_OBJECTS, TRUE_GOAL_OBJECTS, EPISODE, CLOCK,
     Topic('subgoal', 'tap_msgs/msg/Subgoal', latched=True),
     Topic('subgoal/image', IMAGE_TYPE, latched=True),
     Topic('subgoal/overlay', IMAGE_TYPE, latched=True),

@@ -253,19 +253,29 @@ class Client:
 
     # Simulator and recorder
 
-    def reset(self, task: str = 'push2', seed: int = 0,
-              hide_arm: bool = False) -> tuple[View, View]:
+    def reset(self, task: str = 'push2', seed: int = 0, hide_arm: bool = False,
+              objects: bool = True) -> tuple[View, View]:
         """
         Start a scene in the simulator.
 
+        :param objects: wait for the objects, too; not where they are yet to be selected.
         :return: the first view of the camera, and the goal.
         :raises CallError: when the simulator refuses, or shows nothing.
         """
         self._views('goal')  # subscribed before something comes
-        before = self.camera().stamp_ns
+        before = self.camera(objects=objects).stamp_ns
         self.call('reset', task=task, seed=seed, hide_arm=hide_arm)
-        goal = self.goal(before)
-        return self.camera(goal.stamp_ns - 1), goal
+        goal = self.goal(before, objects)
+        return self.camera(goal.stamp_ns - 1, objects), goal
+
+    def select(self, pixels: Mapping[str, Sequence[float]]) -> None:
+        """
+        Have the tracker follow other objects {name: (u, v)}, clicked in the newest picture.
+
+        :raises CallError: with the reason, such as a click on the robot; then nothing changes.
+        """
+        u, v = np.reshape(list(pixels.values()), (-1, 2)).astype(float).T.tolist()
+        self.call('select', names=list(pixels), u=u, v=v)
 
     def set_goal(self, pixels: Mapping[str, Sequence[float]]) -> None:
         """Have the simulator put the goal of objects {name: (u, v)} elsewhere."""

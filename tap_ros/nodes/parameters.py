@@ -7,6 +7,7 @@ from dataclasses import replace
 import math
 from typing import Any
 
+import numpy as np
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -16,6 +17,7 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from scipy.spatial.transform import Rotation
 from tap_ros.errors import ConfigError
 from tap_ros.plugins import names
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
@@ -127,6 +129,35 @@ def declare_mount(parameters: Parameters, arm: str) -> None:
                        low=-2 * math.pi, high=2 * math.pi)
     parameters.declare('tool_length', default.tool,
                        'From the flange to the fingertips along its z, m.', low=0.0, high=2.0)
+
+
+def declare_camera(parameters: Parameters, frame: str) -> None:
+    """Declare the pose of the camera in a frame, and what counts of its camera_info."""
+    for axis in 'xyz':
+        parameters.declare(f'camera_{axis}', 0.0, f'{axis} of the camera in {frame}, m.',
+                           low=-100.0, high=100.0)
+    for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
+        parameters.declare(
+            f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
+            f'optical frame (z forward, x right, y down in the picture) into {frame}.',
+            low=-1.0, high=1.0)
+    parameters.declare('rectified', False,
+                       'The pictures are rectified: P of camera_info counts, else K.')
+
+
+def camera_pose(parameters: Parameters) -> np.ndarray:
+    """
+    Return the pose (4, 4) of the camera, by the parameters of declare_camera.
+
+    :raises ConfigError: for a quaternion of length 0.
+    """
+    quaternion = [parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')]
+    if np.linalg.norm(quaternion) < 0.1:
+        raise ConfigError('parameters camera_qx to camera_qw: a quaternion of no direction')
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
+    pose[:3, 3] = [parameters[f'camera_{axis}'] for axis in 'xyz']
+    return pose
 
 
 def declare_opening(parameters: Parameters) -> None:

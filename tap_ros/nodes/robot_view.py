@@ -16,10 +16,10 @@ from tap_ros.nodes.parameters import Parameters
 from tap_ros.training.robot_mask import FreeView, RobotMask
 
 
-def declare_robot_mask(parameters: Parameters) -> None:
+def declare_robot_mask(parameters: Parameters, usual: RobotMask = 'none') -> None:
     """Declare the parameter robot_mask of a node."""
     parameters.declare(
-        'robot_mask', 'none',
+        'robot_mask', usual,
         'What camera/robot_mask takes out of the pictures: nothing (none), the arm with its '
         'shadow (arm), or the whole robot (all). What was seen there free last takes its place.',
         choices=ROBOT_MASKS)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
@@ -21,7 +20,13 @@ from tap_ros.messages.joints import JointHistory
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import reception_time
-from tap_ros.nodes.parameters import declare_mount, declared_mount, Parameters
+from tap_ros.nodes.parameters import (
+    camera_pose,
+    declare_camera,
+    declare_mount,
+    declared_mount,
+    Parameters,
+)
 from tap_ros.nodes.ros_messages import encode_mask
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
@@ -185,19 +190,10 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('hand_radius', 0.06,
                        'With a named arm: radius of a cylinder around the hand, from the flange '
                        'to the fingertips, m.', low=0.001, high=1.0)
-    for axis in 'xyz':
-        parameters.declare(f'camera_{axis}', 0.0,
-                           f'{axis} of the camera in base_frame, m.', low=-100.0, high=100.0)
-    for axis, value in zip(('qx', 'qy', 'qz', 'qw'), (1.0, 0.0, 0.0, 0.0)):
-        parameters.declare(
-            f'camera_{axis}', value, f"{axis[1]} of the quaternion that turns the camera's "
-            'optical frame (z forward, x right, y down in the picture) into base_frame.',
-            low=-1.0, high=1.0)
+    declare_camera(parameters, 'base_frame')
     parameters.declare('base_frame', '',
                        'Link of the robot in which the pose of the camera is given; empty: its '
                        'root.')
-    parameters.declare('rectified', False,
-                       'The pictures are rectified: P of camera_info counts, else K.')
     parameters.declare('dilation', 1.0,
                        'Pixels by which the mask is larger than the shapes on all sides.',
                        low=0.0, high=100.0, read_only=False)
@@ -254,21 +250,6 @@ def declared_light(parameters: Parameters) -> Light | None:
         raise ConfigError(f'parameter light_z: is {direction[2]:g}; expected less than 0: light '
                           'shines down')
     return Light(direction, parameters['table_height'])
-
-
-def camera_pose(parameters: Parameters) -> np.ndarray:
-    """
-    Return the pose (4, 4) of the camera in base_frame.
-
-    :raises ConfigError: for a quaternion of length 0.
-    """
-    quaternion = [parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')]
-    if np.linalg.norm(quaternion) < 0.1:
-        raise ConfigError('parameters camera_qx to camera_qw: a quaternion of no direction')
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    pose[:3, 3] = [parameters[f'camera_{axis}'] for axis in 'xyz']
-    return pose
 
 
 def main(args: list[str] | None = None) -> int:

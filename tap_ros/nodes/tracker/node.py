@@ -1,0 +1,437 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Follows objects that were clicked once in the camera's pictures: objects and goal/objects."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+import math
+import threading
+import time
+from typing import Any
+
+from geometry_msgs.msg import Point32, Polygon
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, JointState
+from tap_msgs.msg import Episode, ObjectStates
+from tap_msgs.srv import SelectObjects
+from tap_ros.contract import WORLD_FRAME
+from tap_ros.errors import ImageError, KinematicsError, TapError, TrackingError
+from tap_ros.messages.images import decode_camera_info, decode_image, decode_mask, is_empty
+from tap_ros.messages.joints import GripperHistory
+from tap_ros.messages.objects import decode_objects
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.topics import CAMERA_INFO, JOINT_STATES
+from tap_ros.nodes.diagnostics import Diagnostics
+from tap_ros.nodes.observations import Moment, Observations, reception_time
+from tap_ros.nodes.parameters import (
+    camera_pose,
+    declare_arm,
+    declare_camera,
+    declare_opening,
+    declare_transport,
+    declared_arm,
+    Parameters,
+)
+from tap_ros.nodes.robot_view import declare_robot_mask
+from tap_ros.nodes.ros_messages import encode_objects
+from tap_ros.nodes.run import run_node
+from tap_ros.nodes.services import answering, log_error
+from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
+from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, SERVICE_QOS, STREAM
+from tap_ros.plugins import load_plugin, names
+from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.text import escaped, listing
+from tap_ros.tracking.plane import MIDDLE, Plane
+from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, Tracker, View
+from tap_ros.training.robot_mask import hidden_pixels
+
+STALE_S = 2.0  # s without a message after which diagnostics call an input stale
+PATIENCE_S = 0.1  # s that the joints of a picture, or the robot mask of a goal, may come after it
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Objects that are followed, and what was said of them last."""
+
+    names: tuple[str, ...]  # K
+    tracker: Tracker
+    plane: Plane | None  # None: the camera is not calibrated
+    size: tuple[int, int]  # (height, width) of its pictures
+    selected_ns: int  # stamp of the picture in which they were clicked
+    jumps: int  # of the clock of the stamps until then
+    publishers: dict[str, int]  # of each topic then
+    stamp_ns: int  # of the newest picture in which they were followed
+    received: float  # s, monotonic: when that picture was received
+    tracked: Tracked
+    message: ObjectStates
+    goal_ns: int | None = None  # stamp of the goal picture in which they were searched
+
+
+class TrackerNode(Node):
+    """
+    Follows the objects of the last select_objects in every picture, and finds them in that of a goal.
+
+    A thread of its own does, and takes the newest picture whenever it is done with one. A picture
+    that is sent again while time stands still, as in lock-step, is answered again.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('tracker_node', **options)
+        self.params = declare_parameters(self)
+        self._make = load_plugin('tap_ros.trackers', self.params['tracker'])
+        self._pose = camera_pose(self.params)
+        self._lock = threading.RLock()  # of what follows
+        self._selection: Selection | None = None
+        self._info: CameraInfo | None = None
+        self._begun = 0, 0  # stamp at which the newest scene known of began; jumps until then
+        self._told_goal = False  # goal/objects has objects
+        self._gripper = GripperHistory(
+            declared_arm(self.params), self.params['joint_prefix'], self.params['fixed_opening'])
+        camera = {name: topic for name, topic in camera_topics(self.params).items()
+                  if name != 'objects'}
+        goal = {name: topic for name, topic in goal_topics(self.params['robot_mask']).items()
+                if name != 'objects'}
+        self._diagnostics = Diagnostics(self, {
+            **{name: STALE_S for _, name in camera.values()},
+            CAMERA_INFO.name: math.inf, JOINT_STATES.name: math.inf,
+            **{name: math.inf for _, name in goal.values()}}, idle=self._why_not)
+        received = self._diagnostics.received
+        self._topics = tuple(camera)
+        self._sensors, self._goals = Observations(*camera), Observations(*goal, latched=True)
+        self._objects = self.create_publisher(ObjectStates, 'objects', STREAM)
+        self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
+        self.create_subscription(Clock, 'clock', self._on_clock, qos_profile_sensor_data)
+        self._sensors.subscribe(self, camera, STREAM, on_message=received)
+        self._goals.subscribe(self, goal, LATCHED, on_message=self._on_goal)
+        adapt_regularly(self, [
+            AdaptiveSubscription(self, CameraInfo, CAMERA_INFO.name, self._on_info, STREAM),
+            AdaptiveSubscription(self, JointState, JOINT_STATES.name, self._on_joints, STREAM),
+            AdaptiveSubscription(self, Episode, 'episode', self._on_episode, STREAM)])
+        self.create_service(SelectObjects, 'select_objects', answering(self, self._on_select),
+                            qos_profile=SERVICE_QOS)
+        self._closed = False
+        self._thread = threading.Thread(target=self._follow, name='follow', daemon=True)
+        self._thread.start()
+        self.get_logger().info(f'ready: {self.params["tracker"]}, call select_objects')
+
+    def close(self) -> None:
+        """Let the thread end."""
+        self._closed = True
+        self._sensors.wake()
+        self._thread.join(5.0)
+
+    # What comes
+
+    def _on_clock(self, message: Clock) -> None:
+        self._sensors.tell_time(to_nanoseconds(message.clock))
+
+    def _on_goal(self, topic: str) -> None:
+        self._diagnostics.received(topic)
+        self._sensors.wake()
+
+    def _on_info(self, message: CameraInfo) -> None:
+        self._diagnostics.received(CAMERA_INFO.name)
+        self._info = message
+
+    def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
+        self._diagnostics.received(JOINT_STATES.name)
+        with suppress(TapError):  # then the gripper is not known, which a tracker can do without
+            self._gripper.take(message, reception_time(info), self._sensors.time_stands)
+        self._sensors.wake()
+
+    def _on_episode(self, message: Episode) -> None:
+        if message.event != Episode.START:
+            return
+        begun_ns = to_nanoseconds(message.header.stamp)
+        with self._lock:
+            self._begun = begun_ns, self._sensors.jumps
+            if self._selection is not None and begun_ns > self._selection.selected_ns:
+                self._forget('a new episode has begun')
+
+    def _on_select(self, request: SelectObjects.Request,
+                   response: SelectObjects.Response) -> SelectObjects.Response:
+        with self._lock:
+            moment, view = self._newest()
+            plane, camera = self._calibration(view.image.shape[:2])
+            if request.propose:
+                tracked = self._propose(view, camera)
+                found = [f'object_{k + 1}' for k in range(len(tracked.pixels))]
+                response.message = f'{len(found)} things differ in the goal picture'
+            else:
+                tracked = self._select(request, moment, view, plane, camera)
+                found = list(request.names)
+                response.message = f'following {listing(found)}'
+            response.objects = self._encode(
+                found, tracked, plane, moment.messages['image'].header).objects
+        response.outlines = [Polygon(points=[
+            Point32(x=float(u), y=float(v)) for u, v in outline]) for outline in tracked.outlines]
+        response.success = True
+        return response
+
+    def _select(self, request: SelectObjects.Request, moment: Moment, view: View,
+                plane: Plane | None, camera: PinholeCamera | None) -> Tracked:
+        """
+        Follow other objects from a picture on.
+
+        :raises TapError: for names or clicks that cannot be used; then nothing changes.
+        """
+        found, clicks = self._asked(request, view.image.shape[:2])
+        rivals = self.count_publishers('objects') - 1
+        if rivals > 0:
+            raise TrackingError(
+                f'{rivals} other nodes publish on {self.resolve_topic_name("objects")}; end '
+                'them, or start the simulator with objects:=tracked')
+        tracker: Tracker = self._make(camera)
+        tracked = tracker.select(view, clicks)
+        message = self._encode(found, tracked, plane, moment.messages['image'].header)
+        self._selection = Selection(
+            found, tracker, plane, view.image.shape[:2], moment.stamp_ns, self._sensors.jumps,
+            self._publishers(), moment.stamp_ns, moment.received, tracked, message)
+        self._objects.publish(message)
+        self._sensors.wake()  # for the goal
+        self.get_logger().info(f'following {listing(found)}')
+        return tracked
+
+    def _propose(self, view: View, camera: PinholeCamera | None) -> Tracked:
+        """
+        Return what differs between a picture and the goal picture.
+
+        :raises TapError: without a goal picture, and for a tracker that proposes nothing.
+        """
+        goal = self._goals.moment(('image',))
+        if goal is None or is_empty(goal.messages['image']):
+            raise TrackingError(
+                f'nothing has come on {self._goals.names(["image"], explained=True)}; without a '
+                'goal picture nothing can be proposed')
+        tracker = self._make(camera)
+        if not hasattr(tracker, 'propose'):
+            raise TrackingError(f'tracker {self.params["tracker"]} proposes nothing; click on '
+                                'each object')
+        return tracker.propose(view, self._goal_view(goal, view.image.shape[:2]))
+
+    def _asked(self, request: SelectObjects.Request,
+               size: tuple[int, int]) -> tuple[tuple[str, ...], np.ndarray]:
+        """Return names and clicks (K, 2) of a request; TapError for those that are of no use."""
+        if not request.names or not len(request.names) == len(request.u) == len(request.v):
+            raise TrackingError(
+                f'names, u and v have {len(request.names)}, {len(request.u)} and '
+                f'{len(request.v)} entries; expected as many of each, at least one')
+        clicks = np.column_stack([request.u, request.v])
+        asked = encode_objects(request.names, clicks, unknown_poses(len(clicks)), 0, '',
+                               ObjectStates.SOURCE_TRACKED)
+        return decode_objects(asked, 'select_objects', size)
+
+    # What is known of a picture
+
+    def _newest(self) -> tuple[Moment, View]:
+        """Return the newest picture; TrackingError where there is none of this scene."""
+        moment = self._sensors.moment(self._topics)
+        begun_ns, jumps = self._begun
+        if moment is None:
+            missing = self._sensors.missing(self._topics)
+            raise TrackingError(
+                f'nothing has come on {self._sensors.names(missing, explained=True)}' if missing
+                else f'no messages of the same stamp on {self._sensors.names(self._topics)}')
+        if moment.stamp_ns < begun_ns and jumps == self._sensors.jumps:
+            raise TrackingError('no picture of the new episode has come yet; click again')
+        return moment, self._view(moment)
+
+    def _view(self, moment: Moment) -> View:
+        """Return what a picture shows, with the gripper where it is known by now."""
+        picture = decode_image(moment.messages['image'], 'camera/image_raw')
+        gripper = None
+        with suppress(KinematicsError):
+            gripper, _ = self._gripper.at(moment.stamp_ns, self.params['max_silence'])
+        return View(picture, self._mask(moment, 'camera/robot_mask', picture), gripper)
+
+    def _goal_view(self, goal: Moment, size: tuple[int, int]) -> View:
+        """Return what a goal picture shows; ImageError for one of another size."""
+        picture = decode_image(goal.messages['image'], 'goal/image', size)
+        return View(picture, self._mask(goal, 'goal/robot_mask', picture))
+
+    def _mask(self, moment: Moment, name: str, picture: np.ndarray) -> np.ndarray | None:
+        """Return the robot mask of a picture, None where there is none."""
+        if 'mask' not in moment.messages:
+            return None
+        mask = decode_mask(moment.messages['mask'], name, picture.shape[:2])
+        return np.where(hidden_pixels(mask, self.params['robot_mask']), mask, 0)
+
+    def _calibration(self, size: tuple[int, int]) -> tuple[Plane | None, PinholeCamera | None]:
+        """
+        Return the calibrated camera for pictures of a size (height, width); None without a pose.
+
+        :raises ImageError: for a camera_info that is missing, or not that of these pictures.
+        """
+        if not self.params['camera_z']:
+            return None, None
+        if self._info is None:
+            raise ImageError('nothing has come on camera/camera_info; publish it, or leave '
+                             'camera_z at 0: not calibrated')
+        K, found = decode_camera_info(self._info, self.params['rectified'])
+        if found != size:
+            raise ImageError('camera/camera_info: is of pictures of {1}x{0} pixels; they have '
+                             '{3}x{2}'.format(*found, *size))
+        camera = PinholeCamera(K, size, self._pose)
+        return Plane(camera, size), camera
+
+    # Following
+
+    def _follow(self) -> None:
+        """Follow until the node ends; runs in a thread of its own."""
+        while not self._closed:
+            count = self._sensors.count
+            for look in (self._look_at_camera, self._look_at_goal):
+                try:
+                    with self._lock:
+                        if self._selection is not None:
+                            look(self._selection)
+                except TapError as error:
+                    self._diagnostics.error(error)
+                    self.get_logger().error(escaped(error, 1000), throttle_duration_sec=5.0)
+                except Exception as error:  # this thread must not end
+                    self._diagnostics.error(error)
+                    log_error(self, 'following', error)
+            self._sensors.wait_for_change(0.1, count)
+
+    def _look_at_camera(self, selection: Selection) -> None:
+        """Follow the objects in the newest picture."""
+        changed = self._other_scene(selection)
+        if changed:
+            self._forget(changed)
+            return
+        moment = self._sensors.moment(self._topics)
+        if moment is None or moment.stamp_ns < selection.stamp_ns:
+            return
+        if moment.stamp_ns == selection.stamp_ns:
+            if moment.received > selection.received:  # sent again
+                self._objects.publish(selection.message)
+                self._selection = replace(selection, received=moment.received)
+            return
+        view = self._view(moment)
+        if (view.gripper is None and self._gripper.received > -math.inf
+                and time.monotonic() - moment.received < PATIENCE_S):
+            return  # its joints may come
+        begin = time.perf_counter()
+        tracked = selection.tracker.update(view)
+        self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'track')
+        message = self._encode(
+            selection.names, tracked, selection.plane, moment.messages['image'].header)
+        self._objects.publish(message)
+        self._tell(selection, tracked)
+        self._selection = replace(
+            selection, stamp_ns=moment.stamp_ns, received=moment.received, tracked=tracked,
+            message=message)
+
+    def _look_at_goal(self, selection: Selection) -> None:
+        """Find the objects in the goal picture, if that is another one."""
+        goal = self._goals.moment(('image',))
+        if goal is None or goal.stamp_ns == selection.goal_ns:
+            return
+        masked = self.params['robot_mask'] != 'none' and 'mask' not in goal.messages
+        if masked and time.monotonic() - goal.received < PATIENCE_S:
+            return  # its mask may come
+        self._selection = replace(selection, goal_ns=goal.stamp_ns)
+        header = goal.messages['image'].header
+        if is_empty(goal.messages['image']):  # it was taken back
+            self._goal_objects.publish(ObjectStates(header=header))
+            return
+        begin = time.perf_counter()
+        found = selection.tracker.find(self._goal_view(goal, selection.size))
+        self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'find')
+        lost = np.array(found.states) == LOST
+        # What is not found is to be placed, beginning where it is now.
+        pixels = np.where(lost[:, None], selection.tracked.pixels, found.pixels)
+        message = self._encode(
+            selection.names, replace(found, pixels=pixels), selection.plane, header)
+        self._goal_objects.publish(message)
+        self._told_goal = True
+        if lost.any():
+            missing = listing([selection.names[k] for k in np.flatnonzero(lost)])
+            self.get_logger().warning(f'goal/image: {missing} not found: place it, in the '
+                                      'explorer or by goal_objects of reach_goal')
+
+    def _other_scene(self, selection: Selection) -> str:
+        """Say in what way the camera shows another scene than that of a selection, '' if not."""
+        if self._sensors.jumps != selection.jumps:
+            return 'the clock of its pictures has jumped: another camera, simulator or recording'
+        for topic, count in self._publishers().items():
+            if count > max(selection.publishers[topic], 1):
+                return f'{count} nodes publish on {self.resolve_topic_name(topic)} now'
+        return ''
+
+    def _publishers(self) -> dict[str, int]:
+        """Return how many nodes publish each topic of which there may be but one publisher."""
+        topics = [name for _, name in camera_topics(self.params).values()]
+        return {topic: self.count_publishers(topic) for topic in topics}
+
+    def _forget(self, why: str) -> None:
+        """Follow nothing any more."""
+        assert self._selection is not None
+        stamp_ns = self._selection.goal_ns
+        self._selection = None
+        if self._told_goal:
+            goal = encode_objects((), (), (), stamp_ns or 0, '', ObjectStates.SOURCE_TRACKED)
+            self._goal_objects.publish(goal)
+            self._told_goal = False
+        self.get_logger().warning(
+            f'the selected objects are forgotten: {why}; select them again')
+
+    def _why_not(self) -> str:
+        """Say why nothing is followed, '' if something is."""
+        return '' if self._selection is not None else (
+            'no objects are selected; call select_objects')
+
+    def _tell(self, selection: Selection, tracked: Tracked) -> None:
+        """Log which objects are known less well than before, and which well again."""
+        usual = (SEEN, HIDDEN)
+        for name, before, now in zip(selection.names, selection.tracked.states, tracked.states):
+            if now != before and not {before, now} <= {*usual}:
+                log = self.get_logger().info if now in usual else self.get_logger().warning
+                log(f'{escaped(name)} is {now}')
+
+    def _encode(self, found: Sequence[str], tracked: Tracked, plane: Plane | None,
+                header: Any) -> ObjectStates:
+        """Return the message about objects in a picture of this header."""
+        poses = unknown_poses(len(found))
+        if plane is not None:
+            poses[:, :2] = plane.of_middle(plane.shrink(tracked.pixels))
+            poses[:, 2] = MIDDLE
+            poses[np.array(tracked.states) == LOST] = np.nan
+        return encode_objects(
+            found, tracked.pixels, poses, header.stamp,
+            header.frame_id if plane is None else WORLD_FRAME, ObjectStates.SOURCE_TRACKED,
+            tracked.states, tracked.confidence)
+
+
+def unknown_poses(count: int) -> np.ndarray:
+    """Return poses (count, 7) of which nothing is known."""
+    return np.full((count, 7), np.nan)
+
+
+def declare_parameters(node: Node) -> Parameters:
+    """Declare the parameters of the node."""
+    parameters = Parameters(node)
+    parameters.declare('tracker', 'rigid', 'What follows the objects: their shapes on the table '
+                       '(rigid), the forward model that plans (carried), or a tracker of another '
+                       'package.', choices=names('tap_ros.trackers'))
+    declare_transport(parameters)
+    declare_robot_mask(parameters, 'all')
+    declare_camera(parameters, f'{WORLD_FRAME}, with camera_z 0: not calibrated')
+    declare_arm(parameters)
+    declare_opening(parameters)
+    parameters.declare('joint_prefix', '',
+                       "What the names of the arm's joints begin with, before "
+                       'shoulder_pan_joint and so on.')
+    parameters.declare('max_silence', 0.35,
+                       'Seconds; of a picture without joint states nearer to it than this the '
+                       'gripper is not known.', low=0.05, high=60.0, read_only=False)
+    return parameters
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; the answer is the exit code of the process."""
+    return run_node(TrackerNode, 'tracker_node', args)
