@@ -8,25 +8,15 @@ same.
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
+from experiments.planning.following import Follower
 import numpy as np
-from sim_bridge.simulator import Simulator
-from sim_bridge.world.looks import LOOKS
-from tap_ros.contract import GOAL_TOLERANCE, ROBOT_MASK_FREE
+from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError, TrackingError
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
-from tap_ros.plugins import load_plugin
-from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.text import listing
-from tap_ros.tracking.protocols import LOST, View
 from tap_ros.training.robot_mask import FreeView, trained_robot_mask
-
-CAMERA_SIZE = 256  # px, what objects are followed in
-CLICK_ERROR = 1.35  # px of 64, mean distance of a click from the middle of an object
-CLICKS = 5  # at most
 
 
 @dataclass
@@ -43,6 +33,7 @@ class PlannedEpisode:
     tracked: np.ndarray  # (steps + 1, K, 2) pixels that the planner was given
     subgoals: list  # prediction.predictor.Subgoal
     refused: str  # why nothing was planned: objects that were not found; '' if it was
+    aborted: str  # why the loop gave up before the goal or the end of its budget, '' if not
 
     @property
     def frames(self):
@@ -74,115 +65,46 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
         raise ConfigError(f'method {method.name!r} needs a predictor; load one, or use direct')
     start = seen = simulator.reset(seed)
     goal = simulator.goal()
-    clicked, refused = None, ''
-    if method.tracking == 'rigid':
-        try:
-            clicked = ClickedObjects(simulator, seen, seed)
-            seen, goal = clicked.seen, clicked.find(goal)
-        except TrackingError as error:
-            refused = str(error)
     view = FilledView(getattr(mpc.model, 'robot_mask', 'none'))
     asked = FilledView(shown_mask(predictor) if method.predicted else 'none')
-    subgoals = []
-    follower = mpc.model if method.tracking == 'carried' else None
-    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, follower,
-                                   rounds=method.rounds), seed)
-    observations, distances, actions, times = [start], [simulator.distances()], [], []
-    tracked = []
+    subgoals, refused, aborted = [], '', ''
+    reach = Reach(mpc, ReachConfig(step_budget, method.switch, reached, rounds=method.rounds),
+                  seed)
+    observations, distances, actions, times = [seen], [simulator.distances()], [], []
+    tracked, states, true_goal, follower = [], (), goal, None
+    if method.tracking != 'ground_truth':
+        follower = Follower(method.tracking, simulator)
+        try:
+            seen, states = follower.select(seen, seed)
+            goal = follower.find(goal)
+        except TrackingError as error:
+            refused = str(error)
     while method.base != 'nothing' and not refused:
+        tracked.append(seen.object_pixels)
         shown, start_picture = view.see(seen), asked.see(seen).image
-        answer = reach.step(as_seen(shown))
+        answer = reach.step(as_seen(shown, states))
         while isinstance(answer, Aim):
             pictures = start_picture, asked.fill(goal).image, shown.image
             targets, found = make_targets(
-                simulator, mpc, method, replace(seen, object_pixels=answer.seen.pixels),
-                goal, predictor, seed, pictures)
+                simulator, mpc, method, seen, goal, predictor, seed, pictures)
             subgoals += found
             reach.head_for(targets)
-            answer = reach.step(as_seen(shown))
-        tracked.append(reach.pixels)
+            answer = reach.step(as_seen(shown, states))
         if isinstance(answer, End):
+            aborted = answer.message if answer.outcome == 'aborted' else ''
             break
-        observations.append(simulator.step(answer.plan.action))
-        seen = observations[-1] if clicked is None else clicked.follow(observations[-1])
+        seen = simulator.step(answer.plan.action)
         reach.sent()
+        observations.append(seen)
+        if follower is not None:
+            seen, states = follower.see(seen)
         distances.append(simulator.distances())
         actions.append(answer.plan.action)
         times.append(answer.plan.planning_ms)
     return PlannedEpisode(
         np.array(distances), observations, np.array(actions).reshape(-1, 4), np.array(times),
-        goal, reach.targets or [Target(goal.object_pixels)], reach.switches,
-        np.array(tracked or [start.object_pixels]), subgoals, refused)
-
-
-class ClickedObjects:
-    """
-    Observations of one episode with tracked pixels in place of the true ones.
-
-    A click on each object in the first picture is all that comes from the simulator. The tracker
-    is shown CAMERA_SIZE pixels a side, the networks what they were trained on.
-
-    :param simulator: Simulator, just reset.
-    :param seen: Observation, the first.
-    :ivar seen: the same with the pixels of the selected objects.
-    :raises TrackingError: when nothing is found where it was clicked.
-    """
-
-    def __init__(self, simulator, seen, seed):
-        self._simulator = simulator
-        self._camera = _camera(simulator.task_name, next(
-            name for name, look in LOOKS.items() if look is simulator.look))
-        self._scale = CAMERA_SIZE / len(seen.image)
-        self._camera.reset(seed)
-        camera = self._camera
-        self._tracker = load_plugin('tap_ros.trackers', 'rigid')(PinholeCamera(
-            camera.camera_matrix, (CAMERA_SIZE, CAMERA_SIZE), camera.camera_pose))
-        rng = np.random.default_rng([seed, 0])
-        for i in range(CLICKS):  # who is told that a click is of no use clicks again
-            error = rng.normal(0, CLICK_ERROR / np.sqrt(np.pi / 2), seen.object_pixels.shape)
-            try:
-                view = self._view()
-                clicks = (seen.object_pixels + error + 0.5) * self._scale - 0.5
-                self.seen = self._with(
-                    seen, self._tracker.select(view, _beside(clicks, view.robot_mask)))
-                break
-            except TrackingError:
-                if i == CLICKS - 1:
-                    raise
-
-    def follow(self, seen):
-        """Return the Observation of now with tracked pixels."""
-        self._camera.data.qpos[:] = self._simulator.data.qpos
-        return self._with(seen, self._tracker.update(self._view()))
-
-    def find(self, goal):
-        """Return the Observation of the goal with the pixels found in it; TrackingError if not."""
-        picture = self._camera.goal()
-        found = self._tracker.find(View(picture.image, picture.robot_mask, picture.gripper))
-        lost = [name for name, state in zip(goal.object_names, found.states) if state == LOST]
-        if lost:
-            raise TrackingError(f'{listing(lost)} not found in the goal picture')
-        return self._with(goal, found)
-
-    def _view(self):
-        picture = self._camera.observe()
-        return View(picture.image, picture.robot_mask, picture.gripper)
-
-    def _with(self, observation, tracked):
-        pixels = (tracked.pixels + 0.5) / self._scale - 0.5
-        return replace(observation, object_pixels=pixels.astype(np.float32))
-
-
-def _beside(clicks, mask):
-    """Return for each click (K, 2) the nearest pixel that the robot does not hide."""
-    free = np.argwhere(mask == ROBOT_MASK_FREE)[:, ::-1]
-    return np.array([free[((free - click) ** 2).sum(1).argmin()] if len(free) else click
-                     for click in clicks])
-
-
-@lru_cache
-def _camera(task, look):
-    return Simulator(task, CAMERA_SIZE, look)
+        true_goal, reach.targets or [Target(goal.object_pixels)], reach.switches,
+        np.array(tracked or [start.object_pixels]), subgoals, refused, aborted)
 
 
 class FilledView:
@@ -209,10 +131,10 @@ class FilledView:
         return replace(observation, image=fill(observation.image, observation.robot_mask))
 
 
-def as_seen(observation):
-    """Return an Observation of the simulator as reach.Seen."""
+def as_seen(observation, states=()):
+    """Return an Observation of the simulator as reach.Seen, with the states of its objects."""
     return Seen(observation.image, observation.gripper, tuple(observation.object_names),
-                observation.object_pixels, observation.stamp_ns)
+                observation.object_pixels, observation.stamp_ns, states=states)
 
 
 def shown_mask(predictor):

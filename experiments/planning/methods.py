@@ -38,8 +38,7 @@ OPTIONS = {  # option: (field, value; None: the number behind it)
     'half': ('switch', 'half'), 'stalled': ('switch', 'stalled'),  # results have it, plans not
     'recursion': ('recursion', None), 'rounds': ('rounds', None), 'samples': ('samples', None),
     'carried': ('tracking', 'carried'), 'tracked': ('tracking', 'rigid'),
-    'twice': ('search', 'twice'),
-    'steps': ('step_budget', None),
+    'twice': ('search', 'twice'), 'steps': ('step_budget', None),
     **{f'{name}_model': ('model', name) for name in names('tap_ros.forward_models')}}
 SUBGOALS_ONLY = ('switch', 'recursion', 'rounds', 'samples')
 USED = {'true_subgoal': ('switch', 'recursion'), 'oracle_order': ('switch',)}  # of these
@@ -56,8 +55,8 @@ class Method:
     :param rounds: how often subgoals are predicted, see planning.reach.ReachConfig.
     :param samples: subgoals to choose from by the planner's own cost.
     :param tracking: 'ground_truth': object pixels from the simulator at every step; 'carried':
-        only in the first picture, then followed by planning.tracking; 'rigid': clicks in the
-        first picture, then followed, and found in the goal picture, by tap_ros.tracking.
+        only in the first picture and in the goal, then followed by the tracker of this name;
+        'rigid': clicks in the first picture, then followed, and found in the goal picture.
     :param model: name of a forward model, such as 'true', the simulator itself.
     :param search: 'preset'; 'twice': twice the samples, elites and proposals.
     :param step_budget: control periods at most; 0: the task's, see contract.step_budget.

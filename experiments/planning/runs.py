@@ -203,7 +203,8 @@ def run_scene(job, seed):
 
     :return: dict of seed, final_cm (mean over objects), objects_cm and steps; of pushing also
         switches, plan_ms (median) and, without true object pixels, tracking_error_px and why
-        nothing was planned, if so; of stacking success, first_right, moves and seconds.
+        nothing was planned (refused), or no more (aborted), if so; of stacking success,
+        first_right, moves and seconds.
     :raises PlanningError: if it cannot be planned; the message names task, method and scene.
     """
     begin = time.perf_counter()
@@ -222,8 +223,7 @@ def run_scene(job, seed):
                         else None)
     if job.method.tracking != 'ground_truth':
         scene['tracking_error_px'] = round(run.tracking_error(), 3)
-        if run.refused:
-            scene['refused'] = run.refused
+        scene |= {name: why for name in ('refused', 'aborted') if (why := getattr(run, name))}
     return scene
 
 

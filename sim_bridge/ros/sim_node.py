@@ -383,7 +383,7 @@ def declare_parameters(node: Node) -> Parameters:
         'observer', False, 'Publish observer/image_raw, a view from the side for people.')
     parameters.declare(
         'objects', 'truth', 'Where the objects of all nodes come from: objects and goal/objects '
-        'are the ground truth, or tracker_node\'s, and the truth is on truth/objects and '
+        "are the ground truth, or tracker_node's, and the truth is on truth/objects and "
         'truth/goal/objects (tracked).', choices=('truth', 'tracked'))
     parameters.declare(
         'lock_step', False,

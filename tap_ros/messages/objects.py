@@ -11,6 +11,7 @@ from tap_ros.images.crop import Crop
 from tap_ros.images.pixels import in_picture
 from tap_ros.messages.stamps import header_fields, Stamp
 from tap_ros.text import escaped, listing
+from tap_ros.tracking.protocols import LOST, STATES
 
 MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is predicted
 MAX_NAME = 100  # characters
@@ -41,6 +42,34 @@ def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray,
                      'orientation': dict(zip('xyzw', numbers[3:]))}})
     return {'header': header_fields(stamp, frame_id), 'source': source, 'objects': objects,
             'states': list(states), 'confidence': [float(value) for value in confidence]}
+
+
+def decode_states(message: Any, name: str) -> tuple[str, ...]:
+    """
+    Return the states of the objects in a message, in its order; none where it tells none.
+
+    :param message: tap_msgs/ObjectStates.
+    :raises PlanningError: for another number of states than objects, and for unknown ones.
+    """
+    states = tuple(message.states)
+    if states and (len(states) != len(message.objects) or not {*states} <= {*STATES}):
+        raise PlanningError(
+            f'{name}: states are {escaped(listing(states))} of {len(message.objects)} objects; '
+            f'expected none, or one of {", ".join(STATES)} for each object')
+    return states
+
+
+def check_found(message: Any, name: str) -> None:
+    """
+    Refuse objects that were not found.
+
+    :raises PlanningError: naming those whose state is lost.
+    """
+    lost = [state.name for state, known in zip(message.objects, decode_states(message, name))
+            if known == LOST]
+    if lost:
+        raise PlanningError(f'{name}: {listing(lost)} not found in the picture; place it, or '
+                            'select the objects again')
 
 
 def decode_objects(message: Any, name: str,

@@ -22,14 +22,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE, step_budget
 from tap_ros.planning.action_sequences import FULL, Limits
-from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.hierarchy import Itinerary, Target
 from tap_ros.planning.mpc_inputs import Goal, Scene
-from tap_ros.planning.tracking import ObjectTracker, Tracked
 from tap_ros.planning.visual_mpc import Memory, Plan, VisualMPC
 from tap_ros.text import listing
+from tap_ros.tracking.protocols import LOST, UNSURE
 
 MOST_REFUSED = 5  # commands refused in a row, after which the goal ends
+MOST_UNSURE = 3  # pictures in a row in which an object is not known for sure; likewise
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,12 @@ class Seen:
     image: np.ndarray  # (H, W, 3) uint8
     gripper: np.ndarray  # (4,) metres and opening
     names: tuple[str, ...]  # K object names
-    pixels: np.ndarray | None  # (K, 2) (u, v), in the order of the names; None: not looked for
+    pixels: np.ndarray  # (K, 2) (u, v), in the order of the names; the last ones of the hidden
     stamp_ns: int  # of the picture
     received: float = 0.0  # s, on the clock of `now`: when the oldest part of it was received
     scene_ns: int = 0  # stamp at which the newest scene known of began; 0: nothing is known
     jumps: int = 0  # how often the clock of the stamps has jumped so far
+    states: tuple[str, ...] = ()  # K of tracking.protocols.STATES; none: all are seen
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,6 @@ class ReachConfig:
     :param step_budget: commands at most; 0: contract.step_budget.
     :param switch: when to go on from a subgoal, see hierarchy.Itinerary.
     :param reached: px, mean distance of the objects; nearer than this is there. 0: never.
-    :param follower: LearnedForwardModel that follows the objects (tracking.ObjectTracker) from
-        where they are first seen; None: Seen.pixels at every step.
     :param limits: action_sequences.Limits of the actions.
     :param max_age: s; nothing is planned from what was received longer ago.
     :param timeout: s without a command, planning apart, after which the goal ends.
@@ -66,7 +65,6 @@ class ReachConfig:
     step_budget: int = 0
     switch: str = 'reached'
     reached: float = GOAL_TOLERANCE
-    follower: LearnedForwardModel | None = None
     limits: Limits = FULL
     max_age: float = float('inf')
     timeout: float = float('inf')
@@ -77,7 +75,7 @@ class ReachConfig:
 class Aim:
     """Decide from `seen` what to go to, and say so by Reach.head_for."""
 
-    seen: Seen  # where objects are followed, `pixels` is where they are now
+    seen: Seen
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,6 @@ class _State:
     first_step: int = 0  # of this round
     earlier: tuple[Target, ...] = ()  # subgoals passed in the rounds before
     switches: tuple[int, ...] = ()  # steps at which the targets after the first one began
-    tracked: Tracked | None = None
 
 
 class Reach:
@@ -136,9 +133,9 @@ class Reach:
     def __init__(self, mpc: VisualMPC, config: ReachConfig, seed: int = 0,
                  now: float = 0.0) -> None:
         self._mpc, self._config, self._seed = mpc, config, seed
-        self._tracker: ObjectTracker | None = None
         self._tabulated: tuple[Target, Goal] | None = None
         self._first: Seen | None = None
+        self._unsure: dict[str, list[int]] = {}  # object -> stamps of pictures in a row
         self._planned: Command | None = None
         self._answered: Command | None = None
         self._after_ns = -1  # pictures count that are stamped later than this
@@ -150,11 +147,6 @@ class Reach:
         self._sent_at = now  # of the last command, or when there was reason to wait
         self.steps, self.distance = 0, float('nan')
         self.pixels: np.ndarray | None = None
-
-    @property
-    def aimed(self) -> bool:
-        """Return whether head_for has been called."""
-        return self._next is not None
 
     @property
     def targets(self) -> list[Target]:
@@ -205,15 +197,33 @@ class Reach:
 
     def interrupted(self, seen: Seen | None) -> End | None:
         """
-        Return the End if another scene is seen, else None.
+        Return the End if another scene is seen, or an object cannot be found, else None.
 
         To be asked again before a command is carried out, as planning takes time.
         """
-        if seen is not None and self._first is not None:
-            change = scene_change(self._first, seen)
-            if change:
-                return End('aborted', f'the scene has changed: {change}')
-        return None
+        if seen is None:
+            return None
+        change = scene_change(self._first, seen) if self._first is not None else ''
+        if change:
+            return End('aborted', f'the scene has changed: {change}')
+        doubt = self._doubt(seen) if seen.stamp_ns >= seen.scene_ns else ''
+        return End('aborted', doubt) if doubt else None
+
+    def _doubt(self, seen: Seen) -> str:
+        """Say which objects can no longer be followed; an empty string if all can."""
+        lost = [name for name, state in zip(seen.names, seen.states) if state == LOST]
+        if lost:
+            return f'{listing(lost)} lost; see where it is, and select the objects again'
+        for name, state in zip(seen.names, seen.states):
+            stamps = self._unsure.setdefault(name, [])
+            if state != UNSURE:
+                stamps.clear()
+            elif seen.stamp_ns not in stamps:
+                stamps.append(seen.stamp_ns)
+            if len(stamps) >= MOST_UNSURE:
+                return (f'{name} is unsure in {len(stamps)} pictures in a row; see where it is, '
+                        'and select the objects again')
+        return ''
 
     def head_for(self, targets: Sequence[Target], now: float = 0.0) -> None:
         """
@@ -227,20 +237,12 @@ class Reach:
         state = _State(Memory(self._seed), Itinerary(
             targets, self._budget - self.steps, config.switch, config.reached))
         if passed is not None and self._state is not None:
-            # The tracker has seen the picture of the Aim, which is yet to be planned from: it
-            # goes back to the picture before.
             memory = self._state.memory
             state = replace(state, round=passed.round + 1, first_step=self.steps,
                             memory=replace(state.memory, heights=memory.heights,
                                            blocked=memory.blocked),
                             earlier=(*passed.earlier, *passed.itinerary.targets[:-1]),
-                            switches=passed.switches, tracked=self._state.tracked)
-        elif config.follower is not None:
-            first = self._first
-            assert first is not None and first.pixels is not None, 'an Aim comes first'
-            self._tracker = ObjectTracker(
-                config.follower, first.image, first.gripper, first.pixels)
-            state = replace(state, tracked=self._tracker.start)
+                            switches=passed.switches)
         self._state = self._next = state
         self._sent_at = now
 
@@ -296,9 +298,7 @@ class Reach:
         """Plan the next command from a new picture."""
         config, itinerary = self._config, state.itinerary
         self._next = state
-        # where the objects are
-        pixels, tracked = self._find_objects(seen, state)
-        self.pixels = pixels
+        self.pixels = pixels = seen.pixels
         self.distance = itinerary.targets[-1].distance(pixels)
         if self.distance <= config.reached:
             return End('reached', f'{self.distance:.1f} px from the goal, reached')
@@ -309,11 +309,10 @@ class Reach:
         before = len(state.switches) - len(state.earlier)
         stage = itinerary.stage(self.steps - state.first_step, pixels, before)
         self._next = state = replace(
-            state, switches=state.switches + (self.steps,) * (stage - before), tracked=tracked)
+            state, switches=state.switches + (self.steps,) * (stage - before))
         if (0 < stage == len(itinerary.targets) - 1 and state.round < config.rounds
                 and self.steps > state.first_step):
-            assert self._first is not None
-            return Aim(replace(seen, names=self._first.names, pixels=pixels))
+            return Aim(seen)
         # plan
         limit = np.array(seen.image.shape[1::-1]) - 1
         goal = self._goal(itinerary.targets[stage], np.clip(pixels, 0, limit))
@@ -329,18 +328,6 @@ class Reach:
             known = self._tabulated = target, self._mpc.goal(**target.goal(pixels))
         return known[1]
 
-    def _find_objects(self, seen: Seen, state: _State) -> tuple[np.ndarray, Tracked | None]:
-        """Return where the objects are, (K, 2), and what the next search for them needs."""
-        tracked, before = state.tracked, self._answered
-        if self._tracker is None or tracked is None:
-            assert seen.pixels is not None, 'without a follower objects are looked for'
-            return seen.pixels, None
-        if before is not None:
-            tracked = self._tracker.update(
-                tracked, before.seen.image, before.seen.gripper, before.plan.action, seen.image,
-                seen.gripper)
-        return tracked[0], tracked
-
 
 def scene_change(first: Seen, seen: Seen) -> str:
     """
@@ -352,7 +339,7 @@ def scene_change(first: Seen, seen: Seen) -> str:
         return 'the clock of its stamps has jumped: another simulator, or a recording that loops'
     if seen.scene_ns > first.stamp_ns:
         return 'a new episode has begun'
-    if seen.pixels is not None and set(seen.names) != set(first.names):
+    if set(seen.names) != set(first.names):
         gone = [name for name in first.names if name not in seen.names]
         come = [name for name in seen.names if name not in first.names]
         return '; '.join(f'{listing(names)} {what}' for names, what in (

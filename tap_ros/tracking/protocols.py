@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-SEEN, HIDDEN, UNSURE, LOST = 'seen', 'hidden', 'unsure', 'lost'  # as in tap_msgs/ObjectState
+STATES = SEEN, HIDDEN, UNSURE, LOST = 'seen', 'hidden', 'unsure', 'lost'  # of ObjectStates
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,7 @@ def seen_live(node, other, crop, sent, compressed, robot_mask):
             continue
         deadline = time.monotonic() + 10
         while due is not None:  # until the picture and a state after it have come
-            seen, lacking = planner.look(planner.topics())
+            seen, lacking = planner.look()
             if seen is not None and seen.stamp_ns == due:
                 found[due] = seen, reader.read(PredictSubgoal.Request(), predictor).question
                 due = None

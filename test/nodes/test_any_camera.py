@@ -126,4 +126,4 @@ def test_the_planner_sees_the_part_that_its_model_was_trained_on():
         inputs.sensors.attach('joints', 9 * 10**9, np.zeros(4, np.float32), time.monotonic())
         with pytest.raises(ImageError, match='320x240 pixels; the forward model was trained on '
                                              'those of 640x480'):
-            inputs.look(inputs.topics())
+            inputs.look()

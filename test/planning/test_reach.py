@@ -175,6 +175,23 @@ def test_another_scene_ends_the_goal_even_if_nothing_else_is_new(mpc, changes, w
     assert isinstance(reach.step(look(1)), Command)
 
 
+@pytest.mark.parametrize('states, steps, word', [
+    (['hidden'] * 6, 6, ''), (['unsure', 'unsure', 'seen'] * 2, 6, ''),
+    (['seen', 'unsure', 'unsure', 'unsure'], 3, 'b is unsure'), (['seen', 'lost'], 1, 'b lost')])
+def test_hidden_objects_stay_where_they_were_and_those_in_doubt_end_the_goal(
+        mpc, states, steps, word):
+    reach, usual = begun(mpc), begun(mpc)
+    for t, state in enumerate(states):
+        for _ in range(4):  # the same picture again is no other one
+            answer = reach.step(look(t, states=('seen', state)))
+        if isinstance(answer, End):
+            break
+        reach.sent()
+        np.testing.assert_array_equal(answer.plan.action, act(usual, t))
+    assert reach.steps == steps and isinstance(answer, End) == bool(word)
+    assert not word or (answer.outcome, word in answer.message) == ('aborted', True)
+
+
 @pytest.mark.parametrize('seed', [0, 3])
 def test_each_command_is_planned_from_what_the_one_before_left(mpc, seed):
     reach, goal, memory = begun(mpc, seed=seed), mpc.goal(GOAL.pixels), Memory(seed)

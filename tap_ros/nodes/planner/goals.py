@@ -110,7 +110,6 @@ def ask_subgoals(client: Client, inputs: PlannerInputs, request: ReachGoal.Goal,
     :raises TapError: when there is no answer, or a refusal.
     """
     stamp, frame_id = to_stamp(seen.stamp_ns), inputs.frame_id
-    assert seen.pixels is not None
     objects, goal_objects = (encode_objects(
         seen.names, pixels, np.full((len(pixels), 7), np.nan), stamp, frame_id,
         ObjectStates.SOURCE_TRACKED) for pixels in (seen.pixels, goal_pixels))

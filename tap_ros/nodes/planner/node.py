@@ -3,7 +3,6 @@
 """Serves reach_goal: drives planning.reach by what is seen, and sends its commands."""
 
 from collections import deque
-from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 import math
@@ -20,7 +19,7 @@ from std_msgs.msg import Float64
 from tap_msgs.action import ReachGoal
 from tap_msgs.msg import CommandRefused
 from tap_ros.errors import ConfigError, PlanningError, TapError
-from tap_ros.messages.objects import match_objects
+from tap_ros.messages.objects import check_found, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.nodes.calls import CallError
@@ -226,16 +225,14 @@ class VisualMpcNode(LifecycleBase):
         self._goal.begin(request, mode)
         self._inputs.begin(accepted)
         self._refusals.clear()
-        config = reach_config(self.params, request, self._model)
+        config = reach_config(self.params, request)
         reach = Reach(self._mpc, config, request.seed, accepted)
         while True:
             self._go_on(handle)
             count = self._sensors.count
             while self._refusals:
                 reach.refused(*self._refusals.popleft())
-            # Objects that are carried need to be seen once only.
-            topics = self._inputs.topics(objects=not (config.follower and reach.aimed))
-            seen, lacking = self._inputs.look(topics)
+            seen, lacking = self._inputs.look()
             if self._goal.changed(accepted):
                 reach = Reach(self._mpc, config, request.seed, accepted)
             answer = reach.step(seen, time.monotonic(), lacking)
@@ -252,7 +249,7 @@ class VisualMpcNode(LifecycleBase):
                 continue
             # Before sending: the picture that answers may come at once.
             newest_ns = self._inputs.newest_stamp()
-            if isinstance(answer, Command) and self._send(handle, accepted, reach, answer, topics):
+            if isinstance(answer, Command) and self._send(handle, accepted, reach, answer):
                 reach.sent(newest_ns + int(0.9e9 * self.params['control_period']),
                            time.monotonic())
                 result.steps = reach.steps
@@ -263,7 +260,7 @@ class VisualMpcNode(LifecycleBase):
     def _aim(self, handle: ServerGoalHandle, mode: str, seen: Seen,
              limits: Limits) -> list[Target]:
         """Return the Targets of a goal, asking for subgoals in that mode."""
-        if not seen.names or seen.pixels is None:
+        if not seen.names:
             raise PlanningError('objects: none are seen, so there is nothing to push; publish '
                                 'their pixels')
 
@@ -273,6 +270,7 @@ class VisualMpcNode(LifecycleBase):
         request = handle.request
         picture, objects = self._goal.take(self.params['image_timeout'], give_up)
         self._go_on(handle)
+        check_found(objects, 'goal_objects')
         names, pixels = self._inputs.decode_positions(
             objects, 'goal_objects', None if picture is None else picture.shape[:2])
         goal_pixels = match_objects(seen.names, names, pixels, 'objects', 'goal_objects')
@@ -291,15 +289,15 @@ class VisualMpcNode(LifecycleBase):
             self._mpc, Scene(seen.image, seen.gripper, seen.pixels), goal_pixels, found,
             request.seed, limits, lambda: self._go_on(handle)), goal_pixels)
 
-    def _send(self, handle: ServerGoalHandle, accepted: float, reach: Reach, command: Command,
-              topics: Collection[str]) -> bool:
+    def _send(self, handle: ServerGoalHandle, accepted: float, reach: Reach,
+              command: Command) -> bool:
         """
         Send a command; tell whether it was: not when a sensor is silent or it comes too late.
 
         :raises TapError: when what was seen while it was planned forbids it.
         """
         self._go_on(handle)
-        seen, _ = self._inputs.look(topics)
+        seen, _ = self._inputs.look()
         if seen is None:  # the clock has jumped; the next step says so
             return False
         end = reach.interrupted(seen)
@@ -316,7 +314,7 @@ class VisualMpcNode(LifecycleBase):
         if self._goal.changed(accepted):
             return False
         return self._arm.send(
-            handle, command.plan.action, to_stamp(command.seen.stamp_ns), topics)
+            handle, command.plan.action, to_stamp(command.seen.stamp_ns), self._inputs.topics)
 
     def _tell(self, handle: ServerGoalHandle, reach: Reach, command: Command) -> None:
         """Publish feedback, the plan and the distance after a command."""

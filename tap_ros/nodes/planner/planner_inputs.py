@@ -20,7 +20,7 @@ from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import GripperHistory
-from tap_ros.messages.objects import decode_cut_objects, match_objects
+from tap_ros.messages.objects import decode_cut_objects, decode_states
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.nodes.observations import JUMP_NS, Observations, reception_time
@@ -43,6 +43,7 @@ class PlannerInputs:
     :param crop: returns the TrainedCrop: what the planner makes of pictures, and the size that
         they get.
     :param on_message: called with the topic name after each message.
+    :ivar topics: short names of what is looked at.
     :ivar sensors: Observations.
     :ivar robot: RobotView.
     :ivar frame_id: of the picture that was seen last.
@@ -55,6 +56,7 @@ class PlannerInputs:
         self._mark = 0, 0  # that an episode begins: stamp, and jumps of the clock until then
         self.robot = RobotView(params['robot_mask'])
         self._types = {**camera_topics(params), 'joints': of_topic(JOINT_STATES)}
+        self.topics = tuple(self._types)
         self._tell = on_message
         self.sensors = Observations(*self._types)
         self._gripper = GripperHistory(
@@ -66,10 +68,6 @@ class PlannerInputs:
                                others={'joints': self._on_joints})
         node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
 
-    def topics(self, objects: bool = True) -> tuple[str, ...]:
-        """Return the names of what is looked at, with or without the objects."""
-        return tuple(topic for topic in self._types if objects or topic != 'objects')
-
     def begin(self, since: float) -> None:
         """Begin a goal: only what is received from this monotonic time on is seen."""
         self._since = since
@@ -77,16 +75,15 @@ class PlannerInputs:
         self.frame_id = ''
         self._publishers = self._count_publishers()
 
-    def look(self, topics: Collection[str]) -> tuple[Seen | None, str]:
+    def look(self) -> tuple[Seen | None, str]:
         """
         Return what was seen last.
 
-        :param topics: those that are needed, as topics gives them; without objects their pixels
-            are None.
         :return: Seen, or None when nothing was; which sensors are silent, '' if none is.
         :raises TapError: for messages that cannot be used.
         """
         self._check_publishers()
+        topics = self.topics
         moment = self.sensors.moment(topics, since=self._since)
         lacking = self._lacking(topics)
         if moment is None:
@@ -100,7 +97,7 @@ class PlannerInputs:
                 moment.stamp_ns, times['jumps']):
             self._seen = replace(self._seen, **times)
         else:
-            self._seen = self._decode(moment.messages, topics, moment.stamp_ns, times)
+            self._seen = self._decode(moment.messages, moment.stamp_ns, times)
             self.frame_id = moment.messages['image'].header.frame_id
         return self._seen, lacking
 
@@ -194,10 +191,8 @@ class PlannerInputs:
             with suppress(TapError):  # look() reports it
                 self._picture(moment.messages)
 
-    def _decode(self, messages: dict[str, Any], topics: Collection[str], stamp_ns: int,
-                times: dict[str, Any]) -> Seen:
+    def _decode(self, messages: dict[str, Any], stamp_ns: int, times: dict[str, Any]) -> Seen:
         """Return a Seen; the objects keep the order in which they were seen first."""
-        names, pixels = self._seen.names if self._seen else (), None
         name, crop = self._types['image'][1], self._crop()
         picture = self._picture(messages)
         self._camera_size = picture.shape[:2]
@@ -206,13 +201,14 @@ class PlannerInputs:
             raise ImageError('{0}: pictures of {2}x{1} pixels; the forward model was trained on '
                              'those of {4}x{3}, send such ones'.format(
                                  name, *self._camera_size, *crop.camera_size))
-        if 'objects' in topics:
-            found, pixels = self.decode_positions(messages['objects'], 'objects')
-            if set(found) == set(names):
-                pixels = match_objects(names, found, pixels, 'the first objects', 'objects')
-            else:
-                names = found
-        return Seen(self.cut(picture, name), messages['joints'], names, pixels, stamp_ns, **times)
+        names, pixels = self.decode_positions(messages['objects'], 'objects')
+        states = decode_states(messages['objects'], 'objects')
+        if self._seen is not None and set(self._seen.names) == set(names):
+            order = [names.index(name) for name in self._seen.names]
+            names, pixels = self._seen.names, pixels[order]
+            states = tuple(states[k] for k in order) if states else ()
+        return Seen(self.cut(picture, name), messages['joints'], names, pixels, stamp_ns,
+                    states=states, **times)
 
     def _lacking(self, topics: Collection[str]) -> str:
         """Return which sensors are silent and why, '' if none is."""

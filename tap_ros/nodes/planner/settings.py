@@ -27,7 +27,6 @@ from tap_ros.nodes.parameters import (
 )
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.planning.action_sequences import Limits
-from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import ReachConfig
@@ -38,7 +37,6 @@ from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
 MODES = ('subgoal', 'direct')
 SHIPPED = ', '.join(('push', *PLANNING_TASKS))
-TRACKING = ('ground_truth', 'carried')
 MAX_BUDGET = 1000
 MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two cores
 
@@ -86,10 +84,6 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('subgoal_rounds', 1, 'How often a goal in subgoal mode asks for subgoals: '
                        'again, from what is seen then, when those of a round are passed.',
                        low=1, high=16, read_only=False)
-    parameters.declare('tracking', 'ground_truth', 'Where the objects are: as objects says at '
-                       'every picture (ground_truth), or there only at first, then carried by '
-                       'the forward model and found again in the pictures.', choices=TRACKING,
-                       read_only=False)
     parameters.declare('max_silence', 0.35,
                        'The arm is stopped when the picture, the objects or the joints have been '
                        'silent for so many seconds, or when the last command is so old. Has to '
@@ -146,12 +140,10 @@ def load_planner(parameters: Parameters) -> VisualMPC:
     return mpc
 
 
-def reach_config(parameters: Parameters, request: ReachGoal.Goal,
-                 model: LearnedForwardModel) -> ReachConfig:
+def reach_config(parameters: Parameters, request: ReachGoal.Goal) -> ReachConfig:
     """Return the settings of the control loop for one goal."""
     return ReachConfig(
         request.step_budget, parameters['switch'], parameters['goal_tolerance'],
-        model if parameters['tracking'] == 'carried' else None,
         Limits(parameters['max_step_xy'], parameters['max_step_z']),
         parameters['max_age'], parameters['image_timeout'], rounds=parameters['subgoal_rounds'])
 

@@ -18,7 +18,7 @@ from tap_ros.errors import ConfigError, ImageError, TapError
 from tap_ros.images.crop import TrainedCrop
 from tap_ros.images.pixels import check_image
 from tap_ros.messages.images import decode_image, is_empty
-from tap_ros.messages.objects import decode_cut_objects, match_objects
+from tap_ros.messages.objects import check_found, decode_cut_objects, match_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import Subgoal
 from tap_ros.nodes.observations import Observations
@@ -136,6 +136,7 @@ class RequestReader:
         picture, header = self._picture(name, found), found['image'].header
         given_size = picture.shape[:2]
         cut = crop.of(given_size, name)
+        check_found(objects, f'{name}_objects')
         names, pixels = decode_cut_objects(objects, f'{name}_objects', given_size, cut)
         return AskedPicture(
             check_image(cut.image(picture), name, crop.size), names, pixels, lacking,

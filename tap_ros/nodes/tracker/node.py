@@ -47,6 +47,7 @@ from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.text import escaped, listing
 from tap_ros.tracking.plane import MIDDLE, Plane
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, Tracker, View
+from tap_ros.tracking.registration import propose
 from tap_ros.training.robot_mask import hidden_pixels
 
 STALE_S = 2.0  # s without a message after which diagnostics call an input stale
@@ -73,7 +74,7 @@ class Selection:
 
 class TrackerNode(Node):
     """
-    Follows the objects of the last select_objects in every picture, and finds them in that of a goal.
+    Follows the objects of the last select_objects, and finds them in the goal picture.
 
     A thread of its own does, and takes the newest picture whenever it is done with one. A picture
     that is sent again while time stands still, as in lock-step, is answered again.
@@ -190,7 +191,7 @@ class TrackerNode(Node):
         message = self._encode(found, tracked, plane, moment.messages['image'].header)
         self._selection = Selection(
             found, tracker, plane, view.image.shape[:2], moment.stamp_ns, self._sensors.jumps,
-            self._publishers(), moment.stamp_ns, moment.received, tracked, message)
+            self._count_publishers(), moment.stamp_ns, moment.received, tracked, message)
         self._objects.publish(message)
         self._sensors.wake()  # for the goal
         self.get_logger().info(f'following {listing(found)}')
@@ -200,18 +201,18 @@ class TrackerNode(Node):
         """
         Return what differs between a picture and the goal picture.
 
-        :raises TapError: without a goal picture, and for a tracker that proposes nothing.
+        :raises TapError: without a goal picture, and where nothing differs.
         """
         goal = self._goals.moment(('image',))
         if goal is None or is_empty(goal.messages['image']):
             raise TrackingError(
                 f'nothing has come on {self._goals.names(["image"], explained=True)}; without a '
                 'goal picture nothing can be proposed')
-        tracker = self._make(camera)
-        if not hasattr(tracker, 'propose'):
-            raise TrackingError(f'tracker {self.params["tracker"]} proposes nothing; click on '
-                                'each object')
-        return tracker.propose(view, self._goal_view(goal, view.image.shape[:2]))
+        pixels = propose(view, self._goal_view(goal, view.image.shape[:2]))
+        if not len(pixels):
+            raise TrackingError('the goal picture shows nothing elsewhere; click on each object')
+        tracker: Tracker = self._make(camera)
+        return tracker.select(view, pixels)  # for the outlines
 
     def _asked(self, request: SelectObjects.Request,
                size: tuple[int, int]) -> tuple[tuple[str, ...], np.ndarray]:
@@ -358,12 +359,12 @@ class TrackerNode(Node):
         """Say in what way the camera shows another scene than that of a selection, '' if not."""
         if self._sensors.jumps != selection.jumps:
             return 'the clock of its pictures has jumped: another camera, simulator or recording'
-        for topic, count in self._publishers().items():
+        for topic, count in self._count_publishers().items():
             if count > max(selection.publishers[topic], 1):
                 return f'{count} nodes publish on {self.resolve_topic_name(topic)} now'
         return ''
 
-    def _publishers(self) -> dict[str, int]:
+    def _count_publishers(self) -> dict[str, int]:
         """Return how many nodes publish each topic of which there may be but one publisher."""
         topics = [name for _, name in camera_topics(self.params).values()]
         return {topic: self.count_publishers(topic) for topic in topics}

@@ -1,0 +1,97 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Objects of the evaluation as a user has them: clicked once, then followed by a tracker."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from sim_bridge.simulator import Simulator
+from sim_bridge.world.looks import LOOKS
+from tap_ros.contract import ROBOT_MASK_FREE
+from tap_ros.errors import TrackingError
+from tap_ros.plugins import load_plugin
+from tap_ros.robots.silhouette import PinholeCamera
+from tap_ros.text import listing
+from tap_ros.tracking.protocols import LOST, View
+
+CAMERA_SIZE = 256  # px, what objects are followed in
+CLICK_ERROR = 1.35  # px of 64, mean distance of a click from the middle of an object
+CLICKS = 5  # at most
+
+
+class Follower:
+    """
+    Tells where the objects of an episode are, in place of the simulator.
+
+    A click on each object in the first picture is all that comes from there. The tracker is shown
+    CAMERA_SIZE pixels a side, the networks what they were trained on.
+
+    :param tracker: of the plugin group tap_ros.trackers. 'carried' sees what the networks see, and
+        is told the true pixels at the start and in the goal.
+    :param simulator: Simulator.
+    """
+
+    def __init__(self, tracker, simulator):
+        self._simulator, self._exact = simulator, tracker == 'carried'
+        size = simulator.camera.width if self._exact else CAMERA_SIZE
+        self._camera = _camera(simulator.task_name, size, next(
+            name for name, look in LOOKS.items() if look is simulator.look))
+        self._scale = size / simulator.camera.width
+        self._tracker = load_plugin('tap_ros.trackers', tracker)(PinholeCamera(
+            self._camera.camera_matrix, (size, size), self._camera.camera_pose))
+
+    def select(self, seen, seed):
+        """
+        Click on the objects.
+
+        :param seen: Observation of the start; seed: of the scene.
+        :return: the Observation with tracked pixels, and the states of the objects.
+        :raises TrackingError: when nothing is found where it was clicked.
+        """
+        view, rng = _view(self._camera.reset(seed)), np.random.default_rng([seed, 0])
+        for i in range(1 if self._exact else CLICKS):  # who is refused clicks again
+            error = rng.normal(0, CLICK_ERROR / np.sqrt(np.pi / 2), seen.object_pixels.shape)
+            clicks = (seen.object_pixels + (0 if self._exact else error) + 0.5) * self._scale - 0.5
+            try:
+                return self._told(seen, self._tracker.select(
+                    view, clicks if self._exact else _beside(clicks, view.robot_mask)))
+            except TrackingError as refusal:
+                reason = refusal
+        raise reason
+
+    def see(self, seen):
+        """Follow the objects to the Observation of now; return as select."""
+        self._camera.data.qpos[:] = self._simulator.data.qpos
+        return self._told(seen, self._tracker.update(_view(self._camera.observe())))
+
+    def find(self, goal):
+        """Return the Observation of the goal with the pixels found in it; TrackingError if not."""
+        if self._exact:
+            return goal
+        found = self._tracker.find(_view(self._camera.goal()))
+        lost = [name for name, state in zip(goal.object_names, found.states) if state == LOST]
+        if lost:
+            raise TrackingError(f'{listing(lost)} not found in the goal picture')
+        return self._told(goal, found)[0]
+
+    def _told(self, observation, tracked):
+        pixels = (tracked.pixels + 0.5) / self._scale - 0.5
+        return replace(observation, object_pixels=pixels.astype(np.float32)), tracked.states
+
+
+def _view(picture):
+    return View(picture.image, picture.robot_mask, picture.gripper)
+
+
+def _beside(clicks, mask):
+    """Return for each click (K, 2) the nearest pixel that the robot does not hide."""
+    free = np.argwhere(mask == ROBOT_MASK_FREE)[:, ::-1]
+    return np.array([free[((free - click) ** 2).sum(1).argmin()] if len(free) else click
+                     for click in clicks])
+
+
+@lru_cache
+def _camera(task, size, look):
+    """Return a Simulator that takes the pictures that objects are followed in."""
+    return Simulator(task, size, look)

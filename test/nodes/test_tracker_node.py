@@ -1,0 +1,149 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""tracker_node: objects of the stamp of each picture after a click on each, or the reason."""
+
+from geometry_msgs.msg import TwistStamped
+import numpy as np
+from processes import LocalNode, Newest, NodeProcess, until
+import pytest
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import Image
+from sim_bridge.world.looks import LOOKS
+from tap_msgs.msg import ObjectStates
+import tap_ros
+from tap_ros.contract import CONTROL_PERIOD
+from tap_ros.messages.objects import decode_objects
+from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.nodes.calls import CallError
+from tap_ros.nodes.client import positions_of
+from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.nodes.tracker.node import TrackerNode
+
+SEED, SIZE = 1_000_003, 128
+
+
+def calibrated(look='hand'):
+    """Return the parameters that tell where the simulator's camera is."""
+    pose = LOOKS[look].camera(False, SIZE, SIZE).pose
+    values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+    return {f'camera_{name}': float(value) for name, value in zip(
+        ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values)}
+
+
+class Scene:
+    """A simulator whose objects are tracked, and the truth beside."""
+
+    def __init__(self, node):
+        self.client = tap_ros.Client(node=node, timeout_s=30.0)
+        self.twist = node.create_publisher(TwistStamped, 'arm/delta_twist_cmds', STREAM)
+        self.image = Newest(node, Image, 'camera/image_raw', STREAM)
+        self.topics = {topic: Newest(node, ObjectStates, topic, qos) for topic, qos in (
+            ('objects', STREAM), ('truth/objects', STREAM), ('goal/objects', LATCHED),
+            ('truth/goal/objects', LATCHED))}
+
+    def at(self, topic, stamp_ns, accept=lambda message: True):
+        """Return what a topic says of a picture: the message, names and pixels."""
+        message = self.topics[topic].wait(20, lambda m: accept(m) and to_nanoseconds(
+            m.header.stamp) == stamp_ns)
+        return message, *decode_objects(message, topic)
+
+    def reset(self, seed=SEED):
+        """Start a scene; return the stamps of its first picture and its goal."""
+        start, goal = self.client.reset('push2', seed, objects=False)
+        return start.stamp_ns, goal.stamp_ns
+
+    def true_clicks(self, stamp_ns):
+        """Return what a user would click."""
+        _, names, pixels = self.at('truth/objects', stamp_ns)
+        return dict(zip(names, pixels.tolist()))
+
+    def select(self, clicks):
+        """Select objects once the node has heard of the scene."""
+        def accepted():
+            try:
+                self.client.select(clicks)
+            except CallError as error:
+                assert 'no picture of the new' in str(error) or 'nothing has come' in str(error)
+                return False
+            return True
+        assert until(accepted)
+
+    def move(self, *move):
+        """Let one control period pass; return the stamp of the next picture."""
+        command = TwistStamped(header=self.image.wait(10).header)
+        command.twist.linear.x, command.twist.linear.y, command.twist.linear.z = move
+        self.twist.publish(command)
+        return to_nanoseconds(command.header.stamp) + round(CONTROL_PERIOD * 1e9)
+
+
+@pytest.fixture(scope='module')
+def sim(tmp_path_factory):
+    """Start a simulator that keeps its truth to itself."""
+    process = NodeProcess('sim_node', tmp_path_factory.mktemp('sim') / 'log.txt', {
+        'lock_step': 'true', 'image_size': SIZE, 'objects': 'tracked'})
+    yield process.wait_for('ready')
+    process.kill()
+
+
+@pytest.fixture
+def scene(sim, client):
+    """Return the scene, beside a tracker that knows its camera."""
+    scene, node = Scene(client), LocalNode(TrackerNode, **calibrated())
+    yield scene
+    assert node.end() == 0
+
+
+def test_clicked_objects_are_followed_and_found_in_the_goal(scene):
+    start_ns, goal_ns = scene.reset()
+    scene.select(scene.true_clicks(start_ns))
+    for topic, stamp in (('objects', start_ns), ('goal/objects', goal_ns)):
+        message, names, pixels = scene.at(topic, stamp)
+        true, same, wanted = scene.at(f'truth/{topic}', stamp)
+        assert (names, message.source) == (same, ObjectStates.SOURCE_TRACKED)
+        assert np.abs(pixels - wanted).max() < SIZE / 64
+        assert np.abs(positions_of(message) - positions_of(true)).max() < 0.02
+        assert list(message.states) == ['seen'] * 2 and min(message.confidence) > 0.5
+    stamp = start_ns
+    for _ in range(3):
+        stamp = scene.move(0.02, 0.02, 0.0)
+        _, _, pixels = scene.at('objects', stamp)
+        _, _, wanted = scene.at('truth/objects', stamp)
+        assert np.abs(pixels - wanted).max() < SIZE / 64
+    count = scene.topics['objects'].count  # sent again, as its picture is
+    assert until(lambda: scene.topics['objects'].count > count + 2)
+
+
+def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(scene):
+    start_ns, _ = scene.reset()
+    clicks = scene.true_clicks(start_ns)
+    scene.select(clicks)
+    scene.at('objects', start_ns)
+    first, second = clicks.values()
+    for asked, words in (
+            ({'names': ['a'], 'u': [first[0]], 'v': []}, '1, 1 and 0 entries'),
+            ({'names': [], 'u': [], 'v': []}, 'at least one'),
+            ({'names': ['a', 'a'], 'u': [first[0], second[0]], 'v': [first[1], second[1]]},
+             'a name of its own'),
+            ({'names': ['a' * 200], 'u': [first[0]], 'v': [first[1]]}, 'characters'),
+            ({'names': ['a'], 'u': [SIZE + 3.0], 'v': [2.0]}, 'outside the picture'),
+            ({'names': ['a'], 'u': [float('nan')], 'v': [2.0]}, 'finite numbers')):
+        with pytest.raises(CallError, match=words):
+            scene.client.call('select', **asked)
+    _, names, _ = scene.at('objects', scene.move(0.0, 0.0, 0.01))
+    assert set(names) == set(clicks)
+
+
+def test_another_scene_or_camera_ends_the_selection(scene, client):
+    start_ns, goal_ns = scene.reset()
+    scene.select(scene.true_clicks(start_ns))
+    scene.at('goal/objects', goal_ns, lambda m: m.objects)
+    start_ns, _ = scene.reset(SEED + 1)
+    empty = scene.topics['goal/objects'].wait(10, lambda m: not m.objects)
+    assert to_nanoseconds(empty.header.stamp) == goal_ns
+    scene.select(scene.true_clicks(start_ns))
+    scene.at('objects', start_ns)
+    client.create_publisher(Image, 'camera/image_raw', STREAM)
+    scene.topics['goal/objects'].wait(10, lambda m: not m.objects)
+    stamp = scene.move(0.0, 0.0, 0.01)
+    scene.at('truth/objects', stamp)
+    assert to_nanoseconds(scene.topics['objects'].wait(1).header.stamp) < stamp
