@@ -1,7 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Start simulation, predictor, planner and, if asked for, recorder, robot masks, explorer and rviz2.
+Start simulation, predictor, planner; if asked for tracker, recorder, robot masks, explorer, rviz2.
 
 Parameters come from config/tap_ros.yaml of the package or from params_file; for a real camera and
 arm start with sim:=false.
@@ -10,15 +10,27 @@ arm start with sim:=false.
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution, PathJoinSubstitution
+from launch.substitutions import (
+    AndSubstitution,
+    EqualsSubstitution,
+    LaunchConfiguration,
+    NotEqualsSubstitution,
+    NotSubstitution,
+    PathJoinSubstitution,
+)
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+# Where the simulator's camera is, in its look 'hand' and the tasks that push.
+SIM_CAMERA = {'camera_x': 0.0, 'camera_y': -1.1, 'camera_z': 1.3, 'camera_qx': 0.942755,
+              'camera_qy': 0.0, 'camera_qz': 0.0, 'camera_qw': -0.333487}
+
 
 def generate_launch_description():
     """Describe the nodes and the arguments of this file."""
-    record = LaunchConfiguration('record')
+    record, sim = LaunchConfiguration('record'), LaunchConfiguration('sim')
+    tracked = EqualsSubstitution(LaunchConfiguration('objects'), 'tracked')
     return LaunchDescription([
         DeclareLaunchArgument(
             'params_file',
@@ -34,6 +46,10 @@ def generate_launch_description():
             'lock_step', default_value='false', choices=['true', 'false'],
             description='Simulated time passes only with commands, so that runs repeat exactly.'),
         DeclareLaunchArgument(
+            'objects', default_value='truth', choices=['truth', 'tracked'],
+            description='Where the objects come from: the simulation, or tracker_node, which '
+                        'follows what is clicked; with a real camera tracked starts it, too.'),
+        DeclareLaunchArgument(
             'record', default_value='', description='Folder to record into; empty: no recorder.'),
         DeclareLaunchArgument(
             'mask', default_value='false', choices=['true', 'false'],
@@ -47,8 +63,11 @@ def generate_launch_description():
         DeclareLaunchArgument(
             'use_sim_time', default_value=LaunchConfiguration('sim'), choices=['true', 'false'],
             description='All but the simulation take the time from /clock.'),
-        start('sim_node', {'lock_step': typed('lock_step', bool)},
-              condition=IfCondition(LaunchConfiguration('sim'))),
+        start('sim_node', {'lock_step': typed('lock_step', bool), 'objects': typed('objects', str)},
+              condition=IfCondition(sim)),
+        start('tracker_node', SIM_CAMERA, condition=IfCondition(AndSubstitution(tracked, sim))),
+        start('tracker_node',
+              condition=IfCondition(AndSubstitution(tracked, NotSubstitution(sim)))),
         start('predictor_node'),
         start('visual_mpc_node'),
         start('recorder_node', {'folder': typed('record', str)},
@@ -72,7 +91,7 @@ def start(executable, parameters=None, condition=None):
     :param parameters: dict of those that override the parameter file.
     :param condition: launch condition, None for always.
     """
-    parameters = parameters or {}
+    parameters = dict(parameters or {})
     if executable != 'sim_node':  # which publishes /clock
         parameters['use_sim_time'] = typed('use_sim_time', bool)
     return Node(

@@ -17,7 +17,6 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from scipy.spatial.transform import Rotation
 from tap_ros.errors import ConfigError
 from tap_ros.plugins import names
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
@@ -151,6 +150,7 @@ def camera_pose(parameters: Parameters) -> np.ndarray:
 
     :raises ConfigError: for a quaternion of length 0.
     """
+    from scipy.spatial.transform import Rotation  # here, since not every node needs it
     quaternion = [parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')]
     if np.linalg.norm(quaternion) < 0.1:
         raise ConfigError('parameters camera_qx to camera_qw: a quaternion of no direction')

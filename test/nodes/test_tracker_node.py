@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """tracker_node: objects of the stamp of each picture after a click on each, or the reason."""
 
+import ast
+from pathlib import Path
+
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from processes import LocalNode, Newest, NodeProcess, until
@@ -28,6 +31,13 @@ def calibrated(look='hand'):
     values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
     return {f'camera_{name}': float(value) for name, value in zip(
         ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values)}
+
+
+def test_launch_knows_where_the_camera_of_the_simulator_is():
+    file = Path(__file__).parents[2] / 'launch' / 'nodes.launch.py'
+    told, = (ast.literal_eval(node.value) for node in ast.parse(file.read_text()).body
+             if isinstance(node, ast.Assign) and node.targets[0].id == 'SIM_CAMERA')
+    assert told == pytest.approx(calibrated(), abs=1e-6)
 
 
 class Scene:
