@@ -63,8 +63,9 @@ def generate_launch_description():
         DeclareLaunchArgument(
             'use_sim_time', default_value=LaunchConfiguration('sim'), choices=['true', 'false'],
             description='All but the simulation take the time from /clock.'),
-        start('sim_node', {'lock_step': typed('lock_step', bool), 'objects': typed('objects', str)},
-              condition=IfCondition(sim)),
+        start('sim_node', {
+            'lock_step': typed('lock_step', bool), 'objects': typed('objects', str)},
+            condition=IfCondition(sim)),
         start('tracker_node', SIM_CAMERA, condition=IfCondition(AndSubstitution(tracked, sim))),
         start('tracker_node',
               condition=IfCondition(AndSubstitution(tracked, NotSubstitution(sim)))),

@@ -50,7 +50,7 @@ class Follower:
         :raises TrackingError: when nothing is found where it was clicked.
         """
         view, rng = _view(self._camera.reset(seed)), np.random.default_rng([seed, 0])
-        for i in range(1 if self._exact else CLICKS):  # who is refused clicks again
+        for _ in range(1 if self._exact else CLICKS):  # who is refused clicks again
             error = rng.normal(0, CLICK_ERROR / np.sqrt(np.pi / 2), seen.object_pixels.shape)
             clicks = (seen.object_pixels + (0 if self._exact else error) + 0.5) * self._scale - 0.5
             try:
