@@ -4,7 +4,6 @@
 
 import cv2
 import numpy as np
-from tap_ros.tracking.search import likeness
 from tap_ros.tracking.template import Matcher, Template
 
 _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.5)
@@ -18,7 +17,7 @@ def mean_shift(matcher: Matcher, template: Template,
     :return: (2,) the place where they are densest near by; and how much of them is there, as a
         share of the object's own area.
     """
-    like = likeness(matcher, template)
+    like = matcher.likeness(template)
     h, w = like.shape
     half = min(max(6, round(template.area ** 0.5 * 0.6)), h // 2, w // 2)
     u, v = matcher.plane.top_pixels(place) - half

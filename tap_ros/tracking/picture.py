@@ -8,10 +8,13 @@ from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import View
 
 LIGHTNESS = 0.14  # weight of a step of L of OpenCV's 8-bit Lab, beside steps of a and b
-# The middles of the bins of L, a and b in a colour's index: 3, 6 and 6 bits.
-_AXES = np.ix_(*(weight * (np.arange(bins, dtype=np.float32) + 0.5) * (256 // bins) - 0.5 * weight
-                 for bins, weight in ((8, np.float32(LIGHTNESS)), (64, np.float32(1)),
-                                      (64, np.float32(1)))))
+_LEVELS = np.arange(256)
+_WEIGHED = np.rint(np.outer(_LEVELS, (LIGHTNESS, 1, 1))).astype(np.uint8)[:, None]
+# The index of a colour has 3, 6 and 6 bits of L, a and b; and the middles of their bins.
+_INDEX = np.stack([_LEVELS >> 5 << 12, _LEVELS >> 2 << 6, _LEVELS >> 2], -1).astype(
+    np.uint16)[:, None]
+_AXES = np.ix_(*(np.float32(weight * ((np.arange(bins) + 0.5) * 256 / bins - 0.5))
+                 for bins, weight in ((8, LIGHTNESS), (64, 1), (64, 1))))
 
 
 class Picture:
@@ -22,8 +25,8 @@ class Picture:
     the sides of a block change that first.
 
     :ivar image: (h, w, 3) uint8.
-    :ivar lab: (3, h * w) float32.
-    :ivar index: (h * w,) uint16, into tables of Palette.
+    :ivar lab: (h, w, 3) uint8, lightness already weighed.
+    :ivar index: (h, w) uint16, into tables of Palette.
     :ivar hidden: (h, w) bool, the robot and its shadow.
     """
 
@@ -32,16 +35,13 @@ class Picture:
         image = view.image
         if image.shape[:2] != self.size:
             smaller = image.shape[0] > h or image.shape[1] > w
-            image = cv2.resize(
-                image, (w, h), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
+            image = np.asarray(cv2.resize(
+                image, (w, h), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC))
         self.image = image
-        lab = np.asarray(cv2.cvtColor(cv2.GaussianBlur(image, (3, 3), 0.7), cv2.COLOR_RGB2LAB))
-        L, a, b = np.moveaxis(lab, -1, 0)
-        self.lab = np.empty((3, h * w), np.float32)
-        np.multiply(L.ravel(), LIGHTNESS, out=self.lab[0], casting='unsafe')
-        self.lab[1], self.lab[2] = a.ravel(), b.ravel()
-        self.index = ((L >> 5).astype(np.uint16) << 12 | (a >> 2).astype(np.uint16) << 6
-                      | b >> 2).ravel()
+        lab = cv2.cvtColor(cv2.GaussianBlur(image, (3, 3), 0.7), cv2.COLOR_RGB2LAB)
+        self.lab = np.asarray(cv2.LUT(lab, _WEIGHED))
+        L, a, b = cv2.split(cv2.LUT(lab, _INDEX))
+        self.index = np.asarray(L) | a | b
         if view.robot_mask is None:
             self.hidden = np.zeros(self.size, bool)
         else:
@@ -49,33 +49,38 @@ class Picture:
             self.hidden = (mask if mask.shape == self.size else cv2.resize(
                 mask, (w, h), interpolation=cv2.INTER_NEAREST)) > 0
 
-    def colours(self, mask: np.ndarray) -> np.ndarray:
-        """Return the colours (N, 3) float32 where a mask (h, w) holds."""
-        return self.lab[:, mask.ravel()].T
+    def apart(self, other: 'Picture') -> np.ndarray:
+        """Return the distance (h, w) float32 of the colours of each pixel."""
+        return np.asarray(cv2.transform(
+            cv2.absdiff(self.lab, other.lab).astype(np.float32), np.ones((1, 3))))
+
+
+def weighed(image: np.ndarray) -> np.ndarray:
+    """Return the colours (..., 3) uint8 of an rgb picture as Picture.lab has them."""
+    return np.asarray(cv2.LUT(cv2.cvtColor(image, cv2.COLOR_RGB2LAB), _WEIGHED))
 
 
 class Palette:
     """
     A few colours, and how far any colour is from the nearest of them.
 
-    :param colours: (N, 3) float32 of Picture.colours, at least one.
+    :param colours: (N, 3) of Picture.lab, at least one.
+    :param least: share of the colours near one of them without which it is left out.
     """
 
-    def __init__(self, colours: np.ndarray, count: int = 4) -> None:
+    def __init__(self, colours: np.ndarray, count: int = 4, least: float = 0.0) -> None:
         colours = np.ascontiguousarray(colours, np.float32)
         if len(colours) > count:
             cv2.setRNGSeed(0)
-            colours = cv2.kmeans(
+            _, labels, colours = cv2.kmeans(
                 colours, count, np.zeros((len(colours), 1), np.int32), (3, 15, 1.0), 2,
-                cv2.KMEANS_PP_CENTERS)[2]
+                cv2.KMEANS_PP_CENTERS)
+            shares = np.bincount(np.ravel(labels), minlength=count) / len(labels)
+            colours = np.asarray(colours)[shares >= min(least, shares.max())]
         self.centres = colours
         self._table = np.min([sum(np.abs(axis - value) for axis, value in zip(_AXES, centre))
                               for centre in self.centres], 0).ravel()
 
-    def distance(self, picture: Picture) -> np.ndarray:
-        """Return the distance (h, w) float32 of every pixel."""
-        return self._table[picture.index].reshape(picture.size)
-
-    def look_up(self, index: np.ndarray) -> np.ndarray:
-        """Return the distances of colours by their index."""
-        return self._table[index]
+    def distance(self, index: np.ndarray) -> np.ndarray:
+        """Return the distances of colours by their index, any shape, float32."""
+        return self._table.take(index)

@@ -36,7 +36,7 @@ class Plane:
         self.working = max(round(height * scale), 1), max(round(width * scale), 1)
         self._scale = np.array([self.working[1] / width, self.working[0] / height])
         self.top = self._homography(camera, TOP)
-        self._middle = self._homography(camera, MIDDLE)
+        self._middle, self._base = (self._homography(camera, z) for z in (MIDDLE, 0.0))
         self._from_top, self._from_middle = np.linalg.inv(self.top), np.linalg.inv(self._middle)
 
     def _homography(self, camera: PinholeCamera | None, height: float) -> np.ndarray:
@@ -72,6 +72,15 @@ class Plane:
     def middle_pixels(self, places: ArrayLike) -> np.ndarray:
         """Return the working pixels (..., 2) of the middles of objects at places."""
         return project(self._middle, places)
+
+    def rise(self, place: np.ndarray) -> np.ndarray:
+        """Return the working pixels (2,) from the table at a place up to a top; 0 if unknown."""
+        return project(self.top, place) - project(self._base, place)
+
+    def toward_camera(self, place: np.ndarray) -> np.ndarray:
+        """Return the direction (2,) on the table in which the sides of an object are seen."""
+        down = self.of_top(self.top_pixels(place) - self.rise(place)) - place
+        return down / max(float(np.linalg.norm(down)), 1e-9)
 
 
 def project(matrix: np.ndarray, points: ArrayLike) -> np.ndarray:

@@ -11,7 +11,7 @@ from tap_ros.tracking.picture import Palette, Picture
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import LOST, SEEN, Tracked, View
 from tap_ros.tracking.search import locate
-from tap_ros.tracking.silhouette import middle, silhouette
+from tap_ros.tracking.silhouette import centre, silhouette
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 LEAST_FIT, MOST_COST = 0.8, 0.4  # else not found
@@ -22,8 +22,7 @@ KEPT = 0.1  # weight of places where nothing changed
 
 def change(first: Picture, second: Picture) -> np.ndarray:
     """Return which pixels differ between two pictures, the robot aside, (h, w) bool."""
-    apart = np.abs(first.lab - second.lab).sum(0).reshape(first.size)
-    return (apart > CHANGED) & ~first.hidden & ~second.hidden
+    return (first.apart(second) > CHANGED) & ~first.hidden & ~second.hidden
 
 
 def register(first: Picture, picture: Picture, plane: Plane,
@@ -35,8 +34,8 @@ def register(first: Picture, picture: Picture, plane: Plane,
     :return: Tracked, LOST what fits nowhere well enough.
     """
     matcher = Matcher(picture, plane)
-    apart = np.abs(first.lab - picture.lab).sum(0).reshape(first.size)
-    region = KEPT + cv2.GaussianBlur((apart > CHANGED).astype(np.float32), (0, 0), 4)
+    changed = (first.apart(picture) > CHANGED).astype(np.float32)
+    region = KEPT + cv2.GaussianBlur(changed, (0, 0), 4)
     found: dict[int, tuple[Pose, Template]] = {}
     left = set(range(len(objects)))
     while left:
@@ -84,13 +83,13 @@ def propose(start: View, goal: View) -> np.ndarray:
         around = beside & ~before.hidden & ~after.hidden
         if not around.any():
             continue
-        table = Palette(before.colours(around))
-        here, there = (float(np.median(table.distance(picture)[part]))
+        table = Palette(before.lab[around])
+        here, there = (float(np.median(table.distance(picture.index[part])))
                        for picture in (before, after))
         if here <= there:  # something came there
             continue
         mask, _ = silhouette(before, centres[i])
-        if mask.any() and not any(np.hypot(*(middle(mask) - other)) < 8 for _, other in found):
-            found.append((int(mask.sum()), middle(mask)))
+        if mask.any() and not any(np.hypot(*(centre(mask) - other)) < 8 for _, other in found):
+            found.append((int(mask.sum()), centre(mask)))
     found.sort(key=lambda one: -one[0])
     return plane.enlarge([at for _, at in found]).reshape(-1, 2)

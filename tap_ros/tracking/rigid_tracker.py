@@ -19,7 +19,7 @@ from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
 from tap_ros.tracking.registration import register
 from tap_ros.tracking.search import locate
-from tap_ros.tracking.silhouette import clicked, middle, silhouette
+from tap_ros.tracking.silhouette import clicked, middle, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
@@ -36,8 +36,8 @@ class _Object:
     """What is known of one object."""
 
     place: np.ndarray  # (2,) m
-    offset: np.ndarray  # (2,) px from the middle on the plane to the middle of the silhouette
     keys: list[Template]
+    face: Template  # of its top alone, which looks alike from all sides
     angle: float = 0.0
     state: str = SEEN
     age: int = 0  # pictures since it was seen
@@ -74,8 +74,11 @@ class RigidTracker:
         for k, click in enumerate(clicks):
             name = 'click ' + str(tuple(round(float(x), 1) for x in plane.enlarge(click)))
             mask = clicked(picture, click, np.delete(clicks, k, 0), name)
-            place = plane.of_middle(middle(mask) if self._snap else click)
-            objects.append(_Object(place, np.zeros(2), [Template(picture, plane, mask, place)]))
+            place = middle(mask, plane) if self._snap else plane.of_middle(click)
+            face = top_face(mask, plane)
+            objects.append(_Object(
+                place, [Template(picture, plane, mask, place)],
+                Template(picture, plane, mask, place, face=face)))
         self._objects, self._plane, self._first = objects, plane, picture
         self._gripper = view.gripper
         return self._tracked()
@@ -96,7 +99,7 @@ class RigidTracker:
     def find(self, view: View) -> Tracked:
         """Find the objects in another picture; see Tracker."""
         return register(self._first, Picture(view, self._plane), self._plane,
-                        [one.keys for one in self._objects])
+                        [[one.face] for one in self._objects])
 
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
@@ -110,7 +113,7 @@ class RigidTracker:
             if pose.seen > NEW_SEEN and (pose.cost > NEW_COST or nearest > NEW_ANGLE):
                 self._cut_anew(one, picture)
             return
-        seen = matcher.score(keys[0], one.place[None], np.array([one.angle - keys[0].angle]))[1]
+        seen = matcher.score(keys[0], one.place[None], np.array([one.angle - keys[0].angle]))[1][0]
         one.age += 1
         one.state = HIDDEN if seen[0] < 0.5 else UNSURE if one.age <= PATIENCE else LOST
         one.confidence *= 0.8

@@ -6,21 +6,13 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from tap_ros.tracking.template import FAR, Matcher, Pose, Template
+from tap_ros.tracking.template import Matcher, Pose, Template
 
 PLACES = 6  # that are tried
 APART = 0.035  # m from other objects
 EDGE = 0.47  # m, |x| and |y| on a calibrated table
 _TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
-_LINE = np.linspace(-0.03, 0.03, 5)  # m around a place
-_GRID = np.stack(np.meshgrid(_LINE, _LINE, _TURNS, indexing='ij'), -1).reshape(-1, 3)
-
-
-def likeness(matcher: Matcher, template: Template) -> np.ndarray:
-    """Return how like the object's colours pixels are that are not covered, (h, w) 0 to 1."""
-    like = np.clip(1 - template.palette.distance(matcher.picture) / FAR, 0, 1)
-    like[matcher.covered] = 0
-    return like
+_AROUND = np.stack(np.meshgrid(*[np.linspace(-0.03, 0.03, 5)] * 2), -1).reshape(-1, 2)  # m
 
 
 def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (),
@@ -36,7 +28,7 @@ def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (
     """
     plane = matcher.plane
     side = max(5.0, template.area ** 0.5)
-    dense = cv2.GaussianBlur(likeness(matcher, template), (0, 0), side / 2.5)
+    dense = cv2.GaussianBlur(matcher.likeness(template), (0, 0), side / 2.5)
     if region is not None:
         dense *= region
     peaks = []
@@ -51,13 +43,14 @@ def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (
         if (plane.calibrated and (np.abs(place) > EDGE).any()
                 or any(np.linalg.norm(place - other) < APART for other in avoid)):
             continue
-        places, angles = place + _GRID[:, :2], _GRID[:, 2]
-        cost, seen, _ = matcher.score(template, places, angles, thin=3)
+        places = place + _AROUND
+        cost, seen = matcher.score(template, places, _TURNS, thin=3)
         cost[seen < least] = np.inf
-        j = int(cost.argmin())
-        if not np.isfinite(cost[j]):
+        i, j = np.unravel_index(cost.argmin(), cost.shape)
+        if not np.isfinite(cost[i, j]):
             continue
-        found = matcher.refine(template, places[j], angles[j] + template.angle, 0.02, 0.3, pull=0)
+        found = matcher.refine(
+            template, places[j], float(_TURNS[i]) + template.angle, 0.02, 0.3, pull=0)
         if found is not None and (best is None or found.cost < best.cost):
             best = found
     return best

@@ -7,11 +7,15 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 from tap_ros.errors import TrackingError
-from tap_ros.tracking.picture import Palette, Picture
+from tap_ros.tracking.picture import Palette, Picture, weighed
+from tap_ros.tracking.plane import Plane
 
 RADIUS = 36  # working pixels from a click to where no object reaches
 CORE = 3.5  # px around a click that are the object
-LIKELY, POSSIBLE = 12.0, 6.0  # distance from the table's colours of what may be the object
+COMMON = 0.12  # share of the ring around that a colour of the table has at least
+SHADES = (1.0, 0.5)  # of the table's light, in shadows of objects
+LIKELY, POSSIBLE, SURE = 12.0, 6.0, 25.0  # from the table's colours, of what may be the object
+FLAT = 0.3  # share of a silhouette that is its top at least, else the object is not upright
 LEAST_AREA = 25  # px
 LEAST_CONTRAST = 7.0  # of the object's colours and the table's, for a click to be believed
 _RINGS = (0.75, 1.3)  # of RADIUS, between which the table is seen
@@ -46,15 +50,19 @@ def silhouette(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray] = 
     empty = np.zeros(picture.size, bool)
     if not ring.any():
         return empty, 0.0
-    lab = picture.lab.reshape(3, h, w)[:, y0:y1, x0:x1]
-    around = Palette(lab[:, ring].T)
-    unlike = around.distance(picture)[window]
+    table = picture.image[window][ring][:, None]
+    unlike = np.min([Palette(shaded(table, share), least=COMMON).distance(picture.index[window])
+                     for share in SHADES], 0)
     mask = np.full(far.shape, cv2.GC_BGD, np.uint8)
     near = far < radius
     mask[near] = cv2.GC_PR_BGD
     mask[near & (unlike > LIKELY)] = cv2.GC_PR_FGD
     mask[(far < radius / 3) & (unlike > POSSIBLE)] = cv2.GC_PR_FGD
     mask[far < CORE] = cv2.GC_FGD
+    own = near
+    for other in others:
+        own = own & (far < np.hypot(x - other[0], y - other[1]))
+    mask[own & (unlike > SURE)] = cv2.GC_FGD
     mask[hidden] = cv2.GC_BGD
     for other in others:
         if np.hypot(other[0] - u, other[1] - v) > 2 * CORE:
@@ -75,6 +83,11 @@ def silhouette(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray] = 
     if not empty.any():
         return empty, 0.0
     return empty, float(np.median(unlike[found > 0]))
+
+
+def shaded(colours: np.ndarray, share: float) -> np.ndarray:
+    """Return colours (N, 1, 3) uint8 rgb with a share of their light, (N, 3) as Picture.lab."""
+    return weighed(np.rint(colours * share).astype(np.uint8))[:, 0]
 
 
 def clicked(picture: Picture, at: np.ndarray, others: Iterable[np.ndarray],
@@ -105,7 +118,29 @@ def outline(mask: np.ndarray) -> np.ndarray:
     return max(found, key=len)[:, 0].astype(np.float64) if found else np.zeros((0, 2))
 
 
-def middle(mask: np.ndarray) -> np.ndarray:
+def top_face(mask: np.ndarray, plane: Plane) -> np.ndarray:
+    """
+    Return the part of a silhouette (h, w) that is the top of an upright object.
+
+    Beneath a pixel of the top the whole side is in the silhouette, too. What is too flat for that
+    is all top.
+    """
+    top = mask.copy()
+    rise = plane.rise(plane.of_top(centre(mask)))
+    v, u = np.nonzero(mask)
+    for share in np.linspace(0, 1, 9)[1:]:
+        below = np.rint(np.column_stack([u, v]) - share * rise).astype(int)
+        below = below.clip(0, np.array(mask.shape[::-1]) - 1)
+        top[v, u] &= mask[below[:, 1], below[:, 0]]
+    return top if top.sum() > FLAT * mask.sum() else mask
+
+
+def middle(mask: np.ndarray, plane: Plane) -> np.ndarray:
+    """Return the place (2,) of an object by its silhouette (h, w)."""
+    return plane.of_top(centre(top_face(mask, plane)))
+
+
+def centre(mask: np.ndarray) -> np.ndarray:
     """Return the mean pixel (2,) of a mask (h, w)."""
     v, u = np.nonzero(mask)
     return np.array([u.mean(), v.mean()])

@@ -43,21 +43,28 @@ class Template:
     """
 
     def __init__(self, picture: Picture, plane: Plane, mask: np.ndarray, place: np.ndarray,
-                 angle: float = 0.0) -> None:
+                 angle: float = 0.0, face: np.ndarray | None = None) -> None:
         rng = np.random.default_rng(0)
         self.place, self.angle, self.area = place, angle, int(mask.sum())
-        pixels = _draw(mask, POINTS, rng)
-        self.points = (plane.of_top(pixels) - place).astype(np.float32)
-        flat = pixels @ (1, picture.size[1])
-        self.colours = picture.lab[:, flat]  # (3, P)
-        self.palette = Palette(self.colours.T)
+        self.palette = Palette(picture.lab[mask])
         self.outline = plane.of_top(outline(mask)) - place
-        inner, outer = (cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(
+        part = mask if face is None else face
+        pixels = _draw(part, POINTS, rng)
+        self.points = (plane.of_top(pixels) - place).astype(np.float32)
+        self.colours = picture.lab[pixels[:, 1], pixels[:, 0]]
+        inner, outer = (cv2.dilate(part.astype(np.uint8), cv2.getStructuringElement(
             cv2.MORPH_ELLIPSE, (side, side))) for side in (5, 9))
         beside = _draw(outer > inner, RING, rng)
-        near = self.palette.look_up(picture.index[beside @ (1, picture.size[1])])
+        self.normals: np.ndarray | None = None
+        if face is not None and plane.calibrated:
+            smooth = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 3)
+            slope = -np.stack(np.gradient(smooth)[::-1], -1)[beside[:, 1], beside[:, 0]]
+            slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-9)
+            normals = plane.of_top(beside + slope) - plane.of_top(beside)
+            self.normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        near = self.palette.distance(picture.index[beside[:, 1], beside[:, 0]])
         self.contrast = float(np.median(near)) if len(near) else 0.0
-        if self.contrast <= CONTRAST:
+        if self.normals is None and self.contrast <= CONTRAST:
             beside = beside[:0]
         self.ring = (plane.of_top(beside) - place).astype(np.float32)
 
@@ -77,56 +84,105 @@ class Matcher:
     def __init__(self, picture: Picture, plane: Plane, covered: np.ndarray | None = None) -> None:
         self.picture, self.plane = picture, plane
         self.covered = picture.hidden if covered is None else covered
-        self._homography = plane.top.astype(np.float32)
+        # A colour is read as one word, negative where it is covered.
+        words = cv2.merge([picture.lab, np.where(self.covered, np.uint8(255), np.uint8(0))])
+        self._words = np.asarray(words).view(np.int32).ravel()
+        self._likeness: dict[Template, np.ndarray] = {}
+
+    def likeness(self, template: Template) -> np.ndarray:
+        """Return how like the object's colours each pixel is, (h, w) 0 to 1, 0 where covered."""
+        if template not in self._likeness:
+            like = 1 - template.palette.distance(self.picture.index) / FAR
+            self._likeness[template] = np.maximum(like, 0) * ~self.covered
+        return self._likeness[template]
 
     def score(self, template: Template, places: np.ndarray, angles: np.ndarray,
-              thin: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+              thin: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """
-        Compare a template at S poses.
+        Compare a template at all places with all angles.
 
-        :param places: (S, 2) m; angles: (S,) relative to the template's picture.
+        :param places: (S, 2) m; angles: (A,) relative to the template's picture.
         :param thin: take every so many points.
-        :return: (S,) each: cost, share seen, share that fits, see Pose.
+        :return: (A, S) each: cost, share seen, see Pose.
         """
-        index, free = self._look(template.points[::thin], places, angles)  # (S, P)
-        difference = np.zeros(index.shape, np.float32)
-        for axis, own in zip(self.picture.lab, template.colours):
-            apart = axis[index]
-            apart -= own[::thin]
-            difference += np.abs(apart, out=apart)
-        seen = free.mean(1)
-        known = np.maximum(free.sum(1), 1)
-        cost = (np.minimum(difference, FAR) * free).mean(1) / FAR + HIDDEN * (1 - seen)
-        # other sides show as it turns: any of its colours fits
-        any_colour = template.palette.look_up(self.picture.index[index]) < OWN * FAR
-        fit = (any_colour & free).sum(1) / known
-        fit = np.where(((difference < SAME * FAR) & free).sum(1) / known > LEAST_SAME, fit, 0)
+        apart, free = self._apart(template, *self._look(template.points[::thin], places, angles),
+                                  thin)
+        cost = _mean(np.minimum(apart, int(FAR))) / FAR
+        seen = np.ones_like(cost) if free.all() else _mean(free)
+        cost += (HIDDEN - 1) * (1 - seen)
         if len(template.ring):
-            index, free = self._look(template.ring[::thin], places, angles)
-            like = 1 - template.palette.look_up(self.picture.index[index]) / FAR
-            cost += AROUND * (np.maximum(like, 0) * free).sum(1) / np.maximum(free.sum(1), 1)
-        return cost, seen, fit
+            index, inside = self._look(template.ring[::thin], places, angles)
+            like = self.likeness(template).ravel().take(index)
+            free = self._words.take(index) >= 0
+            if inside is not None:
+                like, free = like * inside, free & inside
+            if template.normals is not None:
+                toward = self.plane.toward_camera(places.mean(0))
+                c, s = np.cos(angles), np.sin(angles)
+                turned = np.stack([c * toward[0] + s * toward[1], c * toward[1] - s * toward[0]])
+                away = (template.normals[::thin] @ turned).T < 0.2  # (A, R)
+                like, free = like * away[:, None], free & away[:, None]
+            beside = _mean(like)
+            cost += AROUND * (beside if free.all() else beside / np.maximum(_mean(free), 1e-3))
+        return cost, seen
+
+    def fit(self, template: Template, place: np.ndarray, angle: float) -> float:
+        """Return the share of the points seen that have colours of the object, see Pose."""
+        index, inside = self._look(template.points, place[None], np.array([angle]))
+        apart, free = self._apart(template, index, inside)
+        known = max(int(free.sum()), 1)
+        if (apart[free] < SAME * FAR).sum() <= LEAST_SAME * known:
+            return 0.0
+        # other sides show as it turns: any of its colours fits
+        own = self.likeness(template).ravel().take(index) > 1 - OWN
+        return float((own & free).sum() / known)
+
+    def _apart(self, template: Template, index: np.ndarray, inside: np.ndarray | None,
+               thin: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Return how colours differ from the template's, (A, S, P); and which are seen."""
+        P = index.shape[-1]
+        words = self._words.take(index)
+        own = np.zeros((P, 4), np.uint8)
+        own[:, :3] = template.colours[::thin]
+        read = words.view(np.uint8).reshape(-1, 4 * P)
+        apart = np.asarray(cv2.absdiff(read, np.tile(own.ravel(), (len(read), 1))))
+        # the sum of the four bytes of each word
+        sums = apart.view(np.uint32).reshape(index.shape)
+        sums = (sums & 0xFF00FF) + ((sums >> 8) & 0xFF00FF)
+        sums = (sums & 0xFFFF) + (sums >> 16)
+        if inside is None:
+            return sums, words >= 0
+        return np.where(inside, sums, 255), (words >= 0) & inside
 
     def _look(self, points: np.ndarray, places: np.ndarray,
-              angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flat pixels (S, P) of points (P, 2) at S poses, and whether they are seen."""
-        places, angles = places.astype(np.float32), angles.astype(np.float32)
-        c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
-        x, y = points.T
-        X, Y = places[:, :1] + (c * x - s * y), places[:, 1:] + (s * x + c * y)
-        m = self._homography
-        scale = m[2, 0] * X + m[2, 1] * Y
-        scale += m[2, 2]
-        u = ((m[0, 0] * X + m[0, 1] * Y + m[0, 2]) / scale + np.float32(0.5)).astype(np.int32)
-        v = ((m[1, 0] * X + m[1, 1] * Y + m[1, 2]) / scale + np.float32(0.5)).astype(np.int32)
+              angles: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """
+        Project points (P, 2) of a template at all places with all angles.
+
+        :return: (A, S, P) flat pixels; and whether they are in the picture, None if all are.
+        """
         h, w = self.picture.size
-        inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
-        index = np.where(inside, v * w + u, 0)
-        return index, inside & ~self.covered.ravel()[index]
+        c, s = np.cos(angles), np.sin(angles)
+        x, y = points.T
+        X, Y = np.outer(c, x) - np.outer(s, y), np.outer(s, x) + np.outer(c, y)  # (A, P)
+        rays = []
+        for across, down, still in self.plane.top:
+            moved = places @ (across, down) + still
+            rays.append(np.add((across * X + down * Y)[:, None].astype(np.float32),
+                               moved[None, :, None].astype(np.float32)))
+        u, v, scale = rays
+        np.reciprocal(scale, out=scale)
+        for ray in (u, v):
+            ray *= scale
+            ray += np.float32(0.5)
+        inside = None
+        if u.min() < 0 or v.min() < 0 or u.max() >= w or v.max() >= h:
+            inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
+            u[~inside] = v[~inside] = 0
+        return v.astype(np.int32) * np.int32(w) + u.astype(np.int32), inside
 
     def refine(self, template: Template, place: np.ndarray, angle: float, reach: float,
-               turn: float, levels: int = 3, pull: float = ROUND,
-               least: float = 0.2) -> Pose | None:
+               turn: float, pull: float = ROUND, least: float = 0.2) -> Pose | None:
         """
         Search around a pose, coarsely and then finely.
 
@@ -137,20 +193,25 @@ class Matcher:
         :return: the best Pose, its angle relative to the first picture; or None.
         """
         centre, wide = np.asarray(place), reach
-        best, found = (centre, angle - template.angle), None
-        for level in range(levels):
-            places, angles = best[0] + reach * _GRID[:, :2], best[1] + turn * _GRID[:, 2]
-            cost, seen, fit = self.score(template, places, angles, thin=1 + (level == 0))
+        best, turned, found = centre, angle - template.angle, (0.0, 0.0)
+        for line, turns, thin, next_reach, next_turn in _LEVELS:
+            places, angles = best + reach * line, turned + turn * turns
+            cost, seen = self.score(template, places, angles, thin)
             total = cost + pull * (((places - centre) / wide) ** 2).sum(1)
             total[seen < least] = np.inf
-            j = int(total.argmin())
-            if not np.isfinite(total[j]):
+            i, j = np.unravel_index(total.argmin(), total.shape)
+            if not np.isfinite(total[i, j]):
                 return None
-            best = places[j], float(angles[j])
-            found = Pose(best[0], best[1] + template.angle, *map(
-                float, (cost[j], seen[j], fit[j])))
-            reach, turn = reach / 3.2, turn / 2.5
-        return found
+            best, turned, found = places[j], float(angles[i]), (cost[i, j], seen[i, j])
+            reach, turn = reach * next_reach, turn * next_turn
+        return Pose(best, turned + template.angle, float(found[0]), float(found[1]),
+                    self.fit(template, best, turned))
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Return the mean over the last axis, faster than numpy does."""
+    P = values.shape[-1]
+    return values.astype(np.float32) @ np.full(P, 1 / P, np.float32)
 
 
 def _draw(mask: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -160,6 +221,14 @@ def _draw(mask: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     return np.column_stack([u[kept], v[kept]])
 
 
-# (S, 3): x, y from -1 to 1 by seven steps, turned by five.
-_GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 7)] * 2, np.linspace(-1, 1, 5), indexing='ij'),
-                 -1).reshape(-1, 3)
+def _square(count: int) -> np.ndarray:
+    """Return places (count * count, 2) from -1 to 1."""
+    line = np.linspace(-1, 1, count)
+    return np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
+
+
+# Of refine: places, turns, every so many points, and what the next level is of this one.
+_LEVELS = ((_square(7), np.linspace(-1, 1, 5), 2, 1 / 3.2, 1 / 2.5),
+           (_square(5), np.linspace(-1, 1, 5), 1, 1 / 3, 1 / 2.5),
+           (_square(5), np.linspace(-1, 1, 3), 1, 1 / 3, 1 / 2.5),
+           (_square(3), np.linspace(-1, 1, 3), 1, 1 / 3, 1 / 2.5))
