@@ -26,6 +26,7 @@ class Plane:
     :param camera: PinholeCamera in the frame of the table, or None.
     :param size: (height, width) of the pictures.
     :ivar working: (height, width) of the working picture.
+    :ivar blur: px of it that an edge is wide at most, where it is enlarged.
     :ivar top: (3, 3) homography of places of tops to working pixels.
     """
 
@@ -34,6 +35,7 @@ class Plane:
         height, width = size
         scale = SIDE / max(size)
         self.working = max(round(height * scale), 1), max(round(width * scale), 1)
+        self.blur = round(scale / 2) if scale > 1.5 else 0
         self._scale = np.array([self.working[1] / width, self.working[0] / height])
         self.top = self._homography(camera, TOP)
         self._middle, self._base = (self._homography(camera, z) for z in (MIDDLE, 0.0))

@@ -14,7 +14,7 @@ from tap_ros.tracking.search import locate
 from tap_ros.tracking.silhouette import centre, silhouette
 from tap_ros.tracking.template import Matcher, Pose, Template
 
-LEAST_FIT, MOST_COST = 0.8, 0.4  # else not found
+LEAST_FIT, MOST_COST = 0.4, 0.4  # else not found
 CHANGED = 8.0  # distance of colours
 LEAST_CHANGED = 60  # px of the working picture
 KEPT = 0.1  # weight of places where nothing changed

@@ -49,11 +49,14 @@ class Template:
         self.palette = Palette(picture.lab[mask])
         self.outline = plane.of_top(outline(mask)) - place
         part = mask if face is None else face
+        if plane.blur:  # pixels at its edge are mixed with the table
+            inside = cv2.erode(part.astype(np.uint8), _round(2 * plane.blur + 1)) > 0
+            part = inside if inside.sum() > 0.3 * part.sum() else part
         pixels = _draw(part, POINTS, rng)
         self.points = (plane.of_top(pixels) - place).astype(np.float32)
         self.colours = picture.lab[pixels[:, 1], pixels[:, 0]]
-        inner, outer = (cv2.dilate(part.astype(np.uint8), cv2.getStructuringElement(
-            cv2.MORPH_ELLIPSE, (side, side))) for side in (5, 9))
+        inner, outer = (cv2.dilate(part.astype(np.uint8), _round(side + 4 * plane.blur))
+                        for side in (5, 9))
         beside = _draw(outer > inner, RING, rng)
         self.normals: np.ndarray | None = None
         if face is not None and plane.calibrated:
@@ -131,11 +134,12 @@ class Matcher:
         index, inside = self._look(template.points, place[None], np.array([angle]))
         apart, free = self._apart(template, index, inside)
         known = max(int(free.sum()), 1)
-        if (apart[free] < SAME * FAR).sum() <= LEAST_SAME * known:
+        same = (apart < SAME * FAR) & free
+        if same.sum() <= LEAST_SAME * known:
             return 0.0
         # other sides show as it turns: any of its colours fits
         own = self.likeness(template).ravel().take(index) > 1 - OWN
-        return float((own & free).sum() / known)
+        return float((same | own & free).sum() / known)
 
     def _apart(self, template: Template, index: np.ndarray, inside: np.ndarray | None,
                thin: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -212,6 +216,11 @@ def _mean(values: np.ndarray) -> np.ndarray:
     """Return the mean over the last axis, faster than numpy does."""
     P = values.shape[-1]
     return values.astype(np.float32) @ np.full(P, 1 / P, np.float32)
+
+
+def _round(side: int) -> np.ndarray:
+    """Return a round structuring element."""
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
 
 
 def _draw(mask: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
