@@ -3,11 +3,31 @@
 
 from glob import glob
 from runpy import run_path
+import sys
 
 from setuptools import find_packages, setup
 
 NAME = 'tap_ros'
 NODE_MODULES = run_path('tap_ros/contract.py')['NODE_MODULES']
+REQUIRED = [  # for pip
+    'jinja2>=3.1',
+    'lz4>=4.0',
+    'matplotlib>=3.6',
+    'mcap>=1.1',
+    'mujoco>=3.3',
+    'numpy>=1.26',
+    'opencv-python-headless>=4.6',
+    'pillow>=10.2',
+    'pyyaml>=6.0',
+    'rosbags>=0.10',
+    'safetensors>=0.4.3',
+    'scipy>=1.11',
+    'tensorboard>=2.16',
+    'torch>=2.6',
+    'tqdm>=4.66',
+    'tyro>=0.9',
+    'zstandard>=0.22',
+]
 
 setup(
     name=NAME,
@@ -20,7 +40,8 @@ setup(
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
     package_data={
         NAME: ['*.pyi', 'nodes/demo/*.html', 'nodes/explorer/page/*', 'nodes/*.xml',
-               'prediction/page/*', 'py.typed', 'weights/*.safetensors', 'weights/*.md'],
+               'prediction/page/*', 'py.typed', 'weights/*.md', 'weights/*.png',
+               'weights/*.safetensors'],
         'sim_bridge': ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
@@ -29,7 +50,8 @@ setup(
         (f'share/{NAME}/config/layouts', glob('config/layouts/*')),
         (f'share/{NAME}/launch', glob('launch/*.launch.py')),
     ],
-    install_requires=['setuptools'],
+    # colcon takes what package.xml names: of apt's packages some are no distributions.
+    install_requires=REQUIRED if 'setuptools.build_meta' in sys.modules else ['setuptools'],
     extras_require={  # what only some commands need; `colcon test` runs pytest because of the last
         'tfrecord': ['google-crc32c'],
         'explorer': ['websockets'],

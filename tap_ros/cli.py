@@ -80,10 +80,10 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }
-EXTRAS = {  # what only some commands need, and what pip installs for it
-    'google': "'.[tfrecord]'", 'google_crc32c': "'.[tfrecord]'", 'huggingface_hub': "'.[hub]'",
-    'jinja2': '-r requirements-experiments.txt', 'pandas': '-r requirements-experiments.txt',
-    'pyarrow': "'.[lerobot]'", 'ray': "'.[ray]'", 'websockets': "'.[explorer]'"}
+EXTRAS = {  # what only some commands need, and what pip calls it
+    'google': 'google-crc32c', 'google_crc32c': 'google-crc32c',
+    'huggingface_hub': 'huggingface_hub', 'pandas': 'pandas', 'pyarrow': 'pyarrow', 'ray': 'ray',
+    'websockets': 'websockets'}
 PROG = 'python -m tap_ros'
 
 
@@ -118,8 +118,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
-        print(f'error: {error.name} is not installed; type `pip install {EXTRAS[error.name]}` in '
-              'a checkout (`make build` has done it)', file=sys.stderr)
+        print(f'error: {error.name} is not installed; type `pip install '
+              f'{EXTRAS[error.name]}`', file=sys.stderr)
         return 1
     except BrokenPipeError:  # who read the output has seen enough, as in `... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to flush

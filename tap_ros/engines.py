@@ -40,7 +40,7 @@ class Engine:
     """
     Where tasks run.
 
-    :param name: local: processes of this machine; ray: Ray, which needs `pip install '.[ray]'`.
+    :param name: local: processes of this machine; ray: Ray, which needs `pip install ray`.
     :param workers: tasks at a time, a process each; 0: one a core, of the cluster with an address.
     :param address: of a Ray cluster to join, such as 'auto' or '10.0.0.1:6379'; empty: Ray is
         started on this machine. Its machines need this package in the same place, and the folders
@@ -195,7 +195,7 @@ def _ray(engine: Engine) -> Iterator[Workers]:
         import ray
         from ray import exceptions
     except ImportError as error:
-        raise ConfigError("engine: Ray is not installed; type `pip install '.[ray]'`, or "
+        raise ConfigError('engine: Ray is not installed; type `pip install ray`, or '
                           'choose --engine local') from error
     place = {'address': engine.address} if engine.address else {
         'address': 'local',  # not one that happens to run here

@@ -11,6 +11,8 @@ import sys
 
 from ament_index_python import get_package_prefix, get_package_share_directory
 from catkin_pkg.package import parse_package
+from packaging.requirements import Requirement
+import setuptools.build_meta  # noqa: F401  setup.py sees that it is pip who asks
 from tap_ros.contract import NODE_MODULES
 
 ROOT = Path(__file__).parents[2]
@@ -25,6 +27,7 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
+DISTRIBUTIONS = {'PIL': 'pillow', 'cv2': 'opencv-python-headless', 'yaml': 'pyyaml'}  # other names
 ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules with another name
 
 
@@ -123,9 +126,20 @@ def test_requirements_and_constraints_agree():
             assert pinned[distribution] == version, f'{name}: {distribution}'
 
 
-def test_extras_are_those_of_the_commands(monkeypatch):
+def test_pip_brings_what_is_imported_and_the_pinned_versions_will_do(monkeypatch):
     monkeypatch.chdir(ROOT)
-    extras = dict(run_setup('setup.py', stop_after='commandline').extras_require)
+    described = run_setup('setup.py', stop_after='commandline')
+    extras = dict(described.extras_require)
     assert extras.pop('test') == ['pytest']
-    assert {normalized(each) for extra in extras.values() for each in extra} == set(
-        requirements('requirements-extras.txt'))
+    extras = {normalized(each) for extra in extras.values() for each in extra}
+    assert extras == set(requirements('requirements-extras.txt'))
+
+    bounds = {normalized(each.name): each.specifier
+              for each in map(Requirement, described.install_requires)}
+    pinned = requirements('constraints.txt')
+    assert all(bound.contains(pinned[name]) for name, bound in bounds.items())
+    of_ros = {depend.name for depend in parse_package(str(ROOT)).exec_depends} | set(ROS_PACKAGES)
+    imported = imported_packages('tap_ros', 'sim_bridge') - of_ros
+    imported = {normalized(DISTRIBUTIONS.get(name, name)) for name in imported}
+    imported |= {'ray', 'tensorboard'}  # where it is there; by way of torch.utils.tensorboard
+    assert set(bounds) | extras == imported - set(requirements('requirements-worlds.txt'))
