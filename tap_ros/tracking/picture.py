@@ -40,8 +40,8 @@ class Picture:
         self.image = image
         lab = cv2.cvtColor(cv2.GaussianBlur(image, (3, 3), 0.7), cv2.COLOR_RGB2LAB)
         self.lab = np.asarray(cv2.LUT(lab, _WEIGHED))
-        L, a, b = cv2.split(cv2.LUT(lab, _INDEX))
-        self.index = np.asarray(L) | a | b
+        parts: list[np.ndarray] = [np.asarray(part) for part in cv2.split(cv2.LUT(lab, _INDEX))]
+        self.index: np.ndarray = np.bitwise_or(np.bitwise_or(parts[0], parts[1]), parts[2])
         if view.robot_mask is None:
             self.hidden = np.zeros(self.size, bool)
         else:

@@ -19,7 +19,7 @@ from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
 from tap_ros.tracking.registration import register
 from tap_ros.tracking.search import locate
-from tap_ros.tracking.silhouette import clicked, middle, silhouette, top_face
+from tap_ros.tracking.silhouette import clicked, middle, RADIUS, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
@@ -27,6 +27,8 @@ REST, REST_TURN = 0.012, 0.1  # the same, of what the hand is not near to
 HAND_FAR, HAND_HIGH = 0.22, 0.1  # m: a hand farther off, or higher, moves nothing
 GOOD, GOOD_COST = 0.7, 0.35  # fit of what is believed; cost up to which no other is tried
 NEW_COST, NEW_ANGLE, NEW_SEEN = 0.25, 0.35, 0.85  # from when on the object is cut out anew
+WAITS = 4  # pictures from one such cut to the next
+BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
 KEYS = 6  # templates of an object, the first among them
 PATIENCE = 2  # pictures in which what should be seen may be missed, before it is lost
 
@@ -43,6 +45,8 @@ class _Object:
     age: int = 0  # pictures since it was seen
     confidence: float = 1.0
     shown: Template = field(init=False)  # that it was seen by last
+    around: 'tuple[tuple[slice, slice], Picture] | None' = None  # window of it in which picture
+    waits: int = 0  # pictures until it may be cut out anew
 
     def __post_init__(self) -> None:
         self.shown = self.keys[0]
@@ -103,6 +107,9 @@ class RigidTracker:
 
     def _follow(self, one: _Object, picture: Picture, hand: np.ndarray | None) -> None:
         """Bring one object into the next picture."""
+        if one.state == SEEN and one.around is not None and _still(*one.around, picture):
+            return
+        one.around, one.waits = None, one.waits - 1
         matcher = Matcher(picture, self._plane, self._covered(one, picture))
         keys, found = one.nearest(), self._search(one, matcher, hand)
         pose, key = found if found is not None else (None, keys[0])
@@ -110,7 +117,9 @@ class RigidTracker:
             one.place, one.angle, one.age, one.shown = pose.place, pose.angle, 0, key
             one.state, one.confidence = SEEN, probability(pose.fit, pose.cost, pose.seen)
             nearest = min(abs(_turned(other.angle - one.angle)) for other in one.keys)
-            if pose.seen > NEW_SEEN and (pose.cost > NEW_COST or nearest > NEW_ANGLE):
+            one.around = self._window(one), picture
+            if one.waits <= 0 and pose.seen > NEW_SEEN and (
+                    pose.cost > NEW_COST or nearest > NEW_ANGLE):
                 self._cut_anew(one, picture)
             return
         seen = matcher.score(keys[0], one.place[None], np.array([one.angle - keys[0].angle]))[1][0]
@@ -139,7 +148,7 @@ class RigidTracker:
         best = attempt(one.place, keys[0])
         if best is not None and best[0].fit > GOOD and best[0].cost < GOOD_COST:
             return best
-        others = [(one.place, key) for key in keys[1:2]]
+        others = [(one.place, key) for key in (*keys[1:2], one.face)]
         if push is not None and np.linalg.norm(push) > 0.01:
             others.append((one.place + push, keys[0]))
         for place, key in others:
@@ -148,12 +157,11 @@ class RigidTracker:
                 best = other
         if one.age >= 1 and not (best is not None and best[0].fit > GOOD):
             avoid = [other.place for other in self._objects if other is not one]
-            for key in dict.fromkeys([keys[0], one.keys[0], one.keys[-1]]):
-                pose = locate(matcher, key, avoid)
-                if (pose is not None and pose.fit > 0.8
-                        and np.linalg.norm(pose.place - one.place) < 0.08 * (one.age + 1) + 0.03
-                        and (best is None or pose.cost < best[0].cost - 0.1)):
-                    return pose, key
+            pose = locate(matcher, one.face, avoid)
+            if (pose is not None and pose.fit > GOOD and pose.cost < 0.4
+                    and np.linalg.norm(pose.place - one.place) < 0.08 * (one.age + 1) + 0.03
+                    and (best is None or pose.cost < best[0].cost - 0.1)):
+                return pose, one.face
         return best
 
     def _covered(self, one: _Object, picture: Picture) -> np.ndarray:
@@ -165,11 +173,21 @@ class RigidTracker:
                     other.place, other.angle))).astype(np.int32)], 1)
         return covered > 0
 
+    def _window(self, one: _Object) -> tuple[slice, slice]:
+        """Return the part of the working picture that shows an object and what is next to it."""
+        pixels = self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
+        (u, v), (right, low) = pixels.min(0).astype(int), pixels.max(0).astype(int)
+        return np.s_[max(v - BESIDE, 0):max(low + BESIDE, 0), max(u - BESIDE, 0):max(
+            right + BESIDE, 0)]
+
     def _cut_anew(self, one: _Object, picture: Picture) -> None:
         """Add a template of the object as it is now: it has turned, and shows other sides."""
         at, *others = self._plane.middle_pixels([one.place, *(
             other.place for other in self._objects if other is not one)])
-        mask, _ = silhouette(picture, at, others)
+        one.waits = WAITS
+        pixels = self._plane.top_pixels(one.shown.outlined(one.place, one.angle))
+        radius = min(float(np.linalg.norm(pixels - at, axis=1).max()) * 1.4 + 4, RADIUS)
+        mask, _ = silhouette(picture, at, others, radius)
         beside = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
         if 0.6 < mask.sum() / one.keys[0].area < 1.6 and not (beside & picture.hidden).any():
             key = Template(picture, self._plane, mask, one.place, one.angle)
@@ -184,6 +202,14 @@ class RigidTracker:
             np.array([one.confidence for one in self._objects]),
             tuple(self._plane.enlarge(self._plane.top_pixels(one.shown.outlined(
                 one.place, one.angle))) for one in self._objects))
+
+
+def _still(window: tuple[slice, slice], before: Picture, now: Picture) -> bool:
+    """Return whether a window shows the same in two pictures."""
+    if (before.hidden[window] != now.hidden[window]).any():
+        return False
+    apart = cv2.absdiff(before.lab[window], now.lab[window])
+    return bool((np.asarray(apart) > SAME).mean() < 0.003)
 
 
 def _turned(angle: float) -> float:
