@@ -24,15 +24,20 @@ def generate_launch_description():
     nodes = PathJoinSubstitution([FindPackageShare('tap_ros'), 'launch', 'nodes.launch.py'])
     # python3 of the shell, like the nodes: ros2 itself may run with another one.
     driver = ['python3', '-m', 'tap_ros', 'demo', '--attach',
-              '--scenes', LaunchConfiguration('scenes')]
+              '--scenes', LaunchConfiguration('scenes'),
+              '--objects', LaunchConfiguration('objects')]
     return LaunchDescription([
         DeclareLaunchArgument('scenes', default_value='3', description='How many scenes to push.'),
+        DeclareLaunchArgument(
+            'objects', default_value='tracked', choices=['tracked', 'truth'],
+            description='Where the objects come from: clicks and a tracker, or the simulation.'),
         DeclareLaunchArgument(
             'record', default_value='runs/demo-recording', description='Folder to record into.'),
         IncludeLaunchDescription(
             PythonLaunchDescriptionSource(nodes),
             launch_arguments={
-                'lock_step': 'true', 'record': LaunchConfiguration('record')}.items()),
+                'lock_step': 'true', 'objects': LaunchConfiguration('objects'),
+                'record': LaunchConfiguration('record')}.items()),
         ExecuteProcess(cmd=driver, name='demo', output='screen', emulate_tty=True,
                        on_exit=Shutdown(reason='the demo has ended')),
     ])

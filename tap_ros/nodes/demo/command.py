@@ -6,9 +6,12 @@ The demo: real nodes in processes of their own push objects to where a goal pict
 Each scene is pushed twice: directly, and via the subgoal that predict_subgoal answers. Everything
 goes through the topics, services and actions that any client would use. Where a gripper is needed
 the subgoal is predicted only; nothing here plans grasps.
+
+The objects are tracked: a click on each in the first picture, here at its true pixel, and another
+in the goal picture on what is not found there. Ground truth only measures.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 import math
 import os
@@ -17,7 +20,7 @@ import platform
 import shlex
 import sys
 import time
-from typing import Annotated, Any, TYPE_CHECKING
+from typing import Annotated, Any, Literal, TYPE_CHECKING
 
 import numpy as np
 from sensor_msgs.msg import Image
@@ -29,9 +32,10 @@ from tap_msgs.msg import ObjectStates
 from tap_ros.contract import ROBOT_MASKS, step_budget
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.messages.images import decode_image
+from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.client import Client, positions_of, View
+from tap_ros.nodes.client import Client, positions_of, request_fields, subgoals_of, View
 from tap_ros.nodes.demo.report import (
     results_table,
     Run,
@@ -40,11 +44,12 @@ from tap_ros.nodes.demo.report import (
     write_report,
 )
 from tap_ros.nodes.node_processes import NodeProcesses
-from tap_ros.nodes.topics import STREAM
+from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.options import Flag, Folder, one_of
 from tap_ros.planning.mpc_config import FIRST_SCENE
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
+from tap_ros.tracking.protocols import LOST
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tqdm import tqdm
 from tyro import conf
@@ -57,9 +62,14 @@ USUAL_TASKS = ('push2', 'order2', 'stack2')
 OTHERS_OBJECTS = 1  # of tasks of other worlds
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 MODES = ('direct', 'subgoal')
+TOLD = {  # by whether objects are tracked
+    True: 'Objects are tracked from a click on each in the first picture (here its true pixel), '
+          'and found in the goal picture; the ground truth of the simulator only measures the '
+          'distances.',
+    False: 'Object pixels at every step, and the distances, are ground truth of the simulator.'}
 STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
-TOPICS = {'camera/image_raw': Image, 'objects': ObjectStates, 'observer/image_raw': Image,
-          'plan/overlay': Image}
+FOUND_S = 10.0  # that the tracker may take to find the objects of a goal
+TOPICS = {'camera/image_raw': Image, 'observer/image_raw': Image, 'plan/overlay': Image}
 
 
 class Watch:
@@ -67,12 +77,29 @@ class Watch:
     Keep every camera picture of a scene, the objects in it, and what else is shown for people.
 
     :param node: rclpy Node that another thread spins.
+    :param tracked: whether objects and goal/objects are the tracker's, and the truth is beside.
+    :ivar truth: topic of the true objects; true_goal: of those of the goal.
     """
 
-    def __init__(self, node: 'Node') -> None:
-        self._kept: dict[str, dict[int, Any]] = {topic: {} for topic in TOPICS}
-        for topic, kind in TOPICS.items():
-            node.create_subscription(kind, topic, partial(self._keep, topic), STREAM)
+    def __init__(self, node: 'Node', tracked: bool) -> None:
+        self.tracked, beside = tracked, 'truth/' if tracked else ''
+        self.truth, self.true_goal = f'{beside}objects', f'{beside}goal/objects'
+        latched = dict.fromkeys(['goal/objects', self.true_goal], ObjectStates)
+        streams = {**TOPICS, self.truth: ObjectStates}
+        self._kept: dict[str, dict[int, Any]] = {topic: {} for topic in {**streams, **latched}}
+        for topics, qos in ((streams, STREAM), (latched, LATCHED)):
+            for topic, kind in topics.items():
+                node.create_subscription(kind, topic, partial(self._keep, topic), qos)
+
+    def at(self, topic: str, stamp_ns: int, timeout_s: float) -> Any | None:
+        """Return the message of a stamp with objects, None where it does not come in time."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            found = self._kept[topic].get(stamp_ns)
+            if found is not None and found.objects:
+                return found
+            time.sleep(0.05)
+        return None
 
     def since(self, first_ns: int, *topics: str) -> list[tuple[Any, ...]]:
         """Return the messages that came on all of some topics, in order of their stamps."""
@@ -88,12 +115,57 @@ class Watch:
         self._kept[topic][to_nanoseconds(message.header.stamp)] = message
 
 
-def predict(client: Client) -> 'Subgoal':
-    """Ask for a subgoal as a person would by hand: with an empty request."""
+def begin(client: Client, watch: Watch, task: str, seed: int) -> tuple[View, View, dict[str, Any]]:
+    """
+    Start a scene; where objects are tracked, stand in for the user who clicks on them.
+
+    :return: the first picture and the goal, with the objects as the nodes know them and with true
+        positions; goal pixels by name if the goal has objects that the tracker did not find.
+    """
+    start, goal = client.reset(task, seed, objects=not watch.tracked)
+    placed: dict[str, Any] = {}
+    if watch.tracked:
+        start, goal, placed = click(client, watch, start, goal)
+    return start, goal, placed
+
+
+def click(client: Client, watch: Watch, start: View,
+          goal: View) -> tuple[View, View, dict[str, Any]]:
+    """Click on each object in the first picture, and on those not found in the goal picture."""
+    true, wanted = (watch.at(topic, view.stamp_ns, client.timeout_s) for topic, view in (
+        (watch.truth, start), (watch.true_goal, goal)))
+    if true is None or wanted is None:
+        raise TapError(f'{watch.truth}: nothing came; start sim_node with objects:=tracked, or '
+                       'the demo with --objects truth')
+    names, clicks = decode_objects(true, watch.truth)
+    deadline, found = time.monotonic() + client.timeout_s, None
+    while found is None:
+        try:  # right after a reset the tracker may not have heard of the scene yet
+            client.select(dict(zip(names, clicks.tolist())))
+            found = watch.at('goal/objects', goal.stamp_ns, FOUND_S)
+        except CallError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.2)
+    places = dict(zip(*decode_objects(wanted, watch.true_goal)))
+    told = dict(zip(*decode_objects(found, 'goal/objects')))
+    lost = [one.name for one, state in zip(found.objects, found.states) if state == LOST]
+    if lost:
+        print(f'    {", ".join(lost)} not found in the goal picture: clicked there', flush=True)
+    goal_pixels = told | {name: places[name] for name in lost}
+    start = replace(client.camera(start.stamp_ns - 1), positions=positions_of(true))
+    goal = replace(goal, names=names, pixels=np.array([goal_pixels[name] for name in names]),
+                   positions=positions_of(wanted))
+    return start, goal, goal_pixels if lost else {}
+
+
+def predict(client: Client, placed: dict[str, Any]) -> 'Subgoal':
+    """Ask for a subgoal as a person would by hand: empty but for what was clicked in the goal."""
     deadline = time.monotonic() + client.timeout_s
+    fields = request_fields(tuple(placed), goal_objects=list(placed.values()) or None)
     while True:
         try:
-            subgoal = client.predict()[0]
+            subgoal = subgoals_of(client.call('predict', **fields))[0]
             if len(subgoal.object_maps):
                 return subgoal
         except CallError:  # right after the start it may not have heard of the simulator yet
@@ -103,10 +175,10 @@ def predict(client: Client) -> 'Subgoal':
 
 
 def push(client: Client, watch: Watch, mode: str, seed: int, step_budget: int,
-         goal: View) -> Run:
+         goal: View, placed: dict[str, Any]) -> Run:
     """Have the arm push until the goal is reached or the budget spent; return the Run."""
     planning_ms = [math.nan]
-    reaching = client.reach(mode=mode, step_budget=step_budget, seed=seed,
+    reaching = client.reach(mode=mode, step_budget=step_budget, seed=seed, goal_pixels=placed,
                             timeout_s=client.timeout_s + STEP_TIMEOUT_S * step_budget)
     with tqdm(total=step_budget, desc=f'    {mode:<8}', unit='step', leave=False) as bar:
         for feedback in reaching:
@@ -115,9 +187,10 @@ def push(client: Client, watch: Watch, mode: str, seed: int, step_budget: int,
                 f'to the {feedback.stage}, {feedback.expected_distance:.1f} px expected')
             bar.update(feedback.step - bar.n)
     result = reaching.result()
-    if result.end != 'succeeded':
+    # An object that is lost on the way ends the run, and not the demo.
+    if result.end != 'succeeded' and not (watch.tracked and len(planning_ms) > 1):
         raise TapError(f'reach_goal ({mode}): {result.message}')
-    seen = watch.since(goal.stamp_ns, 'camera/image_raw', 'objects')
+    seen = watch.since(goal.stamp_ns, 'camera/image_raw', watch.truth)
     return Run(
         frames=[decode_image(image, 'camera/image_raw') for image, _ in seen],
         distances=np.array([np.linalg.norm(positions_of(objects) - goal.positions, axis=1)
@@ -138,16 +211,16 @@ def run_scene(client: Client, watch: Watch, task: str, seed: int, step_budget: i
     :return: SceneRuns.
     """
     runs: dict[str, Run] = {}
-    start, goal = client.reset(task, seed)
-    subgoal = predict(client)
+    start, goal, placed = begin(client, watch, task, seed)
+    subgoal = predict(client, placed)
     for mode in () if gripping else MODES:
         if runs:
-            _, goal = client.reset(task, seed)
-        begin = time.monotonic()
-        run = runs[mode] = push(client, watch, mode, seed, step_budget, goal)
+            _, goal, placed = begin(client, watch, task, seed)
+        begun = time.monotonic()
+        run = runs[mode] = push(client, watch, mode, seed, step_budget, goal, placed)
         print(f'    {mode:<8} {100 * run.distances[0].mean():5.1f} -> '
               f'{100 * run.distances[-1].mean():5.1f} cm in {len(run.frames) - 1} steps, '
-              f'{time.monotonic() - begin:.0f} s ({run.planning_ms:.0f} ms a plan)', flush=True)
+              f'{time.monotonic() - begun:.0f} s ({run.planning_ms:.0f} ms a plan)', flush=True)
     return SceneRuns(
         task=task, seed=seed, start=start.image, goal=goal.image, start_pixels=start.pixels,
         goal_pixels=goal.pixels, subgoal=subgoal.image, object_maps=subgoal.object_maps,
@@ -183,6 +256,8 @@ class Options:
     :param predictor: weights, shipped or a file; empty: those of the task.
     :param forward_model: weights of the planner.
     :param robot_mask: what is taken out of pictures, as it was in the training of the weights.
+    :param objects: where they come from: tracked, from a click on each in the first picture, or
+        truth, the simulator. In another world it is the truth.
     :param look: of the world, see sim_node.
     :param arm: at the table, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
@@ -198,6 +273,7 @@ class Options:
     predictor: str = ''
     forward_model: str = 'push'
     robot_mask: Annotated[str, one_of(ROBOT_MASKS)] = 'none'
+    objects: Literal['tracked', 'truth'] = 'tracked'
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
     arm: Annotated[str, one_of(names('tap_ros.arms'))] = DEFAULT_ARM
     step_budget: Annotated[int, conf.arg(
@@ -228,8 +304,8 @@ def run(args: Options) -> int:
     write_report(
         folder / 'report.html', scenes,
         f'Tasks {", ".join(tasks)}, seeds {args.seed} to {args.seed + args.scenes - 1} of each, '
-        f'at most {_budget(args, tasks[0])} steps of a push, {seconds:.0f} s in all. Object '
-        'pixels at every step, and the distances, are ground truth of the simulator.', {
+        f'at most {_budget(args, tasks[0])} steps of a push, {seconds:.0f} s in all. '
+        f'{TOLD[_tracked(args)]}', {
             'date': time.strftime('%Y-%m-%d %H:%M'),
             'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
             'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'})
@@ -246,19 +322,23 @@ def run(args: Options) -> int:
 def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
     """Run the scenes of one task with nodes of its own, or with those that run already."""
     with NodeProcesses(folder / 'logs' / task) as processes, Client() as client:
-        watch, gripping = Watch(client.node), _gripping(args, task)
+        tracked, gripping = _tracked(args), _gripping(args, task)
+        watch = Watch(client.node, tracked)
         world = {'look': args.look, 'arm': args.arm} if args.world == TABLE else {
             'world': args.world}
         if args.attach:
             print(f'{task}: waiting for the nodes that run already', flush=True)
-            client.wait_until_ready('sim_node', 'predictor_node', *(
-                [] if gripping else ['visual_mpc_node']))
+            client.wait_until_ready(
+                'sim_node', 'predictor_node', *['tracker_node'] * tracked,
+                *([] if gripping else ['visual_mpc_node']))
         else:
             print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
                   flush=True)
             processes.start('recorder_node', folder=folder / 'recording' / task)
             processes.start('sim_node', lock_step=True, task=task, observer=args.world == TABLE,
-                            **world)
+                            objects='tracked' if tracked else 'truth', **world)
+            if tracked:
+                processes.start('tracker_node', **camera_parameters(args.look, gripping))
             processes.start(
                 'predictor_node', robot_mask=args.robot_mask, weights=args.predictor or (
                     task if task in PREDICTORS else DEFAULT_PREDICTOR))
@@ -273,6 +353,20 @@ def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
                 client, watch, task, args.seed + i, _budget(args, task), world, gripping))
             processes.check()
         return scenes
+
+
+def camera_parameters(look: str, gripping: bool) -> dict[str, float]:
+    """Return where the simulator's camera is, as parameters of nodes."""
+    from scipy.spatial.transform import Rotation
+    pose = LOOKS[look].camera(gripping, 64, 64).pose  # of pictures of any size
+    values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+    return {f'camera_{axis}': float(value)
+            for axis, value in zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values)}
+
+
+def _tracked(args: Options) -> bool:
+    """Return whether objects are tracked."""
+    return args.objects == 'tracked' and args.world == TABLE
 
 
 def _gripping(args: Options, task: str) -> bool:
