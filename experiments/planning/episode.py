@@ -32,7 +32,8 @@ class PlannedEpisode:
     switches: list  # steps at which the second, third ... target began
     tracked: np.ndarray  # (steps + 1, K, 2) pixels that the planner was given
     subgoals: list  # prediction.predictor.Subgoal
-    refused: str  # why nothing was planned: objects that were not found; '' if it was
+    placed: list  # names of objects that had to be clicked in the goal picture
+    refused: str  # why nothing was planned: a click was of no use; '' if it was
     aborted: str  # why the loop gave up before the goal or the end of its budget, '' if not
 
     @property
@@ -104,7 +105,8 @@ def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,
     return PlannedEpisode(
         np.array(distances), observations, np.array(actions).reshape(-1, 4), np.array(times),
         true_goal, reach.targets or [Target(goal.object_pixels)], reach.switches,
-        np.array(tracked or [start.object_pixels]), subgoals, refused, aborted)
+        np.array(tracked or [start.object_pixels]), subgoals,
+        follower.placed if follower else [], refused, aborted)
 
 
 class FilledView:

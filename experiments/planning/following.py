@@ -12,7 +12,6 @@ from tap_ros.contract import ROBOT_MASK_FREE
 from tap_ros.errors import TrackingError
 from tap_ros.plugins import load_plugin
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.text import listing
 from tap_ros.tracking.protocols import LOST, View
 
 CAMERA_SIZE = 256  # px, what objects are followed in
@@ -24,16 +23,18 @@ class Follower:
     """
     Tells where the objects of an episode are, in place of the simulator.
 
-    A click on each object in the first picture is all that comes from there. The tracker is shown
+    A click on each object in the first picture is all that comes from there; in the goal picture
+    one on each object that is not found, as tracker_node asks for it. The tracker is shown
     CAMERA_SIZE pixels a side, the networks what they were trained on.
 
     :param tracker: of the plugin group tap_ros.trackers. 'carried' sees what the networks see, and
         is told the true pixels at the start and in the goal.
     :param simulator: Simulator.
+    :ivar placed: names of objects that were clicked in the goal picture.
     """
 
     def __init__(self, tracker, simulator):
-        self._simulator, self._exact = simulator, tracker == 'carried'
+        self._simulator, self._exact, self.placed = simulator, tracker == 'carried', []
         size = simulator.camera.width if self._exact else CAMERA_SIZE
         self._camera = _camera(simulator.task_name, size, next(
             name for name, look in LOOKS.items() if look is simulator.look))
@@ -49,10 +50,10 @@ class Follower:
         :return: the Observation with tracked pixels, and the states of the objects.
         :raises TrackingError: when nothing is found where it was clicked.
         """
-        view, rng = _view(self._camera.reset(seed)), np.random.default_rng([seed, 0])
+        view, self._rng = _view(self._camera.reset(seed)), np.random.default_rng([seed, 0])
         for _ in range(1 if self._exact else CLICKS):  # who is refused clicks again
-            error = rng.normal(0, CLICK_ERROR / np.sqrt(np.pi / 2), seen.object_pixels.shape)
-            clicks = (seen.object_pixels + (0 if self._exact else error) + 0.5) * self._scale - 0.5
+            error = 0 if self._exact else self._slips(seen)
+            clicks = (seen.object_pixels + error + 0.5) * self._scale - 0.5
             try:
                 return self._told(seen, self._tracker.select(
                     view, clicks if self._exact else _beside(clicks, view.robot_mask)))
@@ -66,14 +67,20 @@ class Follower:
         return self._told(seen, self._tracker.update(_view(self._camera.observe())))
 
     def find(self, goal):
-        """Return the Observation of the goal with the pixels found in it; TrackingError if not."""
+        """Return the Observation of the goal with the pixels found in it, or clicked."""
         if self._exact:
             return goal
         found = self._tracker.find(_view(self._camera.goal()))
-        lost = [name for name, state in zip(goal.object_names, found.states) if state == LOST]
-        if lost:
-            raise TrackingError(f'{listing(lost)} not found in the goal picture')
-        return self._told(goal, found)[0]
+        told = self._told(goal, found)[0]
+        lost = np.array([state == LOST for state in found.states])
+        self.placed = [name for name, is_lost in zip(goal.object_names, lost) if is_lost]
+        clicks = goal.object_pixels + self._slips(goal)
+        return replace(told, object_pixels=np.where(
+            lost[:, None], clicks, told.object_pixels).astype(np.float32))
+
+    def _slips(self, observation):
+        return self._rng.normal(
+            0, CLICK_ERROR / np.sqrt(np.pi / 2), observation.object_pixels.shape)
 
     def _told(self, observation, tracked):
         pixels = (tracked.pixels + 0.5) / self._scale - 0.5

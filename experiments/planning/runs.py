@@ -223,7 +223,8 @@ def run_scene(job, seed):
                         else None)
     if job.method.tracking != 'ground_truth':
         scene['tracking_error_px'] = round(run.tracking_error(), 3)
-        scene |= {name: why for name in ('refused', 'aborted') if (why := getattr(run, name))}
+        scene |= {name: why for name in ('placed', 'refused', 'aborted')
+                  if (why := getattr(run, name))}
     return scene
 
 
