@@ -13,7 +13,7 @@ from pathlib import Path
 
 from experiments.pages import render, share
 from experiments.worlds.command import read
-from experiments.worlds.trained import held_out_of, mark, MARKS
+from experiments.worlds.trained import held_out_of, mark, MARKED, marks_of
 import numpy as np
 import pandas as pd
 from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
@@ -32,7 +32,7 @@ from tap_ros.recording.marks import read_marks
 from tap_ros.training.train import train
 import torch
 
-MARKED, HELD_OUT = 10, 40  # demonstrations in Meta-World
+HELD_OUT = 40  # demonstrations in Meta-World
 IN_A_FILE = 10
 SETTINGS = {'recipe': 'push2', 'steps': 400, 'batch_size': 8, 'size': 64, 'threads': 1,
             'progress_margin': 0.0, 'save_every': 10 ** 6}
@@ -98,15 +98,14 @@ def curve(args):
         collect(folder, CollectConfig(
             world='metaworld', task=args.task, episodes=episodes, seed=seed, image_size=128,
             episodes_per_file=IN_A_FILE), Engine())
-    if not (bag / MARKS).exists():
-        mark(bag, read(bag)[:MARKED], 0)
+    mark(bag, read(bag), 0)
     files = sorted(bag.glob('*.mcap'), key=natural)
     rows = []
     for seed in range(args.seeds):
         for count in args.demonstrations:
             weights = train(
                 files[:count // IN_A_FILE], Path(args.runs, f'{args.task}_{count}_{seed}'),
-                seed=seed, held_out=(str(held_out_of(bag)),), marks=str(bag / MARKS),
+                seed=seed, held_out=(str(held_out_of(bag)),), marks=str(marks_of(bag, 0)),
                 selection='marks', **SETTINGS)
             store, scores = score(weights, [held_out_of(bag)])
             truth = read_marks(held_out_of(bag) / BOTTLENECKS_FILE, store).episodes

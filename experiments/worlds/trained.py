@@ -11,7 +11,7 @@ from tap_ros.engines import run_tasks, Work
 from tap_ros.files import write_atomically
 from tqdm import tqdm
 
-MARKS = 'marks.json'  # those that a person would have made
+MARKED = 10  # demonstrations of each task, others in each training
 # A name in tables: settings beside those that all have.
 METHODS = {
     'fix': {'loss': 'fix'},
@@ -30,25 +30,31 @@ def held_out_of(folder):
     return Path(f'{folder}-held-out')
 
 
-def place_marks(demonstrations, seed):
-    """Return a frame each: the middle of its bottleneck, off by -1, 0 or 1."""
-    rng = np.random.default_rng(seed)
-    return [int(np.clip(sum(one.window) // 2 + rng.integers(-1, 2), 1, len(one.frames) - 2))
-            for one in demonstrations]
+def place_marks(folder, demonstrations, seed):
+    """
+    Mark demonstrations as a person would: the middle of the bottleneck, off by up to 1.5 frames.
+
+    :param folder: of the bag; its name and the seed say by how much each is off.
+    :param demonstrations: list of command.Demonstrations, of which each seed has MARKED others.
+    :return: those that are marked, and the frame of each.
+    """
+    rng = np.random.default_rng([seed, *folder.name.encode()])
+    marked = demonstrations[seed * MARKED:][:MARKED]
+    return marked, [int(np.clip(round(sum(one.window) / 2 + rng.uniform(-1.5, 1.5)),
+                                1, len(one.frames) - 2)) for one in marked]
+
+
+def marks_of(folder, seed):
+    """Return the file of the marks that a seed has."""
+    return Path(folder, f'marks_{seed}.json')
 
 
 def mark(folder, demonstrations, seed):
-    """
-    Mark demonstrations as a person would, see place_marks.
-
-    :param folder: of the bag; the file lies in it.
-    :param demonstrations: list of command.Demonstrations.
-    """
+    """Write the marks of a seed beside the bag, see place_marks."""
     from tap_ros.recording.cache import open_recordings
     from tap_ros.recording.marks import write_marks
-    write_marks(Path(folder, MARKS), open_recordings([folder]), [folder], {
-        one.number: [(t, t)]
-        for one, t in zip(demonstrations, place_marks(demonstrations, seed))})
+    write_marks(marks_of(folder, seed), open_recordings([folder]), [folder], {
+        one.number: [(t, t)] for one, t in zip(*place_marks(folder, demonstrations, seed))})
 
 
 def train_all(folders, methods, seeds, out, engine):
@@ -87,7 +93,7 @@ def train_and_score(folder, method, seed, out):
     if path.exists():
         return json.loads(path.read_text())
     torch.set_num_threads(1)
-    marks = {'marks': str(Path(folder, MARKS))} if 'marks' in method else {}
+    marks = {'marks': str(marks_of(folder, seed))} if 'marks' in method else {}
     Path(out).mkdir(parents=True, exist_ok=True)
     with open(Path(out, 'log.txt'), 'a') as log, redirect_stderr(log):
         weights = train(folder, out, seed=seed, held_out=(str(held_out_of(folder)),),

@@ -10,7 +10,7 @@ from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
 from tap_ros.evaluation.keyframes import middle, slowest, uvd
 from tap_ros.prediction.marks import chance, features_of
 from tap_ros.prediction.nearest_keyframe import halfway, l1_distance
-from tap_ros.prediction.preference import Preference
+from tap_ros.prediction.preference import Preference, SIZE
 from tap_ros.recording.cache import EpisodeStore
 from tap_ros.recording.marks import Mark, Marks
 from tap_ros.training.robot_mask import trained_robot_mask
@@ -34,6 +34,8 @@ def score_hits(store: EpisodeStore, marks: Marks, episodes: np.ndarray, others: 
     scored = [int(episodes[row]) for row in rows]
     frames = {'prediction': [int(matched[row]) for row in rows]}
     for one in (training.get('marks') or {}).get('preferences', [])[:1]:
+        if len(one['weights']) != SIZE:  # of an earlier version, of other features
+            continue
         preference, robot_mask = Preference.from_json(one), trained_robot_mask(training)[0]
         frames['preference alone'] = [
             preference.best(features_of(store, i, robot_mask)) for i in scored]

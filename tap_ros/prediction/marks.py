@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def features_of(store: 'EpisodeStore', i: int, robot_mask: RobotMask) -> np.ndarray:
-    """Describe the frames of an episode, (T, 20), without the pixels that a robot mask hides."""
+    """Describe the frames of an episode, (T, SIZE), without the pixels that a robot mask hides."""
     episode = store[i]
     return describe(episode.frames, None if robot_mask == 'none' or episode.robot_masks is None
                     else hidden_pixels(episode.robot_masks, robot_mask))
@@ -48,7 +48,7 @@ def prefer(store: 'EpisodeStore', preferences: Sequence[Callable[[np.ndarray], n
     """
     Compute preferences w(t) in every episode.
 
-    :param preferences: of each level of recursion a function of features (T, 20) to w (T,).
+    :param preferences: of each level of recursion a function of features (T, SIZE) to w (T,).
     :return: w of each episode, float32 (levels, T); 1 in those too short for targets.
     """
     found = [np.ones((len(preferences), T), np.float32) for T in store.lengths]

@@ -4,9 +4,9 @@
 Time preferences w(t) of Eq. 5 that are not functions of the time alone.
 
 One is learned from a few marked demonstrations: a softmax over the frames of a demonstration, of a
-linear function of ten features and their squares. The features are what every sequence of pictures
-has: where a frame is in time and on the way from start to goal, how fast the pictures change
-there, whether that slows down, and where in the picture. The other one, `still`, needs no marks.
+linear function of ten features and of the picture, small and grey. The features are what every
+sequence of pictures has: where a frame is in time and on the way from start to goal, how fast the
+pictures change there, whether that slows down, and where. The other one, `still`, needs no marks.
 """
 
 from collections.abc import Sequence
@@ -14,14 +14,17 @@ from dataclasses import dataclass
 import math
 from typing import Any, Self
 
+import cv2
 import numpy as np
 from tap_ros.errors import ConfigError
 
 FEATURES = ('time', 'progress', 'distance to both', 'speed', 'distance to start',
             'distance to goal', 'change of speed', 'column of motion', 'row of motion',
             'motion to change')
+SMALL = 8  # pixels a side of the grey picture
+SIZE = len(FEATURES) + SMALL ** 2
 FLOOR = math.exp(-4)  # the least w of a frame, as a share of the largest of its demonstration
-RIDGE = 0.1  # price of the squared weights, in nats; the features have variance 1
+RIDGE = 0.1  # price of the squared weights, in nats; features and pictures have variance 1
 SPREAD = (0.25, 0.5, 0.25)  # a mark is off by a frame as often as not
 LEAST_FRAMES = 3
 WINDOW = 4  # frames, before and after, between which speed changes
@@ -35,10 +38,11 @@ def describe(frames: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray
     Distances are l1, speed is the distance to the frames beside. Progress is (d_0 - d_T) / (d_0 +
     d_T), with d_0 and d_T the distances to start and goal. Motion is where squared differences of
     frames have their centre, in shares of the picture; change, where those of start and goal do.
+    The small pictures of a demonstration have together mean 0 and variance 1.
 
     :param frames: uint8 (T, H, W, 3), T at least 3: start, what lies between, goal.
     :param hidden: bool (T, H, W), pixels that do not count, such as the robot's; None: none.
-    :return: float64 (T, 20): FEATURES, then their squares.
+    :return: float64 (T, SIZE): FEATURES, then the small grey picture.
     :raises ConfigError: for fewer frames.
     """
     T = len(frames)
@@ -65,12 +69,12 @@ def describe(frames: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray
     before = np.array([speed[max(0, t + 1 - WINDOW):t + 1].mean() for t in range(T)])
     after = np.array([speed[t:t + WINDOW].mean() for t in range(T)])
     log_speed = np.pad(np.log(speed / usual + 0.1), 1, 'edge')
-    found = np.stack([
+    return np.concatenate([np.stack([
         np.arange(T) / (T - 1), (start - goal) / np.maximum(start + goal, 1e-6),
         nearer / max(nearer.max(), 1e-6), np.convolve(log_speed, np.ones(3) / 3, 'valid'),
         start / largest, goal / largest,
-        np.log((after + 0.1 * usual) / (before + 0.1 * usual)), *places.T, away], 1)
-    return np.concatenate([found, found ** 2], 1)
+        np.log((after + 0.1 * usual) / (before + 0.1 * usual)), *places.T, away], 1),
+        _small(pictures.mean(-1), hidden)], 1)
 
 
 def still(features: np.ndarray) -> np.ndarray:
@@ -79,7 +83,7 @@ def still(features: np.ndarray) -> np.ndarray:
 
     w(t) is the bell over time, see losses.bell_preference, over the speed.
 
-    :param features: (T, 20), as describe returns them.
+    :param features: (T, SIZE), as describe returns them.
     :return: w (T,), 1 at most.
     """
     time, speed = features[:, FEATURES.index('time')], features[:, FEATURES.index('speed')]
@@ -92,9 +96,9 @@ class Preference:
     """
     A learned w(t).
 
-    :param weights: (20,), of the features with their mean taken off, in their deviations.
-    :param mean: (20,), of the features in the demonstrations that were marked.
-    :param deviation: (20,), likewise.
+    :param weights: (SIZE,), of the features with their mean taken off, in their deviations.
+    :param mean: (SIZE,), of the features in the demonstrations that were marked.
+    :param deviation: (SIZE,), likewise.
     """
 
     weights: np.ndarray
@@ -102,7 +106,7 @@ class Preference:
     deviation: np.ndarray
 
     def __call__(self, features: np.ndarray) -> np.ndarray:
-        """Return w (T,), FLOOR to 1, of the frames of a demonstration with features (T, 20)."""
+        """Return w (T,), FLOOR to 1, of the frames of a demonstration with features (T, SIZE)."""
         logits = self._logits(features)
         return np.maximum(np.exp(logits - logits.max()), FLOOR)
 
@@ -130,7 +134,7 @@ class Preference:
         except (AttributeError, TypeError, ValueError) as error:
             raise ConfigError(f'preference: expected weights, mean and deviation of features '
                               f'({error})') from error
-        size = (2 * len(FEATURES),)
+        size = (SIZE,)
         if not all(each.shape == size and np.isfinite(each).all() for each in vars(
                 found).values()) or (found.deviation <= 0).any():
             raise ConfigError(f'preference: expected {size[0]} finite numbers of each, and '
@@ -145,7 +149,7 @@ def learn_preference(features: Sequence[np.ndarray], marks: Sequence[int]) -> Pr
     Minimises sum_n (-sum_k SPREAD_k log softmax(x_n a)_{m_n + k}) + RIDGE |a|^2, which is convex,
     by Newton's method.
 
-    :param features: of N demonstrations, (T, 20) each.
+    :param features: of N demonstrations, (T, SIZE) each.
     :param marks: N, the frame that is marked in each.
     :return: Preference.
     :raises ConfigError: without marks, or for one outside of its demonstration.
@@ -159,6 +163,7 @@ def learn_preference(features: Sequence[np.ndarray], marks: Sequence[int]) -> Pr
                               f'{len(one)} frames')
     everything = np.concatenate(features)
     mean, deviation = everything.mean(0), np.maximum(everything.std(0), 1e-6)
+    deviation[len(FEATURES):] = 1  # a pixel in which little happens says little
     inputs = [(one - mean) / deviation for one in features]
     wanted = [np.array(SPREAD) @ x[np.clip([mark - 1, mark, mark + 1], 0, len(x) - 1)]
               for x, mark in zip(inputs, marks)]
@@ -205,6 +210,16 @@ def _centre(mass: np.ndarray) -> np.ndarray:
     at = [(mass.sum(axis) @ (np.arange(n) + 0.5)) / (total * n) if total else 0.5
           for axis, n in enumerate(mass.shape[::-1])]
     return np.array(at)
+
+
+def _small(grey: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
+    """Return pictures (T, H, W) as (T, SMALL ** 2), see describe; what is hidden is 0."""
+    seen = np.ones_like(grey) if hidden is None else (~hidden).astype(np.float32)
+    light, count = (np.stack([cv2.resize(one, (SMALL, SMALL), interpolation=cv2.INTER_AREA).ravel()
+                              for one in pictures]) for pictures in (grey * seen, seen))
+    found = light / np.maximum(count, 1e-6)
+    found = np.where(count > 0, found - found[count > 0].mean(), 0) if count.any() else 0 * found
+    return np.asarray(found / max(found.std(), 1e-6))
 
 
 def _softmax(logits: np.ndarray) -> tuple[np.ndarray, float]:

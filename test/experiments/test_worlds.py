@@ -37,17 +37,19 @@ def test_the_last_subgoal_is_where_the_way_turns_to_the_goal():
 
 def test_scores_are_shares_of_the_demonstrations_with_their_intervals():
     shown = 40 * [command.Demonstration(REST, (7, 8))]
-    rows = {row['method']: row for row in command.score(shown[:12], shown)}
+    rows = {row['method']: row for row in command.score([(shown[:12], 12 * [7])], shown)}
     assert rows['random']['hit']['value'] == pytest.approx(2 / 14)
-    assert rows['slowest']['hit']['value'] == rows['12 marks']['near']['value'] == 1
+    assert rows['slowest']['hit']['value'] == rows['10 marks']['near']['value'] == 1
     assert rows['UVD-like']['hit'] | {'low': 0} == {'value': 0, 'low': 0, 'high': pytest.approx(
         0.0876, abs=1e-3)} and rows['slowest']['n'] == 40
     rows = [row | {'task': 'a/b'} for row in rows.values()]
     runs = [{'task': 'a/b', 'method': 'marks', 'hit': [1, 0], 'near': [1, by]} for by in (0, 1)]
     page = command.page(rows + command.average(runs))
     assert '| a b | 16, 2.0 of the bottleneck | 14% (14 to 14), 29% | 100% (91 to 100)' in page
-    assert 'Seeds: marks 2.' in page and '50% (0 to 100), 75%' in page
+    assert 'Seeds, at least: marks 2.' in page and '50% (0 to 100), 75%' in page
     assert '| **found** |  | **0 of 1** |\n' in page  # by marks; 'random' is not the last column
+    aside = [row | {'task': 'aside/c/d'} for row in rows + command.average(runs)]
+    assert 'with 2 seeds' in command.page(rows + command.average(runs) + aside).split('aside')[1]
 
 
 def test_the_page_is_made_from_the_data():
