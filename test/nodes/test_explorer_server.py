@@ -18,9 +18,12 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.errors import ConfigError
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.explorer.calls import CommandError, parse_command
-from tap_ros.nodes.explorer.node import Distances, ExplorerNode
+from tap_ros.nodes.explorer.goal import GoalByHand, simulated
+from tap_ros.nodes.explorer.node import ExplorerNode
 from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
+from tap_ros.nodes.explorer.shown import Distances
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -286,3 +289,44 @@ def test_a_photograph_of_a_real_camera_becomes_the_goal_with_its_own_objects_alo
         assert bytes(goal_image.wait(5).data)[3:] == image.tobytes()[3:]
         place, = goal_objects.wait(5).objects
         assert (place.name, place.u, place.v) == ('cup', 3.0, 4.0)
+
+
+def test_goals_placed_by_hand_leave_the_others_and_belong_to_their_picture():
+    def message(stamp, **places):
+        """Return objects that a tracker follows: (u, v, state) of each."""
+        u, v, states = zip(*places.values())
+        return encode_objects(
+            places, np.column_stack([u, v]), np.full((len(u), 7), np.nan), to_stamp(stamp),
+            WORLD_FRAME, ObjectStates.SOURCE_TRACKED, states, [0.5] * len(u))
+
+    placed = []
+    with Client('hand') as node:
+        hand = GoalByHand(node)
+        hand._publish = lambda message, topic: placed.append(message)
+        newest = {'objects': message(5, cup=(1.0, 2.0, 'seen'), ring=(3.0, 4.0, 'hidden'))}
+
+        def place(name, *pixel):
+            hand.place(name, pixel, newest)
+            newest['goal_objects'] = placed[-1]
+            return {one.name: (one.u, one.v, state) for one, state in zip(
+                placed[-1].objects, placed[-1].states)}
+
+        assert place('cup', 9.0, 9.0) == {'cup': (9.0, 9.0, 'seen'), 'ring': (3.0, 4.0, 'hidden')}
+        assert place('ring', 8.0, 8.0)['cup'] == (9.0, 9.0, 'seen')
+        newest['goal'] = Image()
+        newest['goal'].header.stamp = to_stamp(7)
+        assert place('ring', 6.0, 6.0) == {'ring': (6.0, 6.0, 'seen')}, 'another picture'
+        assert placed[-1].header.stamp == to_stamp(7)
+        newest['goal_objects'] = message(7, cup=(1.0, 2.0, 'lost'), ring=(3.0, 4.0, 'seen'))
+        assert place('ring', 5.0, 5.0)['cup'] == (1.0, 2.0, 'lost'), 'was not found there'
+        with pytest.raises(CallError, match='cup, ring'):
+            hand.place('plate', (1.0, 1.0), newest)
+
+
+def test_the_simulator_moves_what_is_where_the_dragged_object_was_found():
+    goals = {'left': (*3 * [math.nan], 10.0, 10.0), 'right': (*3 * [math.nan], 40.0, 10.0)}
+    truth = {'object_0': (*3 * [0.0], 41.0, 10.0), 'object_1': (*3 * [0.0], 10.0, 11.0)}
+    assert simulated('right', (20.0, 5.0), goals, truth, 64) == {'object_0': (21.0, 5.0)}
+    assert simulated('right', (20.0, 5.0), goals, {}, 64) == {'right': (20.0, 5.0)}
+    assert simulated('cup', (20.0, 5.0), goals, truth, 64) == {}
+    assert simulated('left', (20.0, 5.0), goals, {'object_0': truth['object_0']}, 64) == {}

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import time
 from typing import Annotated
 
-from sim_bridge.tasks.tasks import task_names
-from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
+from scipy.spatial.transform import Rotation
+from sim_bridge.tasks.tasks import get_task, task_names
+from sim_bridge.world.looks import DEFAULT_LOOK, get_look, LOOKS
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.demo.command import new_folder
 from tap_ros.nodes.node_processes import NodeProcesses
@@ -23,6 +24,7 @@ class Options:
     :param task: of the first scene; its predictor is the one that is started.
     :param seed: of the first scene.
     :param look: of the world, see sim_node.
+    :param objects: whether tracker_node follows those that are clicked, or the simulator tells.
     :param host: address at which browsers find the page; 0.0.0.0: of every network of this
         machine, with a token.
     :param port: of the page; 0: any that is free.
@@ -33,6 +35,7 @@ class Options:
     task: Annotated[str, one_of(task_names())] = 'push2'
     seed: int = 1_000_000
     look: Annotated[str, one_of(LOOKS)] = DEFAULT_LOOK
+    objects: Annotated[str, one_of(('tracked', 'truth'))] = 'tracked'
     host: str = '127.0.0.1'
     port: int = 8000
     token: str = ''
@@ -52,7 +55,9 @@ def run(args: Options) -> None:
     with NodeProcesses(folder) as processes:
         # In lock-step a scene waits for those who look at it, however slow the machine is.
         processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,
-                        look=args.look)
+                        look=args.look, objects=args.objects)
+        if args.objects == 'tracked':
+            processes.start('tracker_node', **camera_parameters(args.look, args.task))
         processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
                         else DEFAULT_PREDICTOR)
         processes.start('visual_mpc_node')
@@ -64,3 +69,11 @@ def run(args: Options) -> None:
         while True:
             time.sleep(0.2)
             processes.check()
+
+
+def camera_parameters(look: str, task: str) -> dict[str, float]:
+    """Return where the simulator's camera is, as parameters of tracker_node."""
+    pose = get_look(look).camera(get_task(task).gripping, 64, 64).pose
+    values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+    return {f'camera_{name}': float(value) for name, value in zip(
+        ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values)}
