@@ -9,7 +9,9 @@ function drawChart({unit, names, times, values}) {
   const context = canvas.getContext('2d');
   const style = getComputedStyle(document.body);
   const [left, bottom, right, top] = [40, canvas.height - 24, canvas.width - 8, 8];
-  const source = unit === 'cm' && state?.simulator ? ", the simulator's ground truth" : '';
+  const followed = state?.camera.objects.some((one) => one.state);
+  const source = followed ? ', as followed'
+    : unit === 'cm' && state?.simulator ? ", the simulator's ground truth" : '';
   $('unit').textContent = unit ? `in ${unit}${source}` : '';
   context.clearRect(0, 0, canvas.width, canvas.height);
   context.font = '12px system-ui, sans-serif';
