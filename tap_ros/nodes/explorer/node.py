@@ -52,6 +52,8 @@ PERIOD_S = 0.1  # between two looks at what is to be shown
 LOG_LINES = 50
 PICTURES = ('camera', 'goal', 'subgoal', 'plan', 'observer')
 VIEWS = {'plan': 'plan/overlay', 'observer': 'observer/image_raw'}
+NOTHING_SELECTED = json.dumps(
+    {'kind': 'selection', 'count': 0, 'followed': True, 'objects': []})
 COLUMNS, MAX_SHOWN = 4, 12  # subgoals of one answer in the page
 
 
@@ -84,6 +86,7 @@ class ExplorerNode(Node):
         self._calls = ExplorerCalls(self)
         self._server = ExplorerServer(
             self._calls.do, self.params['host'], self.params['port'], self.params['token'])
+        self._server.put('selection', NOTHING_SELECTED)
         kind, topic = camera_image(self.params)
         self._service = Diagnostics(self, {topic: SILENT_S, 'objects': SILENT_S,
                                            'goal/image': math.inf, 'goal/objects': math.inf})
@@ -164,8 +167,7 @@ class ExplorerNode(Node):
         if message.event == Episode.START:
             self._task = escaped(message.task, 40)
             self._distances.clear()
-            self._server.put('selection', json.dumps(
-                {'kind': 'selection', 'count': 0, 'followed': True, 'objects': []}))
+            self._server.put('selection', NOTHING_SELECTED)
             with self._lock:
                 if self._calls.offered('reset'):  # stamps are the simulator's
                     self._scene_ns = to_nanoseconds(message.header.stamp)
