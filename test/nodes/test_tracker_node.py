@@ -3,6 +3,7 @@
 """tracker_node: objects of the stamp of each picture after a click on each, or the reason."""
 
 import ast
+import json
 from pathlib import Path
 
 from geometry_msgs.msg import TwistStamped
@@ -19,8 +20,10 @@ from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import positions_of
+from tap_ros.nodes.explorer.node import ExplorerNode
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.nodes.tracker.node import TrackerNode
+from websockets.sync.client import connect
 
 SEED, SIZE = 1_000_003, 128
 
@@ -157,3 +160,51 @@ def test_another_scene_or_camera_ends_the_selection(scene, client):
     stamp = scene.move(0.0, 0.0, 0.01)
     scene.at('truth/objects', stamp)
     assert to_nanoseconds(scene.topics['objects'].wait(1).header.stamp) < stamp
+
+
+def test_the_explorer_selects_proposes_and_moves_goals_of_objects_by_their_own_names(scene):
+    start_ns, goal_ns = scene.reset()
+    explorer = LocalNode(ExplorerNode, port=0)
+    with connect(f'{explorer.node.url.replace("http", "ws")}socket', open_timeout=10) as page:
+
+        def told(kind, accept=lambda message: True):
+            """Return the next message of a kind that is acceptable."""
+            while True:
+                text = page.recv(20)
+                found = json.loads(text) if isinstance(text, str) else {}
+                if found.get('kind') == kind and accept(found):
+                    return found
+
+        def ask(do, **fields):
+            page.send(json.dumps({'do': do, **fields}))
+
+        def select(clicks):
+            ask('select', objects=[{'name': name, 'u': u, 'v': v}
+                                   for name, (u, v) in clicks.items()])
+
+        told('state', lambda state: state['tracker'] and state['simulator'])
+        first, second = scene.true_clicks(start_ns).values()
+        select({'corner': (SIZE + 3.0, 2.0)})
+        problem = told('state', lambda state: state['problem']['count'])['problem']
+        assert 'outside the picture' in problem['text']
+        ask('propose')
+        proposed = told('selection', lambda selection: selection['count'])
+        assert not proposed['followed'] and len(proposed['objects']) == 2
+        select({'left': second, 'right': first})  # not the names of the simulator
+        chosen = told('selection', lambda selection: selection['followed'] and selection['count'])
+        for one in chosen['objects']:
+            outline = np.array(one['outline'])
+            assert (outline.min(axis=0) < -1).all() and (outline.max(axis=0) > 1).all()
+        shown = told('state', lambda state: state['goal']['objects'] and state['movable'])
+        assert [one['state'] for one in shown['camera']['objects']] == ['seen', 'seen']
+        goal = {one['name']: one for one in shown['goal']['objects']}['right']
+        _, names, before = scene.at('truth/goal/objects', goal_ns)
+        ask('move', name='right', u=goal['u'] + 8.0, v=goal['v'])
+        moved = scene.topics['truth/goal/objects'].wait(
+            20, lambda message: to_nanoseconds(message.header.stamp) > goal_ns)
+        _, after = decode_objects(moved, 'truth/goal/objects')
+        assert np.allclose(after - before, [[8.0, 0.0], [0.0, 0.0]], atol=0.5)
+        told('state', lambda state: any(
+            one['name'] == 'right' and abs(one['u'] - goal['u'] - 8.0) < SIZE / 64
+            for one in state['goal']['objects']))
+    assert explorer.end() == 0

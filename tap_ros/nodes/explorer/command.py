@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import time
 from typing import Annotated
 
-from scipy.spatial.transform import Rotation
 from sim_bridge.tasks.tasks import get_task, task_names
-from sim_bridge.world.looks import DEFAULT_LOOK, get_look, LOOKS
+from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.errors import ConfigError
-from tap_ros.nodes.demo.command import new_folder
+from tap_ros.nodes.demo.command import camera_parameters, new_folder
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.options import Folder, one_of
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
@@ -57,7 +56,8 @@ def run(args: Options) -> None:
         processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,
                         look=args.look, objects=args.objects)
         if args.objects == 'tracked':
-            processes.start('tracker_node', **camera_parameters(args.look, args.task))
+            processes.start('tracker_node', **camera_parameters(
+                args.look, get_task(args.task).gripping))
         processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
                         else DEFAULT_PREDICTOR)
         processes.start('visual_mpc_node')
@@ -69,11 +69,3 @@ def run(args: Options) -> None:
         while True:
             time.sleep(0.2)
             processes.check()
-
-
-def camera_parameters(look: str, task: str) -> dict[str, float]:
-    """Return where the simulator's camera is, as parameters of tracker_node."""
-    pose = get_look(look).camera(get_task(task).gripping, 64, 64).pose
-    values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
-    return {f'camera_{name}': float(value) for name, value in zip(
-        ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values)}

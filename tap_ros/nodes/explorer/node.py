@@ -4,7 +4,6 @@
 
 from collections import deque
 from collections.abc import Mapping
-from functools import cache
 import json
 import math
 import sys
@@ -31,6 +30,7 @@ from tap_ros.nodes.explorer.goal import GoalByHand, simulated
 from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.explorer.shown import (
     Distances,
+    grips,
     listed,
     NodeStates,
     picture_bytes,
@@ -45,7 +45,7 @@ from tap_ros.nodes.parameters import declare_transport, Parameters
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
 from tap_ros.nodes.topics import camera_image, LATCHED, STREAM
-from tap_ros.plugins import load_plugin, names
+from tap_ros.plugins import names
 from tap_ros.text import escaped
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
@@ -274,7 +274,7 @@ class ExplorerNode(Node):
         self._server.put('state', json.dumps({
             'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
             'simulator': simulator,
-            'plans': not simulator or not _grips(self._task),
+            'plans': not simulator or not grips(self._task),
             'tracker': self._calls.offered('select'), 'observer': self._observed,
             'movable': self._movable(bool(objects), bool(goals), 'goal' in newest),
             'camera': {**self._size('camera'),
@@ -320,15 +320,6 @@ class ExplorerNode(Node):
     def _size(self, kind: str) -> dict[str, int]:
         width, height = self._sizes.get(kind, (0, 0))
         return {'width': width, 'height': height}
-
-
-@cache
-def _grips(task: str) -> bool:
-    """Tell whether a task needs a gripper, which nothing plans; False for an unknown one."""
-    try:
-        return bool(getattr(load_plugin('tap_ros.tasks', task), 'gripping', False))
-    except TapError:
-        return False
 
 
 def declare_parameters(node: Node) -> Parameters:

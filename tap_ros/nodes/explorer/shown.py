@@ -4,6 +4,7 @@
 
 from collections import deque
 from collections.abc import Mapping
+from functools import cache
 import math
 import time
 from typing import Any
@@ -12,11 +13,13 @@ import cv2
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from tap_msgs.msg import ObjectStates, Subgoal
+from tap_ros.errors import TapError
 from tap_ros.images.drawing import overlay, png_bytes
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.nodes.client import positions_of
+from tap_ros.plugins import load_plugin
 from tap_ros.text import escaped
 
 SILENT_S = 2.0  # after which the page says that a topic is silent
@@ -146,3 +149,12 @@ def silence(now: float, newest: tuple[Any, float] | None) -> str:
         return 'nothing has come yet'
     age = now - newest[1]
     return f'silent for {age:.0f} s' if age > SILENT_S else ''
+
+
+@cache
+def grips(task: str) -> bool:
+    """Tell whether a task needs a gripper, which nothing plans; False for an unknown one."""
+    try:
+        return bool(getattr(load_plugin('tap_ros.tasks', task), 'gripping', False))
+    except TapError:
+        return False

@@ -92,7 +92,7 @@ function paint(kind) {
   const size = kind === 'goal' ? state?.goal : state?.camera;
   const unit = size?.width ? canvas.width / size.width : scale;
   context.setTransform(unit, 0, 0, unit, unit / 2, unit / 2);
-  context.lineWidth = 2.5 / unit * (canvas.width / 400);
+  context.lineWidth = 2.5 / unit * (canvas.width / 550);
   return context;
 }
 
