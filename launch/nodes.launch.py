@@ -11,26 +11,19 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
 from launch.substitutions import (
-    AndSubstitution,
     EqualsSubstitution,
     LaunchConfiguration,
     NotEqualsSubstitution,
-    NotSubstitution,
     PathJoinSubstitution,
 )
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-# Where the simulator's camera is, in its look 'hand' and the tasks that push.
-SIM_CAMERA = {'camera_x': 0.0, 'camera_y': -1.1, 'camera_z': 1.3, 'camera_qx': 0.942755,
-              'camera_qy': 0.0, 'camera_qz': 0.0, 'camera_qw': -0.333487}
-
 
 def generate_launch_description():
     """Describe the nodes and the arguments of this file."""
-    record, sim = LaunchConfiguration('record'), LaunchConfiguration('sim')
-    tracked = EqualsSubstitution(LaunchConfiguration('objects'), 'tracked')
+    record = LaunchConfiguration('record')
     return LaunchDescription([
         DeclareLaunchArgument(
             'params_file',
@@ -65,10 +58,9 @@ def generate_launch_description():
             description='All but the simulation take the time from /clock.'),
         start('sim_node', {
             'lock_step': typed('lock_step', bool), 'objects': typed('objects', str)},
-            condition=IfCondition(sim)),
-        start('tracker_node', SIM_CAMERA, condition=IfCondition(AndSubstitution(tracked, sim))),
-        start('tracker_node',
-              condition=IfCondition(AndSubstitution(tracked, NotSubstitution(sim)))),
+            condition=IfCondition(LaunchConfiguration('sim'))),
+        start('tracker_node', condition=IfCondition(
+            EqualsSubstitution(LaunchConfiguration('objects'), 'tracked'))),
         start('predictor_node'),
         start('visual_mpc_node'),
         start('recorder_node', {'folder': typed('record', str)},
@@ -92,7 +84,7 @@ def start(executable, parameters=None, condition=None):
     :param parameters: dict of those that override the parameter file.
     :param condition: launch condition, None for always.
     """
-    parameters = dict(parameters or {})
+    parameters = parameters or {}
     if executable != 'sim_node':  # which publishes /clock
         parameters['use_sim_time'] = typed('use_sim_time', bool)
     return Node(

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
 import mujoco
 import numpy as np
 from rclpy.node import Node
@@ -19,6 +20,7 @@ from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, OBSERVER_FRAME, WORLD_FRAME
 from tap_ros.messages.topics import (
+    CAMERA_POSE,
     GOAL_OBJECTS,
     OBJECTS,
     TRUE_GOAL_OBJECTS,
@@ -60,6 +62,7 @@ class ScenePublishers:
                             for kinds, qos in ((streams, STREAM), (GOAL, LATCHED))
                             for topic, kind in kinds.items()}
         self._observer = observer
+        self._pose = node.create_publisher(PoseStamped, CAMERA_POSE.name, LATCHED)
         self._description = node.create_publisher(String, 'robot_description', LATCHED)
         if world.arm is not None:
             self._description.publish(String(data=robot_description(world.arm)))
@@ -107,6 +110,11 @@ class ScenePublishers:
         fixed = [] if world.arm is None else world.arm.fixed_transforms
         if world.camera_pose is not None:
             fixed.append(Transform(WORLD_FRAME, CAMERA_FRAME, world.camera_pose))
+            place, turn = _fields(world.camera_pose)
+            self._pose.publish(make_message(PoseStamped, {
+                'header': {'stamp': {'sec': stamp.sec, 'nanosec': stamp.nanosec},
+                           'frame_id': WORLD_FRAME},
+                'pose': {'position': place, 'orientation': turn}}))
         if hasattr(world, 'observer_picture'):
             fixed.append(Transform(WORLD_FRAME, OBSERVER_FRAME, OBSERVER.pose))
         _send(self._fixed, fixed, stamp)
@@ -125,11 +133,16 @@ def _send(publisher: Any, transforms: Iterable[Transform], stamp: Time) -> None:
         return
     fields = []
     for parent, child, pose in transforms:
-        quaternion = np.empty(4)  # w, x, y, z
-        mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
+        place, turn = _fields(pose)
         fields.append({
             'header': {'stamp': {'sec': stamp.sec, 'nanosec': stamp.nanosec}, 'frame_id': parent},
             'child_frame_id': child,
-            'transform': {'translation': dict(zip('xyz', pose[:3, 3].tolist())),
-                          'rotation': dict(zip('wxyz', quaternion.tolist()))}})
+            'transform': {'translation': place, 'rotation': turn}})
     publisher.publish(make_message(publisher.msg_type, {'transforms': fields}))
+
+
+def _fields(pose: np.ndarray) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the fields of place and orientation of a pose (4, 4)."""
+    quaternion = np.empty(4)  # w, x, y, z
+    mujoco.mju_mat2Quat(quaternion, pose[:3, :3].ravel())
+    return dict(zip('xyz', pose[:3, 3].tolist())), dict(zip('wxyz', quaternion.tolist()))

@@ -150,13 +150,26 @@ def camera_pose(parameters: Parameters) -> np.ndarray:
 
     :raises ConfigError: for a quaternion of length 0.
     """
-    from scipy.spatial.transform import Rotation  # here, since not every node needs it
-    quaternion = [parameters[f'camera_{axis}'] for axis in ('qx', 'qy', 'qz', 'qw')]
-    if np.linalg.norm(quaternion) < 0.1:
-        raise ConfigError('parameters camera_qx to camera_qw: a quaternion of no direction')
+    place, quaternion = ([parameters[f'camera_{axis}'] for axis in axes]
+                         for axes in ('xyz', ('qx', 'qy', 'qz', 'qw')))
+    try:
+        return pose_matrix(place, quaternion)
+    except ConfigError as error:
+        raise ConfigError(f'parameters camera_qx to camera_qw: {error}') from error
+
+
+def pose_matrix(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarray:
+    """
+    Return a pose (4, 4) of a place (3,), m, and a quaternion x, y, z, w of any length.
+
+    :raises ConfigError: for a quaternion of length 0.
+    """
+    from scipy.spatial.transform import Rotation  # later, since not every node needs it
+    if not np.linalg.norm(quaternion) > 0.1:
+        raise ConfigError('a quaternion of no direction')
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-    pose[:3, 3] = [parameters[f'camera_{axis}'] for axis in 'xyz']
+    pose[:3, 3] = place
     return pose
 
 

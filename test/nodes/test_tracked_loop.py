@@ -11,7 +11,6 @@ from sensor_msgs.msg import Image
 from sim_bridge.simulator import Simulator
 from tap_msgs.msg import ObjectStates
 from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.demo.command import camera_parameters
 from tap_ros.nodes.ros_messages import encode_objects
 from tap_ros.nodes.topics import STREAM
 
@@ -34,7 +33,7 @@ def test_clicks_and_a_goal_picture_are_enough_and_objects_in_doubt_stop_the_arm(
     loop.processes['sim_node'] = NodeProcess('sim_node', tmp_path / 'sim.log', {
         'lock_step': True, 'seed': SEED, 'objects': 'tracked'}, PULLED)
     try:
-        loop.start('tracker_node', **camera_parameters('hand', False))
+        loop.start('tracker_node')
         loop.start('predictor_node')
         loop.start('visual_mpc_node', image_timeout=10.0)
         for process in loop.processes.values():

@@ -2,17 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """tracker_node: objects of the stamp of each picture after a click on each, or the reason."""
 
-import ast
 import json
-from pathlib import Path
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
 from processes import LocalNode, Newest, NodeProcess, until
 import pytest
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
-from sim_bridge.world.looks import LOOKS
 from tap_msgs.msg import ObjectStates
 import tap_ros
 from tap_ros.contract import CONTROL_PERIOD
@@ -26,21 +22,6 @@ from tap_ros.nodes.tracker.node import TrackerNode
 from websockets.sync.client import connect
 
 SEED, SIZE = 1_000_003, 128
-
-
-def calibrated(look='hand'):
-    """Return the parameters that tell where the simulator's camera is."""
-    pose = LOOKS[look].camera(False, SIZE, SIZE).pose
-    values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
-    return {f'camera_{name}': float(value) for name, value in zip(
-        ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values)}
-
-
-def test_launch_knows_where_the_camera_of_the_simulator_is():
-    file = Path(__file__).parents[2] / 'launch' / 'nodes.launch.py'
-    told, = (ast.literal_eval(node.value) for node in ast.parse(file.read_text()).body
-             if isinstance(node, ast.Assign) and node.targets[0].id == 'SIM_CAMERA')
-    assert told == pytest.approx(calibrated(), abs=1e-6)
 
 
 class Scene:
@@ -100,8 +81,8 @@ def sim(tmp_path_factory):
 
 @pytest.fixture
 def scene(sim, client):
-    """Return the scene, beside a tracker that knows its camera."""
-    scene, node = Scene(client), LocalNode(TrackerNode, **calibrated())
+    """Return the scene, beside a tracker."""
+    scene, node = Scene(client), LocalNode(TrackerNode)
     yield scene
     assert node.end() == 0
 

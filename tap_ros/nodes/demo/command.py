@@ -338,7 +338,7 @@ def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
             processes.start('sim_node', lock_step=True, task=task, observer=args.world == TABLE,
                             objects='tracked' if tracked else 'truth', **world)
             if tracked:
-                processes.start('tracker_node', **camera_parameters(args.look, gripping))
+                processes.start('tracker_node')
             processes.start(
                 'predictor_node', robot_mask=args.robot_mask, weights=args.predictor or (
                     task if task in PREDICTORS else DEFAULT_PREDICTOR))
@@ -353,15 +353,6 @@ def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
                 client, watch, task, args.seed + i, _budget(args, task), world, gripping))
             processes.check()
         return scenes
-
-
-def camera_parameters(look: str, gripping: bool) -> dict[str, float]:
-    """Return where the simulator's camera is, as parameters of nodes."""
-    from scipy.spatial.transform import Rotation
-    pose = LOOKS[look].camera(gripping, 64, 64).pose  # of pictures of any size
-    values = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
-    return {f'camera_{axis}': float(value)
-            for axis, value in zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values)}
 
 
 def _tracked(args: Options) -> bool:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import time
 from typing import Annotated
 
-from sim_bridge.tasks.tasks import get_task, task_names
+from sim_bridge.tasks.tasks import task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS
 from tap_ros.errors import ConfigError
-from tap_ros.nodes.demo.command import camera_parameters, new_folder
+from tap_ros.nodes.demo.command import new_folder
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.options import Folder, one_of
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
@@ -56,8 +56,7 @@ def run(args: Options) -> None:
         processes.start('sim_node', lock_step=True, observer=True, task=args.task, seed=args.seed,
                         look=args.look, objects=args.objects)
         if args.objects == 'tracked':
-            processes.start('tracker_node', **camera_parameters(
-                args.look, get_task(args.task).gripping))
+            processes.start('tracker_node')
         processes.start('predictor_node', weights=args.task if args.task in PREDICTORS
                         else DEFAULT_PREDICTOR)
         processes.start('visual_mpc_node')

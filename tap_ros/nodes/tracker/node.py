@@ -10,7 +10,7 @@ import threading
 import time
 from typing import Any
 
-from geometry_msgs.msg import Point32, Polygon
+from geometry_msgs.msg import Point32, Polygon, PoseStamped
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
@@ -24,7 +24,7 @@ from tap_ros.messages.images import decode_camera_info, decode_image, decode_mas
 from tap_ros.messages.joints import GripperHistory
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.messages.topics import CAMERA_INFO, JOINT_STATES
+from tap_ros.messages.topics import CAMERA_INFO, CAMERA_POSE, JOINT_STATES
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import Moment, Observations, reception_time
 from tap_ros.nodes.parameters import (
@@ -35,6 +35,7 @@ from tap_ros.nodes.parameters import (
     declare_transport,
     declared_arm,
     Parameters,
+    pose_matrix,
 )
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.nodes.ros_messages import encode_objects
@@ -84,10 +85,11 @@ class TrackerNode(Node):
         super().__init__('tracker_node', **options)
         self.params = declare_parameters(self)
         self._make = load_plugin('tap_ros.trackers', self.params['tracker'])
-        self._pose = camera_pose(self.params)
+        self._mounted = camera_pose(self.params) if self.params['camera_z'] else None
         self._lock = threading.RLock()  # of what follows
         self._selection: Selection | None = None
         self._info: CameraInfo | None = None
+        self._told: PoseStamped | None = None  # where the camera is
         self._begun = 0, 0  # stamp at which the newest scene known of began; jumps until then
         self._told_goal = False  # goal/objects has objects
         self._gripper = GripperHistory(
@@ -110,6 +112,7 @@ class TrackerNode(Node):
         self._goals.subscribe(self, goal, LATCHED, on_message=self._on_goal)
         adapt_regularly(self, [
             AdaptiveSubscription(self, CameraInfo, CAMERA_INFO.name, self._on_info, STREAM),
+            AdaptiveSubscription(self, PoseStamped, CAMERA_POSE.name, self._on_pose, LATCHED),
             AdaptiveSubscription(self, JointState, JOINT_STATES.name, self._on_joints, STREAM),
             AdaptiveSubscription(self, Episode, 'episode', self._on_episode, STREAM)])
         self.create_service(SelectObjects, 'select_objects', answering(self, self._on_select),
@@ -137,6 +140,9 @@ class TrackerNode(Node):
     def _on_info(self, message: CameraInfo) -> None:
         self._diagnostics.received(CAMERA_INFO.name)
         self._info = message
+
+    def _on_pose(self, message: PoseStamped) -> None:
+        self._told = message
 
     def _on_joints(self, message: JointState, info: dict[str, Any]) -> None:
         self._diagnostics.received(JOINT_STATES.name)
@@ -265,18 +271,25 @@ class TrackerNode(Node):
         """
         Return the calibrated camera for pictures of a size (height, width); None without a pose.
 
+        The pose is that of the parameters, else of camera/pose, as the simulator tells it.
+
         :raises ImageError: for a camera_info that is missing, or not that of these pictures.
         """
-        if not self.params['camera_z']:
+        pose = self._mounted
+        if pose is None and self._told is not None:
+            told = self._told.pose
+            pose = pose_matrix([getattr(told.position, axis) for axis in 'xyz'],
+                               [getattr(told.orientation, axis) for axis in 'xyzw'])
+        if pose is None:
             return None, None
         if self._info is None:
-            raise ImageError('nothing has come on camera/camera_info; publish it, or leave '
-                             'camera_z at 0: not calibrated')
+            raise ImageError('the pose of the camera is known, and nothing has come on '
+                             'camera/camera_info; publish it')
         K, found = decode_camera_info(self._info, self.params['rectified'])
         if found != size:
             raise ImageError('camera/camera_info: is of pictures of {1}x{0} pixels; they have '
                              '{3}x{2}'.format(*found, *size))
-        camera = PinholeCamera(K, size, self._pose)
+        camera = PinholeCamera(K, size, pose)
         return Plane(camera, size), camera
 
     # Following
@@ -421,7 +434,7 @@ def declare_parameters(node: Node) -> Parameters:
                        'package.', choices=names('tap_ros.trackers'))
     declare_transport(parameters)
     declare_robot_mask(parameters, 'all')
-    declare_camera(parameters, f'{WORLD_FRAME}, with camera_z 0: not calibrated')
+    declare_camera(parameters, f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
     declare_arm(parameters)
     declare_opening(parameters)
     parameters.declare('joint_prefix', '',
