@@ -2,9 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is told of a loop that Meta-World judges."""
 
+from dataclasses import replace
 import json
 
 from experiments.worlds import loop
+from made_episodes import move_squares, write_bag
+import numpy as np
+from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.marks import read_marks
+
+
+def test_marked_is_where_the_object_has_not_yet_moved_in_what_succeeds(tmp_path):
+    still = [[4, 4]] * 6 + [[10, 4]] * 3
+    made = []
+    for i, outcome in enumerate(('success', 'failure')):
+        episode = move_squares(still[:2], still[:2], seed=i, outcome=outcome)
+        pixels = np.stack([still, still], axis=1).astype(np.float32)
+        made.append(replace(episode, object_pixels=pixels))
+    bag = write_bag(tmp_path / 'bag', made)
+    (marked, ((first, last),)), = read_marks(
+        loop.mark(bag), open_recordings([bag])).episodes.items()
+    assert marked == 0 and first == last and abs(first - 5) <= 1
 
 
 def test_scenes_without_a_goal_are_left_out_and_what_was_run_is_not_run_again(
