@@ -223,7 +223,11 @@ class ExplorerCalls:
         if self._is_cancelled():  # meanwhile
             goal.cancel()
         self._node.tell(f'{words}: begun')
-        result = goal.result()
+        try:
+            result = goal.result()
+        except CallError:
+            goal.cancel()  # its node may be no more than slow
+            raise
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
         self._node.tell(f'{words}: {end} ({result.steps} steps)')
 
