@@ -222,7 +222,8 @@ def run_scene(job, seed):
     scene['plan_ms'] = (round(float(np.median(run.planning_ms)), 1) if len(run.planning_ms)
                         else None)
     if job.method.tracking != 'ground_truth':
-        scene['tracking_error_px'] = round(run.tracking_error(), 3)
+        if not run.refused:
+            scene['tracking_error_px'] = round(run.tracking_error(), 3)
         scene |= {name: why for name in ('placed', 'refused', 'aborted')
                   if (why := getattr(run, name))}
     return scene
