@@ -47,9 +47,11 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'forward': ("train the planner's forward model",
                     'tap_ros.planning.forward_training_config'),
     }),
-    'evaluate': ('score trained weights', {
+    'evaluate': ('score trained weights, a planner or a tracker', {
         'prediction': ('score a predictor on recordings', 'tap_ros.evaluation.command:prediction'),
         'forward': ('score a forward model on recordings', 'tap_ros.evaluation.command:forward'),
+        'tracking': ('score what follows objects on recordings or films',
+                     'tap_ros.evaluation.command:tracking'),
         'planning': ('push or stack objects and score where they end (Table 2)',
                      'experiments.planning.command'),
     }),

@@ -1,11 +1,12 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands `python -m tap_ros evaluate prediction` and `evaluate forward`: their options."""
+"""The commands `python -m tap_ros evaluate ...`, planning aside: their options."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from tap_ros.options import Bags, File, Flag, Folder, ShippedFile, Topic
+from tap_ros.options import Bags, File, Flag, Folder, one_of, ShippedFile, Topic
+from tap_ros.plugins import names
 from tap_ros.training.split import TEST_FRACTION
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 from tyro import conf
@@ -65,6 +66,32 @@ class Forward:
     out: Folder = ''
 
 
+@dataclass(frozen=True)
+class Tracking:
+    """
+    Options of `python -m tap_ros evaluate tracking`.
+
+    Objects are clicked in the first picture that shows them all. The camera is fitted to the true
+    places, where recordings have them.
+
+    :param recordings: bag folders with object pixels; with --labels folders of films.
+    :param image_topic: the camera's topic; needed where several topics of pictures are in them.
+    :param labels: JSON file of pixels by hand, see tap_ros/evaluation/films.py.
+    :param tracker: a name of the plugin group tap_ros.trackers.
+    :param size: px of the longer side that pictures are scaled down to; 0: as they are.
+    :param click: px of a picture 64 wide that clicks are off; 0: exact, and taken as they are.
+    :param out: write tracking.json and tracking.png there.
+    """
+
+    recordings: Bags
+    image_topic: Topic = ''
+    labels: File = ''
+    tracker: Annotated[str, one_of(names('tap_ros.trackers'))] = 'rigid'
+    click: float = 0.0
+    size: int = 0
+    out: Folder = ''
+
+
 def prediction(args: Prediction) -> None:
     """Score a predictor, see report.run."""
     from tap_ros.evaluation import report  # torch takes seconds to import
@@ -75,3 +102,9 @@ def forward(args: Forward) -> None:
     """Score a forward model, see forward.run."""
     from tap_ros.evaluation import forward
     forward.run(args)
+
+
+def tracking(args: Tracking) -> None:
+    """Score a tracker, see tracking.run."""
+    from tap_ros.evaluation import tracking
+    tracking.run(args)

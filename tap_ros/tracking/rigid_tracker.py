@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.tracking.confidence import probability
+from tap_ros.tracking.confidence import doubt, probability
+from tap_ros.tracking.mean_shift import mean_shift
 from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
@@ -30,6 +31,8 @@ NEW_COST, NEW_ANGLE, NEW_SEEN = 0.25, 0.35, 0.85  # from when on the object is c
 WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
 KEYS = 6  # templates of an object, the first among them
+COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
+MOST = (0.5, 1.8)  # of its area, that has to be there then
 PATIENCE = 2  # pictures in which what should be seen may be missed, before it is lost
 
 
@@ -125,7 +128,11 @@ class RigidTracker:
         seen = matcher.score(keys[0], one.place[None], np.array([one.angle - keys[0].angle]))[1][0]
         one.age += 1
         one.state = HIDDEN if seen[0] < 0.5 else UNSURE if one.age <= PATIENCE else LOST
-        one.confidence *= 0.8
+        if one.state != HIDDEN and keys[0].contrast > COLOURFUL:
+            place, amount = mean_shift(matcher, keys[0], one.place)
+            if MOST[0] < amount < MOST[1]:  # lifted, or turned to a side not seen before
+                one.place, one.state = place, UNSURE
+        one.confidence = doubt(one.state, one.age)
 
     def _search(self, one: _Object, matcher: Matcher,
                 hand: np.ndarray | None) -> tuple[Pose, Template] | None:

@@ -8,6 +8,7 @@ import pytest
 from tap_ros.errors import TrackingError
 from tap_ros.plugins import load_plugin
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, UNSURE, View
+from tap_ros.tracking.registration import propose
 
 SIZE = 256
 COLOURS = (((200, 60, 60), (60, 90, 200)), ((70, 170, 70), (220, 210, 80)))  # halves of objects
@@ -101,3 +102,8 @@ def test_objects_are_found_in_a_goal_picture_or_refused(tracker):
     assert found.states == (SEEN, LOST) and np.isnan(found.pixels[1]).all()
     # the objects are followed on as before
     assert np.abs(tracker.update(draw(STARTS)).pixels - STARTS).max() < 1.5
+
+
+def test_what_moved_from_one_picture_to_another_is_proposed():
+    found = propose(draw(STARTS, robot=(0, 0, 40, 60)), draw((STARTS[0], (120.0, 220.0))))
+    assert len(found) == 1 and np.abs(found - STARTS[1:]).max() < 2

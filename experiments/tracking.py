@@ -1,0 +1,151 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Measure the tracker on simulated scenes and real films, and write docs/results/tracking.md.
+
+    python -m experiments.tracking --real FOLDER
+
+The scenes are others than those on which thresholds and confidence were fitted (seeds 9000 to
+9006). What stands in the data file is kept; remove the file to measure anew.
+"""
+
+from dataclasses import dataclass
+import json
+from pathlib import Path
+import sys
+
+from experiments.pages import render, share
+import pandas as pd
+from sim_bridge.collect import collect, CollectConfig
+from tap_ros.engines import Engine
+from tap_ros.evaluation.command import Tracking
+from tap_ros.evaluation.tracking import draw, score
+from tap_ros.files import write_atomically, write_rows
+from tap_ros.images.drawing import png_bytes
+from tap_ros.options import Folder, parse
+
+SEED = 88_000
+TASKS = ('push2', 'push3', 'order2')
+EPISODES = {'arm': 10, 'hand': 4}  # by look
+SIZE, SMALL = 256, 64
+OFF = 1.35  # px of 64 that a person's clicks are off
+# Look, size (0: SIZE) and clicks of a column of the page.
+COLUMNS = {'UR10e, exact': ('arm', 0, 0.0), 'UR10e, clicks off': ('arm', 0, OFF),
+           'UR10e, 64 px': ('arm', SMALL, 0.0), 'hand, exact': ('hand', 0, 0.0)}
+LINES = {
+    'median_px': 'median error, px', 'within_2px': 'right: within 2 px',
+    'wrong_sure': 'wrong by 3 px and said to be seen', 'lost': 'objects lost at the end',
+    'recovered': 'right within three pictures after an occlusion',
+    'selected_px': 'click to the middle of the object, px', 'refused': 'clicks refused',
+    'cpu_ms': 'CPU a picture of two objects, ms', 'goal_right': 'found in goal pictures, right',
+    'goal_visible_right': 'the same, middle in sight', 'goal_wrong': 'found, and wrong',
+    'goal_refused': 'said to be not found'}
+LABELS = 'tracking_labels.json'
+
+
+@dataclass(frozen=True)
+class Options:
+    """
+    Options of the command.
+
+    :param real: folder of the labelled films; without it those measured before stay.
+    :param bags: folder of the recordings; what is there is kept.
+    :param out: folder of tracking.json, tracking.png and tracking.md.
+    """
+
+    real: Folder = ''
+    bags: Folder = 'bags/tracking'
+    out: Folder = 'docs/results'
+
+
+def run(args):
+    """Record, measure what is not there yet, and write the page."""
+    out = Path(args.out)
+    file = out / 'tracking.json'
+    rows = json.loads(file.read_text()) if file.exists() else []
+    for look, size, click in COLUMNS.values():
+        for task in TASKS:
+            bag = Path(args.bags, f'{task}_{look}_{SIZE}')
+            if any((row['recording'], row['size'], row['click_px']) == (bag.name, size, click)
+                   for row in rows):
+                continue
+            collect(bag, CollectConfig(
+                task=task, episodes=EPISODES[look], seed=SEED, image_size=SIZE, look=look,
+                episodes_per_file=5), Engine(workers=1))
+            found, tracks = score(Tracking((str(bag),), size=size, click=click))
+            rows += found
+            write_rows(file, rows)
+            if (look, task, size, click) == ('arm', 'push3', 0, OFF):
+                write_atomically(out / 'tracking.png', png_bytes(draw(tracks[:4])))
+    if args.real:
+        found, _ = score(Tracking((args.real,), labels=str(out / LABELS)))
+        rows = [row for row in rows if not row['recording'].endswith('.mp4')] + found
+        write_rows(file, rows)
+    write_atomically(out / 'tracking.md', page(rows))
+
+
+def page(rows):
+    """Return the page of these rows."""
+    rows = pd.DataFrame(rows)
+    films = rows[rows.recording.str.endswith('.mp4')]
+    return render('tracking.md.j2', columns=table(rows), films=film_table(films),
+                  confidence=confidence(rows.drop(films.index)), real=len(films) > 0,
+                  tasks=by_task(rows), seed=SEED, off=OFF, episodes=EPISODES)
+
+
+def pooled(rows, metric):
+    """Return the mean of recordings, weighed by their numbers, with the widest of their ends."""
+    rows = rows[rows.metric == metric]
+    if not len(rows):
+        return '-'
+    value, low, high = ((rows[name] * rows.n).sum() / rows.n.sum()
+                        for name in ('value', 'ci_low', 'ci_high'))
+    if metric.endswith(('_px', '_ms')) and metric != 'within_2px':
+        return f'{value:.2f} ({low:.2f} to {high:.2f})'
+    return share((value, low, high))
+
+
+def of(rows, look, size, click):
+    """Return the rows of a column."""
+    return rows[rows.recording.str.contains(f'_{look}_') & (rows['size'] == size)
+                & (rows.click_px == click)]
+
+
+def table(rows):
+    """Return a table of metrics by column."""
+    return pd.DataFrame([{'': line} | {
+        name: pooled(of(rows, *column) if metric != 'cpu_ms' else of(rows, *column)[
+            ~of(rows, *column).recording.str.startswith('push3')], metric)
+        for name, column in COLUMNS.items()} for metric, line in LINES.items()])
+
+
+def by_task(rows):
+    """Return a table of the UR10e's tasks."""
+    some = {key: LINES[key] for key in ('median_px', 'within_2px', 'wrong_sure', 'goal_right')}
+    mine = of(rows, *COLUMNS['UR10e, exact'])
+    return pd.DataFrame([{'task': task} | {line: pooled(
+        mine[mine.recording.str.startswith(task)], metric) for metric, line in some.items()}
+        for task in TASKS])
+
+
+def confidence(rows):
+    """Return a table of what is right by confidence."""
+    rows = rows[rows.metric == 'confidence']
+    lines = []
+    for low, mine in rows.groupby('step'):
+        right = (mine.value * mine.n).sum() / mine.n.sum()
+        lines.append({'confidence from': f'{low:g}', 'right': f'{100 * right:.1f}%',
+                      'pictures': f'{mine.n.sum():,}'})
+    return pd.DataFrame(lines)
+
+
+def film_table(rows):
+    """Return a table of films."""
+    some = ('median_px', 'within_2px', 'wrong_sure', 'longest_wrong_sure', 'lost', 'cpu_ms')
+    return pd.DataFrame([{'film': film} | {metric.replace('_', ' '): round(float(
+        mine[mine.metric == metric].value.iloc[0]), 2) for metric in some}
+        for film, mine in rows.groupby('recording')])
+
+
+if __name__ == '__main__':
+    sys.exit(run(parse(Options, sys.argv[1:], 'python -m experiments.tracking')))
