@@ -40,7 +40,7 @@ def test_every_node_tells_how_it_is(loop):
         DiagnosticArray, '/diagnostics',
         lambda array: told.update({status.name: status for status in array.status}), STREAM)
     wanted = [*(f'{name}: service' for name in NODE_MODULES
-                if name not in ('robot_mask_node', 'explorer_node')),
+                if name not in ('robot_mask_node', 'tracker_node', 'explorer_node')),
               'visual_mpc_node: /joint_states', 'predictor_node: /goal/image',
               'sim_node: /arm/delta_twist_cmds', 'recorder_node: /objects']
     assert until(lambda: all(name in told for name in wanted))

@@ -17,7 +17,8 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import positions_of
 from tap_ros.nodes.explorer.node import ExplorerNode
-from tap_ros.nodes.topics import LATCHED, STREAM
+from tap_ros.nodes.ros_messages import encode_image
+from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from tap_ros.nodes.tracker.node import TrackerNode
 from websockets.sync.client import connect
 
@@ -87,7 +88,7 @@ def scene(sim, client):
     assert node.end() == 0
 
 
-def test_clicked_objects_are_followed_and_found_in_the_goal(scene):
+def test_clicked_objects_are_followed_and_found_in_the_goal(scene, client):
     start_ns, goal_ns = scene.reset()
     scene.select(scene.true_clicks(start_ns))
     for topic, stamp in (('objects', start_ns), ('goal/objects', goal_ns)):
@@ -105,6 +106,10 @@ def test_clicked_objects_are_followed_and_found_in_the_goal(scene):
         assert np.abs(pixels - wanted).max() < SIZE / 64
     count = scene.topics['objects'].count  # sent again, as its picture is
     assert until(lambda: scene.topics['objects'].count > count + 2)
+    goal = client.create_publisher(Image, 'goal/image', LATCHED)
+    goal.publish(encode_image(np.zeros((16, 16, 3), np.uint8), to_stamp(7), 'eye'))
+    empty = scene.topics['goal/objects'].wait(10, lambda m: not m.objects)
+    assert to_nanoseconds(empty.header.stamp) == 7  # a goal picture that cannot be used
 
 
 def test_what_cannot_be_selected_is_refused_and_the_objects_before_are_followed(scene):

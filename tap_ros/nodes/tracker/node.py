@@ -42,7 +42,14 @@ from tap_ros.nodes.ros_messages import encode_objects
 from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import answering, log_error
 from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
-from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED, SERVICE_QOS, STREAM
+from tap_ros.nodes.topics import (
+    camera_topics,
+    goal_topics,
+    LATCHED,
+    SERVICE_QOS,
+    STREAM,
+    to_stamp,
+)
 from tap_ros.plugins import load_plugin, names
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.text import escaped, listing
@@ -354,7 +361,11 @@ class TrackerNode(Node):
             self._goal_objects.publish(ObjectStates(header=header))
             return
         begin = time.perf_counter()
-        found = selection.tracker.find(self._goal_view(goal, selection.size))
+        try:
+            found = selection.tracker.find(self._goal_view(goal, selection.size))
+        except TapError:
+            self._goal_objects.publish(ObjectStates(header=header))  # not those of another goal
+            raise
         self._diagnostics.took(1e3 * (time.perf_counter() - begin), 'find')
         lost = np.array(found.states) == LOST
         # What is not found is to be placed, beginning where it is now.
@@ -385,11 +396,11 @@ class TrackerNode(Node):
     def _forget(self, why: str) -> None:
         """Follow nothing any more."""
         assert self._selection is not None
-        stamp_ns = self._selection.goal_ns
+        none = ObjectStates(source=ObjectStates.SOURCE_TRACKED)
+        none.header.stamp = to_stamp(self._selection.goal_ns or 0)
         self._selection = None
         if self._told_goal:
-            goal = encode_objects((), (), (), stamp_ns or 0, '', ObjectStates.SOURCE_TRACKED)
-            self._goal_objects.publish(goal)
+            self._goal_objects.publish(none)
             self._told_goal = False
         self.get_logger().warning(
             f'the selected objects are forgotten: {why}; select them again')
