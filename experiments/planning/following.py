@@ -8,11 +8,11 @@ from functools import lru_cache
 import numpy as np
 from sim_bridge.simulator import Simulator
 from sim_bridge.world.looks import LOOKS
-from tap_ros.contract import ROBOT_MASK_FREE
 from tap_ros.errors import TrackingError
 from tap_ros.plugins import load_plugin
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.protocols import LOST, View
+from tap_ros.training.robot_mask import nearest_free
 
 CAMERA_SIZE = 256  # px, what objects are followed in
 CLICK_ERROR = 1.35  # px of 64, mean distance of a click from the middle of an object
@@ -56,7 +56,7 @@ class Follower:
             clicks = (seen.object_pixels + error + 0.5) * self._scale - 0.5
             try:
                 return self._told(seen, self._tracker.select(
-                    view, clicks if self._exact else _beside(clicks, view.robot_mask)))
+                    view, clicks if self._exact else nearest_free(clicks, view.robot_mask)))
             except TrackingError as refusal:
                 reason = refusal
         raise reason
@@ -89,13 +89,6 @@ class Follower:
 
 def _view(picture):
     return View(picture.image, picture.robot_mask, picture.gripper)
-
-
-def _beside(clicks, mask):
-    """Return for each click (K, 2) the nearest pixel that the robot does not hide."""
-    free = np.argwhere(mask == ROBOT_MASK_FREE)[:, ::-1]
-    return np.array([free[((free - click) ** 2).sum(1).argmin()] if len(free) else click
-                     for click in clicks])
 
 
 @lru_cache

@@ -33,6 +33,13 @@ def hidden_pixels(mask: np.ndarray, robot_mask: RobotMask) -> np.ndarray:
     return np.zeros(mask.shape, bool)
 
 
+def nearest_free(pixels: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return for each pixel (K, 2) the nearest that the robot does not hide; itself if all are."""
+    free = np.argwhere(mask == ROBOT_MASK_FREE)[:, ::-1]
+    return np.array([free[((free - pixel) ** 2).sum(1).argmin()] if len(free) else pixel
+                     for pixel in pixels])
+
+
 def trained_robot_mask(training: Mapping[str, Any]) -> tuple[RobotMask, float]:
     """
     Return what weights were trained with.

@@ -5,10 +5,10 @@ The demo: real nodes in processes of their own push objects to where a goal pict
 
 Each scene is pushed twice: directly, and via the subgoal that predict_subgoal answers. Everything
 goes through the topics, services and actions that any client would use. Where a gripper is needed
-the subgoal is predicted only; nothing here plans grasps.
+the subgoal is predicted only, from true pixels; nothing here plans grasps.
 
-The objects are tracked: a click on each in the first picture, here at its true pixel, and another
-in the goal picture on what is not found there. Ground truth only measures.
+The objects that are pushed are tracked: a click on each in the first picture, here at its true
+pixel, and another in the goal picture on what is not found there. Ground truth only measures.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
 from tap_msgs.msg import ObjectStates
 from tap_ros.contract import ROBOT_MASKS, step_budget
 from tap_ros.errors import ConfigError, TapError
-from tap_ros.messages.images import decode_image
+from tap_ros.messages.images import decode_image, decode_mask
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
@@ -50,6 +50,7 @@ from tap_ros.planning.mpc_config import FIRST_SCENE
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
 from tap_ros.tracking.protocols import LOST
+from tap_ros.training.robot_mask import nearest_free
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tqdm import tqdm
 from tyro import conf
@@ -63,13 +64,14 @@ OTHERS_OBJECTS = 1  # of tasks of other worlds
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
 MODES = ('direct', 'subgoal')
 TOLD = {  # by whether objects are tracked
-    True: 'Objects are tracked from a click on each in the first picture (here its true pixel), '
-          'and found in the goal picture; the ground truth of the simulator only measures the '
-          'distances.',
+    True: 'Objects that are pushed are tracked from a click on each in the first picture (here '
+          'its true pixel), and found in the goal picture; the ground truth of the simulator only '
+          'measures the distances.',
     False: 'Object pixels at every step, and the distances, are ground truth of the simulator.'}
 STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
 FOUND_S = 10.0  # that the tracker may take to find the objects of a goal
-TOPICS = {'camera/image_raw': Image, 'observer/image_raw': Image, 'plan/overlay': Image}
+TOPICS = {'camera/image_raw': Image, 'camera/robot_mask': Image, 'observer/image_raw': Image,
+          'plan/overlay': Image}
 
 
 class Watch:
@@ -138,6 +140,8 @@ def click(client: Client, watch: Watch, start: View,
         raise TapError(f'{watch.truth}: nothing came; start sim_node with objects:=tracked, or '
                        'the demo with --objects truth')
     names, clicks = decode_objects(true, watch.truth)
+    for mask, in watch.since(start.stamp_ns, 'camera/robot_mask'):  # what is hidden: beside it
+        clicks = nearest_free(clicks, decode_mask(mask))
     deadline, found = time.monotonic() + client.timeout_s, None
     while found is None:
         try:  # right after a reset the tracker may not have heard of the scene yet
@@ -257,7 +261,7 @@ class Options:
     :param forward_model: weights of the planner.
     :param robot_mask: what is taken out of pictures, as it was in the training of the weights.
     :param objects: where they come from: tracked, from a click on each in the first picture, or
-        truth, the simulator. In another world it is the truth.
+        truth, the simulator; so it is in another world, and where a gripper is needed.
     :param look: of the world, see sim_node.
     :param arm: at the table, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
@@ -305,7 +309,7 @@ def run(args: Options) -> int:
         folder / 'report.html', scenes,
         f'Tasks {", ".join(tasks)}, seeds {args.seed} to {args.seed + args.scenes - 1} of each, '
         f'at most {_budget(args, tasks[0])} steps of a push, {seconds:.0f} s in all. '
-        f'{TOLD[_tracked(args)]}', {
+        f'{TOLD[any(_tracked(args, task) for task in tasks)]}', {
             'date': time.strftime('%Y-%m-%d %H:%M'),
             'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
             'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'})
@@ -322,7 +326,7 @@ def run(args: Options) -> int:
 def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
     """Run the scenes of one task with nodes of its own, or with those that run already."""
     with NodeProcesses(folder / 'logs' / task) as processes, Client() as client:
-        tracked, gripping = _tracked(args), _gripping(args, task)
+        tracked, gripping = _tracked(args, task), _gripping(args, task)
         watch = Watch(client.node, tracked)
         world = {'look': args.look, 'arm': args.arm} if args.world == TABLE else {
             'world': args.world}
@@ -355,9 +359,9 @@ def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
         return scenes
 
 
-def _tracked(args: Options) -> bool:
+def _tracked(args: Options, task: str) -> bool:
     """Return whether objects are tracked."""
-    return args.objects == 'tracked' and args.world == TABLE
+    return args.objects == 'tracked' and args.world == TABLE and not _gripping(args, task)
 
 
 def _gripping(args: Options, task: str) -> bool:
