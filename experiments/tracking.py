@@ -88,7 +88,7 @@ def page(rows):
     """Return the page of these rows."""
     rows = pd.DataFrame(rows)
     films = rows[rows.recording.str.endswith('.mp4')]
-    return render('tracking.md.j2', columns=table(rows), films=film_table(films),
+    return render('templates/tracking.md.j2', columns=table(rows), films=film_table(films),
                   confidence=confidence(rows.drop(films.index)), real=len(films) > 0,
                   tasks=by_task(rows), seed=SEED, off=OFF, episodes=EPISODES)
 
