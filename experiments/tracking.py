@@ -76,7 +76,7 @@ def run(args):
             rows += found
             write_rows(file, rows)
             if (look, task, size, click) == ('arm', 'push3', 0, OFF):
-                write_atomically(out / 'tracking.png', png_bytes(draw(tracks[:4])))
+                write_atomically(out / 'tracking.png', png_bytes(draw(tracks[:2])))
     if args.real:
         found, _ = score(Tracking((args.real,), labels=str(out / LABELS)))
         rows = [row for row in rows if not row['recording'].endswith('.mp4')] + found

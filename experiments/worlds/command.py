@@ -48,6 +48,7 @@ ASIDE = {'metaworld/faucet-open-v3': 0, 'metaworld/dial-turn-v3': 0, 'metaworld/
 HELD_OUT = 40  # demonstrations of each task
 STRIPS = 6  # demonstrations that are drawn, of each task
 FOUND = 0.75, 0.85  # of the demonstrations, exactly or within a frame: a task counts as found
+FRAMES = 'frames, in the bottleneck'  # a column
 
 
 @dataclass(frozen=True)
@@ -218,15 +219,14 @@ def page(rows):
         if 'seeds' in row:
             seeds[kind][method] = min(row['seeds'], seeds[kind].get(method, row['seeds']))
         else:
-            lengths[task] = (f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f} of the "
-                             'bottleneck')
+            lengths[task] = f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f}"
         line = tables[kind].setdefault(task, {
-            'task': task.removeprefix('aside/').replace('/', ' '), 'frames': lengths[task]})
+            'task': task.removeprefix('aside/').replace('/', ' '), FRAMES: lengths[task]})
         line[method] = f"{share(hit.values())}, {near['value']:.0%}"
         found[kind].setdefault(method, []).append(
             any(value['value'] >= least for value, least in zip((hit, near), FOUND)))
     for kind, lines in tables.items():
-        lines['found'] = {'task': '**found**', 'frames': ''} | {
+        lines['found'] = {'task': '**found**', FRAMES: ''} | {
             method: f'**{sum(tasks)} of {len(tasks)}**' for method, tasks in found[kind].items()}
     return render('worlds/templates/worlds.md.j2', marked=MARKED, held_out=HELD_OUT,
                   seeds=seeds['trained'], seeds_aside=seeds['aside'].get('marks'),
