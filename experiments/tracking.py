@@ -15,6 +15,7 @@ from pathlib import Path
 import sys
 
 from experiments.pages import render, share
+from experiments.tables import find, number
 import pandas as pd
 from sim_bridge.collect import collect, CollectConfig
 from tap_ros.engines import Engine
@@ -41,6 +42,8 @@ LINES = {
     'goal_visible_right': 'the same, middle in sight', 'goal_wrong': 'found, and wrong',
     'goal_refused': 'said to be not found'}
 LABELS = 'tracking_labels.json'
+METHODS = ('shipped', 'shipped:tracked')  # of pushing
+REACHED_CM = 5.0
 
 
 @dataclass(frozen=True)
@@ -81,16 +84,16 @@ def run(args):
         found, _ = score(Tracking((args.real,), labels=str(out / LABELS)))
         rows = [row for row in rows if not row['recording'].endswith('.mp4')] + found
         write_rows(file, rows)
-    write_atomically(out / 'tracking.md', page(rows))
+    write_atomically(out / 'tracking.md', page(rows, loop(out / 'tracking')))
 
 
-def page(rows):
-    """Return the page of these rows."""
+def page(rows, pushed):
+    """Return the page of these rows, and of what loop returns."""
     rows = pd.DataFrame(rows)
     films = rows[rows.recording.str.endswith('.mp4')]
     return render('templates/tracking.md.j2', columns=table(rows), films=film_table(films),
                   confidence=confidence(rows.drop(films.index)), real=len(films) > 0,
-                  tasks=by_task(rows), seed=SEED, off=OFF, episodes=EPISODES)
+                  tasks=by_task(rows), loop=pushed, seed=SEED, off=OFF, episodes=EPISODES)
 
 
 def pooled(rows, metric):
@@ -137,6 +140,43 @@ def confidence(rows):
         lines.append({'confidence from': f'{low:g}', 'right': f'{100 * right:.1f}%',
                       'pictures': f'{mine.n.sum():,}'})
     return pd.DataFrame(lines)
+
+
+def loop(folder):
+    """
+    Compare pushing with tracked and with true objects.
+
+    :param folder: --out of `evaluate planning` with METHODS.
+    :return: what the page says of it, by name.
+    """
+    scenes = [{scene['seed']: scene for scene in json.loads(
+        Path(folder, 'planning', f'push2-{name.replace(":", "--")}.json').read_text())['scenes']}
+        for name in METHODS]
+    true, tracked = ([max(mine[seed]['objects_cm']) <= REACHED_CM for seed in scenes[0]]
+                     for mine in scenes)
+    placed = ['placed' in scenes[1][seed] for seed in scenes[0]]
+
+    def said(metric, method, **about):
+        row = find(folder, 'planning.json', task='push2', method=method, metric=metric, **about)
+        if metric.startswith('final'):
+            return number(row, 1, 1, ' cm', '+' if about else '')
+        return number(row, 100, 0, ' points' if about else '%', '+' if about else '')
+
+    lines = [{'': title, 'true pixels': said(metric, METHODS[0]),
+              'tracked': said(metric, METHODS[1]), 'difference': said(
+                  f'{difference}_difference{unit}', METHODS[1], compares='tracking')}
+             for title, metric, difference, unit in (
+                 ('success: all within 5 cm', 'success_5cm', 'success_5cm', ''),
+                 ('final distance', 'final_distance_cm', 'final_distance', '_cm'))]
+    beside = [pair for pair, clicked in zip(zip(true, tracked), placed) if not clicked]
+    return {
+        'table': pd.DataFrame(lines), 'scenes': len(true), 'points': lines[0]['difference'],
+        'placed': sum(placed), 'placed_failed': sum(
+            clicked and not ok for clicked, ok in zip(placed, tracked)),
+        'only_tracked': beside.count((True, False)), 'only_true': beside.count((False, True)),
+        'command': 'python -m tap_ros evaluate planning --tasks push2 --methods '
+                   f'{" ".join(METHODS)} --scenes {len(true)} --no-films '
+                   '--out docs/results/tracking'}
 
 
 def film_table(rows):

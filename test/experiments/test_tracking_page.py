@@ -12,4 +12,5 @@ RESULTS = Path(__file__).parents[2] / 'docs' / 'results'
 
 def test_the_page_is_made_from_the_data():
     found = json.loads((RESULTS / 'tracking.json').read_text())
-    assert tracking.page(found) == (RESULTS / 'tracking.md').read_text()
+    pushed = tracking.loop(RESULTS / 'tracking')
+    assert tracking.page(found, pushed) == (RESULTS / 'tracking.md').read_text()
