@@ -65,6 +65,6 @@ def test_a_missing_package_of_the_experiments_is_named_and_others_are_not_hidden
     for name in ('pandas', 'nosuch'):
         monkeypatch.setitem(COMMANDS, name, ('', name))
     assert main(['pandas']) == 1
-    assert 'requirements-experiments.txt' in capsys.readouterr().err
+    assert 'pip install pandas' in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError):
         main(['nosuch'])

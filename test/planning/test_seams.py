@@ -13,7 +13,7 @@ from tap_ros.planning.cost import PlanCost
 from tap_ros.planning.hierarchy import Target
 from tap_ros.planning.mpc_config import VisualMPCConfig
 from tap_ros.planning.protocols import Problem, SearchConfig, Solution
-from tap_ros.planning.reach import Command, End, Reach, ReachConfig, Seen
+from tap_ros.planning.reach import Aim, Command, End, Reach, ReachConfig, Seen
 from toy_world import SCALE, SIZE, Telekinesis
 
 START, GOAL = np.array([[8.0, 20.0]], np.float32), np.array([[20.0, 12.0]], np.float32)
@@ -34,10 +34,10 @@ def reach(mpc, budget=60):
     while True:
         seen = Seen(np.zeros((SIZE, SIZE, 3), np.uint8), np.zeros(4, np.float32), ('a',), pixels,
                     step)
-        if not loop.aimed:
-            loop.step(seen)
-            loop.head_for([Target(GOAL)])
         answer = loop.step(seen)
+        if isinstance(answer, Aim):
+            loop.head_for([Target(GOAL)])
+            answer = loop.step(seen)
         if isinstance(answer, End):
             return answer, loop.steps
         assert isinstance(answer, Command)

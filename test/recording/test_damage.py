@@ -118,8 +118,8 @@ def test_flips_cuts_and_holes_are_named_or_harmless(chunked):
 def test_complete_chunks_of_a_cut_off_file_are_read(chunked):
     path, episodes = chunked
     data = path.read_bytes()
-    boundary = [start for _, start, _ in records(data) if start > 0.6 * len(data)][0]
-    for length, zeros in ((0.3 * len(data), 0), (0.8 * len(data), 0),
+    boundary = [start for _, start, _ in records(data) if start > 0.5 * len(data)][0]
+    for length, zeros in ((0.3 * len(data), 0), (0.6 * len(data), 0),
                           (boundary, 10**6)):  # zeros are what a crash of the machine leaves
         path.write_bytes(data[:int(length)] + bytes(zeros))
         with pytest.warns(RecordingWarning, match='a.mcap: the file is cut off at byte'):
