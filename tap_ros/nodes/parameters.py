@@ -180,6 +180,13 @@ def declare_opening(parameters: Parameters) -> None:
                        'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
 
 
+def declare_joint_prefix(parameters: Parameters) -> None:
+    """Declare what names of joints begin with."""
+    parameters.declare('joint_prefix', '',
+                       "What the names of the arm's joints begin with, before "
+                       'shoulder_pan_joint and so on.')
+
+
 def declared_arm(parameters: Parameters) -> Arm:
     """Return the Arm at its place, by the parameters of declare_arm."""
     return replace(get_arm(parameters['arm']), mount=declared_mount(parameters))

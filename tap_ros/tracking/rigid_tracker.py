@@ -18,7 +18,7 @@ from tap_ros.tracking.mean_shift import mean_shift
 from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
-from tap_ros.tracking.registration import register
+from tap_ros.tracking.registration import MOST_COST, register
 from tap_ros.tracking.search import locate
 from tap_ros.tracking.silhouette import clicked, middle, RADIUS, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template
@@ -114,7 +114,8 @@ class RigidTracker:
             return
         one.around, one.waits = None, one.waits - 1
         matcher = Matcher(picture, self._plane, self._covered(one, picture))
-        keys, found = one.nearest(), self._search(one, matcher, hand)
+        keys = one.nearest()
+        found = self._search(one, keys, matcher, hand)
         pose, key = found if found is not None else (None, keys[0])
         if pose is not None and pose.fit > GOOD:
             one.place, one.angle, one.age, one.shown = pose.place, pose.angle, 0, key
@@ -134,9 +135,13 @@ class RigidTracker:
                 one.place, one.state = place, UNSURE
         one.confidence = doubt(one.state, one.age)
 
-    def _search(self, one: _Object, matcher: Matcher,
+    def _search(self, one: _Object, keys: Sequence[Template], matcher: Matcher,
                 hand: np.ndarray | None) -> tuple[Pose, Template] | None:
-        """Return the best pose near by, else anywhere; and the template it was found with."""
+        """
+        Return the best pose near by, else anywhere; and the template it was found with.
+
+        :param keys: templates of the object, the nearest first.
+        """
         grown = 1 + 0.5 * min(one.age, 4)
         reach, turn, push = REACH * grown, TURN * min(grown, 2), None
         if hand is not None:
@@ -146,7 +151,6 @@ class RigidTracker:
                 push = hand[1, :2] - hand[0, :2]
             elif one.age == 0:
                 reach, turn = REST, REST_TURN
-        keys = one.nearest()
 
         def attempt(place: np.ndarray, key: Template) -> tuple[Pose, Template] | None:
             pose = matcher.refine(key, place, one.angle, reach, turn)
@@ -165,7 +169,7 @@ class RigidTracker:
         if one.age >= 1 and not (best is not None and best[0].fit > GOOD):
             avoid = [other.place for other in self._objects if other is not one]
             pose = locate(matcher, one.face, avoid)
-            if (pose is not None and pose.fit > GOOD and pose.cost < 0.4
+            if (pose is not None and pose.fit > GOOD and pose.cost < MOST_COST
                     and np.linalg.norm(pose.place - one.place) < 0.08 * (one.age + 1) + 0.03
                     and (best is None or pose.cost < best[0].cost - 0.1)):
                 return pose, one.face

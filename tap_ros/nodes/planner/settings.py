@@ -21,6 +21,7 @@ from tap_ros.nodes.parameters import (
     check_device,
     declare_arm,
     declare_device,
+    declare_joint_prefix,
     declare_opening,
     declare_transport,
     Parameters,
@@ -97,9 +98,7 @@ def declare_parameters(node: Node) -> Parameters:
                        'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
     declare_arm(parameters)
     declare_opening(parameters)
-    parameters.declare('joint_prefix', '',
-                       "What the names of the arm's joints begin with, before "
-                       'shoulder_pan_joint and so on.')
+    declare_joint_prefix(parameters)
     parameters.declare('image_timeout', 5.0,
                        'Seconds without a usable observation after which a goal is aborted.',
                        low=0.1, high=600.0, read_only=False)

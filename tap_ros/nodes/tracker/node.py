@@ -31,6 +31,7 @@ from tap_ros.nodes.parameters import (
     camera_pose,
     declare_arm,
     declare_camera,
+    declare_joint_prefix,
     declare_opening,
     declare_transport,
     declared_arm,
@@ -448,9 +449,7 @@ def declare_parameters(node: Node) -> Parameters:
     declare_camera(parameters, f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
     declare_arm(parameters)
     declare_opening(parameters)
-    parameters.declare('joint_prefix', '',
-                       "What the names of the arm's joints begin with, before "
-                       'shoulder_pan_joint and so on.')
+    declare_joint_prefix(parameters)
     parameters.declare('max_silence', 0.35,
                        'Seconds; of a picture without joint states nearer to it than this the '
                        'gripper is not known.', low=0.05, high=60.0, read_only=False)
