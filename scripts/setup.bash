@@ -142,6 +142,7 @@ make_wheels() {
 build_packages() {
   . scripts/environment.bash
   step 'packages tap_msgs and tap_ros' colcon build --symlink-install --base-paths . tap_msgs
+  . scripts/environment.bash  # now with what was built
   # Where an environment forbids writing bytecode, each process would compile torch anew.
   step 'bytecode' env -u PYTHONDONTWRITEBYTECODE python -c '
 import contextlib, importlib, pkgutil, pytest, hypothesis, xdist
