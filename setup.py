@@ -8,7 +8,7 @@ import sys
 from setuptools import find_packages, setup
 
 NAME = 'tap_ros'
-NODE_MODULES = run_path('tap_ros/contract.py')['NODE_MODULES']
+NODE_CLASSES = run_path('tap_ros/contract.py')['NODE_CLASSES']
 REQUIRED = [  # for pip
     'jinja2>=3.1',
     'lz4>=4.3',
@@ -62,6 +62,6 @@ setup(
     },
     zip_safe=False,
     entry_points={
-        'console_scripts': [f'{name} = {module}:main' for name, module in NODE_MODULES.items()],
+        'console_scripts': [f'{name} = tap_ros.nodes.run:main' for name in NODE_CLASSES],
     },
 )

@@ -42,15 +42,15 @@ ROBOT_MASK_HAND = 128  # the hand (gripper) or its shadow
 ROBOT_MASK_ARM = 255  # the arm or its shadow
 ROBOT_MASKS = ('none', 'arm', 'all')  # what is taken for hidden: nothing, arm, arm and hand
 
-# The module with the main of each node, by the name of the node and of its executable.
-NODE_MODULES = {
-    'sim_node': 'sim_bridge.ros.sim_node',
-    'predictor_node': 'tap_ros.nodes.predictor_node',
-    'visual_mpc_node': 'tap_ros.nodes.visual_mpc_node',
-    'recorder_node': 'tap_ros.nodes.recorder_node',
-    'robot_mask_node': 'tap_ros.nodes.robot_mask_node',
-    'tracker_node': 'tap_ros.nodes.tracker_node',
-    'explorer_node': 'tap_ros.nodes.explorer.node',
+# Module and class of each node, by the name of the node and of its executable.
+NODE_CLASSES = {
+    'sim_node': 'sim_bridge.ros.sim_node:SimNode',
+    'predictor_node': 'tap_ros.nodes.predictor.node:PredictorNode',
+    'visual_mpc_node': 'tap_ros.nodes.planner.node:VisualMpcNode',
+    'recorder_node': 'tap_ros.nodes.recorder.node:RecorderNode',
+    'robot_mask_node': 'tap_ros.nodes.robot_mask.node:RobotMaskNode',
+    'tracker_node': 'tap_ros.nodes.tracker.node:TrackerNode',
+    'explorer_node': 'tap_ros.nodes.explorer.node:ExplorerNode',
 }
 
 

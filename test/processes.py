@@ -15,7 +15,6 @@ from rclpy.context import Context
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from tap_ros.contract import NODE_MODULES
 from tap_ros.nodes.calls import CallError, Spinner
 from tap_ros.nodes.heartbeat import Heartbeat
 
@@ -40,7 +39,7 @@ class NodeProcess:
     """
     One node in a process group of its own.
 
-    :param name: of the node, one of NODE_MODULES.
+    :param name: of the node, one of NODE_CLASSES.
     :param log: file for what it prints; a new start adds to it.
     :param parameters: its ROS parameters.
     :param remaps: further arguments after --ros-args.
@@ -50,7 +49,7 @@ class NodeProcess:
         self.name, self.log, self.parameters = name, Path(log), dict(parameters or {})
         values = {key: str(value).lower() if isinstance(value, bool) else value
                   for key, value in self.parameters.items()}
-        self._command = [sys.executable, '-m', NODE_MODULES[name], '--ros-args', *' '.join(
+        self._command = [sys.executable, '-m', 'tap_ros.nodes', name, '--ros-args', *' '.join(
             [*(f'-p {key}:={value}' for key, value in values.items()), *remaps]).split()]
         self.start()
 

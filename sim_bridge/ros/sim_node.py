@@ -5,7 +5,6 @@
 from collections.abc import Callable
 from importlib.util import find_spec
 import math
-import sys
 import time
 from typing import Any
 
@@ -30,7 +29,6 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
-from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import answering
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.plugins import names
@@ -392,12 +390,3 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('real_time_factor', 1.0,
                        'Simulated seconds per second when not in lock-step.', low=0.05, high=20.0)
     return parameters
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; the answer is the exit code of the process."""
-    return run_node(SimNode, 'sim_node', args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -10,7 +10,6 @@ import sys
 import time
 from typing import Any, Self
 
-from tap_ros.contract import NODE_MODULES
 from tap_ros.errors import TapError
 import yaml
 
@@ -39,10 +38,10 @@ class NodeProcesses:
         """
         Start a node.
 
-        :param name: one of NODE_MODULES.
+        :param name: one of NODE_CLASSES.
         :param parameters: its ROS parameters.
         """
-        command = [sys.executable, '-m', NODE_MODULES[name], '--ros-args']
+        command = [sys.executable, '-m', 'tap_ros.nodes', name, '--ros-args']
         if parameters:  # in a file that others cannot read: a token is no argument for all to see
             file = self._folder / f'{name}.yaml'
             file.touch(mode=0o600)

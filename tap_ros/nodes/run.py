@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, MutableMapping
 from difflib import get_close_matches
+from importlib import import_module
 import os
 from pathlib import Path
 import signal
@@ -20,6 +21,7 @@ from rclpy.executors import (
 )
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from tap_ros.contract import NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.nodes.heartbeat import Heartbeat
 from tap_ros.nodes.services import log_error
@@ -38,8 +40,20 @@ class _Ended(BaseException):
     """A signal came while the node started."""
 
 
-def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = None,
-             num_threads: int = 1) -> int:
+def main(name: str = '', args: list[str] | None = None) -> int:
+    """
+    Run a node; what all executables of nodes call.
+
+    :param name: one of NODE_CLASSES; by default that of the executable.
+    :param args: as of run_node.
+    :return: exit code.
+    """
+    name = name or Path(sys.argv[0]).name
+    module, node_class = NODE_CLASSES[name].split(':')
+    return run_node(getattr(import_module(module), node_class), name, args)
+
+
+def run_node(node_class: Callable[[], Any], name: str, args: list[str] | None = None) -> int:
     """
     Run one node until SIGINT, SIGTERM, or its terminal is closed.
 
@@ -48,10 +62,10 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
     last episode mark could be sent. `close` is called whatever ends the node. An exception in a
     callback is logged, and the node goes on.
 
-    :param make_node: called without arguments after rclpy.init; a TapError from it is fatal.
+    :param node_class: made without arguments after rclpy.init; a TapError from it is fatal. Its
+        attribute num_threads says how many threads callbacks have: by default the calling one.
     :param name: name for the log until the node has one.
     :param args: command-line arguments, None for those of the process.
-    :param num_threads: threads for callbacks; with 1 all of them run in the calling thread.
     :return: exit code: 1 when the node could not be started, or when close returns 1.
     """
     stop = threading.Event()
@@ -68,9 +82,10 @@ def run_node(make_node: Callable[[], Any], name: str, args: list[str] | None = N
         _handle_signals(end)
         configure_fast_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = make_node()
+        node = node_class()
         warn_of_unknown_parameters(node)
         _handle_signals(lambda *_: stop.set())
+        num_threads = getattr(node_class, 'num_threads', 1)
         executor = (SingleThreadedExecutor() if num_threads == 1
                     else MultiThreadedExecutor(num_threads))
         executor.add_node(node)

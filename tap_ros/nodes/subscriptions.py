@@ -16,11 +16,11 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from tap_ros.contract import NODE_MODULES
+from tap_ros.contract import NODE_CLASSES
 from tap_ros.messages.topics import COMPRESSED_TYPE, IMAGE_TYPE, TOPICS
 from tap_ros.text import escaped, listing
 
-OURS = NODE_MODULES.keys() - {'sim_node'}  # nodes whose pictures are no camera's
+OURS = NODE_CLASSES.keys() - {'sim_node'}  # nodes whose pictures are no camera's
 UNKNOWN = '_NODE_NAME_UNKNOWN_'  # of a publisher that was discovered before its node
 ADAPT_PERIOD = 0.5  # s between two comparisons with what is offered
 

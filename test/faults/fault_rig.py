@@ -10,7 +10,7 @@ import time
 from driven import Arm, goal_fields, MOVING_S, predict_fields, World
 from processes import Newest, NodeProcess
 from sensor_msgs.msg import JointState
-from tap_ros.contract import NODE_MODULES
+from tap_ros.contract import NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.nodes.client import Client, PLANNER, READY
 from tap_ros.nodes.heartbeat import Liveness
@@ -34,7 +34,7 @@ class Rig:
         self._reaching = None
         self.joints = Newest(self.node, JointState, 'joint_states', STREAM)
         self.arm = Arm(self.node)
-        self.alive = {name: Liveness(self.node, name) for name in NODE_MODULES}
+        self.alive = {name: Liveness(self.node, name) for name in NODE_CLASSES}
 
     def __enter__(self):
         return self
@@ -50,7 +50,7 @@ class Rig:
         """
         Have these nodes running and ready, no others, and none with a goal.
 
-        :param names: names of NODE_MODULES without sim_node.
+        :param names: names of NODE_CLASSES without sim_node.
         :param sim: 'lock-step', 'real' or None for no simulator.
         :param parameters: {node: its parameters}, beside those that it always gets.
         """

@@ -18,7 +18,7 @@ from rcl_interfaces.srv import GetParameters
 from rclpy.action import ActionClient
 from rclpy.qos import QoSProfile
 from tap_msgs.action import ReachGoal
-from tap_ros.contract import GRIPPER_JOINTS, MAP_ENCODING, MASK_ENCODING, NODE_MODULES
+from tap_ros.contract import GRIPPER_JOINTS, MAP_ENCODING, MASK_ENCODING, NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.images.encodings import ENCODINGS
 from tap_ros.nodes import heartbeat
@@ -185,7 +185,7 @@ class Target:
         self._clients = {name: rig.node.create_client(interface(kind), name)
                          for name, kind in SERVICES.items()}
         self._parameters = {name: rig.node.create_client(GetParameters, f'{name}/get_parameters')
-                            for name in NODE_MODULES}
+                            for name in NODE_CLASSES}
         self._reach = ActionClient(rig.node, ReachGoal, 'reach_goal')
         self.restore()
 
@@ -201,7 +201,7 @@ class Target:
                 self._look(name)
             except (AssertionError, TapError):
                 process.kill()
-        self._rig.need(*NODE_MODULES.keys() - {'sim_node'}, sim='real', parameters=PARAMETERS)
+        self._rig.need(*NODE_CLASSES.keys() - {'sim_node'}, sim='real', parameters=PARAMETERS)
         for name, client in self._parameters.items():
             assert client.wait_for_service(20), f'{name}: its parameters were not found'
 
@@ -216,7 +216,7 @@ class Target:
                 call(self._clients[where], request, ANSWER_S)
             elif where not in self._publishers:
                 self._pursue(request)
-        for name in NODE_MODULES:
+        for name in NODE_CLASSES:
             self._look(name)
 
     def good_calls(self):

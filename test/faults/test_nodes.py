@@ -14,7 +14,7 @@ from processes import NodeProcess, until
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates
-from tap_ros.contract import NODE_MODULES
+from tap_ros.contract import NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.nodes.topics import STREAM, to_stamp
 
@@ -86,11 +86,11 @@ def test_start_stop(trials, tmp_path, name):
     {'wieghts': 'push2'}, {'weights': 'push2'}, {'image_topic': '/camera/image_raw'}],
     ids=lambda given: next(iter(given)))
 @fault('parameters that a node does not have, or weights by name, to each node', 'it works with '
-       'them, or one line in the log names the parameter; no traceback', 2 * len(NODE_MODULES))
+       'them, or one line in the log names the parameter; no traceback', 2 * len(NODE_CLASSES))
 def test_parameters(trials, tmp_path, given):
     (parameter, value), = given.items()
     for trial in trials:
-        name = list(NODE_MODULES)[trial % len(NODE_MODULES)]
+        name = list(NODE_CLASSES)[trial % len(NODE_CLASSES)]
         own = {'folder': tmp_path / 'bag'} if name == 'recorder_node' else (
             {'port': 0} if name == 'explorer_node' else {})
         process = NodeProcess(name, tmp_path / f'{name}.log', own | {parameter: value})

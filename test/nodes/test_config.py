@@ -4,13 +4,12 @@
 
 from importlib import import_module
 from pathlib import Path
-import sys
 import threading
 
 import pytest
 from rclpy.context import Context
 from rclpy.node import Node
-from tap_ros.contract import CLIMB_LIMIT, MOVE_LIMIT, NODE_MODULES
+from tap_ros.contract import CLIMB_LIMIT, MOVE_LIMIT, NODE_CLASSES
 from tap_ros.nodes.calls import CallError, in_executor
 from tap_ros.nodes.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
 import yaml
@@ -27,7 +26,7 @@ def declared(name, *arguments):
     node = Node(name, context=context)
     try:
         before = set(node._parameters)
-        sys.modules[import_module(NODE_MODULES[name]).main.__module__].declare_parameters(node)
+        import_module(NODE_CLASSES[name].split(':')[0]).declare_parameters(node)
         return {key: node.get_parameter(key).value for key in set(node._parameters) - before}
     finally:
         node.destroy_node()
@@ -35,7 +34,7 @@ def declared(name, *arguments):
 
 
 def test_the_file_has_every_parameter_with_its_default_and_reaches_the_nodes(tmp_path):
-    assert set(NODES) == set(NODE_MODULES)
+    assert set(NODES) == set(NODE_CLASSES)
     for name, written in NODES.items():
         values = declared(name)
         values.pop('topics', None)  # of recorder_node; all that are known

@@ -15,7 +15,7 @@ from processes import LocalNode, until
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from tap_msgs.action import ReachGoal
-from tap_ros.contract import NODE_MODULES
+from tap_ros.contract import NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
@@ -39,7 +39,7 @@ def test_every_node_tells_how_it_is(loop):
     loop.node.create_subscription(
         DiagnosticArray, '/diagnostics',
         lambda array: told.update({status.name: status for status in array.status}), STREAM)
-    wanted = [*(f'{name}: service' for name in NODE_MODULES
+    wanted = [*(f'{name}: service' for name in NODE_CLASSES
                 if name not in ('robot_mask_node', 'tracker_node', 'explorer_node')),
               'visual_mpc_node: /joint_states', 'predictor_node: /goal/image',
               'sim_node: /arm/delta_twist_cmds', 'recorder_node: /objects']

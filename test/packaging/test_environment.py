@@ -62,8 +62,7 @@ def test_without_a_home_cache_and_logs_find_a_place(tmp_path, home):
 
 
 @pytest.mark.parametrize('module', [
-    'tap_ros', pytest.param('tap_ros.nodes.predictor_node', marks=pytest.mark.ros),
-    pytest.param('sim_bridge.ros.sim_node', marks=pytest.mark.ros)])
+    'tap_ros', pytest.param('tap_ros.nodes', marks=pytest.mark.ros)])
 def test_ctrl_c_while_python_imports_is_one_line(module, tmp_path):
     slow = tmp_path / 'numpy.py'  # imported by all, for ever
     slow.write_text('print("importing", flush=True)\n'
@@ -71,7 +70,7 @@ def test_ctrl_c_while_python_imports_is_one_line(module, tmp_path):
                     'try: time.sleep(60)\n'
                     'except BaseException as error: raise ImportError from error\n')
     path = os.pathsep.join([str(tmp_path), str(ROOT), os.environ.get('PYTHONPATH', '')])
-    words = ['inspect', str(tmp_path)] if module == 'tap_ros' else []
+    words = ['inspect', str(tmp_path)] if module == 'tap_ros' else ['predictor_node']
     process = subprocess.Popen(
         [sys.executable, '-m', module, *words], cwd=ROOT, env=os.environ | {'PYTHONPATH': path},
         text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Mapping
 import json
 import math
-import sys
 import threading
 import time
 from typing import Any
@@ -42,7 +41,6 @@ from tap_ros.nodes.explorer.shown import (
 )
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import declare_transport, Parameters
-from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
 from tap_ros.nodes.topics import camera_image, LATCHED, STREAM
 from tap_ros.plugins import names
@@ -335,12 +333,3 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('task', '', "Of the simulator's first scene; resets are heard.")
     declare_transport(parameters)
     return parameters
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; the answer is the exit code of the process."""
-    return run_node(ExplorerNode, 'explorer_node', args)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

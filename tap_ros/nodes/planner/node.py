@@ -39,7 +39,6 @@ from tap_ros.nodes.planner.settings import (
 )
 from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
-from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import internal_error, log_error
 from tap_ros.nodes.topics import camera_topics, goal_topics, STREAM, to_stamp
 from tap_ros.planning.action_sequences import Limits
@@ -69,6 +68,7 @@ class VisualMpcNode(LifecycleBase):
     """
 
     loaded_by = 'weights',
+    num_threads = 4
     _mpc: VisualMPC  # while configured
 
     def __init__(self, **options: Any) -> None:
@@ -353,8 +353,3 @@ def stage_name(index: int, num_subgoals: int) -> str:
     if index == num_subgoals:
         return 'goal'
     return 'subgoal' if num_subgoals == 1 else f'subgoal {index + 1} of {num_subgoals}'
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; the answer is the exit code of the process."""
-    return run_node(VisualMpcNode, 'visual_mpc_node', args, num_threads=4)

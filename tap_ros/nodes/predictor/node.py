@@ -37,7 +37,6 @@ from tap_ros.nodes.predictor.requests import (
 )
 from tap_ros.nodes.robot_view import declare_robot_mask, warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
-from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import (
     create_deferred_service,
     internal_error,
@@ -224,8 +223,3 @@ def declare_parameters(node: Node) -> Parameters:
     declare_transport(parameters)
     declare_robot_mask(parameters)
     return parameters
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; the answer is the exit code of the process."""
-    return run_node(PredictorNode, 'predictor_node', args)

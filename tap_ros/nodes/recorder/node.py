@@ -22,7 +22,6 @@ from tap_ros.nodes.parameters import (
 )
 from tap_ros.nodes.recorder.bags import Bags
 from tap_ros.nodes.ros_messages import message_class
-from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import AdaptiveSubscription
 from tap_ros.nodes.topics import camera_image, SERVICE_QOS
 from tap_ros.text import escaped
@@ -173,8 +172,3 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('record_on_start', True,
                        'Record from the start; else from the call of recorder/record on.')
     return parameters
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; the answer is the exit code of the process."""
-    return run_node(RecorderNode, 'recorder_node', args)

@@ -28,7 +28,6 @@ from tap_ros.nodes.parameters import (
     Parameters,
 )
 from tap_ros.nodes.ros_messages import encode_mask
-from tap_ros.nodes.run import run_node
 from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.plugins import names
@@ -250,8 +249,3 @@ def declared_light(parameters: Parameters) -> Light | None:
         raise ConfigError(f'parameter light_z: is {direction[2]:g}; expected less than 0: light '
                           'shines down')
     return Light(direction, parameters['table_height'])
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; the answer is the exit code of the process."""
-    return run_node(RobotMaskNode, 'robot_mask_node', args)

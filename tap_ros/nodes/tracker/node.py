@@ -40,7 +40,6 @@ from tap_ros.nodes.parameters import (
 )
 from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.nodes.ros_messages import encode_objects
-from tap_ros.nodes.run import run_node
 from tap_ros.nodes.services import answering, log_error
 from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
 from tap_ros.nodes.topics import (
@@ -454,8 +453,3 @@ def declare_parameters(node: Node) -> Parameters:
                        'Seconds; of a picture without joint states nearer to it than this the '
                        'gripper is not known.', low=0.05, high=60.0, read_only=False)
     return parameters
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node; the answer is the exit code of the process."""
-    return run_node(TrackerNode, 'tracker_node', args)

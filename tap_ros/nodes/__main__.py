@@ -1,0 +1,13 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""Run a node without the command ros2: python -m tap_ros.nodes NAME --ros-args ..."""
+
+import sys
+
+from tap_ros.contract import NODE_CLASSES
+from tap_ros.nodes.run import main
+
+if __name__ == '__main__':
+    if len(sys.argv) < 2 or sys.argv[1] not in NODE_CLASSES:
+        sys.exit(f'error: expected the name of a node, one of {", ".join(NODE_CLASSES)}')
+    sys.exit(main(sys.argv[1], sys.argv[2:]))
