@@ -124,10 +124,10 @@ class LearnedForwardModel(nn.Module):
 
         constant('homography', torch.tensor(config.table).view(3, 3).float())
         constant('arm_camera', torch.tensor(config.arm).view(3, 4).float())
-        constant('grid', grid_points(config.table_cells))
+        constant('grid', grid_points(config.table_cells).movedim(-1, 0).contiguous())
         constant('ahead', torch.tensor([1.0, 0.0]))
         constant('pixels', pixel_points((config.image_size, config.image_size)))
-        constant('crop', crop.flatten(0, 1) / config.table_half)
+        constant('crop', (crop.flatten(0, 1) / config.table_half).T.contiguous())
         low = torch.tensor([*config.workspace_low, 0.0])
         high = torch.tensor([*config.workspace_high, 1.0])
         constant('limits', torch.stack([low, high]))
@@ -209,11 +209,11 @@ class LearnedForwardModel(nn.Module):
             homography = self.homography.expand(len(image), 3, 3)
         features, objects, background = self.encoder(image, arm_mask)
         at = self.table.points().expand(len(image), -1, -1)
-        at = project(homography, at).unflatten(1, self.grid.shape[:2])
+        at = project(homography, at).unflatten(1, self.grid.shape[1:])
         return Look(sample_picture(features, at), objects, background)
 
     def still(self, count: int) -> torch.Tensor:
-        """Return the flow (count, n, n, 2) of a scene in which nothing has moved."""
+        """Return the flow (count, 2, n, n) of a scene in which nothing has moved."""
         return torch.zeros_like(self.grid).expand(count, -1, -1, -1)
 
     def move_gripper(self, gripper: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
@@ -228,7 +228,7 @@ class LearnedForwardModel(nn.Module):
         Predict one control period.
 
         :param features: (N, C, n, n) of the Look, expanded to the samples.
-        :param flow: (N, n, n, 2) backward flow from now to the first picture, table units.
+        :param flow: (N, 2, n, n) backward flow from now to the first picture, table units.
         :param gripper: (N, 4) metres; action: (N, 4) metres and opening.
         :return: flow and gripper after the step, and the step's masks (N, 3, h, w), see PushNet.
         """
@@ -240,9 +240,8 @@ class LearnedForwardModel(nn.Module):
         cos, sin = direction[:, 0], direction[:, 1]
         turn = torch.stack([cos, sin, -sin, cos], 1).view(-1, 2, 2)  # rows: local axes on table
         # 1. look at what is now around the gripper
-        here = gripper[:, None, :2] / half
-        at = torch.baddbmm(here, self.crop.expand(len(turn), -1, -1), turn)
-        at = at.view(-1, *self.config.crop_cells, 2)
+        at = (turn.mT.flatten(0, 1) @ self.crop).view(-1, 2, self.crop.shape[1])
+        at = (at + gripper[:, :2, None] / half).unflatten(2, self.config.crop_cells)
         crop = sample(features, shifted(at, flow))
         # 2. predict the flow of this step, from new places back to old ones
         local, masks = self.push(crop, action_terms(gripper, following, direction, length))
@@ -250,34 +249,35 @@ class LearnedForwardModel(nn.Module):
         # 3. compose, where the crop reaches: phi'(x) = f(x) + phi(x + f(x))
         window, points = self._window(gripper)
         step = sample(step.view_as(local), self._crop_coordinates(points, gripper, turn), 'zeros')
-        back = points + step.movedim(1, -1)
-        moved = back - points + sample(flow.movedim(-1, 1), back).movedim(1, -1)
-        return flow.index_put(window, moved), following, masks
+        back = points + step
+        moved = back - points + sample(flow, back)
+        cells = flow.flatten(2).scatter(2, window.expand(-1, 2, -1), moved.flatten(2))
+        return cells.view_as(flow), following, masks
 
-    def _window(self, gripper: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
-        """Return the indices (N, m, m) and points (N, m, m, 2) of the cells near the gripper."""
+    def _window(self, gripper: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the cells (N, 1, m m) near the gripper, row-major, and points (N, 2, m, m)."""
         n, m = self.config.table_cells, self.config.window_cells
         corner = (gripper[:, :2] / self.config.table_half + 1) * ((n - 1) / 2) - (m - 1) / 2
         corner = corner.round().long().clamp(0, n - m)  # (N, 2) column, row
-        line, which = (torch.arange(k, device=gripper.device) for k in (m, len(gripper)))
+        line = torch.arange(m, device=gripper.device)
         columns, rows = corner[:, :1] + line, corner[:, 1:] + line  # (N, m)
-        first = corner[:, None, None] * (2 / (n - 1))  # (N, 1, 1, 2)
-        return (which[:, None, None], rows[:, :, None], columns[:, None]), (
-            self.grid[:m, :m] + first)
+        cells = rows[:, :, None] * n + columns[:, None]
+        first = corner[..., None, None] * (2 / (n - 1))  # (N, 2, 1, 1)
+        return cells.flatten(1)[:, None], self.grid[:, :m, :m] + first
 
     def _crop_coordinates(self, points: torch.Tensor, gripper: torch.Tensor,
                           turn: torch.Tensor) -> torch.Tensor:
-        """Return where points (N, m, m, 2) lie in the crop, in [-1, 1] if inside."""
+        """Return where points (N, 2, m, m) lie in the crop, in [-1, 1] if inside."""
         config = self.config
         h, w = config.crop_cells[0] // 2, config.crop_cells[1] // 2
         # the push net's cells are two of the crop's wide, the first at the crop's corner
         spans = gripper.new_tensor([h - 1, w - 1]) * config.crop_cell  # half extents, metres
-        corner = self.crop[0] * config.table_half
+        corner = self.crop[:, 0] * config.table_half
         rows = turn.mT / spans  # (N, 2, 2): table metres to [-1, 1] along, across
         shift = -(gripper[:, None, :2] @ rows) - corner / spans - 1
         # grid_sample wants the last axis of the crop, across, first
         return torch.baddbmm(
-            shift.flip(-1), points.flatten(1, 2), rows.flip(-1) * config.table_half
+            shift.flip(-1).mT, (rows.flip(-1) * config.table_half).mT, points.flatten(2)
         ).view_as(points)
 
     def carry(self, maps: torch.Tensor, flow: torch.Tensor) -> torch.Tensor:
@@ -285,7 +285,7 @@ class LearnedForwardModel(nn.Module):
         Carry object maps by the flow.
 
         :param maps: (N, K, n, n) on the table grid, in the first picture.
-        :param flow: (N, n, n, 2), table units.
+        :param flow: (N, 2, n, n), table units.
         :return: (N, K, n, n), each summing to 1, or to 0 where nearly all of it was lost: a flow
             that jumps over an object or off the table does not say where it went.
         """
@@ -298,7 +298,7 @@ class LearnedForwardModel(nn.Module):
         """
         Compose the picture that the flow leads to, for training and for people.
 
-        :param scene: Look of B first pictures; flow (B, n, n, 2); arm (B, 4, H, W) as drawn.
+        :param scene: Look of B first pictures; flow (B, 2, n, n); arm (B, 4, H, W) as drawn.
         :return: picture (B, 3, H, W) and masks (B, 3, 1, H, W) of arm, objects and background.
         """
         if homography is None:
@@ -306,9 +306,9 @@ class LearnedForwardModel(nn.Module):
         pixels = self.pixels
         half = self.config.table_half
         table = project(torch.linalg.inv(homography), pixels.flatten(0, 1)) / half
-        table = table.unflatten(1, pixels.shape[:2])  # (B, H, W, 2)
-        source = shifted(table, flow, 'zeros')
-        source = project(homography, source.flatten(1, 2) * half).view_as(table)
+        table = table.unflatten(1, pixels.shape[:2]).movedim(-1, 1)  # (B, 2, H, W)
+        source = shifted(table, flow, 'zeros').movedim(1, -1)
+        source = project(homography, source.flatten(1, 2) * half).view_as(source)
         objects = sample_picture(scene.objects, source)
         arm_mask = arm[:, 3:]
         object_mask = (1 - arm_mask) * objects[:, 3:]

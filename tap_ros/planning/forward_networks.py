@@ -112,12 +112,13 @@ class PushNet(nn.Module):
         dtype = self.look.weight.dtype
         # in two steps: both at once takes three times as long
         x = self.look(crop.to(dtype).contiguous(memory_format=torch.channels_last))
-        x = F.relu(x + self.place + self.action(action_terms.to(dtype))[..., None, None])
-        x = F.relu(self.blocks[0](x))
-        whole = F.relu(self.gather(F.relu(self.squeeze(x)).flatten(1)))
+        place = self.place.contiguous(memory_format=torch.channels_last)  # mixed layouts are slow
+        x = F.relu_(x.add_(place).add_(self.action(action_terms.to(dtype))[..., None, None]))
+        x = F.relu_(self.blocks[0](x))
+        whole = F.relu_(self.gather(F.relu_(self.squeeze(x)).flatten(1)))
         x = x + self.spread(whole)[..., None, None]
         for block in self.blocks[1:]:
-            x = x + F.relu(block(x))
+            x = x + F.relu_(block(x))
         masks = self.masks(x).float().softmax(1)
         N, _, h, w = masks.shape
         rigid = self.twists(whole).float().view(2 * N, 3) @ self.fields.flatten(1)

@@ -106,13 +106,13 @@ def sample_picture(images: torch.Tensor, pixels: torch.Tensor,
 
 
 def sample(fields: torch.Tensor, points: torch.Tensor, padding: str = 'border') -> torch.Tensor:
-    """Read fields (B, C, n, n) on the table grid at points (B, h, w, 2): (B, C, h, w)."""
-    return F.grid_sample(fields, points, padding_mode=padding, align_corners=True)
+    """Read fields (B, C, n, n) on the table grid at points (B, 2, h, w): (B, C, h, w)."""
+    return F.grid_sample(fields, points.movedim(1, -1), padding_mode=padding, align_corners=True)
 
 
 def shifted(points: torch.Tensor, flow: torch.Tensor, padding: str = 'border') -> torch.Tensor:
-    """Return points (B, h, w, 2) moved by the flow (B, n, n, 2) that is there."""
-    return points + sample(flow.movedim(-1, 1), points, padding).movedim(1, -1)
+    """Return points (B, 2, h, w) moved by the flow (B, 2, n, n) that is there."""
+    return points + sample(flow, points, padding)
 
 
 def mirror_table(homography: torch.Tensor, width: int) -> torch.Tensor:
