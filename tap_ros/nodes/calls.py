@@ -4,23 +4,21 @@
 
 from collections.abc import Callable, Iterator
 from concurrent import futures
+from contextlib import suppress
 from dataclasses import dataclass
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 import threading
 import time
-from typing import Any, Self, TYPE_CHECKING, TypeVar
+from typing import Any, Self, TypeVar
 
 from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
+from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.task import Future
 from tap_ros.errors import TapError
-
-if TYPE_CHECKING:
-    from rclpy.action import ActionClient
-    from rclpy.action.client import ClientGoalHandle
-    from rclpy.client import Client
-    from rclpy.node import Node
-    from rclpy.task import Future
-    from tap_ros.nodes.heartbeat import Liveness
+from tap_ros.nodes.heartbeat import Liveness
 
 Found = TypeVar('Found')
 
@@ -43,7 +41,7 @@ class Spinner:
     :param node: rclpy Node; destroying it stays with the caller.
     """
 
-    def __init__(self, node: 'Node') -> None:
+    def __init__(self, node: Node) -> None:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._stop = threading.Event()
@@ -63,8 +61,8 @@ class Spinner:
             self._executor.spin_once(timeout_sec=0.1)
 
 
-def call(client: 'Client', request: Any, timeout_s: float,
-         give_up: Callable[[], bool] = lambda: False, server: 'Liveness | None' = None) -> Any:
+def call(client: Client, request: Any, timeout_s: float,
+         give_up: Callable[[], bool] = lambda: False, server: Liveness | None = None) -> Any:
     """
     Call a service from a thread that does not spin the node.
 
@@ -96,7 +94,7 @@ def call(client: 'Client', request: Any, timeout_s: float,
     return future.result()
 
 
-def in_executor(node: 'Node', function: Callable[[], Found], timeout_s: float) -> Found:
+def in_executor(node: Node, function: Callable[[], Found], timeout_s: float) -> Found:
     """
     Call a function in the thread that spins a node, where no answer is handled meanwhile.
 
@@ -127,73 +125,6 @@ def in_executor(node: 'Node', function: Callable[[], Found], timeout_s: float) -
                         f'{timeout_s:g} s') from error
 
 
-def wait_for_future(future: 'Future', timeout_s: float) -> bool:
-    """Wait until a future is done, without spinning; tell whether it is."""
-    done = threading.Event()
-    future.add_done_callback(lambda _: done.set())
-    return done.wait(max(timeout_s, 0.0))
-
-
-def send_goal(action_client: 'ActionClient', goal: Any, timeout_s: float,
-              on_feedback: Callable[[Any], object] | None = None,
-              server: 'Liveness | None' = None) -> 'ClientGoalHandle':
-    """
-    Send a goal and wait until it is accepted.
-
-    :param action_client: rclpy ActionClient of a node that another thread spins.
-    :param goal: the action's goal.
-    :param timeout_s: most seconds to wait.
-    :param on_feedback: called with each feedback message, or None.
-    :param server: heartbeat.Liveness of the node that offers it, as in call.
-    :return: the client's goal handle.
-    :raises CallError: when no server answers in time, or it rejects the goal.
-    """
-    name = f'action {action_client._action_name}'
-    deadline = time.monotonic() + timeout_s
-    _expect_alive(name, timeout_s, server)
-    if not action_client.wait_for_server(timeout_sec=timeout_s):
-        raise CallError(f'{name}: nobody offers it after {timeout_s:g} s; start {_named(server)}')
-    told = None if on_feedback is None else lambda message: on_feedback(message.feedback)
-    future = in_executor(
-        action_client._node, lambda: action_client.send_goal_async(goal, told), timeout_s)
-    if not _wait_for_server(future, deadline, f'{name}: its node ended before it answered',
-                            action_client.server_is_ready, server):
-        raise CallError(f'{name}: no answer to the goal within {timeout_s:g} s')
-    handle = future.result()
-    if not handle.accepted:
-        raise CallError(f'{name}: the goal was rejected; the log of {_named(server)} says why')
-    return handle
-
-
-def cancel_goal(handle: 'ClientGoalHandle', timeout_s: float = 1.0) -> 'Future':
-    """Ask for the end of a goal, as in_executor; return the future of the answer."""
-    return in_executor(handle._action_client._node, handle.cancel_goal_async, timeout_s)
-
-
-def wait_for_result(handle: 'ClientGoalHandle', timeout_s: float,
-                    server: 'Liveness | None' = None) -> tuple[int, Any]:
-    """
-    Wait for the end of a goal; cancel it when it takes too long.
-
-    :return: status, one of the STATUS_ constants of action_msgs/GoalStatus, and the result.
-    :raises CallError: when it has not ended in time, or the node that pursues it has.
-    """
-    client = handle._action_client
-    deadline = time.monotonic() + timeout_s
-    future = in_executor(client._node, handle.get_result_async, timeout_s)
-    if not _wait_for_server(
-            future, deadline, f'action {client._action_name}: its node ended before the goal did; '
-            'what the arm does now is up to its driver', client.server_is_ready, server):
-        cancelled = wait_for_future(cancel_goal(handle), 1.0)
-        raise CallError(
-            f'the goal has not ended within {timeout_s:g} s and '
-            + ('was cancelled' if cancelled else 'its node does not answer the cancel'))
-    answer = future.result()
-    if answer.status == GoalStatus.STATUS_UNKNOWN:
-        raise CallError('the action server does not know the goal; was it started anew?')
-    return answer.status, answer.result
-
-
 @dataclass(frozen=True)
 class ReachResult:
     """
@@ -219,25 +150,50 @@ class Reaching:
 
     A feedback has step, stage ('subgoal' or 'goal'), expected_distance (px) and planning_ms.
 
+    :param action_client: rclpy ActionClient of a node that another thread spins.
+    :param goal: the action's goal.
+    :param timeout_s: most seconds until the end; whoever waits for longer cancels the goal.
+    :param accept_s: most seconds until it is accepted.
+    :param on_feedback: called with each feedback by another thread; without it they are kept for
+        the iteration.
+    :param server: Liveness of the node that offers the action, as in call.
     :ivar handle: rclpy's handle of the goal.
+    :raises CallError: when no server answers in time, or it rejects the goal.
     """
 
-    def __init__(self, handle: 'ClientGoalHandle', feedback: 'SimpleQueue[Any]',
-                 deadline: float, server: 'Liveness') -> None:
-        self.handle = handle
-        self._feedback, self._deadline, self._server = feedback, deadline, server
-        self._result: ReachResult | Exception = CallError('reach_goal: ended without a result')
-        self._thread = threading.Thread(target=self._wait, name='reaching', daemon=True)
-        self._thread.start()
+    def __init__(self, action_client: ActionClient, goal: Any, timeout_s: float,
+                 accept_s: float = 20.0, on_feedback: Callable[[Any], object] | None = None,
+                 server: Liveness | None = None) -> None:
+        self._client, self._server, self._timeout_s = action_client, server, timeout_s
+        self._name = f'action {action_client._action_name}'
+        self._deadline = time.monotonic() + timeout_s
+        self._feedback: SimpleQueue[Any] = SimpleQueue()
+        take, accept_s = on_feedback or self._feedback.put, min(accept_s, timeout_s)
+        deadline = time.monotonic() + accept_s
+        _expect_alive(self._name, accept_s, server)
+        if not action_client.wait_for_server(timeout_sec=accept_s):
+            raise CallError(f'{self._name}: nobody offers it after {accept_s:g} s; start '
+                            f'{_named(server)}')
+        accepted = self._in_executor(lambda: action_client.send_goal_async(
+            goal, lambda message: take(message.feedback)), accept_s)
+        if not _wait_for_server(accepted, deadline, f'{self._name}: its node ended before it '
+                                'answered', action_client.server_is_ready, server):
+            raise CallError(f'{self._name}: no answer to the goal within {accept_s:g} s')
+        self.handle = accepted.result()
+        if not self.handle.accepted:
+            raise CallError(f'{self._name}: the goal was rejected; the log of {_named(server)} '
+                            'says why')
+        self._answer = self._in_executor(self.handle.get_result_async, accept_s)
 
     def __iter__(self) -> Iterator[Any]:
-        yield from iter(self._feedback.get, None)
-        self._feedback.put(None)
+        while not (self._feedback.empty() and self._is_over()):
+            with suppress(Empty):
+                yield self._feedback.get(timeout=POLL_S)
         self.result()  # raises what has ended it
 
     def cancel(self) -> None:
         """Ask for the end of the goal; result tells when it has come."""
-        cancel_goal(self.handle)
+        self._in_executor(self.handle.cancel_goal_async, 1.0)
 
     def result(self) -> ReachResult:
         """
@@ -246,35 +202,42 @@ class Reaching:
         :raises CallError: when the planner ends before, or takes longer than it was given; then
             the goal is cancelled.
         """
-        self._thread.join()
-        if isinstance(self._result, Exception):
-            raise self._result
-        return self._result
+        if not _wait_for_server(
+                self._answer, self._deadline, f'{self._name}: its node ended before the goal did; '
+                'what the arm does now is up to its driver', self._client.server_is_ready,
+                self._server):
+            self.cancel()
+            raise CallError(f'the goal has not ended within {self._timeout_s:g} s and was '
+                            'cancelled')
+        answer = self._answer.result()
+        if answer.status == GoalStatus.STATUS_UNKNOWN:
+            raise CallError('the action server does not know the goal; was it started anew?')
+        result = answer.result
+        return ReachResult(ENDS[answer.status], result.success, result.message, result.steps,
+                           result.expected_distance)
 
-    def _wait(self) -> None:
-        try:
-            status, result = wait_for_result(
-                self.handle, max(self._deadline - time.monotonic(), 0.0), self._server)
-            self._result = ReachResult(
-                ENDS.get(status, 'aborted'), result.success, result.message, result.steps,
-                result.expected_distance)
-        except Exception as error:
-            self._result = error
-        self._feedback.put(None)
+    def _is_over(self) -> bool:
+        """Return whether result would return or raise at once."""
+        return (self._answer.done() or time.monotonic() > self._deadline
+                or not self._client.server_is_ready()
+                or self._server is not None and self._server.dead)
+
+    def _in_executor(self, function: Callable[[], Future], timeout_s: float) -> Future:
+        return in_executor(self._client._node, function, timeout_s)
 
 
-def _named(server: 'Liveness | None') -> str:
+def _named(server: Liveness | None) -> str:
     return 'its node' if server is None else server.name
 
 
-def _expect_alive(name: str, timeout_s: float, server: 'Liveness | None') -> None:
+def _expect_alive(name: str, timeout_s: float, server: Liveness | None) -> None:
     """Raise CallError if a node that was heard before has ended."""
     if server is not None and not server.wait_until_alive(min(NEWBORN_S, timeout_s)):
         raise CallError(f'{name}: its node, {server.name}, has ended; start it again')
 
 
-def _wait_for_server(future: 'Future', deadline: float, ended: str, ready: Callable[[], bool],
-                     server: 'Liveness | None', give_up: Callable[[], bool] = lambda: False
+def _wait_for_server(future: Future, deadline: float, ended: str, ready: Callable[[], bool],
+                     server: Liveness | None, give_up: Callable[[], bool] = lambda: False
                      ) -> bool:
     """
     Wait for what a server answers; tell whether it has come before the deadline.
@@ -283,7 +246,7 @@ def _wait_for_server(future: 'Future', deadline: float, ended: str, ready: Calla
     """
     done = threading.Event()
     future.add_done_callback(lambda _: done.set())
-    while not done.wait(min(POLL_S, max(deadline - time.monotonic(), 0.0))):
+    while not (future.done() or done.wait(min(POLL_S, max(deadline - time.monotonic(), 0.0)))):
         if not ready() or (server is not None and server.dead):
             raise CallError(ended)
         if time.monotonic() >= deadline or give_up():

@@ -4,7 +4,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from queue import SimpleQueue
 import threading
 import time
 from typing import Any, Self, TYPE_CHECKING
@@ -32,7 +31,7 @@ from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.messages.subgoals import decode_subgoals
-from tap_ros.nodes.calls import call, CallError, Reaching, send_goal, Spinner
+from tap_ros.nodes.calls import call, CallError, Reaching, Spinner
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
@@ -215,20 +214,17 @@ class Client:
         :param num_samples: of them to choose from.
         :param on_feedback: called with each feedback by another thread; without it they are
             kept for the iteration over what is returned.
-        :param timeout_s: most seconds until the end; then the goal is cancelled.
+        :param timeout_s: most seconds until the end; whoever waits for longer cancels the goal.
         :return: Reaching, once the goal is accepted.
         :raises CallError: when the planner does not answer, or rejects it: it has another goal.
         """
-        deadline = time.monotonic() + timeout_s
         pixels = goal_pixels or {}
-        feedback: SimpleQueue[Any] = SimpleQueue()
         request = _message(ReachGoal.Goal, request_fields(
             tuple(pixels), goal_image=goal, goal_objects=list(pixels.values()) or None) | {
                 'mode': mode, 'step_budget': step_budget, 'recursion_depth': recursion_depth,
                 'num_samples': num_samples, 'seed': seed})
-        handle = send_goal(self._planner(), request, min(self.timeout_s, timeout_s),
-                           on_feedback or feedback.put, self._liveness(PLANNER))
-        return Reaching(handle, feedback, deadline, self._liveness(PLANNER))
+        return Reaching(self._planner(), request, timeout_s, self.timeout_s, on_feedback,
+                        self._liveness(PLANNER))
 
     def weights(self) -> str:
         """Return the predictor's weights, a name or a file."""

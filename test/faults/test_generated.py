@@ -22,7 +22,7 @@ from tap_ros.contract import GRIPPER_JOINTS, MAP_ENCODING, MASK_ENCODING, NODE_C
 from tap_ros.errors import TapError
 from tap_ros.images.encodings import ENCODINGS
 from tap_ros.nodes import heartbeat
-from tap_ros.nodes.calls import call, CallError, cancel_goal, send_goal, wait_for_result
+from tap_ros.nodes.calls import call, CallError, Reaching
 from tap_ros.nodes.topics import LATCHED
 from tap_ros.robots.description import robot_description
 from tap_ros.robots.ur10e import UR10E
@@ -233,14 +233,14 @@ class Target:
     def _pursue(self, goal):
         """Send a goal, let it begin, and cancel it; raise TapError if it does not end."""
         try:
-            handle = send_goal(self._reach, goal, ANSWER_S)
+            reaching = Reaching(self._reach, goal, 3 * ANSWER_S, ANSWER_S)
         except CallError as error:
             if 'rejected' not in str(error):  # as another one is pursued
                 raise
             return
         time.sleep(0.2)
-        cancel_goal(handle, ANSWER_S)
-        wait_for_result(handle, ANSWER_S)
+        reaching.cancel()
+        reaching.result()
 
 
 @fault('generated messages: wrong sizes, extreme numbers, control characters', 'no node ends, '

@@ -5,7 +5,6 @@
 from contextlib import contextmanager, suppress
 import threading
 
-from action_msgs.msg import GoalStatus
 from experiments.planning.episode import run_episode
 from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
@@ -22,7 +21,7 @@ from tap_msgs.action import ReachGoal
 from tap_msgs.msg import ObjectStates, Subgoal
 import tap_ros
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError, send_goal, wait_for_future, wait_for_result
+from tap_ros.nodes.calls import CallError, Reaching
 from tap_ros.nodes.heartbeat import Liveness
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.topics import LATCHED, STREAM
@@ -78,7 +77,7 @@ class Loop:
         client = AsyncParameterClient(self.node, name)
 
         def answer(future):
-            assert wait_for_future(future, 30)
+            assert until(future.done)
             return future.result()
 
         def change(values):
@@ -105,32 +104,30 @@ class Loop:
 
         assert until(seen, pause=0.1)
 
-    def reach(self, on_feedback=None, **fields):
-        """Send a goal and wait for its end."""
-        handle = send_goal(self.reach_client, ReachGoal.Goal(**fields), 30, on_feedback)
-        return wait_for_result(handle, 300)
+    def begin(self, on_feedback=None, **fields):
+        """Send a goal; return its Reaching."""
+        return Reaching(self.reach_client, ReachGoal.Goal(**fields), 300, 30, on_feedback)
 
     def reached(self, on_feedback=None, **fields):
         """Send a goal that is to be pursued to its end; return the result."""
-        status, result = self.reach(on_feedback, **fields)
-        assert status == GoalStatus.STATUS_SUCCEEDED, result.message
+        result = self.begin(on_feedback, **fields).result()
+        assert result.end == 'succeeded', result.message
         return result
 
-    def ended(self, handle, status, words=''):
+    def ended(self, reaching, end, words=''):
         """Check that a goal ends so and for this reason, and that the arm then stands."""
-        found, result = wait_for_result(handle, 60)
-        assert found == status and words in result.message, result.message
+        result = reaching.result()
+        assert result.end == end and words in result.message, result.message
         assert self.stopped()
         return result
 
     def begin_moving(self, **fields):
-        """Start a scene and a goal; return its handle once the arm was moved."""
+        """Start a scene and a goal; return its Reaching once the arm was moved."""
         self.reset()
         moving = threading.Event()
-        handle = send_goal(self.reach_client, ReachGoal.Goal(**{'mode': 'direct'} | fields), 30,
-                           lambda feedback: moving.set())
+        reaching = self.begin(lambda feedback: moving.set(), **{'mode': 'direct'} | fields)
         assert moving.wait(120)
-        return handle
+        return reaching
 
     @contextmanager
     def other_planner(self, **parameters):

@@ -6,7 +6,6 @@ from collections import Counter
 from pathlib import Path
 import re
 
-from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from loop import SEED
 from mcap.reader import make_reader
@@ -14,12 +13,10 @@ import numpy as np
 from processes import LocalNode, until
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from tap_msgs.action import ReachGoal
 from tap_ros.contract import NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import send_goal
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.nodes.topics import STREAM
@@ -83,10 +80,10 @@ def set_goal(loop, pixels):
 
 
 def test_a_goal_that_moves_on_the_way_ends_the_request_and_the_next_one_reaches_it(loop):
-    handle = loop.begin_moving(mode='subgoal', step_budget=1000)
+    reaching = loop.begin_moving(mode='subgoal', step_budget=1000)
     before = loop.client.call('predict').subgoals[0]
     set_goal(loop, MOVED)
-    result = loop.ended(handle, GoalStatus.STATUS_ABORTED, 'a new goal has come on')
+    result = loop.ended(reaching, 'aborted', 'a new goal has come on')
     assert result.steps >= 1 and '/goal/objects' in result.message
     after = loop.client.call('predict').subgoals[0]
     assert len(after.object_maps) == 2, 'objects and picture of the goal go together'
@@ -114,7 +111,7 @@ def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
     picture = loop.goal_image.wait(1)
     loop.reset(seed=8)
     drawn = decode_objects(loop.goal_objects.wait(1), 'goal_objects')[1]
-    loop.reach(mode='direct', step_budget=1)  # by then the recorder knows of the new episode
+    loop.reached(mode='direct', step_budget=1)  # by then the recorder knows of the new episode
     loop.client.record(False)
     # What the scene before sent last may reach the recorder after the bag was begun.
     episode, = (e for e in iter_episodes(folder) if e.seed == 7)
@@ -137,7 +134,7 @@ def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
     moves = loop.moves()
     loop.reset()
     begin = to_nanoseconds(loop.image.wait(30).header.stamp)
-    send_goal(loop.reach_client, ReachGoal.Goal(mode='direct'), 30)
+    loop.begin(mode='direct')
     # A step was made: the stop that the planner sends when it ends may overtake a command.
     loop.image.wait(120, lambda m: to_nanoseconds(m.header.stamp) > begin)
     for name in ('visual_mpc_node', 'predictor_node', 'sim_node', 'recorder_node'):

@@ -14,7 +14,7 @@ from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
 from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.messages.images import decode_image
-from tap_ros.nodes.calls import call, wait_for_future
+from tap_ros.nodes.calls import call
 from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
@@ -223,12 +223,12 @@ def test_many_requests_at_once_get_their_own_answer_and_beyond_the_queue_busy(se
     futures = [latent.client.call_async(PredictSubgoal.Request(seed=seed, **WITH_GOAL))
                for seed in range(8)]
     for future, expected in zip(futures, alone, strict=True):
-        assert wait_for_future(future, 60)
+        assert until(future.done, 60)
         assert future.result().success, future.result().message
         assert differ(pictures(future.result()), expected) < 0.1
     request = PredictSubgoal.Request(num_samples=6, recursion_depth=3, **WITH_GOAL)
     futures = [latent.client.call_async(request) for _ in range(100)]
-    assert all(wait_for_future(future, 120) for future in futures)
+    assert all(until(future.done, 120) for future in futures)
     refused = [f.result().message for f in futures if not f.result().success]
     assert 0 < len(refused) <= 100 - 64
     assert set(refused) == {'busy: 64 requests are waiting, which is the most that may; ask again'}
@@ -278,11 +278,11 @@ def test_a_node_answers_while_it_is_active_alone_by_the_weights_of_that_time(
         before = pictures(service.answer(**WITH_GOAL))
         request = PredictSubgoal.Request(recursion_depth=8, **WITH_GOAL)
         waiting = [service.client.call_async(request) for _ in range(40)]
-        assert wait_for_future(waiting[0], 60)
+        assert until(waiting[0].done, 60)
         reason = states.set('weights', files['latent'])
         assert 'weights' in reason and 'deactivate, then' in reason and 'cleanup' in reason
         assert states.to('deactivate') and 'inactive' in service.refusal(**WITH_GOAL)
-        assert all(wait_for_future(future, 60) for future in waiting), 'who waits is answered'
+        assert all(until(future.done, 60) for future in waiting), 'who waits is answered'
         assert waiting[0].result().success
         refused = [one.result().message for one in waiting if not one.result().success]
         assert all('activate it' in message for message in refused)

@@ -7,7 +7,6 @@ import re
 import signal
 import threading
 
-from action_msgs.msg import GoalStatus
 from lifecycle import Lifecycle
 from lively import lively_network
 from loop import acts_like, SEED
@@ -16,10 +15,9 @@ from processes import Newest, until
 import pytest
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
-from tap_msgs.action import ReachGoal
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.objects import decode_objects
-from tap_ros.nodes.calls import CallError, cancel_goal, send_goal
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.planner.plan_view import CHOSEN
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.training.weights import save_weights, stored_digest
@@ -31,17 +29,17 @@ pytestmark = pytest.mark.slow
 def served(loop, steps=1):
     """Check that a goal is served now, as soon as the machine lets the planner go on."""
     for _ in range(3):
-        status, result = loop.reach(mode='direct', step_budget=steps)
+        result = loop.begin(mode='direct', step_budget=steps).result()
         if not re.search('stood still|no command could be sent', result.message):
             break
-    assert status == GoalStatus.STATUS_SUCCEEDED and result.steps == steps, result.message
+    assert result.end == 'succeeded' and result.steps == steps, result.message
 
 
 def aborted(loop, *words, **fields):
     """Check that a goal is aborted for this reason before a command."""
     count = len(loop.moves())
-    status, result = loop.reach(**fields)
-    assert status == GoalStatus.STATUS_ABORTED and not result.success and result.steps == 0
+    result = loop.begin(**fields).result()
+    assert result.end == 'aborted' and not result.success and result.steps == 0
     assert all(word in result.message for word in words), result.message
     assert loop.stopped() and len(loop.moves()) == count
 
@@ -91,10 +89,10 @@ def test_the_nodes_choose_among_chains_of_samples_as_one_process_does(loop, tmp_
         run, told, _ = acts_like(loop, 'sampling:samples2:recursion2', weights, num_samples=2,
                                  recursion_depth=2, step_budget=2)
         loop.reset()
-        handle = send_goal(loop.reach_client, ReachGoal.Goal(num_samples=32), 30)
+        reaching = loop.begin(num_samples=32)
         threading.Event().wait(0.5)  # it would make 64 plans before it moves
-        cancel_goal(handle)
-        assert loop.ended(handle, GoalStatus.STATUS_CANCELED).steps == 0
+        reaching.cancel()
+        assert loop.ended(reaching, 'cancelled').steps == 0
     finally:
         loop.client.use_weights(DEFAULT_PREDICTOR)
     assert len(run.subgoals) == 2 and told[-1].stage == 'goal'
@@ -116,12 +114,12 @@ def test_a_bad_goal_is_aborted_with_the_reason_and_moves_nothing(loop):
 
 
 def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
-    handle = loop.begin_moving(step_budget=40)
+    reaching = loop.begin_moving(step_budget=40)
     with pytest.raises(CallError, match='rejected'):
-        send_goal(loop.reach_client, ReachGoal.Goal(), 30)
+        loop.begin()
     assert 'another goal is in progress' in loop.processes['visual_mpc_node'].text
-    cancel_goal(handle)
-    result = loop.ended(handle, GoalStatus.STATUS_CANCELED, 'cancelled')
+    reaching.cancel()
+    result = loop.ended(reaching, 'cancelled', 'cancelled')
     assert 1 <= result.steps < 40
     count = len(loop.moves())
     threading.Event().wait(0.6)  # more than two control periods
@@ -132,13 +130,13 @@ def test_cancelling_stops_the_arm_and_the_next_goal_is_served(loop):
 
 
 def test_another_scene_or_camera_during_a_goal_aborts_it(loop):
-    handle = loop.begin_moving()
+    reaching = loop.begin_moving()
     loop.client.call('reset', seed=SEED + 1)
-    loop.ended(handle, GoalStatus.STATUS_ABORTED, 'the scene has changed')
-    handle = loop.begin_moving()
+    loop.ended(reaching, 'aborted', 'the scene has changed')
+    reaching = loop.begin_moving()
     publisher = loop.node.create_publisher(Image, 'camera/image_raw', STREAM)
     try:
-        loop.ended(handle, GoalStatus.STATUS_ABORTED, '2 nodes publish on /camera/image_raw')
+        loop.ended(reaching, 'aborted', '2 nodes publish on /camera/image_raw')
     finally:
         loop.node.destroy_publisher(publisher)
 
@@ -185,18 +183,18 @@ def test_a_planner_with_a_robot_mask_waits_for_masks_and_stops_when_it_is_deacti
             loop.reset()
             aborted(loop, '/own_mask', mode='direct', step_budget=2)
             sending.set()
-            handle = loop.begin_moving()
+            reaching = loop.begin_moving()
             assert states.to('deactivate')
-            loop.ended(handle, GoalStatus.STATUS_ABORTED, 'deactivated')
+            loop.ended(reaching, 'aborted', 'deactivated')
             aborted(loop, 'ros2 lifecycle set /other_node activate', mode='direct', step_budget=1)
             assert 'cleanup' in states.set('weights', loop.folder / 'none.safetensors')
             assert states.to('cleanup') and states.set('weights', FORWARD_MODEL) == ''
             assert states.to('configure') and states.to('activate')
             loop.reset()
             served(loop, 2)
-            handle = loop.begin_moving()
+            reaching = loop.begin_moving()
             assert states.to('active_shutdown')
-            loop.ended(handle, GoalStatus.STATUS_ABORTED, 'deactivated')
+            loop.ended(reaching, 'aborted', 'deactivated')
             aborted(loop, 'start it again', mode='direct', step_budget=1)
     finally:
         loop.node.destroy_subscription(images)

@@ -19,7 +19,7 @@ import tap_ros
 from tap_ros.errors import TapError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError, wait_for_future
+from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 
 PERIOD_NS = 250_000_000
@@ -215,7 +215,7 @@ def test_a_paused_simulation_takes_no_commands_but_steps(rig):
     newest = rig.image.wait(
         30, lambda m: to_nanoseconds(m.header.stamp) > after + 105 * PERIOD_NS)
     rig.send(x=0.08, stamp=newest.header.stamp)
-    assert all(wait_for_future(future, 60) for future in waiting)
+    assert all(until(future.done, 60) for future in waiting)
     assert 'paused' in rig.refusals.wait(
         20, lambda m: m.header.stamp == newest.header.stamp).message
     rig.image.wait(10, lambda m: to_nanoseconds(m.header.stamp) == after + 400 * PERIOD_NS)

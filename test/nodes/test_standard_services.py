@@ -8,12 +8,12 @@ import re
 
 from made_bags import decode_gripper
 import numpy as np
-from processes import Client, NodeProcess
+from processes import Client, NodeProcess, until
 import pytest
 from std_msgs.msg import Float64
 from tap_msgs.msg import Episode
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import call, wait_for_future
+from tap_ros.nodes.calls import call
 from tap_ros.nodes.topics import STREAM
 from test_sim_node import PERIOD_NS
 from test_sim_node import Rig as SimRig
@@ -242,7 +242,7 @@ def test_paused_nothing_moves_and_no_command_is_made_up_for(rig):
     newest = rig.image.wait(
         30, lambda m: to_nanoseconds(m.header.stamp) > stamp + 105 * PERIOD_NS)
     rig.command(newest.header, x=0.08)
-    assert all(wait_for_future(future, 60) for future in waiting)
+    assert all(until(future.done, 60) for future in waiting)
     assert all(future.result().result.result == OK for future in waiting)
     assert 'paused' in rig.refusal(newest)
     if not rig.lock_step:

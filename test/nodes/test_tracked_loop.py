@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole path from clicks and a goal picture alone: no node is told the truth."""
 
-from action_msgs.msg import GoalStatus
 from loop import Loop, SEED
 import numpy as np
 from processes import NodeProcess, until
@@ -56,8 +55,8 @@ def test_clicks_and_a_goal_picture_are_enough_and_objects_in_doubt_stop_the_arm(
         assert result.steps == 3 and len(loop.moves()) == 3 and loop.stopped()
 
         told.states[0] = 'lost'
-        status, result = loop.reach(goal_objects=told, step_budget=3, mode='direct')
-        assert status == GoalStatus.STATUS_ABORTED and 'object_0 not found' in result.message
+        result = loop.begin(goal_objects=told, step_budget=3, mode='direct').result()
+        assert result.end == 'aborted' and 'object_0 not found' in result.message
         assert not result.steps and len(loop.moves()) == 3
 
         assert loop.processes['tracker_node'].end() == 0
@@ -79,8 +78,8 @@ def test_clicks_and_a_goal_picture_are_enough_and_objects_in_doubt_stop_the_arm(
 
             def doubt(feedback, state=state):
                 states[1] = state
-            status, result = loop.reach(doubt, **fields)
-            assert status == GoalStatus.STATUS_ABORTED and result.steps >= steps
+            result = loop.begin(doubt, **fields).result()
+            assert result.end == 'aborted' and result.steps >= steps
             assert f'object_1 {"is " * (state == "unsure")}{state}' in result.message
             assert loop.stopped()
     finally:
