@@ -6,7 +6,8 @@ The tables of docs/results, from the data beside the pages.
     python -m experiments.tables
 
 A page has its sentences from a person, and its table between two marks from here. Numbers have
-their 95% intervals in brackets. Each row names the file that its numbers are of.
+their 95% intervals in brackets. Each row names the file that its numbers are of. A row is reached
+if its number is at least the paper's; where the aim is `over` something, if the interval is.
 """
 
 from functools import cache
@@ -62,9 +63,14 @@ def number(row, unit=1.0, digits=0, after='%', sign=''):
     return f'{value}{after} ({low} to {high})'
 
 
+def reached(yes, aim):
+    """Say whether an aim is reached."""
+    return f'{"reached" if yes else "**missed**"}: {aim}'
+
+
 class Tables:
     """
-    The lines of each page's table: claim, paper, here, file.
+    The lines of each page's table: claim, paper, here, reached or missed, file.
 
     :param folder: of the data.
     """
@@ -74,116 +80,140 @@ class Tables:
 
     def prediction(self):
         """Compare the paper's claims about prediction with what was measured."""
-        def share(method, metric='gain_over_fix', task='push2', new_pixels=True,
-                  mode='bidirectional'):
-            return number(self._find(
-                PREDICTION, task=task, mode=mode, method=method, metric=metric,
-                new_pixels=new_pixels), 100)
+        def row(method, metric='gain_over_fix', task='push2', new_pixels=True,
+                mode='bidirectional'):
+            return self._find(PREDICTION, task=task, mode=mode, method=method, metric=metric,
+                              new_pixels=new_pixels)
 
         def found(method, task='push2'):
-            return share(method, 'bottleneck_frequency_2px', task, new_pixels=False)
+            return row(method, 'bottleneck_frequency_2px', task, new_pixels=False)
 
+        def one(claim, measured, paper=None, said=''):
+            good, aim = ((measured['ci_low'] > 0, 'over 0') if paper is None else
+                         (measured['value'] >= paper, f'{paper:.1%}'.replace('.0%', '%')))
+            return (claim, said if paper is None else aim, number(measured, 100),
+                    reached(good, aim), PREDICTION)
+
+        def two(claim, ours, fix):
+            return (f'{claim}: `genmin`; `fix`', '', f'{number(ours, 100)}; {number(fix, 100)}',
+                    reached(ours['ci_low'] > fix['ci_high'], 'over `fix`'), PREDICTION)
+
+        plain = OURS.format('')
+        for method, network in ((plain, ''), ('genmin', "the paper's network with GAN, ")):
+            for task, title in TASKS.items():
+                yield one(f'error of `genmin` below `fix`: {network}{title}',
+                          row(method, task=task), GAINS[task])
         for task, title in TASKS.items():
-            same = share(OURS.format(''), 'gain_over_fix_at_match_step', task)
-            yield (f'error of `genmin` below `fix`: {title}', f'{GAINS[task]:.1%}',
-                   f'{share(OURS.format(""), task=task)}; at the same match-step {same}',
-                   PREDICTION)
-        yield ("the same, the paper's network with GAN", '',
-               '; '.join(f'{share("genmin", task=task)}' for task in TASKS), PREDICTION)
+            yield one(f'error of `genmin` below `fix` at the same match-step: {title}',
+                      row(plain, 'gain_over_fix_at_match_step', task))
         for task, title in {'stack2': 'stacking two blocks', 'push3': 'pushing three'}.items():
-            yield f'the same: {title}', '', share(OURS.format(''), task=task), PREDICTION
-        yield ('predictions that show hand and object, pick-and-place: `genmin`; `fix`', '',
-               '; '.join(share(method, 'shows_both', 'pick_place')
-                         for method in (OURS.format(''), FIX)), PREDICTION)
-        yield ('from the start alone, `genmin`, beta 4: error below fixed times at the same '
-               'match-step', 'lower', share('genmin4-wo-gan+skips', 'gain_over_fix_at_match_step',
-                                            'grasp', mode='forward'), PREDICTION)
-        yield ('bottlenecks at 2 px, pushing two objects: `genmin`; `fix`',
-               f'{BOTTLENECK_2PX["genmin"]:.0%}; {BOTTLENECK_2PX["fix"]:.0%}',
-               f'{found(OURS.format(""))}; {found(FIX)}', PREDICTION)
-        for name, method in (('over progress', PROGRESS), ('relative to copying', RELATIVE)):
-            yield f'the same: `genmin` {name}', '', found(method), PREDICTION
-        for task, title in (('push2_late', 'late'), ('push2_mixed', 'at any time'),
+            yield one(f'error of `genmin` below `fix`: {title}', row(plain, task=task))
+        yield two('predictions that show hand and object, pick-and-place',
+                  *(row(method, 'shows_both', 'pick_place') for method in (plain, FIX)))
+        yield one('from the start alone, grasping: error of `genmin`, beta 4, below fixed times '
+                  'at the same match-step', row(
+                      'genmin4-wo-gan+skips', 'gain_over_fix_at_match_step', 'grasp',
+                      mode='forward'), said='lower')
+        bottlenecks = 'bottlenecks found to 2 px, pushing two objects'
+        for name, method in (('', plain), (' over progress', PROGRESS),
+                             (' relative to copying', RELATIVE)):
+            yield one(f'{bottlenecks}: `genmin`{name}', found(method), BOTTLENECK_2PX['genmin'])
+        yield (f'{bottlenecks}: `fix` finds none', f'{BOTTLENECK_2PX["fix"]:.0%}',
+               number(found(FIX), 100), reached(found(FIX)['value'] == 0, '0%'), PREDICTION)
+        for task, title in (('push2_late', 'late in the recordings'),
+                            ('push2_mixed', 'at any time'),
                             ('order2', 'two objects in order'), ('push3', 'three objects')):
-            yield (f'bottlenecks {title}: relative to copying; `fix`', '',
-                   f'{found(RELATIVE, task)}; {found(FIX, task)}', PREDICTION)
-        for task, form in (('pick_place', 'narrow'), ('push2', 'frame')):
-            yield (f'best of 100 samples below the best without: {TASKS[task]}', 'lower',
-                   share(f'genmin-vae-wo-gan-best-of-100+skips+{form}',
-                         'gain_over_deterministic', task), PREDICTION)
-        yield ('recursion, pick-and-place, over progress: the pick before the place, trained on '
-               'whole episodes; on pieces', 'shown', '; '.join(share(
-                   method, 'pick_after_place', 'pick_place') for method in PIECES), PREDICTION)
+            yield two(f'bottlenecks found, {title}, relative to copying', found(RELATIVE, task),
+                      found(FIX, task))
+        for task, form in (('grasp', ''), ('pick_place', '+narrow'), ('push2', '+frame')):
+            yield one(f'error of the best of 100 samples below the best without: {TASKS[task]}',
+                      row(f'genmin-vae-wo-gan-best-of-100+skips{form}',
+                          'gain_over_deterministic', task), said='lower')
+        for method, title in zip(PIECES, ('whole episodes', 'pieces of episodes'), strict=True):
+            yield one('recursion, pick-and-place, over progress: the pick comes before the place, '
+                      f'trained on {title}', row(method, 'pick_after_place', 'pick_place'),
+                      said='shown')
 
     def planning(self):
         """Compare the paper's claims about planning with what was measured."""
         def final(task, method, metric='final_distance_cm', **about):
-            return number(self._find(PLANNING, task=task, method=method, metric=metric, **about),
-                          1, 1, ' cm')
+            return self._find(PLANNING, task=task, method=method, metric=metric, **about)
 
         def success(task, method, **about):
             metric = 'success_5cm_difference' if about else 'success_5cm'
-            row = self._find(PLANNING, task=task, method=method, metric=metric, **about)
-            return number(row, 100, 0, ' points' if about else '%', '+' if about else '')
+            return self._find(PLANNING, task=task, method=method, metric=metric, **about)
+
+        def points(row):
+            return number(row, 100, 0, ' points', '+')
 
         for task, title in (('push2', 'two'), ('push3', 'three')):
             paper = [TABLE_2[task, method][0] for method in ('direct', 'genmin')]
             less = final(task, 'shipped', 'final_distance_difference_cm', compares='direct')
             yield (f'final distance, {title} objects anywhere: direct; via the subgoal; '
                    'difference', '{} cm; {} cm; {:.1f} cm'.format(*paper, paper[1] - paper[0]),
-                   f'{final(task, "direct")}; {final(task, "shipped")}; {less}', PLANNING)
+                   '; '.join(number(row, 1, 1, ' cm') for row in (
+                       final(task, 'direct'), final(task, 'shipped'), less)),
+                   reached(less['ci_high'] < 0, 'nearer'), PLANNING)
         for task, shipped, title in (
                 ('push2', 'shipped', 'two objects anywhere'),
                 ('push3', 'shipped', 'three objects anywhere'),
                 ('order2', 'shipped', 'two in order'),
                 ('order3', 'shipped:rounds2', 'three in order, two predictions')):
+            more = success(task, shipped, compares='direct')
             yield (f'success, {title}: direct; via the subgoal; difference', '', '; '.join((
-                success(task, 'direct'), success(task, shipped),
-                success(task, shipped, compares='direct'))), PLANNING)
+                number(success(task, 'direct'), 100), number(success(task, shipped), 100),
+                points(more))), reached(more['ci_low'] > 0, 'over direct'), PLANNING)
         for task, fix, ours, title in (
                 ('order2', 'fix', 'shipped', 'two in order'),
                 ('order3', 'fix+rounds:rounds2', 'shipped:rounds2', 'three in order'),
                 ('order2', 'fix+rounds', 'genmin+relative+rounds', 'two in order, trained alike'),
                 ('order2', 'fix+late', 'genmin+relative+late',
                  'two in order, trained on late bottlenecks')):
+            more = success(task, ours, compares='fix')
             yield (f'success, {title}: via `fix`; via the subgoal minus via `fix`', '', '; '.join((
-                success(task, fix), success(task, ours, compares='fix'))), PLANNING)
+                number(success(task, fix), 100), points(more))),
+                reached(more['value'] >= 0.2, '20 points'), PLANNING)
         yield ('success in order, told the right order: two; three objects', '', '; '.join(
-            success(task, 'oracle_order') for task in ('order2', 'order3')), PLANNING)
+            number(success(task, 'oracle_order'), 100) for task in ('order2', 'order3')),
+            'to compare', PLANNING)
         yield ('success with the simulator as forward model, direct: two anywhere; two in order',
-               '', '; '.join(success(task, 'true_model') for task in ('push2', 'order2')),
-               PLANNING)
+               '', '; '.join(number(success(task, 'true_model'), 100)
+                             for task in ('push2', 'order2')), 'to compare', PLANNING)
 
     def stacking(self):
         """Say how many towers stand."""
-        def share(task, method, metric='success', **about):
-            return number(self._find(STACKING, task=task, method=method, metric=metric, **about),
-                          100)
+        def row(task, method, metric='success', **about):
+            return self._find(STACKING, task=task, method=method, metric=metric, **about)
 
         methods = {'direct': 'the goal picture alone', 'lowest_first': 'a rule: lowest first',
                    'shipped': 'via one predicted subgoal',
                    'shipped:recursion2': 'via two predicted subgoals',
                    'true_subgoals': 'via true subgoals',
                    'oracle_order': 'told the right order'}
+        direct = row('stack3', 'direct')
         for method, title in methods.items():
-            yield (f'a tower of three: {title}', '', f'{share("stack3", method)}; first move '
-                   f'right {share("stack3", method, "first_right")}', STACKING)
-        less = self._find(STACKING, task='stack3', method='shipped', metric='success_difference',
-                          against='lowest_first')
+            stands, first = row('stack3', method), row('stack3', method, 'first_right')
+            aimed = reached(stands['ci_low'] > direct['ci_high'], 'over the goal picture alone')
+            yield (f'a tower of three: {title}', '', f'{number(stands, 100)}; first move right '
+                   f'{number(first, 100)}', aimed if 'shipped' in method else 'to compare',
+                   STACKING)
+        less = row('stack3', 'shipped', 'success_difference', against='lowest_first')
         yield ('a tower of three: via one subgoal minus the rule', '',
-               number(less, 100, 0, ' points', '+'), STACKING)
+               number(less, 100, 0, ' points', '+'), reached(less['ci_low'] > 0, 'over the rule'),
+               STACKING)
         for task, title in (('stack2', 'one block on another'), ('pick_place', 'one object')):
             yield (f'{title}: the goal picture alone; via one subgoal; via two', '', '; '.join(
-                share(task, method) for method in ('direct', 'shipped', 'shipped:recursion2')),
-                STACKING)
+                number(row(task, method), 100)
+                for method in ('direct', 'shipped', 'shipped:recursion2')),
+                'to compare', STACKING)
 
     def _find(self, file, **wanted):
         return find(self._folder, file, **wanted)
 
 
 def markdown(lines):
-    """Write lines of claim, paper, here, file as a table."""
-    rows = [('claim', 'paper', 'here', 'file'), ('---',) * 4,
+    """Write lines of claim, paper, here, reached or missed, file as a table."""
+    rows = [('claim', 'paper', 'here', 'aim', 'file'), ('---',) * 5,
             *((*cells, f'[data]({file})') for *cells, file in lines)]
     return ''.join(f'| {" | ".join(row)} |\n' for row in rows)
 
