@@ -31,7 +31,6 @@ from tap_ros.errors import RecordingError
 from tap_ros.recording.align import assemble, runs_of
 from tap_ros.recording.bags import check_sizes, find_bags, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
-from tap_ros.recording.copies import copies, sqlite_logs
 from tap_ros.recording.episode import Episode, EpisodeTable
 from tap_ros.recording.metadata import ArmMount, read_mount
 from tap_ros.recording.reading import AS_RECORDED, for_bags, Reading
@@ -176,8 +175,8 @@ def _jobs(bags: Sequence[Sequence[Path]], found: Sequence[Mapping[str, str]], re
     def job(path: Path, names: Mapping[str, str]) -> _Job:
         with open(path, 'rb') as stream:
             digest = hashlib.file_digest(stream, 'sha256')
-        for log in sqlite_logs(path):
-            digest.update(log.read_bytes())
+        with suppress(FileNotFoundError):  # of a recorder that was killed
+            digest.update(path.with_name(f'{path.name}-wal').read_bytes())
         key = hashlib.sha256(json.dumps([
             FORMAT, sorted(names.items()), reading.crop, reading.size, reading.rate,
         ]).encode()).hexdigest()[:8]
@@ -204,8 +203,7 @@ def _built(jobs: Iterable[_Job]) -> Iterator[_Job]:
     workers = min(_workers(), len(left))
     if (workers > 1 and sum(job.size for job in left) > _ALONE_BYTES
             and not multiprocessing.current_process().daemon):  # which may not have children
-        with ProcessPoolExecutor(workers, multiprocessing.get_context('spawn'), _begin,
-                                 (copies,)) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context('spawn'), _begin) as pool:
             try:
                 # Ctrl-C ends a worker in silence: until `_begin` lets it, it has to wait.
                 masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -227,11 +225,10 @@ def _built(jobs: Iterable[_Job]) -> Iterator[_Job]:
         yield job
 
 
-def _begin(copied: dict[tuple[object, ...], Path]) -> None:
-    """Prepare a worker: it ends at Ctrl-C without a word, and uses the copies of its parent."""
+def _begin() -> None:
+    """Prepare a worker: it ends at Ctrl-C without a word."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    copies.update(copied)
 
 
 def _build(job: _Job) -> None:

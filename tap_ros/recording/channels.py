@@ -3,15 +3,13 @@
 """
 The channels of recordings, and how messages of other kinds become those of ROS 2.
 
-These are messages of ROS 1, and pictures of Foxglove's schemas, which its programs write as
-protobuf, JSON, or as messages of ROS.
+These are pictures and video of Foxglove's schemas, which its programs write as protobuf or as
+messages of ROS 2.
 """
 
-import base64
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, partial
-import json
 import re
 from typing import Any
 
@@ -60,20 +58,11 @@ def is_packets(channel: Channel) -> bool:
 
 
 def converted(channel: Channel) -> Channel:
-    """Return how a channel is read: as it is, or with messages that become those of ROS 2."""
-    name, encoding = called(channel.type_name), channel.encoding
-    convert: Convert | None = None
-    kind = channel.type_name
-    if name in PICTURES and encoding in ('protobuf', 'json', 'cdr', 'ros1'):
-        kind = PICTURES[name]
-        convert = partial(_picture, channel, kind)
-    elif encoding == 'json' and kind in IMAGE.types:
-        convert = partial(_picture, channel, kind)
-    elif encoding == 'ros1' and not is_packets(channel):
-        kind = _ros2_name(kind)
-        convert = partial(_from_ros1, kind)
-    return replace(channel, type_name=kind, encoding='cdr', schema_encoding='', schema='',
-                   convert=convert) if convert else channel
+    """Return how a channel is read: as it is, or with pictures that become those of ROS 2."""
+    kind = PICTURES.get(called(channel.type_name))
+    if kind is None or channel.encoding not in ('protobuf', 'cdr'):
+        return channel
+    return Channel(channel.topic, kind, 'cdr', convert=partial(_picture, channel, kind))
 
 
 def packet(channel: Channel, data: memoryview) -> bytes:
@@ -81,23 +70,11 @@ def packet(channel: Channel, data: memoryview) -> bytes:
     return bytes(_fields(channel, data)['data'])
 
 
-def _from_ros1(kind: str, data: memoryview, _: int) -> memoryview:
-    """Return a message of ROS 1 as one of ROS 2, whose fields are the same but for header.seq."""
-    return typestore().ros1_to_cdr(data, kind)
-
-
-def _ros2_name(kind: str) -> str:
-    return kind.replace('/msg/', '/').replace('/', '/msg/')
-
-
 def _picture(channel: Channel, kind: str, data: memoryview, log: int) -> bytes:
     """Return a picture as a message of ROS 2; without a time, the log's."""
     found = _fields(channel, data)
-    time = found.get('timestamp') or found.get('header', {}).get('stamp')
-    if not isinstance(time, dict):
-        time = {'sec': log // 10**9, 'nanosec': log % 10**9}
-    stamp = {'sec': time.get('sec', 0), 'nanosec': time.get('nanosec', time.get('nsec', 0))}
-    wanted = {name for name, _ in typestore().fielddefs[kind][1]} - {'header'}
+    stamp = found.get('timestamp') or {'sec': log // 10**9, 'nanosec': log % 10**9}
+    wanted = {name for name, _ in typestore().fielddefs[kind][1]}
     return encode(kind, {name: value for name, value in found.items() if name in wanted}
                   | {'header': {'stamp': stamp}})
 
@@ -105,9 +82,6 @@ def _picture(channel: Channel, kind: str, data: memoryview, log: int) -> bytes:
 def _fields(channel: Channel, data: memoryview) -> dict[str, Any]:
     """Return the fields of a message of Foxglove's, or of a packet of video."""
     name = called(channel.type_name)
-    if channel.encoding == 'json':
-        found = json.loads(bytes(data))
-        return found | {'data': base64.b64decode(found.get('data', ''))}
     if channel.encoding == 'protobuf':
         raw, known = read_protobuf(data), dict[str, Any]()
         text, numbers = _FIELDS[name]
@@ -115,17 +89,13 @@ def _fields(channel: Channel, data: memoryview) -> dict[str, Any]:
             kind, key = line.split()
             if number in raw:
                 value = raw[number][-1]
-                known[key] = value if kind == 'uint32' else (
-                    bytes(value) if kind == 'uint8[]' else str(value, 'utf-8'))
+                known[key] = str(value, 'utf-8') if kind == 'string' else value
         if 1 in raw:
             time = read_protobuf(raw[1][-1])
             known['timestamp'] = {'sec': time.get(1, [0])[-1], 'nanosec': time.get(2, [0])[-1]}
         return known
-    kind = f'foxglove_msgs/msg/{name}' if name else channel.type_name
     _register()
-    if channel.encoding == 'ros1':
-        data = typestore().ros1_to_cdr(data, kind)
-    message = vars(decode(kind, data))
+    message = vars(decode(f'foxglove_msgs/msg/{name}' if name else channel.type_name, data))
     stamp = message.get('timestamp')
     return message | {'timestamp': stamp and {'sec': stamp.sec, 'nanosec': stamp.nanosec}}
 
@@ -139,28 +109,15 @@ def _register() -> None:
             typestore().register(get_types_from_msg(text, kind))
 
 
-def read_protobuf(data: memoryview) -> dict[int, list[Any]]:
-    """Return the fields of a message by number: integers, and views of what has a length."""
+def read_protobuf(data: bytes | memoryview) -> dict[int, list[Any]]:
+    """Return the fields of a message by number: integers, and bytes of what has a length."""
+    from google.protobuf.empty_pb2 import Empty  # type: ignore[import-untyped]  # few need it
+    from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+    from google.protobuf.unknown_fields import UnknownFieldSet  # type: ignore[import-untyped]
     found: dict[int, list[Any]] = {}
-    at = 0
-
-    def varint() -> int:
-        nonlocal at
-        value = shift = 0
-        while True:
-            value |= (data[at] & 127) << shift
-            at, shift = at + 1, shift + 7
-            if data[at - 1] < 128:
-                return value
-
-    while at < len(data):
-        key = varint()
-        size = {0: 0, 1: 8, 5: 4}.get(key & 7, -1)
-        if key & 7 == 2:
-            size = varint()
-        if size < 0 or at + size > len(data):
-            raise ValueError('no protobuf message')
-        part, at = data[at:at + size], at + size
-        found.setdefault(key >> 3, []).append(varint() if key & 7 == 0 else (
-            part if key & 7 == 2 else int.from_bytes(part, 'little')))
+    try:
+        for one in UnknownFieldSet(Empty.FromString(bytes(data))):
+            found.setdefault(one.field_number, []).append(one.data)
+    except DecodeError as error:
+        raise ValueError('no protobuf message') from error
     return found

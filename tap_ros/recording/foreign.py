@@ -12,16 +12,15 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.errors import RecordingError
 from tap_ros.messages.topics import COMPRESSED_TYPE
 from tap_ros.recording.channels import Channel, is_packets, packet, PICTURES
-from tap_ros.recording.copies import PACKED, unpacked_name
+from tap_ros.recording.file_bytes import PACKED, unpacked_name
 from tap_ros.recording.mcap_file import McapFile
 from tap_ros.recording.metadata import bag_files, FILE_NAME, natural
-from tap_ros.recording.other_bags import Ros1File, SqliteFile
+from tap_ros.recording.sqlite_file import MAGIC as SQLITE
+from tap_ros.recording.sqlite_file import SqliteFile
 from tap_ros.text import escaped, listing
 import zstandard
 
 VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
-_BAGS = {b'SQLite format 3\0': SqliteFile, b'#ROSBAG V2.0': Ros1File}  # by how a file begins
-_ENDINGS = ('.db3', '.bag')
 _THEORA = 'theora_image_transport/msg/Packet'
 _MOST_FILES = 10000  # of a folder that are looked at
 
@@ -59,9 +58,8 @@ def explain(channels: Iterable[Channel], files: Sequence[Path]) -> str:
                     'record the topic of its raw or compressed pictures')
     other = sorted({channel.encoding for channel in channels} - {'cdr'})
     pictures = [f'foxglove.{name}' for name in PICTURES]
-    return f'its messages are encoded as {listing(other)}; only those of ROS are read, and ' \
-        f'{listing(pictures)} as protobuf or JSON; record the topics of ROS, or these' \
-        if other else ''
+    return f'its messages are encoded as {listing(other)}; only those of ROS 2 are read, and ' \
+        f'{listing(pictures)} as protobuf; record the topics of ROS 2, or these' if other else ''
 
 
 def explain_video(topic: str, files: Sequence[Path]) -> str:
@@ -106,19 +104,16 @@ def open_file(path: str | Path) -> McapFile:
     :param path: as find_bags returns it.
     :raises RecordingError: as McapFile.
     """
-    start = _start(Path(path))
-    kind = next((kind for magic, kind in _BAGS.items() if start.startswith(magic)), McapFile)
-    return kind(path)
+    return (SqliteFile if _is_sqlite(Path(path)) else McapFile)(path)
 
 
 def _bag(path: Path) -> list[Path] | None:
-    """Return the files of a bag that rosbags reads, in playing order; None for anything else."""
+    """Return the files of a bag in sqlite3, in playing order; None for anything else."""
     if path.is_file():
-        return [path] if _start(path).startswith(tuple(_BAGS)) else None
-    named = {unpacked_name(file): file for ending in _ENDINGS for end in (*PACKED, '')
-             for file in path.glob(f'*{ending}{end}')}
-    found = [file for file in sorted(named.values(), key=natural)
-             if _start(file).startswith(tuple(_BAGS))]
+        return [path] if _is_sqlite(path) else None
+    named = {unpacked_name(file): file for end in (*PACKED, '')
+             for file in path.glob(f'*.db3{end}')}
+    found = list(filter(_is_sqlite, sorted(named.values(), key=natural)))
     if not any(path.glob('*.mcap*')):
         return found or None
     if found and not (path / FILE_NAME).exists():  # which says what belongs to the bag
@@ -142,8 +137,13 @@ def _what(path: Path) -> str:
             return _advice('TFRecord files, as of RLDS', 'import-tfrecord', path)
         if file.suffix.lower() in VIDEOS and file.is_file():
             return _advice('video', 'import-video', path)
-        if file.is_file() and _start(file).startswith(b'\x89HDF'):
+        start = _start(file)
+        if start.startswith(b'\x89HDF'):
             return _advice('HDF5, as of ALOHA and robomimic', 'import-arrays', path)
+        if start.startswith(b'#ROSBAG'):
+            whole, bag = (shlex.quote(escaped(one, 400)) for one in (file, file.with_suffix('')))
+            return ('a bag of ROS 1; make one of ROS 2 of it: rosbags-convert --src '
+                    f'{whole} --dst {bag} --dst-storage mcap')
     return ''
 
 
@@ -153,6 +153,10 @@ def _advice(what: str, command: str, place: Path) -> str:
 
 def _command(name: str, place: Path) -> str:
     return f'python -m tap_ros {name} {shlex.quote(escaped(place, 400))} --out BAG'
+
+
+def _is_sqlite(path: Path) -> bool:
+    return _start(path).startswith(SQLITE)
 
 
 def _start(path: Path) -> bytes:

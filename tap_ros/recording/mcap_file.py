@@ -15,10 +15,7 @@ from collections.abc import Collection, Iterator
 from contextlib import suppress
 from io import BytesIO
 from itertools import chain
-import mmap
-import os
 from pathlib import Path
-import stat
 import struct
 from typing import TypeVar
 import zlib
@@ -34,8 +31,8 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.errors import RecordingError
 from tap_ros.messages.topics import IMAGE
 from tap_ros.recording.channels import Channel, converted, DAMAGE
-from tap_ros.recording.copies import readable, what_else
 from tap_ros.recording.damage import FAR, Loss
+from tap_ros.recording.file_bytes import bytes_of, what_else
 from tap_ros.text import escaped
 import zstandard
 
@@ -65,7 +62,11 @@ class McapFile:
 
     def __init__(self, path: str | Path) -> None:
         self.path = path
-        self._map = _bytes_of(path)
+        self._map = bytes_of(path)
+        if self._map[:len(MAGIC)] != MAGIC:
+            why = what_else(Path(path)) or (
+                f'not an MCAP file: it starts with {self._map[:8].hex(" ")}, not {MAGIC.hex(" ")}')
+            raise RecordingError(f'{path}: {why}')
         self._data, self.size = memoryview(self._map), len(self._map)
         self.channels: dict[int, Channel] = {}
         self.losses: list[Loss] = []
@@ -354,27 +355,6 @@ def read_record(kind: type[Record], content: bytes | memoryview, whole: bool = T
     if whole and stream.count != len(content):
         raise RecordingError(f'damaged {kind.__name__.lower()} record: wrong length')
     return record
-
-
-def _bytes_of(path: str | Path) -> mmap.mmap:
-    """Map a file into memory, unpacked, if it is MCAP."""
-    try:
-        mode = os.stat(path).st_mode  # opening a FIFO would wait for its writer
-        if not stat.S_ISREG(mode):
-            raise RecordingError(f'{path}: not a regular file; expected an .mcap file')
-        if not os.path.getsize(path):
-            raise RecordingError(f'{path}: the file is empty; it holds no message')
-        with open(readable(Path(path)), 'rb') as stream:
-            if stream.seek(0, 2) == 0:
-                raise RecordingError(f'{path}: does not unpack: it is cut short')
-            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read: {error.strerror}') from error
-    if data[:len(MAGIC)] != MAGIC:
-        why = what_else(Path(path)) or (
-            f'not an MCAP file: it starts with {data[:8].hex(" ")}, not {MAGIC.hex(" ")}')
-        raise RecordingError(f'{path}: {why}')
-    return data
 
 
 def _read_summary(data: memoryview) -> Summary:

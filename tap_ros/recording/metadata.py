@@ -18,7 +18,7 @@ from typing import Any
 from tap_ros.errors import RecordingError
 from tap_ros.files import write_atomically
 from tap_ros.plugins import names
-from tap_ros.recording.copies import PACKED, unpacked_name
+from tap_ros.recording.file_bytes import PACKED, unpacked_name
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
 from tap_ros.text import escaped, listing
 import yaml

@@ -6,7 +6,6 @@ import base64
 import bz2
 from contextlib import closing
 import gzip
-import json
 from pathlib import Path
 import shlex
 import shutil
@@ -14,18 +13,16 @@ import sqlite3
 import struct
 import sys
 from types import SimpleNamespace
-import warnings
 
 import cv2
 from made_bags import camera, joints, record, SECOND
 from mcap.writer import Writer as McapWriter
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import Writer as Ros2Writer
 from tap_ros.cli import main, read
 from tap_ros.errors import RecordingError
-from tap_ros.recording import channels, copies
+from tap_ros.recording import channels
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
 from tap_ros.recording.messages import encode, typestore
@@ -89,28 +86,6 @@ def write_packed(folder):
     return folder
 
 
-def write_ros1(path, compression=None):
-    store, writer = typestore(), Ros1Writer(path)
-    if compression:
-        writer.set_compression(Ros1Writer.CompressionFormat[compression])
-    with writer:
-        topics = {}
-        for topic, kind, data, log in SENT:
-            if topic not in topics:
-                topics[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(topics[topic], log, store.cdr_to_ros1(data, kind))
-    return path
-
-
-def write_without_index(path):
-    """Write a bag of ROS 1 as a killed recorder leaves it."""
-    data = write_ros1(path, 'LZ4').read_bytes()
-    at = data.index(b'index_pos=') + 10
-    index, = struct.unpack_from('<Q', data, at)
-    path.write_bytes(data[:at] + bytes(8) + data[at + 8:index])
-    return path
-
-
 def write_mcap(path, messages):
     """Write (topic, type, data, log time, schema encoding, encoding)."""
     with open(path, 'wb') as stream:
@@ -126,66 +101,34 @@ def write_mcap(path, messages):
     return path
 
 
-def write_ros1_mcap(path):
-    return write_mcap(path, [
-        (topic, kind.replace('/msg/', '/'), typestore().cdr_to_ros1(data, kind), log, 'ros1msg',
-         'ros1') for topic, kind, data, log in SENT])
-
-
 @pytest.mark.parametrize('write, name', [
-    (write_sqlite3, 'bag'), (write_bare_db3, ''), (write_unmerged, ''), (write_packed, 'bag'),
-    (write_ros1, 'a.bag'), (lambda path: write_ros1(path, 'BZ2'), 'a.bag'),
-    (write_without_index, 'a.bag'), (write_ros1_mcap, 'a.mcap')])
-def test_other_bags_say_what_a_bag_of_ours_says(write, name, tmp_path, monkeypatch):
+    (write_sqlite3, 'bag'), (write_bare_db3, ''), (write_unmerged, ''), (write_packed, 'bag')])
+def test_bags_in_sqlite3_say_what_a_bag_of_ours_says(write, name, tmp_path):
     expected, = iter_episodes(record(tmp_path / 'ours', SENT))
     (tmp_path / 'theirs').mkdir()
     path = write(tmp_path / 'theirs' / name)
-    made = []
-    monkeypatch.setattr(copies, '_copy', lambda *args, copy=copies._copy: made.append(
-        args) or copy(*args))
     for place in (path, tmp_path / 'theirs'):
         for found in (list(iter_episodes(place)), [open_recordings(place)[0]]):
             np.testing.assert_array_equal(found[0].frames, expected.frames)
             np.testing.assert_array_equal(found[0].stamps, expected.stamps)
             np.testing.assert_array_equal(found[0].grippers, expected.grippers)
             assert len(found) == 1
-    assert len(made) == (write in (write_unmerged, write_packed))  # once, however often opened
-
-
-def test_a_cut_bag_of_ros_1_gives_what_is_before_the_cut(tmp_path):
-    for number, write in enumerate((write_ros1, write_without_index)):
-        whole = write(tmp_path / f'{number}.bag')
-        data, seen = whole.read_bytes(), set()
-        for length in range(4200, len(data) - 1, 150):  # behind a header of 4 kB
-            whole.write_bytes(data[:length])
-            with warnings.catch_warnings(record=True) as told:
-                warnings.simplefilter('always')
-                try:
-                    values = [frame[0, 0, 0] for each in iter_episodes(whole)
-                              for frame in each.frames]
-                except RecordingError as error:
-                    assert 'cut off' in str(error)
-                    continue
-            assert values == [1, 2, 3, 4, 5][:len(values)]
-            assert len(values) == 5 or any('cut off' in str(each.message) for each in told)
-            seen.add(len(values))
-        assert 5 in seen or write is write_without_index
 
 
 def test_what_is_beside_a_file_is_read_and_stays_as_it_is(tmp_path):
     file = write_unmerged(tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.glob('killed*')}
     whole = open_recordings(file)
-    assert {path: path.read_bytes() for path in tmp_path.glob('killed*')} == before
+    assert {path: path.read_bytes() for path in before} == before
     file.with_name('killed.db3-wal').unlink()
     half = open_recordings(file)  # not what the cache keeps of the whole
     assert len(half[0]) < len(whole[0]) == 5
 
 
 def test_mcap_beside_other_bags_is_refused_by_name(tmp_path):
-    path = write_ros1(tmp_path / 'one.bag')
-    write_ros1_mcap(tmp_path / 'two.mcap')
-    with pytest.raises(RecordingError, match='one.bag'):
+    path = write_bare_db3(tmp_path)
+    write_mcap(tmp_path / 'two.mcap', [(*one, '', 'cdr') for one in SENT])
+    with pytest.raises(RecordingError, match='bare.db3'):
         open_recordings(tmp_path)
     assert len(open_recordings(path)) == len(open_recordings(tmp_path / 'two.mcap')) == 1
 
@@ -207,20 +150,13 @@ def foxglove_image(t, name, encoding):
                 value, int) else length_delimited(
                     number, value.encode() if isinstance(value, str) else value)
         return f'foxglove.{name}', data, pixels
-    if encoding == 'json':
-        coded = base64.b64encode(known['data']).decode()
-        return f'foxglove.{name}', json.dumps(
-            known | {'data': coded, 'timestamp': {'sec': t, 'nsec': 0}}).encode(), pixels
     channels._register()
     kind = f'foxglove_msgs/msg/{name}'
-    data = encode(kind, known | {'timestamp': {'sec': t}})
-    if encoding == 'ros1':
-        return f'foxglove_msgs/{name}', typestore().cdr_to_ros1(data, kind), pixels
-    return kind, data, pixels
+    return kind, encode(kind, known | {'timestamp': {'sec': t}}), pixels
 
 
 @pytest.mark.parametrize('name', ['RawImage', 'CompressedImage'])
-@pytest.mark.parametrize('encoding', ['protobuf', 'json', 'cdr', 'ros1'])
+@pytest.mark.parametrize('encoding', ['protobuf', 'cdr'])
 def test_pictures_of_foxglove_are_read_however_they_are_encoded(encoding, name, tmp_path):
     sent = [foxglove_image(t, name, encoding) for t in range(1, 5)]
     messages = [('/cam', kind, data, t * SECOND, '', encoding)
@@ -237,10 +173,10 @@ def test_pictures_of_foxglove_are_read_however_they_are_encoded(encoding, name, 
 
 def test_damage_of_other_bags_is_named(tmp_path):
     packed = next(write_packed(tmp_path / 'packed').glob('*.zstd'))
-    for path in (write_ros1(tmp_path / 'a.bag'), write_bare_db3(tmp_path), packed):
+    for path in (write_bare_db3(tmp_path), packed):
         data = path.read_bytes()
         path.write_bytes(data[:len(data) // 3])
-        words = path.name + ': (cannot be r|does not u|.*cut off)'
+        words = path.name + ': (cannot be r|does not u)'
         with pytest.raises(RecordingError, match=words):
             list(iter_episodes(path))
 
@@ -314,6 +250,9 @@ def test_what_is_no_bag_but_will_be_one_is_told_with_the_command(tmp_path, capsy
         (tmp_path / name).write_bytes(data)
         assert main(['inspect', str(tmp_path / name)]) == 1
         assert f'type `{command.format(tmp_path / name)}`' in capsys.readouterr().err
+    (tmp_path / 'a.bag').write_bytes(b'#ROSBAG V2.0\n')
+    assert main(['inspect', str(tmp_path / 'a.bag')]) == 1
+    assert f'rosbags-convert --src {tmp_path}/a.bag --dst ' in capsys.readouterr().err
 
 
 def files_of(pictures):

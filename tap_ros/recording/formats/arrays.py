@@ -21,8 +21,8 @@ import numpy as np
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.encodings import decompress
 from tap_ros.options import default_text
-from tap_ros.recording.copies import what_else
 from tap_ros.recording.episode import Episode
+from tap_ros.recording.file_bytes import what_else
 from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
 from tap_ros.recording.metadata import natural
 from tap_ros.text import escaped, listing

@@ -24,9 +24,9 @@ from tap_ros.files import only_writer, storage_errors
 from tap_ros.images.crop import Crop
 from tap_ros.options import default_text, Folder, Topic
 from tap_ros.recording.bags import find_bags
-from tap_ros.recording.copies import what_else
 from tap_ros.recording.damage import describe, Loss
 from tap_ros.recording.episode import Episode, RecordingWarning
+from tap_ros.recording.file_bytes import what_else
 from tap_ros.recording.foreign import video_packets, VIDEOS
 from tap_ros.recording.metadata import natural
 from tap_ros.recording.reading_options import Part

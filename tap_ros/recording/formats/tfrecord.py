@@ -177,11 +177,11 @@ def parse_example(data: bytes) -> dict[str, list[bytes]]:
     :raises ValueError: when the bytes are no such message.
     """
     found = {}
-    for features in read_protobuf(memoryview(data)).get(1, []):
+    for features in read_protobuf(data).get(1, []):
         for entry in map(read_protobuf, read_protobuf(features).get(1, [])):
             lists = [one for value in entry.get(2, []) for one in read_protobuf(value).get(1, [])]
             found[str(entry[1][0], 'utf-8')] = [
-                bytes(value) for one in lists for value in read_protobuf(one).get(1, [])]
+                value for one in lists for value in read_protobuf(one).get(1, [])]
     return found
 
 
