@@ -7,7 +7,7 @@ import sys
 
 import pytest
 from tap_ros.cli import COMMANDS, main
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.weights import FORWARD_MODEL, PREDICTORS
 
 ROOT = Path(__file__).parents[1]
@@ -29,7 +29,7 @@ def test_an_error_names_the_file_and_is_one_line(arguments, named, capsys, tmp_p
 def test_collect_then_inspect(tmp_path, capsys):
     folder, picture = tmp_path / 'push', tmp_path / 'strips.png'
     assert main(['collect', '--out', str(folder), '--episodes', '2', '--seed', '3']) == 0
-    assert [episode.seed for episode in iter_episodes(folder)] == [3, 4]
+    assert [episode.seed for episode in open_recordings(folder)] == [3, 4]
     assert main(['inspect', str(folder), '--picture', str(picture)]) == 0
     assert '2 episodes' in capsys.readouterr().out
     assert picture.read_bytes().startswith(b'\x89PNG')
@@ -45,7 +45,7 @@ def test_shipped_weights_say_what_they_are(path, capsys):
 
 
 def test_the_sample_recording_is_readable():
-    episodes = list(iter_episodes(SAMPLE))
+    episodes = list(open_recordings(SAMPLE))
     assert len(episodes) == 20
     assert all(episode.task == 'push2' and len(episode.frames) <= 50 for episode in episodes)
 

@@ -17,7 +17,7 @@ from tap_ros import contract
 from tap_ros.planning.action_sequences import Limits, SequenceShape
 from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.mpc_config import PLANNING_TASKS
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.weights import FORWARD_MODEL
 import torch
 
@@ -51,7 +51,7 @@ def test_the_forward_model_moves_the_gripper_as_the_simulator_does():
 
 
 def test_the_sample_recording_keeps_to_the_contract():
-    episode = next(iter_episodes(ROOT / 'bags' / 'sample_push2'))
+    episode = open_recordings(ROOT / 'bags' / 'sample_push2')[0]
     assert set(np.diff(episode.stamps)) == {round(1e9 * contract.CONTROL_PERIOD)}
     assert (np.abs(episode.actions[:, :3]) <= np.array(contract.ACTION_LIMIT) + 1e-6).all()
     places = episode.grippers[:, :3]

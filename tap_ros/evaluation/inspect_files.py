@@ -20,8 +20,7 @@ from tap_ros.recording.bags import check_first_picture, find_bags, list_topics
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.columns import first_size
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.reading import Reading, reading_of
-from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.recording.reading import Reading, reading_of, ReadingOptions
 from tap_ros.recording.topic_choice import find_topics
 from tap_ros.text import escaped, listing
 from tap_ros.training.split import split_episodes, warn_if_few

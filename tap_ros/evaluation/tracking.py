@@ -27,7 +27,7 @@ from tap_ros.files import write_atomically, write_rows
 from tap_ros.images.drawing import film_strip, grid, OBJECT_COLOURS, png_bytes
 from tap_ros.plugins import load_plugin
 from tap_ros.recording.bags import reading_like
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.protocols import LOST, SEEN, Tracked, Tracker
 from tap_ros.tracking.rigid_tracker import RigidTracker
@@ -83,11 +83,12 @@ def score(args: Tracking) -> tuple[list[dict[str, Any]], list[Track]]:
     else:
         for recording in args.recordings:
             reading = reading_like({}, [recording], args.image_topic)
-            camera = fit_camera(iter_episodes(recording, reading))
+            store = open_recordings(recording, reading=reading)
+            camera = fit_camera(store)
             few = max(1, STRIPS // len(args.recordings))
             tracks = [follow(_maker(args, camera), scaled(episode, args.size),
                              Path(recording).name, args.click, keep=i < few)
-                      for i, episode in enumerate(iter_episodes(recording, reading))
+                      for i, episode in enumerate(store)
                       if np.isfinite(episode.object_pixels).all(-1).any()]
             if not tracks:
                 raise ConfigError(f'{recording}: no episode of it says where objects are; give '

@@ -55,15 +55,6 @@ def _yuv(code: str) -> Encoding:
     return Encoding(1, to_rgb, (2, 2), planes=1.5)
 
 
-def _nv24() -> Encoding:
-    """Return greys with a plane of colours of the same size, of which every fourth counts."""
-    def to_rgb(pixels: np.ndarray) -> np.ndarray:
-        height, width = len(pixels) // 3, pixels.shape[1]
-        colours = pixels[height:].reshape(height, width, 2)[::2, ::2].reshape(-1, width, 1)
-        return ENCODINGS['nv12'].to_rgb(np.concatenate([pixels[:height], colours]))
-    return Encoding(1, to_rgb, (2, 2), planes=3)
-
-
 def _bayer(code: str) -> Encoding:
     """Return a mosaic; cv2 calls it by the second and third pixel of the second row."""
     def to_rgb(pixels: np.ndarray) -> np.ndarray:
@@ -80,8 +71,7 @@ ENCODINGS = {
     '8UC1': _channels(1, 0, 0, 0), '8UC3': _channels(3, 2, 1, 0), '8UC4': _channels(4, 2, 1, 0),
     'yuv422': _yuv('UYVY'), 'uyvy': _yuv('UYVY'),
     'yuv422_yuy2': _yuv('YUY2'), 'yuyv': _yuv('YUY2'),
-    'nv12': _yuv('NV12'), 'nv21': _yuv('NV21'), 'nv24': _nv24(),
-    'i420': _yuv('I420'),
+    'nv12': _yuv('NV12'), 'nv21': _yuv('NV21'), 'i420': _yuv('I420'),
     'bayer_rggb8': _bayer('BG'), 'bayer_bggr8': _bayer('RG'), 'bayer_gbrg8': _bayer('GR'),
     'bayer_grbg8': _bayer('GB')}
 _DEEP = re.compile(r'(mono|rgb|bgr|rgba|bgra|bayer_[rgb]{4})16|(16|32|64)[US FC]+\d*')

@@ -24,8 +24,7 @@ from tap_ros.prediction.marks import features_of
 from tap_ros.prediction.preference import learn_preference, LEAST_FRAMES
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.marks import beside, Mark, read_marks, write_marks
-from tap_ros.recording.reading import reading_of
-from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.recording.reading import reading_of, ReadingOptions
 from tap_ros.text import escaped
 from tyro import conf
 

@@ -15,7 +15,7 @@ from tap_ros.images.crop import Crop
 from tap_ros.images.encodings import decompress
 from tap_ros.images.pixels import in_picture, resize_image, resize_pixels
 from tap_ros.options import File
-from tap_ros.recording.reading_options import Part
+from tap_ros.recording.reading import Part
 from tap_ros.text import escaped
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
 from tyro import conf

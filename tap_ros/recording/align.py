@@ -26,7 +26,6 @@ from tap_ros.recording.spans import assign, in_gaps, MAX_JITTER_NS, read_spans, 
 from tap_ros.robots.arm import get_arm
 
 MIN_MATCH_NS = 50 * 10**6  # states may be so much off the frame, or half a frame's time
-_LOOKED_AT = 4096  # messages looked at together
 
 
 def runs_of(parts: Iterable[Columns]) -> list[list[Columns]]:
@@ -274,13 +273,8 @@ def _newest(track: Track, span: Span, gaps: np.ndarray) -> int:
     lost = gaps[gaps[:, 0] <= span.end_log, 1]
     first = int(np.searchsorted(track.log, lost.max())) if len(lost) else 0
     end = int(np.searchsorted(track.log, span.end_log, 'right'))
-    while end > first:
-        start = max(end - _LOOKED_AT, first)
-        known = np.flatnonzero(track.stamp[start:end] <= span.end_stamp)
-        if len(known):
-            return start + int(known[-1])
-        end = start
-    return -1
+    known = np.flatnonzero(track.stamp[first:end] <= span.end_stamp)
+    return first + int(known[-1]) if len(known) else -1
 
 
 def _goals(tracks: dict[str, Track], spans: Sequence[Span],

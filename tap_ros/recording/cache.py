@@ -9,8 +9,7 @@ it at once.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed, ProcessPoolExecutor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 import hashlib
@@ -21,13 +20,13 @@ import multiprocessing
 import os
 from pathlib import Path
 import shutil
-import signal
 import tempfile
 
 import numpy as np
 from safetensors import safe_open, SafetensorError
 from safetensors.numpy import save_file
-from tap_ros.errors import RecordingError
+from tap_ros.engines import run_tasks, Work
+from tap_ros.errors import EngineError, RecordingError
 from tap_ros.recording.align import assemble, runs_of
 from tap_ros.recording.bags import check_sizes, find_bags, warn_of_damage
 from tap_ros.recording.columns import Columns, decode_file, PICTURES
@@ -78,6 +77,10 @@ class EpisodeStore:
         """Return Episode i."""
         table, local = self._index[i]
         return table.episode(local)
+
+    def __iter__(self) -> Iterator[Episode]:
+        """Yield the episodes."""
+        return (self[i] for i in range(len(self)))
 
     def source(self, i: int) -> Path:
         """Return the first file of the bag that episode i is in."""
@@ -182,53 +185,29 @@ def _jobs(bags: Sequence[Sequence[Path]], found: Sequence[Mapping[str, str]], re
         ]).encode()).hexdigest()[:8]
         return _Job(path, path.stat().st_size, digest.hexdigest(), tuple(names.items()), reading,
                     cache_dir / f'{digest.hexdigest()}-{key}')
-    with ThreadPoolExecutor(_workers()) as pool:
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         waiting = [[pool.submit(job, path, names) for path in bag]
                    for bag, names in zip(bags, found, strict=True)]
         return [[task.result() for task in bag] for bag in waiting]
 
 
-def _workers() -> int:
-    """Return the number of files decoded at once."""
-    return len(os.sched_getaffinity(0))
-
-
-def _built(jobs: Iterable[_Job]) -> Iterator[_Job]:
+def _built(jobs: Sequence[_Job]) -> Iterator[_Job]:
     """
     Decode files into their cache folders; yield the jobs that are done.
 
     Decoding is Python and holds its lock, so that processes do it where there is much to do.
     """
     left = list(jobs)
-    workers = min(_workers(), len(left))
-    if (workers > 1 and sum(job.size for job in left) > _ALONE_BYTES
+    if (len(left) > 1 and sum(job.size for job in left) > _ALONE_BYTES
             and not multiprocessing.current_process().daemon):  # which may not have children
-        with ProcessPoolExecutor(workers, multiprocessing.get_context('spawn'), _begin) as pool:
-            try:
-                # Ctrl-C ends a worker in silence: until `_begin` lets it, it has to wait.
-                masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-                try:
-                    tasks = {pool.submit(_build, job): job for job in left}
-                finally:
-                    signal.pthread_sigmask(signal.SIG_SETMASK, masked)
-                for task in as_completed(tasks):
-                    task.result()
-                    left.remove(tasks[task])
-                    yield tasks[task]
-            except BrokenProcessPool:  # one was killed, or cannot import the user's script
-                pass
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        with suppress(EngineError):  # one cannot import the user's script, or was killed
+            for work, get in run_tasks([Work(str(job.path), _build, (job,)) for job in jobs]):
+                get()
+                left.remove(work.args[0])
+                yield work.args[0]
     for job in left:
         _build(job)
         yield job
-
-
-def _begin() -> None:
-    """Prepare a worker: it ends at Ctrl-C without a word."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _build(job: _Job) -> None:
@@ -244,15 +223,9 @@ def _build(job: _Job) -> None:
     try:
         with ExitStack() as stack:
             streams = {name: stack.enter_context(open(part / name, 'wb')) for name in PICTURES}
-
-            def restart() -> None:
-                for stream in streams.values():
-                    stream.seek(0)
-                    stream.truncate()
-
             columns = decode_file(
                 job.path, dict(job.found),
-                lambda name, pixels: streams[name].write(pixels.data), restart, job.reading)
+                lambda name, pixels: streams[name].write(pixels.data), job.reading)
         arrays = {key: np.ascontiguousarray(a) for key, a in columns.arrays.items()}
         save_file(arrays, part / 'columns.safetensors', {'columns': columns.describe()})
         _put(part, job)
@@ -264,16 +237,12 @@ def _build(job: _Job) -> None:
 
 def _put(part: Path, job: _Job) -> None:
     """Give a finished folder its name; one that is there stays, unless it cannot be read."""
-    if job.folder.exists() and _load(job) is None:
-        broken = part.with_name(part.name + '.broken')
-        with suppress(FileNotFoundError):  # another process was faster
-            os.rename(job.folder, broken)
-        shutil.rmtree(broken, ignore_errors=True)
     try:
         os.rename(part, job.folder)
     except OSError:
         if _load(job) is None:  # else another process was faster
-            raise
+            shutil.rmtree(job.folder, ignore_errors=True)
+            os.rename(part, job.folder)
 
 
 def _load(job: _Job) -> Columns | None:

@@ -75,38 +75,31 @@ class Columns:
 
 
 def decode_file(path: str | Path, found: Mapping[str, str],
-                write: Callable[[str, np.ndarray], object],
-                restart: Callable[[], object], reading: Reading) -> Columns:
+                write: Callable[[str, np.ndarray], object], reading: Reading) -> Columns:
     """
     Read a file from front to back.
 
-    Pictures of another size than the most of a file are left out, as are those that cannot be
-    used.
+    Pictures of another size than the first one are left out, as are those that cannot be used.
 
     :param path: of the file.
     :param found: dict from the file's topics to names of columns, as topics.resolve gives it.
     :param write: called with the name, one of PICTURES, and the pixels of one picture after the
         other, uint8, in the order of the file; they are not to be kept.
-    :param restart: called without arguments when all that was written is to be forgotten, because
-        the first picture was not of the size that most are.
     :param reading: Reading; pictures, masks and pixels are cut and scaled as it says.
     :return: Columns without pictures.
-    :raises RecordingError: when no size of pictures is that of more than half of them; it names
-        the file.
+    :raises RecordingError: when no more than half of the pictures are of that size; it names the
+        file.
     """
-    size = None
-    while True:
-        decoder = _Decoder(open_file(path), found, write, size, reading)
-        try:
-            for channel, log, _, data in decoder.file.messages(found):
-                if channel.type_name in BY_COLUMNS[found[channel.topic]].types:
-                    decoder.take(channel.topic, channel.type_name, log, data)
-            size = decoder.most_frequent_size()
-        except RecordingError as error:
-            raise RecordingError(f'{path}: {error}') from error
-        if size in (None, decoder.size):
-            return decoder.finish()
-        restart()
+    first = next((first_size([path], topic) for topic in found if found[topic] == 'frame'), None)
+    decoder = _Decoder(open_file(path), found, write, first, reading)
+    try:
+        for channel, log, _, data in decoder.file.messages(found):
+            if channel.type_name in BY_COLUMNS[found[channel.topic]].types:
+                decoder.take(channel.topic, channel.type_name, log, data)
+        decoder.check_sizes()
+    except RecordingError as error:
+        raise RecordingError(f'{path}: {error}') from error
+    return decoder.finish()
 
 
 def first_size(paths: Iterable[str | Path], topic: str) -> tuple[int, int] | None:
@@ -130,10 +123,11 @@ class _Decoder:
     """Collects the columns of a file message by message; pictures are passed on at once."""
 
     def __init__(self, file: McapFile, found: Mapping[str, str],
-                 write: Callable[[str, np.ndarray], object], size: tuple[int, int] | None,
+                 write: Callable[[str, np.ndarray], object], first: tuple[int, int] | None,
                  reading: Reading) -> None:
         self.file, self.found, self.write, self.reading = file, found, write, reading
-        self.size = size  # (H, W) that pictures must have, by _alike
+        self.first = first  # (H, W) of the first camera image
+        self.size: tuple[int, int] | None = None  # that pictures must have, by _alike
         self.columns = Columns(
             str(file.path), topics={name: topic for topic, name in found.items()})
         self.sizes: Counter[tuple[int, int]] = Counter()  # (H, W) -> camera images
@@ -166,22 +160,16 @@ class _Decoder:
             if name in _GOALS:  # what was said before holds no more
                 self._add(name, log, 0, self._number(('',)) if name == 'goal_object' else -1)
 
-    def most_frequent_size(self) -> tuple[int, int] | None:
-        """Return the size of more than half of the camera images, None without any."""
-        alike: Counter[tuple[int, int]] = Counter()
-        for size, count in self.sizes.items():
-            alike[self._alike(size)] += count
-        if not alike:
-            return None
-        (best, count), *_ = alike.most_common(1)
-        if 2 * count <= alike.total():
+    def check_sizes(self) -> None:
+        """Refuse pictures of several sizes of which the first is not that of more than half."""
+        alike = {size: count for size, count in self.sizes.items()
+                 if self._alike(size) == self.size}
+        if 2 * sum(alike.values()) <= self.sizes.total() and self.sizes:
             listing = ', '.join(f'{n} of {w}x{h}' for (h, w), n in self.sizes.most_common(3))
             raise RecordingError(
                 f'images of different sizes (width x height): {listing}; one recording has one '
                 'size, or say by --crop and --size which square part of them is used')
-        self.columns.camera_size = next(
-            size for size, _ in self.sizes.most_common() if self._alike(size) == best)
-        return best
+        self.columns.camera_size = max(alike, key=alike.__getitem__, default=None)
 
     def finish(self) -> Columns:
         """Make arrays."""
@@ -232,7 +220,7 @@ class _Decoder:
         part = cut.mask(pixels) if masks else cut.image(pixels)
         if name == 'frame':
             self.sizes[size] += 1
-        self.size = self.size or self._alike(size)
+        self.size = self.size or self._alike(self.first or size)
         if self._alike(size) != self.size:
             raise RecordingError('a picture of {1}x{0} pixels among those of {3}x{2}'.format(
                 *size, *self.size))

@@ -18,7 +18,6 @@ from tap_ros.files import storage_errors
 from tap_ros.messages import topics
 from tap_ros.recording import metadata
 from tap_ros.recording.messages import schema_text, type_hash
-from tap_ros.text import escaped
 
 LIBRARY = 'tap_ros 1'
 CHUNK_BYTES = 786432  # rosbag2's default
@@ -36,8 +35,7 @@ class FileWriter:
     :param name: of the file in its bag; by default the file's own.
     :param compression: 'zstd', 'lz4' or 'none', of the chunks.
     :param chunk_bytes: size at which a chunk is finished.
-    :raises RecordingError: for an unknown compression, a file that exists, and a name
-        that is no UTF-8.
+    :raises RecordingError: for an unknown compression, and a file that exists.
     """
 
     def __init__(self, path: str | Path, name: str | None = None, compression: str = 'zstd',
@@ -47,9 +45,6 @@ class FileWriter:
                 f'compression: expected zstd, lz4 or none, got {compression!r}')
         self.path = Path(path)
         self._name = name or self.path.name
-        if self._name != self._name.encode(errors='replace').decode():
-            raise RecordingError(f'{escaped(self.path)}: metadata.yaml holds names in UTF-8, '
-                                 'which this is not; take another')
         try:
             self._stream = open(self.path, 'xb')
         except OSError as error:

@@ -2,18 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is given as a recording: MCAP, or something else that is read likewise or explained."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection
 from itertools import islice
 from pathlib import Path
-import re
 import shlex
 
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.errors import RecordingError
-from tap_ros.messages.topics import COMPRESSED_TYPE
-from tap_ros.recording.channels import Channel, is_packets, packet, PICTURES
 from tap_ros.recording.file_bytes import PACKED, unpacked_name
-from tap_ros.recording.mcap_file import McapFile
+from tap_ros.recording.mcap_file import Channel, McapFile
 from tap_ros.recording.metadata import bag_files, FILE_NAME, natural
 from tap_ros.recording.sqlite_file import MAGIC as SQLITE
 from tap_ros.recording.sqlite_file import SqliteFile
@@ -21,7 +18,7 @@ from tap_ros.text import escaped, listing
 import zstandard
 
 VIDEOS = ('.mp4', '.avi', '.mkv', '.mov', '.webm', '.m4v', '.h264')
-_THEORA = 'theora_image_transport/msg/Packet'
+_PACKETS = 'FFMPEGPacket', 'CompressedVideo', 'theora_image_transport/msg/Packet'  # types
 _MOST_FILES = 10000  # of a folder that are looked at
 
 
@@ -48,53 +45,16 @@ def recognise(path: Path) -> list[list[Path]] | None:
     return None
 
 
-def explain(channels: Iterable[Channel], files: Sequence[Path]) -> str:
-    """Return why a bag has no camera that can be read, and a command that helps; '' if unknown."""
+def explain(channels: Collection[Channel]) -> str:
+    """Return why a bag has no camera that can be read, and what helps; '' if unknown."""
     for channel in channels:
-        if is_packets(channel):
-            return explain_video(channel.topic, files)
-        if channel.type_name == _THEORA:
-            return (f'topic {escaped(channel.topic)} holds packets of Theora, which are not read; '
-                    'record the topic of its raw or compressed pictures')
+        if channel.type_name.endswith(_PACKETS):
+            return (f'topic {escaped(channel.topic)} holds packets of a video, which are not '
+                    'read; record the topic of its raw or compressed pictures, or those that '
+                    'image_transport republish makes of it')
     other = sorted({channel.encoding for channel in channels} - {'cdr'})
-    pictures = [f'foxglove.{name}' for name in PICTURES]
-    return f'its messages are encoded as {listing(other)}; only those of ROS 2 are read, and ' \
-        f'{listing(pictures)} as protobuf; record the topics of ROS 2, or these' if other else ''
-
-
-def explain_video(topic: str, files: Sequence[Path]) -> str:
-    """Return the command that makes pictures of a topic with packets of video."""
-    place = files[0] if len(files) == 1 else files[0].parent
-    return (f'topic {escaped(topic)} holds packets of a video; make a bag of its pictures: '
-            f'{_command("import-video", place)} --image-topic {shlex.quote(escaped(topic))}')
-
-
-def is_video(description: str) -> bool:
-    """Tell whether the field `format` of a CompressedImage is a codec of videos."""
-    return bool(re.search('h[.]?26[45]|hevc|av1|vp[89]', description.lower()))
-
-
-def video_packets(files: Iterable[Path], topic: str = '') -> tuple[list[float], bytes]:
-    """
-    Return the video that a topic of a bag holds.
-
-    :param files: of the bag.
-    :param topic: of the packets; '': the only one.
-    :return: seconds of the packets, and all of them, an elementary stream.
-    :raises RecordingError: without such a topic, or where several are.
-    """
-    times, stream, found = list[float](), bytearray(), set[str]()
-    for file in map(open_file, files):
-        found |= {name for name, channel in file.topics().items() if is_packets(channel)
-                  or (name, channel.type_name) == (topic, COMPRESSED_TYPE)}
-        wanted = found & {topic or name for name in found}
-        if len(wanted) != 1:
-            raise RecordingError(f'{escaped(file.path)}: --image-topic: expected one of '
-                                 f'{listing(sorted(found)) or "packets of video, but none is"}')
-        for channel, log, _, data in file.messages(wanted):
-            times.append(log / 1e9)
-            stream += packet(channel, data)
-    return times, bytes(stream)
+    return f'its messages are encoded as {listing(other)}; only those of ROS 2 are read; ' \
+        'record its topics' if other else ''
 
 
 def open_file(path: str | Path) -> McapFile:

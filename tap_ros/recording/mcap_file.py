@@ -13,6 +13,7 @@ What cannot be used is noted as a loss.
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from io import BytesIO
 from itertools import chain
 from pathlib import Path
@@ -29,8 +30,6 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC as MAGIC
 from tap_ros.errors import RecordingError
-from tap_ros.messages.topics import IMAGE
-from tap_ros.recording.channels import Channel, converted, DAMAGE
 from tap_ros.recording.damage import FAR, Loss
 from tap_ros.recording.file_bytes import bytes_of, what_else
 from tap_ros.text import escaped
@@ -47,6 +46,17 @@ _TOPICS: dict[int, type[Schema | ChannelRecord]] = {
 _DAMAGE = (McapError, struct.error, ValueError, OverflowError)  # mcap's, for damaged bytes
 Record = TypeVar('Record', bound=McapRecord)
 Found = tuple[int, int, int, memoryview]  # number of the channel, log and publish time, data
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A topic in a file."""
+
+    topic: str
+    type_name: str
+    encoding: str  # of messages; 'cdr' is all we read
+    schema_encoding: str = ''  # 'ros2msg' when schema is the text of the definition
+    schema: str = ''
 
 
 class McapFile:
@@ -118,14 +128,7 @@ class McapFile:
             channel = self.channels.get(number)
             if channel is None or channel.topic not in wanted:
                 continue
-            log, publish = min(log, FAR), min(publish, FAR)
-            try:
-                yield channel, log, publish, data if channel.convert is None else memoryview(
-                    channel.convert(data, log))
-            except DAMAGE as error:
-                self.losses.append(Loss(f'damaged message: {escaped(error)}',
-                                        f'topic {escaped(channel.topic)}', None, log, log,
-                                        channel.type_name not in IMAGE.types))
+            yield channel, min(log, FAR), min(publish, FAR), data
         self._conclude(wanted)
         self._is_read = True
 
@@ -289,9 +292,9 @@ class McapFile:
             self._schemas.setdefault(record.id, record)
         elif record.id not in self.channels:
             schema = self._schemas.get(record.schema_id, Schema(0, b'', '', ''))
-            self.channels[record.id] = converted(Channel(
+            self.channels[record.id] = Channel(
                 record.topic, schema.name, record.message_encoding, schema.encoding,
-                schema.data.decode(errors='replace')))
+                schema.data.decode(errors='replace'))
 
     def _take_notice(self, found: list[Found]) -> None:
         """Count messages; what was lost before them ends with the first."""

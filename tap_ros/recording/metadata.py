@@ -8,24 +8,21 @@ metadata.yaml is written as by rosbag2 of Jazzy (version 9), and read in any ver
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
 import json
 from math import isfinite
 from pathlib import Path
 import re
 from typing import Any
 
-from tap_ros.errors import RecordingError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import write_atomically
-from tap_ros.plugins import names
 from tap_ros.recording.file_bytes import PACKED, unpacked_name
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, Mount
 from tap_ros.text import escaped, listing
 import yaml
 
 FILE_NAME, MOUNT_NAME = 'metadata.yaml', 'arm_mount.json'
-MAX_BYTES = 2**23  # of either
-DEEPEST = 50  # levels; rosbag2 writes 8
+MAX_BYTES = 2**23  # of metadata.yaml
 _UNUSABLE = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _KEY = 'rosbag2_bagfile_information'
@@ -73,17 +70,6 @@ def bag_information(files: Sequence[dict[str, Any]]) -> dict[str, Any]:
         'custom_data': None,
         'ros_distro': 'jazzy',
     }
-
-
-def from_yaml(text: str | bytes) -> Any:
-    """Return a value; raise ValueError for one so deep that libyaml would end the process."""
-    depth = 0
-    for event in yaml.parse(text, _LOADER):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            raise ValueError(f'it is more than {DEEPEST} levels deep')
-    return yaml.load(text, _LOADER)
 
 
 def to_yaml(value: Any) -> str:
@@ -139,7 +125,7 @@ def bag_files(folder: str | Path) -> list[Path]:
         raise RecordingError(f'{path}: not a regular file')
     try:
         with open(path, 'rb') as stream:
-            information = from_yaml(stream.read(MAX_BYTES))[_KEY]
+            information = yaml.load(stream.read(MAX_BYTES), _LOADER)[_KEY]
         storage, paths = information['storage_identifier'], information['relative_file_paths']
         if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
             raise ValueError('relative_file_paths is no list of names')
@@ -172,16 +158,6 @@ def _is_file(path: Path) -> bool:
         return path.is_file()
     except OSError:  # a name that is too long
         return False
-
-
-@cache
-def qos_from_text(text: str) -> list[Any]:
-    """Return the offered QoS profiles that stand in a channel's metadata; [] when unknown."""
-    try:
-        profiles = from_yaml(text) if text else []
-    except _UNUSABLE:
-        return []
-    return profiles if isinstance(profiles, list) else []
 
 
 @dataclass(frozen=True)
@@ -222,18 +198,12 @@ def read_mount(folder: str | Path) -> ArmMount:
         return ArmMount()
     expected = {**asdict(ArmMount().mount), 'opening': 0.0, 'arm': DEFAULT_ARM}
     try:
-        if not path.is_file() or path.stat().st_size > MAX_BYTES:
-            raise ValueError('no regular file, or too long')
         values = {'arm': DEFAULT_ARM} | json.loads(path.read_bytes())  # earlier ones lack it
-        if set(values) != set(expected) or len(values['position']) != 3:
-            raise ValueError('its fields are others')
-        if values['arm'] not in names('tap_ros.arms'):
-            raise ValueError('it names an arm that is not known')
         x, y, z = map(float, values['position'])
         yaw, tool, opening = (float(values[name]) for name in ('yaw', 'tool', 'opening'))
-        if not all(map(isfinite, (x, y, z, yaw, tool, opening))):
+        if not isfinite(x + y + z + yaw + tool + opening):
             raise ValueError('it holds infinity or NaN')
-    except (OSError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        return ArmMount(Mount((x, y, z), yaw, tool), opening, get_arm(values['arm']).name)
+    except (ConfigError, OSError, LookupError, ValueError, TypeError) as error:
         raise RecordingError(f'{path}: cannot be used ({error}); expected values such as '
                              f'{json.dumps(expected)}') from error
-    return ArmMount(Mount((x, y, z), yaw, tool), opening, values['arm'])

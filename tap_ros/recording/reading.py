@@ -4,9 +4,11 @@
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Annotated, TYPE_CHECKING
 
 from tap_ros.errors import ConfigError
+from tap_ros.options import default_text
+from tyro import conf
 
 if TYPE_CHECKING:
     from tap_ros.images.crop import Crop
@@ -62,6 +64,19 @@ class Reading:
 
 
 AS_RECORDED = Reading()
+Topics = conf.UseAppendAction[Annotated[tuple[str, ...], conf.arg(metavar='TOPIC')]]
+Part = Annotated[str, conf.arg(metavar='PART', help_behavior_hint=default_text)]
+
+
+@dataclass(frozen=True)
+class ReadingOptions(Reading):
+    """Which pictures of the recordings are used."""
+
+    image_topic: Topics = ()
+    crop: Part = ''
+
+    def __post_init__(self) -> None:
+        """Leave it to Reading, which is made of this, to refuse what cannot be read with."""
 
 
 def for_bags(reading: Reading, count: int) -> Reading:

@@ -10,10 +10,9 @@ import sqlite3
 
 from mcap.summary import Summary
 from tap_ros.errors import RecordingError
-from tap_ros.recording.channels import Channel, converted
 from tap_ros.recording.damage import FAR, Loss
 from tap_ros.recording.file_bytes import bytes_of, PACKED
-from tap_ros.recording.mcap_file import Found, McapFile
+from tap_ros.recording.mcap_file import Channel, Found, McapFile
 from tap_ros.text import escaped
 
 MAGIC = b'SQLite format 3\0'
@@ -46,8 +45,8 @@ class SqliteFile(McapFile):
         for number, topic, kind, encoding in base.execute(
                 'SELECT id, name, type, serialization_format FROM topics'):
             text = texts.get(kind, '')
-            self.channels[number] = converted(Channel(
-                topic, kind, encoding, 'ros2msg' if text else '', text))
+            self.channels[number] = Channel(
+                topic, kind, encoding, 'ros2msg' if text else '', text)
         self._counts.update(dict(base.execute(
             'SELECT topic_id, count(*) FROM messages GROUP BY topic_id')))
 

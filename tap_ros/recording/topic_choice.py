@@ -21,11 +21,11 @@ from tap_ros.contract import GRIPPER_JOINTS
 from tap_ros.errors import ImageError, RecordingError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.joints import decode_positions, PLACE
-from tap_ros.messages.topics import BY_COLUMNS, COMPRESSED_TYPE, IMAGE, JOINT_STATES, Topic, TOPICS
-from tap_ros.recording.channels import Channel
+from tap_ros.messages.topics import BY_COLUMNS, IMAGE, JOINT_STATES, Topic, TOPICS
 from tap_ros.recording.damage import describe
 from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.foreign import explain, explain_video, is_video, open_file
+from tap_ros.recording.foreign import explain, open_file
+from tap_ros.recording.mcap_file import Channel
 from tap_ros.recording.messages import check_schema, decode
 from tap_ros.robots.arm import find_joints, known_arms
 from tap_ros.text import escaped, listing
@@ -51,8 +51,6 @@ def find_topics(files: Sequence[Path], image_topic: str = '') -> dict[str, str]:
     """
     bag = _Bag(files)
     camera = bag.camera(image_topic)
-    if (camera, COMPRESSED_TYPE) in bag.every and bag.is_video(camera):
-        raise RecordingError(f'{bag.source}: {explain_video(camera, files)}')
     found = {camera: IMAGE.becomes} | {
         topic: name for name, one in BY_COLUMNS.items() if one is not IMAGE
         for topic in bag.beside(one, camera)}
@@ -129,7 +127,7 @@ class _Bag:
         for rule in rules:
             if len(left) > 1:
                 left = [topic for topic in left if rule(topic)] or left
-        if not left and (why := explain(self.channels.values(), self.files)):
+        if not left and (why := explain(self.channels.values())):
             raise RecordingError(f'{self.source}: {why}; {self.known}')
         if not left:
             raise RecordingError(
@@ -195,10 +193,6 @@ class _Bag:
         """Tell whether one of the first pictures of a topic has colours."""
         picture = self.picture(topic)
         return picture is not None and bool(np.ptp(picture, -1).any())
-
-    def is_video(self, topic: str) -> bool:
-        """Tell whether a topic of compressed pictures holds packets of a video."""
-        return any(is_video(getattr(message, 'format', '')) for message in self._first(topic)[:1])
 
     def joints(self, topic: str) -> Mapping[str, float]:
         """Return the joints in the first message of a topic."""

@@ -10,7 +10,6 @@ from contextlib import suppress
 import os
 from pathlib import Path
 import struct
-import time
 from typing import Any, Self
 
 from mcap.exceptions import McapError
@@ -18,7 +17,7 @@ from mcap.reader import make_reader
 import numpy as np
 from numpy.typing import ArrayLike
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
-from tap_ros.errors import RecordingError, StorageError
+from tap_ros.errors import RecordingError
 from tap_ros.files import storage_errors
 from tap_ros.messages import topics
 from tap_ros.messages.images import camera_info_fields, image_fields, mask_fields
@@ -28,25 +27,22 @@ from tap_ros.messages.stamps import header_fields, stamp_fields
 from tap_ros.recording import metadata
 from tap_ros.recording.episode import check_episode, Episode
 from tap_ros.recording.file_writer import FileWriter
-from tap_ros.recording.messages import encode, typestore
+from tap_ros.recording.messages import encode, type_hash, typestore
 from tap_ros.text import escaped
 
 EPISODE_GAP_NS = 10**9  # between episodes whose stamps do not follow each other
 
 
-class BagWriter:
+class BagWriter(FileWriter):
     """
     Write the messages of a running system into a new bag.
 
     :param folder: of the bag; must not exist, or be empty.
     :param compression: 'zstd', 'lz4' or 'none'.
-    :param flush_seconds: a killed process loses at most the messages of so many seconds.
-    :param split_bytes: go on in a new file when one has grown to this size; None: never.
     :raises RecordingError: when the folder holds something, or cannot be made.
     """
 
-    def __init__(self, folder: str | Path, compression: str = 'zstd', flush_seconds: float = 1.0,
-                 split_bytes: int | None = None) -> None:
+    def __init__(self, folder: str | Path, compression: str = 'zstd') -> None:
         self.folder = Path(folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -55,63 +51,25 @@ class BagWriter:
             raise RecordingError(f'{folder}: cannot be made: {error.strerror}') from error
         if occupied:
             raise RecordingError(f'{folder}: is not empty; name a new folder for the recording')
-        self._compression = compression
-        self._flush_seconds = flush_seconds
-        self._split_bytes = split_bytes
-        self._finished: list[dict[str, Any]] = []
         typestore()  # takes a moment, which no message should wait for
-        self._file: FileWriter | None = self._open()
+        super().__init__(
+            self.folder / f'{self.folder.resolve().name}_0.mcap', compression=compression)
 
-    def write_raw(self, topic: str, type_name: str, data: bytes, log_time_ns: int,
-                  publish_time_ns: int | None = None, qos: topics.Qos | None = None) -> None:
-        """Append one message; see FileWriter.write_raw."""
-        if time.monotonic() - self._flushed > self._flush_seconds:
-            self.flush()
-            file = self._current()
-            if self._split_bytes and file.path.stat().st_size >= self._split_bytes:
-                self._file = None
-                self._finished.append(file.close())
-                self._file = self._open()
-        self._current().write_raw(topic, type_name, data, log_time_ns, publish_time_ns, qos)
-
-    def flush(self) -> None:
-        """Write all that was received so far to the file."""
-        self._current().flush()
-        self._flushed = time.monotonic()
-
-    def close(self) -> None:
+    def close(self) -> dict[str, Any]:
         """
-        Finish the bag: its last file and metadata.yaml.
+        Finish the bag: its file and metadata.yaml.
 
         :raises StorageError: when it cannot be; what was flushed before is readable.
         """
-        if self._file is not None:
-            file, self._file = self._file, None
-            self._finished.append(file.close())
-            metadata.save(self.folder, self._finished)
-
-    def abandon(self) -> None:
-        """Write no more, after an error; what was flushed before is readable."""
-        if self._file is not None:
-            self._file.abandon()
-            self._file = None
+        information = super().close()
+        metadata.save(self.folder, [information])
+        return information
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _current(self) -> FileWriter:
-        """Return the file that is being written."""
-        if self._file is None:
-            raise StorageError(f'{self.folder}: its last file is closed; start a new recording')
-        return self._file
-
-    def _open(self) -> FileWriter:
-        self._flushed = time.monotonic()
-        name = f'{self.folder.resolve().name}_{len(self._finished)}.mcap'
-        return FileWriter(self.folder / name, compression=self._compression)
 
 
 class EpisodeWriter:
@@ -225,7 +183,7 @@ class EpisodeWriter:
 
 def write_metadata(folder: str | Path) -> None:
     """
-    Write metadata.yaml of a bag anew from its finished .mcap files.
+    Write metadata.yaml of a bag of finished files of EpisodeWriter.
 
     :param folder: of the bag; the files play in the order of the numbers in their names.
     :raises RecordingError: when there is no .mcap file, or one is not finished.
@@ -260,11 +218,10 @@ def _describe(path: Path) -> dict[str, Any]:
     counts = summary.statistics.channel_message_counts
     found = {}
     for channel in summary.channels.values():
+        kind = summary.schemas[channel.schema_id].name
         found[channel.topic] = {
-            'type': summary.schemas[channel.schema_id].name,
-            'qos': metadata.qos_from_text(channel.metadata.get('offered_qos_profiles', '')),
-            'type_hash': channel.metadata.get('topic_type_hash', ''),
-            'count': counts.get(channel.id, 0)}
+            'type': kind, 'qos': [topics.default_qos(channel.topic).profile()],
+            'type_hash': type_hash(kind), 'count': counts.get(channel.id, 0)}
     return {
         'path': path.name, 'start': summary.statistics.message_start_time,
         'end': summary.statistics.message_end_time,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from tap_ros.errors import check_fields, ConfigError
 from tap_ros.options import default_text, Folder
-from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.recording.reading import ReadingOptions
 from tap_ros.training.split import TEST_FRACTION
 from tyro import conf
 

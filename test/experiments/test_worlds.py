@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation import keyframes
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 
 
 def film(places, size=28):
@@ -63,7 +63,7 @@ def test_bottlenecks_are_read_by_their_stamps(tmp_path):
         command.read(tmp_path)
     write_bag(tmp_path / 'bag', [move_squares([[3, 3]], [[8, 8]], length=7, seed=seed)
                                  for seed in range(2)])
-    stamps = [list(episode.stamps / 1e9) for episode in iter_episodes(tmp_path / 'bag')]
+    stamps = [list(episode.stamps / 1e9) for episode in open_recordings(tmp_path / 'bag')]
     (tmp_path / 'bag' / 'bottlenecks.json').write_text(json.dumps(
         {'marks': [{'recording': '.', 'episode': 1, 'stamps': [[stamps[1][2], stamps[1][4]]]}]}))
     found, = command.read(tmp_path / 'bag')

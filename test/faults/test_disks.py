@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from tap_ros.errors import TapError
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 from tap_ros.training.weights import load_tensors, save_weights
 
@@ -88,7 +88,7 @@ def read_bag(folder):
     """Return the episodes of what is left, and the warnings; raise TapError for none."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter('always')
-        return list(iter_episodes(folder)), told
+        return list(open_recordings(folder)), told
 
 
 @fault(FULL, CLEAR, 20, 's until it ended (median)', statistics.median)

@@ -30,14 +30,6 @@ def test_a_dot_and_its_position_move_together(height, width, part, size, random)
     np.testing.assert_allclose([(weight * x).sum(), (weight * y).sum()], expected, atol=0.15)
 
 
-def test_without_a_part_and_a_size_nothing_changes():
-    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
-    pixels = np.array([[1.1, 2.7]], np.float32)
-    assert not Crop()
-    np.testing.assert_array_equal(Crop().image(picture), picture)
-    assert Crop().pixels(pixels, (5, 7)) is pixels
-
-
 def test_a_scaled_mask_hides_all_that_the_robot_is_mixed_into():
     rng = np.random.default_rng(1)
     mask = np.full((96, 128), ROBOT_MASK_FREE, np.uint8)

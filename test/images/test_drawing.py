@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from tap_ros.images.drawing import grid, overlay
+from tap_ros.images.drawing import overlay
 
 SCALE = 4
 
@@ -36,9 +36,3 @@ def test_marks_outside_the_picture_are_not_seen_however_far(far):
         assert (shown == 128).all()
     for pixel in ((-0.5, 5), (5, 15.5)):  # at the border half of a mark is
         assert (overlay(start, maps, SCALE, [pixel]) != 128).any()
-
-
-def test_panels_keep_their_pixels_and_have_white_between_them():
-    sheet = grid([[np.zeros((3, 3, 3), np.uint8)] * 2], scale=2)
-    assert sheet.shape == (6, 14, 3)
-    assert (sheet[:, 6:8] == 255).all() and not sheet[:, :6].any()

@@ -67,9 +67,8 @@ def test_planes_have_the_colours_of_the_scene_however_rows_are_counted():
     picture = cv2.resize(np.array([[[200, 60, 30], [30, 160, 90]]], np.uint8), (16, 12))
     planes = cv2.cvtColor(picture, cv2.COLOR_RGB2YUV_I420)
     grey, (u, v) = planes[:12], planes[12:].reshape(2, 6, 8)
-    wide = [plane.repeat(2, 0).repeat(2, 1) for plane in (u, v)]
     for name, colours in (('i420', [u, v]), ('nv12', np.stack([u, v], -1)),
-                          ('nv21', np.stack([v, u], -1)), ('nv24', np.stack(wide, -1))):
+                          ('nv21', np.stack([v, u], -1))):
         raw = np.concatenate([grey.ravel(), np.ravel(colours)]).reshape(-1, 16)
         for height in (12, len(raw)):
             found = decode_image(SimpleNamespace(

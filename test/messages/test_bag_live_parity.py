@@ -29,7 +29,7 @@ from tap_ros.nodes.planner.planner_inputs import PlannerInputs
 from tap_ros.nodes.predictor.requests import RequestReader
 from tap_ros.nodes.ros_messages import encode_image, encode_mask, encode_objects
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.writer import BagWriter
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
@@ -193,7 +193,8 @@ def test_what_is_seen_live_is_what_is_read_from_the_recording(
         for stamp, topic, message in sent:
             kind = f'{type(message).__module__.split(".")[0]}/msg/{type(message).__name__}'
             writer.write_raw(f'/{topic}', kind, serialize_message(message), stamp)
-    (episode,) = iter_episodes(tmp_path / 'bag', Reading(crop=part.part, size=part.size))
+    (episode,) = open_recordings(
+        tmp_path / 'bag', reading=Reading(crop=part.part, size=part.size))
     view = FreeView(robot_mask)
     assert episode.object_source == 'tracked'
     for t, stamp in enumerate(episode.stamps.tolist()):

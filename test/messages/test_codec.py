@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
-from tap_ros.contract import MAX_PICTURE_BYTES
 from tap_ros.errors import ImageError, PlanningError
 from tap_ros.messages import images, objects
 from tap_ros.nodes import ros_messages
@@ -44,9 +43,6 @@ def test_a_picture_survives_the_round_trip_and_rows_may_be_padded():
 @pytest.mark.parametrize('change, words', [
     ({'encoding': 'yuv444'}, ['yuv444', 'rgb8', 'bgr8', 'mono8']),
     ({'step': 20}, ['step', '20', '21']),
-    ({'step': 22}, ['data', '105', '110']),
-    ({'height': 6}, ['data', '105', '126']),
-    ({'width': 8}, ['step', '21', '24']),
     ({'height': 0}, ['empty', '7x0']),
     ({'data': array.array('B', bytes(104))}, ['data', '104', '105']),
     ({'encoding': 'x\n\x1b' + 1000 * 'y'}, ["'x\\n\\x1byyy", 'rgb8']),
@@ -61,19 +57,6 @@ def test_a_bad_picture_is_refused_with_the_reason(change, words):
     for word in ['goal', *words]:
         assert word in str(error.value)
     assert str(error.value).isprintable() and len(str(error.value)) < 400
-
-
-def test_what_is_just_within_the_limits_is_taken():
-    message = ros_messages.encode_image(picture(), STAMP, images.MAX_FRAME_ID * 'x')
-    assert np.array_equal(images.decode_image(message, 'goal'), picture())
-    step = MAX_PICTURE_BYTES
-    message = Image(height=1, width=1, step=step, encoding='rgb8')
-    message.data = array.array('B', bytes([1, 2, 3]) + bytes(step - 3))
-    assert images.decode_image(message, 'goal').tolist() == [[[1, 2, 3]]]
-    names = [str(k) for k in range(objects.MAX_OBJECTS - 1)]
-    names.append(objects.MAX_NAME * 'x')
-    message = some_objects(len(names) * [[1, 2]], names)
-    assert objects.decode_objects(message, 'objects')[0] == tuple(names)
 
 
 def test_another_size_is_refused_unless_resizing_is_allowed():
@@ -128,11 +111,9 @@ def test_objects_survive_the_round_trip_and_are_matched_by_name():
     ([[np.inf, 2], [1, 3]], ('red', 'blue'), ['red', 'inf']),
     ([[1, 2], [1, 3]], ('red', 'red'), ['objects[1].name', 'red']),
     ([[1, 2], [1, 3]], ('', 'red'), ['objects[0].name']),
-    ([[1, 2], [1e39, 3]], ('red', 'blue'), ['blue', 'inf']),
     ([[1, 2], [np.nan, 3]], ('red', 'a\n\x1b[2J'), ['a\\n\\x1b[2J', 'nan']),
     ([[1, 2], [1, 3]], ('red', 101 * 'x'), ['objects[1].name', '101', '100']),
     (33 * [[1, 2]], [f'cup {n}' for n in range(33)], ['33 objects', '32']),
-    (10_000 * [[1, 2]], 10_000 * ['cup'], ['10000 objects', '32']),
 ])
 def test_unusable_objects_are_refused_with_the_reason(pixels, names, words):
     with pytest.raises(PlanningError) as error:

@@ -23,7 +23,7 @@ from tap_ros.nodes.demo.report import (
     write_film,
     write_report,
 )
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_real_nodes_push_in_a_world_of_others_that_says_how_it_ended(tmp_path, c
     said = capsys.readouterr().out
     assert re.search(r'direct .* in 1 steps.*\n    subgoal .* in 1 steps', said)
     assert (folder / 'demo.webp').stat().st_size and (folder / 'report.html').stat().st_size
-    episodes = list(iter_episodes(folder / 'recording' / 'push-v3'))[-2:]
+    episodes = list(open_recordings(folder / 'recording' / 'push-v3'))[-2:]
     assert [(len(one), one.task, one.outcome) for one in episodes] == [
         (2, 'push-v3', 'failure')] * 2
     for one in episodes:

@@ -20,7 +20,7 @@ from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.predictor.node import PredictorNode
 from tap_ros.nodes.topics import STREAM
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL, PREDICTORS
 import yaml
 
@@ -114,8 +114,8 @@ def test_a_recording_has_the_goal_that_holds_at_the_end_of_an_episode(loop):
     loop.reached(mode='direct', step_budget=1)  # by then the recorder knows of the new episode
     loop.client.record(False)
     # What the scene before sent last may reach the recorder after the bag was begun.
-    episode, = (e for e in iter_episodes(folder) if e.seed == 7)
-    following, = (e for e in iter_episodes(folder) if e.seed == 8)
+    episode, = (e for e in open_recordings(folder) if e.seed == 7)
+    following, = (e for e in open_recordings(folder) if e.seed == 8)
     assert (len(episode), episode.outcome) == (3, 'failure')
     np.testing.assert_array_equal(episode.goal_pixels, pixels)
     np.testing.assert_allclose(episode.goal_pixels[1], MOVED['object_1'], atol=1e-4)
@@ -153,7 +153,7 @@ def test_every_node_ends_cleanly_and_the_bag_holds_every_episode(loop):
                   '/arm/delta_twist_cmds', '/subgoal', '/subgoal/image', '/subgoal/overlay',
                   '/plan/distance', '/predictor_node/model_card', '/visual_mpc_node/model_card'):
         assert counts[topic] > 0
-    episodes = list(iter_episodes(bag))
+    episodes = list(open_recordings(bag))
     whole, cut_short = episodes[-2:]
     assert (whole.task, whole.seed, len(whole.frames)) == ('push2', 7, 3)
     assert (cut_short.seed, cut_short.outcome) == (SEED, 'failure')

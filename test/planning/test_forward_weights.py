@@ -16,7 +16,6 @@ from tap_ros.planning.forward_model import LearnedForwardModel
 from tap_ros.planning.forward_scores import held_out_scores, map_errors
 from tap_ros.planning.tracking import ObjectTracker
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.reader import iter_episodes
 from tap_ros.weights import FORWARD_MODEL
 
 SAMPLE = Path(__file__).parents[2] / 'bags' / 'sample_push2'
@@ -28,7 +27,7 @@ def model():
 
 
 def test_object_maps_are_carried_to_where_recorded_pushes_led(model):
-    episodes = list(islice(iter_episodes(SAMPLE), 6))
+    episodes = list(islice(open_recordings(SAMPLE), 6))
     scores = map_errors(model, episodes, range(len(episodes)))
     for t in (5, 10, 15):
         assert scores[f'map_error_px_{t}'] < 0.27 * scores[f'nothing_moves_px_{t}']
@@ -40,7 +39,7 @@ def test_without_object_pixels_pictures_are_compared_with_copying(model, tmp_pat
         replace(episode, object_names=(), object_source='', **{
             name: getattr(episode, name)[..., :0, :] for name in (
                 'object_pixels', 'object_poses', 'goal_pixels', 'goal_poses')})
-        for episode in islice(iter_episodes(SAMPLE), 6)])
+        for episode in islice(open_recordings(SAMPLE), 6)])
     assert main(['evaluate', 'forward', '--recordings', str(bag), '--test-fraction', '1', '--out',
                  str(tmp_path)]) == 0
     assert 'better than copying' in capsys.readouterr().out

@@ -13,13 +13,13 @@ from tap_ros.cli import main
 from tap_ros.messages.images import decode_image
 from tap_ros.prediction.predict_command import read_picture
 from tap_ros.prediction.predictor import load_network, SubgoalPredictor
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.training.weights import save_weights
 
 
 @pytest.fixture(scope='module')
 def episode():
-    return next(iter_episodes('bags/sample_push2'))
+    return open_recordings('bags/sample_push2')[0]
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 
@@ -76,26 +75,6 @@ def test_large_recordings_are_decoded_in_other_processes(tmp_path, bag, episodes
         open_recordings(bag)
 
 
-def test_ctrl_c_while_others_decode_is_one_line(tmp_path, bag):
-    script = tmp_path / 'script.py'
-    script.write_text(
-        'import sys, time\nfrom tap_ros import cli\nfrom tap_ros.recording import cache\n'
-        'cache._ALONE_BYTES = 0\ncache._workers = lambda: 2\n'
-        'decode = cache.decode_file\n'
-        'def slow(*args):\n    print("begun", flush=True)\n    time.sleep(60)\n'
-        'cache.decode_file = slow\n'
-        'if __name__ == "__main__":\n    sys.exit(cli.main(["inspect", sys.argv[1]]))\n')
-    for wait in ('topics', 'begun'):
-        run = subprocess.Popen([sys.executable, script, bag], stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True, start_new_session=True,
-                               env=os.environ | {'PYTHONPATH': os.getcwd()})
-        while not run.stdout.readline().startswith(wait):
-            pass
-        os.killpg(run.pid, signal.SIGINT)
-        _, said = run.communicate(timeout=30)
-        assert run.returncode == 130 and 'Traceback' not in said and said.count('\n') < 3, said
-
-
 def test_a_script_that_other_processes_cannot_import_gets_its_episodes(tmp_path, bag, episodes):
     script = tmp_path / 'script.py'
     script.write_text(
@@ -105,16 +84,6 @@ def test_a_script_that_other_processes_cannot_import_gets_its_episodes(tmp_path,
                          env=os.environ | {'PYTHONPATH': os.getcwd()})
     assert 'bootstrapping phase' in run.stderr  # they say what to do about it
     assert run.stdout.split() == [str(len(episodes))]
-
-
-def test_a_failed_build_leaves_nothing(tmp_path, bag, cache):
-    path = bag / 'both.mcap'
-    with EpisodeWriter(path) as writer:  # of two sizes, refused when all is decoded
-        writer.write(make_episode(size=(8, 8)))
-        writer.write(make_episode(size=(4, 16)))
-    with pytest.raises(RecordingError, match='both.mcap'):
-        open_recordings(path)
-    assert list(cache.glob('*')) == []
 
 
 def test_an_unusable_cache_folder_is_named(tmp_path, bag):

@@ -184,7 +184,7 @@ DEFECTS |= {
 @pytest.mark.parametrize('defect', DEFECTS)
 def test_what_is_read_is_what_was_recorded_whatever_the_clocks_say(defect):
     spoil, words = DEFECTS[defect]
-    for seed in range(12):
+    for seed in range(6):
         random = np.random.default_rng(seed)
         rate = [5, 10, 15, 30][seed % 4]
         good = record(random, rate, 1 + seed // 4 % 2, marks=seed % 3 == 0,
@@ -261,7 +261,7 @@ def written(bag, key):
 
 @pytest.mark.filterwarnings('error')
 def test_good_recordings_stay_as_they_are():
-    for seed in range(60):
+    for seed in range(30):
         random = np.random.default_rng(seed)
         assert_untouched(record(random, [5, 10, 15, 30, 60][seed % 5], marks=seed % 2, **[
             {'jitter': 0.4, 'lost': 0.2}, {'latency': (0.01, 0.3)}, {'latency': (0.2, 0.6)}, {},
@@ -289,16 +289,6 @@ def test_good_recordings_stay_as_they_are():
         assert not said and (np.diff(table.stamps) > 0).all()
         assert sorted(numbers) == list(range(len(numbers)))
         assert (np.array(numbers) != np.arange(len(numbers))).sum() == 20
-
-
-def test_a_camera_of_another_rate_is_told_once_it_is_far_off():
-    good = record(np.random.default_rng(3), 10, 1, 900, joints=False)
-    numbers, table, _ = good.read(episode_seconds=0)
-    drifting = good.spoilt(stamped('frame', lambda s, _: s + (s - WALL) // 50), None)
-    found, read_table, told = drifting.read(episode_seconds=0)
-    assert found == numbers and len(told) == 1 and '/cmd: the clock of' in told[0]
-    wrong = (read_table.actions != table.actions).any(1)
-    assert not wrong[:20].any() and not wrong[-300:].any()  # little at first, and then mended
 
 
 @pytest.mark.parametrize('pause', [3, 6])

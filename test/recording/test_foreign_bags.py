@@ -2,34 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags that others recorded, with other topics, encodings and habits."""
 
-import re
 
 from made_bags import (
     camera,
     command,
     gripper,
-    IMAGE,
     joints,
     mark,
-    message,
     objects,
     read,
     record,
     record_files,
     SECOND,
     shown,
-    write_mcap,
 )
-from made_episodes import assert_all_equal
-from mcap.reader import make_reader
 import numpy as np
 import pytest
-from tap_ros.cli import main
 from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.reading import Reading
 from tap_ros.recording.topic_choice import find_topics
-from tap_ros.recording.writer import EpisodeWriter
 
 
 def test_of_a_bag_with_pictures_alone_all_else_is_unknown(tmp_path):
@@ -62,49 +54,6 @@ def test_another_image_topic_is_found_where_it_is_the_only_one_else_named(tmp_pa
     bag = record(tmp_path / 'none', [camera(1, topic='/goal/image')])
     with pytest.raises(RecordingError, match='no topic ends in /camera/image_raw'):
         open_recordings(bag)
-
-
-def test_an_empty_topic_or_one_of_another_type_is_passed_over_whatever_its_name(tmp_path):
-    write_mcap(tmp_path / 'a.mcap', [
-        camera(1, topic='/front/rgb'), message('/objects', IMAGE, 1), objects(1, '/b/objects', a=1)
-        ], [('/camera/image_raw', IMAGE), ('/c/objects', 'tap_msgs/msg/ObjectStates')])
-    assert topics_of(tmp_path)['/front/rgb'] == 'frame'
-    assert topics_of(tmp_path, '/front/rgb')['/b/objects'] == 'object'
-
-
-def test_a_topic_that_cannot_be_the_camera_is_answered_with_all_topics_and_their_counts(tmp_path):
-    def deep(topic, form):
-        return [camera(t, topic=topic, encoding=form, step=6, data=bytes(12)) for t in (1, 2)]
-
-    write_mcap(tmp_path / 'a.mcap', [camera(t) for t in (1, 2, 3)], [('/front/rgb', IMAGE)])
-    write_mcap(tmp_path / 'b.mcap', deep('/depth', '16UC1') + deep('/far', '32FC1'))
-    for name, wanted, words in (
-            ('a', '/front/rgb', r'/front/rgb holds no message; .*/camera/image_raw .*3 messages'),
-            ('a', '/other', r'no topic /other .*/camera/image_raw .*3 mes.*/front/rgb .*0 mes'),
-            ('b', '', r'can be used: /depth \(2 messages\), /far .*record the colour camera')):
-        with pytest.raises(RecordingError, match=words) as error:
-            find_topics([tmp_path / f'{name}.mcap'], wanted)
-        assert name == 'a' or '--image-topic' not in str(error.value)
-
-
-def test_pictures_seconds_apart_are_kept_together_by_the_gap_that_is_told(tmp_path, capsys):
-    pixels = np.zeros((64, 64, 3), np.uint8)
-    bag = record(tmp_path / 'bag', [camera(6 * t, pixels) for t in range(1, 20)])
-    assert main(['inspect', str(bag)]) == 1
-    option = re.search(r'--gap [0-9.]+', capsys.readouterr().err)[0].split()
-    assert main(['inspect', str(bag), *option]) == 0
-
-
-def test_topics_in_a_namespace(tmp_path, episodes):
-    with EpisodeWriter(tmp_path / 'a.mcap') as writer:
-        for episode in episodes:
-            writer.write(episode)
-    with open(tmp_path / 'a.mcap', 'rb') as stream:
-        record(tmp_path / 'bag', [
-            ('/robot1' + channel.topic, schema.name, message.data, message.log_time)
-            for schema, channel, message in make_reader(stream).iter_messages(
-                log_time_order=False)])
-    assert_all_equal(read(tmp_path / 'bag')[0], episodes)
 
 
 def test_two_robots_are_told_apart_by_the_image_topic(tmp_path):
@@ -169,16 +118,6 @@ def test_states_are_interpolated_and_near_ones_hold(tmp_path):
     assert np.isnan(episode.grippers[3]).all()
 
 
-def test_states_hold_for_half_a_frames_time_and_the_earlier_of_two_counts(tmp_path):
-    for number, (times, expected) in enumerate((
-            ((2.5, 5.5), [2.5, np.nan, 5.5]), ((2.5 - 1e-9, 5.5 + 1e-9), [np.nan] * 3),
-            ((3.5, 4.5), [3.5, 3.5, 4.5]))):
-        (episode,), _ = read(record(tmp_path / str(number), [
-            *map(camera, (3, 4, 5)), *(joints(t, gripper_x=t) for t in times),
-            joints(3, log=6, wheel=0.5)]))  # no state of the gripper
-        np.testing.assert_allclose(episode.grippers[:, 0], expected, rtol=1e-6)
-
-
 def test_objects_are_matched_by_name(tmp_path):
     (episode,), _ = read(record(tmp_path / 'bag', [
         camera(1), objects(1, a=1, b=2), camera(2), objects(2, b=4, a=3), camera(3),
@@ -240,9 +179,3 @@ def test_an_episode_may_span_files(tmp_path):
     assert shown(found) == [[*range(1, 20)], [20, 21]]
     assert found[0].actions[:, 0].tolist() == [*range(1, 19), 0]
     assert [e.outcome for e in found] == ['success', 'failure']
-
-
-def test_frames_are_put_in_order(tmp_path):
-    (episode,), _ = read(record(tmp_path / 'bag', map(camera, (3, 1, 5, 2, 4))))
-    assert shown([episode]) == [[1, 2, 3, 4, 5]]
-    assert episode.stamps.tolist() == [t * SECOND for t in range(1, 6)]

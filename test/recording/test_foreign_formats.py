@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of other storages and messages are read as ours; for what is no bag a command is told."""
 
-import base64
 import bz2
 from contextlib import closing
 import gzip
@@ -10,7 +9,6 @@ from pathlib import Path
 import shlex
 import shutil
 import sqlite3
-import struct
 import sys
 from types import SimpleNamespace
 
@@ -22,20 +20,12 @@ import pytest
 from rosbags.rosbag2 import Writer as Ros2Writer
 from tap_ros.cli import main, read
 from tap_ros.errors import RecordingError
-from tap_ros.recording import channels
 from tap_ros.recording.cache import open_recordings
-from tap_ros.recording.episode import RecordingWarning
-from tap_ros.recording.messages import encode, typestore
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.messages import typestore
 import zstandard
 
 TOPIC = '/camera/image_raw'
 SENT = [each for t in range(1, 6) for each in (camera(t), joints(t, gripper_x=t / 8))]
-# Four packets of H.264, 16x16 pixels, grey of 39, 89, 139 and 189.
-PACKETS = [base64.b64decode(text) for text in (
-    'AAABZ0LACtp6EAAAAwAQAAADAUjxImoAAAFozgbyAAABZYiEOiYoAAkE4A==', 'AAABQZogLqJxQABJfw==',
-    'AAABQZpALqJxQABBww==', 'AAABQZpgLrxkUAAQoooAAhRRQABCiigACFFFAAEKKKAAIUUUAAQoooAAhRRQABCii'
-    'gACFFFAAEKKKAAIUUUAAQoooAAhRRQABCiigACFFg==')]
 
 
 def write_sqlite3(folder):
@@ -104,11 +94,11 @@ def write_mcap(path, messages):
 @pytest.mark.parametrize('write, name', [
     (write_sqlite3, 'bag'), (write_bare_db3, ''), (write_unmerged, ''), (write_packed, 'bag')])
 def test_bags_in_sqlite3_say_what_a_bag_of_ours_says(write, name, tmp_path):
-    expected, = iter_episodes(record(tmp_path / 'ours', SENT))
+    expected, = open_recordings(record(tmp_path / 'ours', SENT))
     (tmp_path / 'theirs').mkdir()
     path = write(tmp_path / 'theirs' / name)
     for place in (path, tmp_path / 'theirs'):
-        for found in (list(iter_episodes(place)), [open_recordings(place)[0]]):
+        for found in (list(open_recordings(place)), [open_recordings(place)[0]]):
             np.testing.assert_array_equal(found[0].frames, expected.frames)
             np.testing.assert_array_equal(found[0].stamps, expected.stamps)
             np.testing.assert_array_equal(found[0].grippers, expected.grippers)
@@ -133,44 +123,6 @@ def test_mcap_beside_other_bags_is_refused_by_name(tmp_path):
     assert len(open_recordings(path)) == len(open_recordings(tmp_path / 'two.mcap')) == 1
 
 
-def length_delimited(number, data):
-    return bytes([number << 3 | 2]) + bytes([len(data) & 127 | 128, len(data) >> 7]) + data
-
-
-def foxglove_image(t, name, encoding):
-    """Return a picture of one of Foxglove's schemas: type, bytes and pixels."""
-    pixels = np.full((8, 8, 3), 20 * t, np.uint8)
-    known = {'data': cv2.imencode('.png', pixels)[1].tobytes(), 'format': 'png'} if (
-        name == 'CompressedImage') else {
-        'width': 8, 'height': 8, 'encoding': 'rgb8', 'step': 24, 'data': pixels.tobytes()}
-    if encoding == 'protobuf':
-        data = length_delimited(1, b'\x08' + bytes([t]))
-        for number, value in enumerate(known.values(), 2):
-            data += bytes([number << 3 | 5]) + struct.pack('<I', value) if isinstance(
-                value, int) else length_delimited(
-                    number, value.encode() if isinstance(value, str) else value)
-        return f'foxglove.{name}', data, pixels
-    channels._register()
-    kind = f'foxglove_msgs/msg/{name}'
-    return kind, encode(kind, known | {'timestamp': {'sec': t}}), pixels
-
-
-@pytest.mark.parametrize('name', ['RawImage', 'CompressedImage'])
-@pytest.mark.parametrize('encoding', ['protobuf', 'cdr'])
-def test_pictures_of_foxglove_are_read_however_they_are_encoded(encoding, name, tmp_path):
-    sent = [foxglove_image(t, name, encoding) for t in range(1, 5)]
-    messages = [('/cam', kind, data, t * SECOND, '', encoding)
-                for t, (kind, data, _) in enumerate(sent, 1)]
-    episode, = iter_episodes(write_mcap(tmp_path / 'a.mcap', messages))
-    np.testing.assert_array_equal(episode.frames, [pixels for *_, pixels in sent])
-    assert episode.stamps.tolist() == [t * SECOND for t in range(1, 5)]
-    both = [messages[0], ('/cam', *camera(2, sent[1][2])[1:], '', 'cdr'), messages[2],
-            ('/cam', *messages[0][1:2], b'\xff', 7 * SECOND // 2, '', encoding), messages[3]]
-    with pytest.warns(RecordingWarning, match='/cam: 1 message cannot be used'):
-        episode, = iter_episodes(write_mcap(tmp_path / 'b.mcap', both))
-    np.testing.assert_array_equal(episode.frames, [pixels for *_, pixels in sent])
-
-
 def test_damage_of_other_bags_is_named(tmp_path):
     packed = next(write_packed(tmp_path / 'packed').glob('*.zstd'))
     for path in (write_bare_db3(tmp_path), packed):
@@ -178,7 +130,7 @@ def test_damage_of_other_bags_is_named(tmp_path):
         path.write_bytes(data[:len(data) // 3])
         words = path.name + ': (cannot be r|does not u)'
         with pytest.raises(RecordingError, match=words):
-            list(iter_episodes(path))
+            list(open_recordings(path))
 
 
 @pytest.mark.parametrize('name, content, command', [
@@ -201,45 +153,22 @@ def test_for_what_is_no_bag_the_command_is_told(name, content, command, tmp_path
         assert advice[3] == command and str(tmp_path) in advice[4] and read(advice[3:])
 
 
-VIDEO = {'foxglove_msgs/msg/CompressedVideo': (
-    'cdr', lambda data: b'\0\1\0\0' + struct.pack('<iII', 1, 0, 1) + bytes(4)
-    + struct.pack('<I', len(data)) + data + bytes(-len(data) % 4) + struct.pack('<I', 5)
-    + b'h264\0'),
-    'sensor_msgs/msg/CompressedImage': ('cdr', lambda data: encode(
-        'sensor_msgs/msg/CompressedImage', {'format': 'h264', 'data': data})),
-    'foxglove.CompressedVideo': ('protobuf', lambda data: length_delimited(3, data))}
-
-
-@pytest.mark.parametrize('kind', VIDEO)
-def test_packets_of_video_become_a_bag_by_the_command_that_is_told(
-        kind, tmp_path, capsys, monkeypatch):
-    encoding, wrap = VIDEO[kind]
-    path = write_mcap(tmp_path / 'a.mcap', [
-        ('/video', kind, wrap(data), t * SECOND // 2, '', encoding)
-        for t, data in enumerate(PACKETS, 1)])
-    assert main(['inspect', str(path)]) == 1
-    said = capsys.readouterr().err
-    advice = shlex.split(said[said.index('python -m tap_ros'):].split(';')[0])
-    monkeypatch.chdir(tmp_path)
-    assert main(advice[3:]) == 0
-    episode, = iter_episodes(tmp_path / 'BAG')
-    assert np.abs(episode.frames.mean((1, 2, 3)) - [39, 89, 139, 189]).max() < 3
-    assert set(np.diff(episode.stamps)) == {SECOND // 2}
-
-
-def test_other_encodings_are_named_instead_of_a_topic_to_choose(tmp_path):
-    path = write_mcap(tmp_path / 'a.mcap', [
-        (TOPIC, 'foxglove.RawImage', b'x', SECOND, 'flatbuffer', 'flatbuffer')])
-    with pytest.raises(RecordingError, match='encoded as flatbuffer; only those of ROS') as error:
-        list(iter_episodes(path))
-    assert '--image-topic' not in str(error.value)
+def test_messages_that_are_not_read_are_named_instead_of_a_topic_to_choose(tmp_path):
+    for kind, encoding, words in (
+            ('foxglove.RawImage', 'protobuf', 'encoded as protobuf; only those of ROS 2 are read'),
+            ('foxglove_msgs/msg/CompressedVideo', 'cdr', 'holds packets of a video'),
+            ('sensor_msgs/Image', 'ros1', 'encoded as ros1')):
+        path = write_mcap(tmp_path / 'a.mcap', [(TOPIC, kind, b'x', SECOND, '', encoding)])
+        with pytest.raises(RecordingError, match=words) as error:
+            open_recordings(path)
+        assert '--image-topic' not in str(error.value)
 
 
 def test_what_is_no_bag_but_will_be_one_is_told_with_the_command(tmp_path, capsys):
     whole = write_mcap(tmp_path / 'whole.mcap', [(*camera(t), '', 'cdr') for t in (1, 2)])
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'bag_0.mcap.zst').write_bytes(zstandard.compress(whole.read_bytes()))
-    assert [len(episode) for episode in iter_episodes(tmp_path / 'bag')] == [2]
+    assert [len(episode) for episode in open_recordings(tmp_path / 'bag')] == [2]
     for name, data, command in (
             ('a b.mcap.gz', gzip.compress(whole.read_bytes()), "gzip -dk '{}'"),
             ('a.tar.gz', gzip.compress(b''), 'tar -xf {}'),
@@ -276,7 +205,7 @@ def test_cameras_whose_arrays_end_alike_are_told_apart(tmp_path, capsys, monkeyp
     assert f'--camera: expected one of {", ".join(names)}' in capsys.readouterr().err
     for number, name in enumerate(names):
         assert main([*words[:3], str(tmp_path / str(number)), '--camera', name]) == 0
-        for episode in (found := list(iter_episodes(tmp_path / str(number)))):
+        for episode in (found := list(open_recordings(tmp_path / str(number)))):
             assert abs(episode.frames.mean() - pictures.mean()) < 5
         assert [len(episode) for episode in found] == [4, 4]
 
@@ -297,7 +226,7 @@ def test_arrays_of_pictures_are_imported(name, tmp_path, capsys, monkeypatch):
     path = tmp_path / 'in'
     path.mkdir() if name == 'zarr' else path.touch()
     assert main(['import-arrays', str(path), '--out', str(tmp_path / 'bag'), '--fps', '5']) == 0
-    found = [episode.frames for episode in iter_episodes(tmp_path / 'bag')]
+    found = [episode.frames for episode in open_recordings(tmp_path / 'bag')]
     cuts = [(0, 3), (1, 4), (2, 5)] if name == 'h5py' else [(0, 4), (4, 9)]
     for frames, (begin, end) in zip(found, cuts, strict=True):
         np.testing.assert_array_equal(frames, pictures[begin:end])

@@ -12,7 +12,7 @@ import google_crc32c
 import numpy as np
 import pytest
 from tap_ros.cli import main
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 
 
 def masked(data):
@@ -79,7 +79,8 @@ def test_records_of_both_kinds_come_in_the_order_of_their_files(make, task, tmp_
     code, said = run_import(capsys, 'import-tfrecord', tmp_path, '--out', tmp_path / 'bag',
                             '--fps', 4)
     assert code == 0 and '4 episodes, 24 frames of 16x16 pixels of image_' in said
-    for number, (episode, seed) in enumerate(zip(iter_episodes(tmp_path / 'bag'), (2, 3, 10, 11))):
+    found = open_recordings(tmp_path / 'bag')
+    for number, (episode, seed) in enumerate(zip(found, (2, 3, 10, 11))):
         np.testing.assert_array_equal(episode.frames, make_frames(seed))
         assert (episode.task, episode.seed) == (task, number)
         assert set(np.diff(episode.stamps)) == {10**9 // 4}
@@ -99,7 +100,7 @@ def test_a_camera_is_asked_for_only_among_those_that_show_something(tmp_path, ca
     assert code == 1 and '--camera: expected one of image_0, wrist\n' in said
     assert run_import(capsys, 'import-tfrecord', file, '--out', tmp_path / 'b', '--camera',
                       'wrist', '--size', '8', '--crop', 'centre')[0] == 0
-    assert next(iter_episodes(tmp_path / 'b')).frames.shape == (6, 8, 8, 3)
+    assert open_recordings(tmp_path / 'b')[0].frames.shape == (6, 8, 8, 3)
 
 
 def test_damage_is_named_with_its_record_and_the_rest_is_read(tmp_path, capsys):
@@ -118,7 +119,7 @@ def test_damage_is_named_with_its_record_and_the_rest_is_read(tmp_path, capsys):
         code, said = run_import(capsys, 'import-tfrecord', file, '--out', out)
         assert code == (not lengths) and words in said
         assert out.exists() == bool(lengths)
-        assert not lengths or [len(e) for e in iter_episodes(out)] == lengths
+        assert not lengths or [len(e) for e in open_recordings(out)] == lengths
 
 
 def write_video(path, frames, fps):
@@ -138,7 +139,7 @@ def test_each_video_is_a_demonstration_at_its_own_rate(tmp_path, capsys):
         capsys, 'import-video', tmp_path / 'a.mp4', tmp_path / 'b.mp4', '--out', tmp_path / 'bag',
         '--task', 'fold', '--crop', 'centre', '--size', 32)
     assert code == 0 and '2 episodes, 20 frames of 32x32 pixels' in said
-    for episode, fps in zip(iter_episodes(tmp_path / 'bag'), (10, 4)):
+    for episode, fps in zip(open_recordings(tmp_path / 'bag'), (10, 4)):
         assert np.abs(episode.frames.mean((1, 2, 3)) - levels).max() < 5
         np.testing.assert_allclose(np.diff(episode.stamps), 1e9 / fps, rtol=1e-3)
         assert episode.task == 'fold'
@@ -159,7 +160,7 @@ def test_a_folder_of_several_cameras_asks_for_one(tmp_path, capsys):
     code, said = run_import(capsys, *words)
     assert code == 1 and '--camera: expected one of front, wrist' in said
     assert run_import(capsys, *words, '--camera', 'front')[0] == 0
-    found = [episode.frames.mean() for episode in iter_episodes(tmp_path / 'bag')]
+    found = [episode.frames.mean() for episode in open_recordings(tmp_path / 'bag')]
     assert np.abs(np.array(found) - [20, 100]).max() < 5
 
 

@@ -10,13 +10,8 @@ from made_bags import camera, read
 from made_bags import record as write
 from made_episodes import assert_all_equal, cover, make_episode, write_bag
 import numpy as np
-import pytest
-from tap_ros.contract import ROBOT_MASK_ARM
-from tap_ros.errors import ConfigError
-from tap_ros.evaluation import inspect_files
 from tap_ros.messages.topics import COMPRESSED_TYPE
 from tap_ros.recording.messages import decode, encode
-from tap_ros.recording.writer import EpisodeWriter
 
 PERIOD = 0.25  # s
 
@@ -118,21 +113,3 @@ def test_goals_and_masks_may_be_compressed_wherever_they_may_be_raw(tmp_path):
         for name in ('frames', 'robot_masks', 'goal_frame', 'goal_mask'):
             np.testing.assert_array_equal(getattr(found, name), getattr(episode, name))
         assert not told
-
-
-def test_inspect_tints_what_masks_mark(tmp_path, capsys):
-    covered = cover(make_episode())
-    path = tmp_path / 'bag'
-    with EpisodeWriter(path) as writer:
-        writer.write(covered)
-    with pytest.raises(ConfigError, match='12x8 pixels'):  # too small to train on
-        inspect_files.run(inspect_files.Options(
-            str(path), str(tmp_path / 'strips.png'), robot_mask=True))
-    tinted = inspect_files._tinted(covered)
-    marked = covered.robot_masks > 0
-    assert marked.any() and np.array_equal(tinted[~marked], covered.frames[~marked])
-    assert (tinted[covered.robot_masks == ROBOT_MASK_ARM, 0] >= 127).all()
-    plain = tmp_path / 'plain.png'
-    with pytest.raises(ConfigError, match='12x8 pixels'):
-        inspect_files.run(inspect_files.Options(str(path), str(plain)))
-    assert plain.read_bytes() != (tmp_path / 'strips.png').read_bytes()

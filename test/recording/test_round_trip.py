@@ -112,14 +112,6 @@ def test_files_play_in_the_order_of_their_numbers_or_of_the_metadata(tmp_path):
     assert_all_equal(read(folder)[0], [episodes[10], *episodes[1:10], episodes[0]])
 
 
-def test_folder_of_bags(tmp_path, bag, episodes):
-    other = tmp_path / 'a_bag_before'
-    other.mkdir()
-    write(other / 'b_0.mcap', episodes[:1])
-    (tmp_path / 'not_a_bag').mkdir()
-    assert_all_equal(read(tmp_path)[0], episodes[:1] + episodes)
-
-
 def test_a_file_has_its_name_only_when_it_is_complete(tmp_path, episodes):
     with pytest.raises(KeyboardInterrupt), EpisodeWriter(tmp_path / 'a.mcap') as writer:
         writer.write(episodes[0])

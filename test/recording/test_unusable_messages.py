@@ -7,8 +7,6 @@ import re
 from made_bags import (
     camera,
     mark,
-    message,
-    OBJECTS,
     objects,
     read,
     record,
@@ -36,13 +34,6 @@ def test_a_bad_picture_costs_itself_alone(tmp_path):
             assert [e.frames[:, 0, 0, 0].tolist() for e in found] == [
                 [t for t in range(1, 7) if t != at], [8]]
             assert [e.outcome for e in found] == ['success', 'failure']
-
-
-def test_many_bad_pictures_are_one_warning(tmp_path):
-    found, (text,) = read(record(tmp_path / 'bag', [
-        camera(t, **(BAD['rgb16'] if t % 2 else {})) for t in range(1, 100)]))
-    assert '50 messages cannot be used: encoding' in text and 'and 47 more' in text
-    assert [len(e) for e in found] == [10, 10, 9, 10, 10]
 
 
 def test_goals_that_cannot_be_used_take_back_those_before(tmp_path):
@@ -73,13 +64,3 @@ def test_a_goal_does_not_hold_beyond_a_file_that_is_cut_off(tmp_path):
     (first, second), (text,) = read(bag)
     assert 'cut off' in text and first.goal_frame[0, 0, 0] == 50
     assert second.frames[:, 0, 0, 0].tolist() == [3] and second.goal_frame is None
-
-
-def many(count):
-    return message('/objects', OBJECTS, 1, objects=[{'name': 'a'}] * count)
-
-
-def test_a_huge_message_costs_itself(tmp_path):
-    (episode,), (text,) = read(record(tmp_path / 'bag', [camera(1), many(20000), camera(2)]))
-    assert len(episode) == 2
-    assert re.search('topic /objects: 1 message .*more than 1048576', text)

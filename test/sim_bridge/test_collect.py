@@ -19,7 +19,7 @@ from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError, StorageError, TapError
 from tap_ros.evaluation.bottleneck import bottleneck_share
 from tap_ros.files import only_writer
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 
 SMALL = CollectConfig(episodes=3, episodes_per_file=1, seed=5, frames=12)
 
@@ -83,7 +83,7 @@ def test_files_depend_on_nothing_but_the_settings(whole, tmp_path):
     """Not on the workers, nor on what was interrupted or damaged before."""
     collect(tmp_path / 'two' / 'push', SMALL, Engine(workers=2), progress=False)
     assert contents(tmp_path / 'two' / 'push') == contents(whole)
-    assert [e.seed for e in iter_episodes(whole)] == [5, 6, 7]
+    assert [e.seed for e in open_recordings(whole)] == [5, 6, 7]
     folder = tmp_path / 'two' / 'push'
     (folder / 'push_0.mcap').rename(folder / 'push_0.mcap.part')
     (folder / 'push_1.mcap').write_bytes((whole / 'push_1.mcap').read_bytes()[:-1000])
@@ -123,9 +123,9 @@ def test_a_full_disk_is_one_line_and_what_was_there_stays(whole, tmp_path):
     assert ended.returncode == 1 and 'Traceback' not in ended.stderr, ended.stderr
     assert ended.stderr.splitlines()[-1].startswith(f'error: {folder}')
     assert contents(folder) | {'collection.json': b''} == before | {'collection.json': b''}
-    assert [e.seed for e in iter_episodes(folder)] == [5] and not is_collected(folder, 2)
+    assert [e.seed for e in open_recordings(folder)] == [5] and not is_collected(folder, 2)
     collect(folder, more, progress=False)
-    assert [e.seed for e in iter_episodes(folder)] == [5, 6] and is_collected(folder, 2)
+    assert [e.seed for e in open_recordings(folder)] == [5, 6] and is_collected(folder, 2)
 
 
 def test_a_folder_is_never_mixed_with_other_settings(whole, tmp_path):

@@ -16,7 +16,7 @@ from sim_bridge.world_protocol import make_world
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_HAND
 from tap_ros.engines import Engine
 from tap_ros.errors import SceneError, TapError
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.topic_choice import find_topics
 
 
@@ -143,7 +143,7 @@ def test_scripts_of_meta_world_demonstrate_as_unsteadily_as_people_do(tmp_path):
     config = CollectConfig(
         world='metaworld', task='plate-slide-v3', episodes=2, episodes_per_file=1, seed=3)
     assert collect(folder, config, Engine(workers=1), progress=False)['success_rate'] == 1
-    first, second = iter_episodes(folder)
+    first, second = open_recordings(folder)
     assert (first.task, first.seed, first.outcome) == ('plate-slide-v3', 3, 'success')
     assert len({12, len(first), len(second)}) == 3, 'each goes its own way at its own speed'
     topics = find_topics(sorted(folder.glob('*.mcap')))
@@ -173,7 +173,7 @@ def test_pushes_of_a_world_are_recorded_as_a_planner_and_its_model_need_them(
     config = CollectConfig(world='metaworld', task='plate-slide-v3', episodes=1, seed=3,
                            image_size=32, pushes='goal')
     collect(tmp_path / 'goal', config, Engine(workers=1), progress=False)
-    pushed, = iter_episodes(tmp_path / 'goal')
+    pushed, = open_recordings(tmp_path / 'goal')
     about = record_pushes(metaworld, 3, 'random')
     assert (pushed.task, pushed.outcome) == ('plate-slide-v3', 'success')
     for episode in (pushed, about):

@@ -15,7 +15,7 @@ from sim_bridge.world.camera import Camera
 from sim_bridge.world.looks import LOOKS, OBSERVER
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import KinematicsError
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 from tap_ros.robots.ur10e import UR10E
 
 TASKS = ('push2', 'pick_place')
@@ -115,7 +115,7 @@ def test_the_camera_projects_as_mujoco_does_and_back(camera):
 def test_a_recording_carries_the_masks_of_its_pictures(tmp_path):
     collect(tmp_path / 'bag', CollectConfig(
         task='pick_place', episodes=1, look='arm', appearance='random'), progress=False)
-    episode, = iter_episodes(tmp_path / 'bag')
+    episode, = open_recordings(tmp_path / 'bag')
     simulator = Simulator('pick_place', 64, 'arm', 'random')
     observations, *_ = run_episode(simulator, 0)
     assert np.array_equal(episode.frames, [o.image for o in observations])

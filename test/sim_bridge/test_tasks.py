@@ -22,7 +22,7 @@ from sim_bridge.tasks.tasks import (
 from sim_bridge.world.scene import HALF_HEIGHT, random_shape
 from tap_ros import plugins
 from tap_ros.contract import SUCCESS_DISTANCE
-from tap_ros.recording.reader import iter_episodes
+from tap_ros.recording.cache import open_recordings
 
 NUM_FRAMES = {'grasp': 15, 'pick_place': 20}
 SEEDS = range(6)
@@ -199,5 +199,5 @@ def test_another_package_adds_a_task_in_a_few_lines(tmp_path, monkeypatch):
     monkeypatch.setattr('sim_bridge.collect.run_tasks', lambda tasks, *_: (
         (task, lambda task=task: task.function(*task.args)) for task in tasks))
     collect(tmp_path / 'bag', CollectConfig(task='visit', episodes=1), progress=False)
-    episode, = iter_episodes(tmp_path / 'bag')
+    episode, = open_recordings(tmp_path / 'bag')
     assert (episode.task, episode.outcome, len(episode.frames)) == ('visit', 'success', 10)

@@ -36,8 +36,7 @@ from tap_ros.recording.formats.lerobot import (
     SUBTASK,
 )
 from tap_ros.recording.marks import Mark, read_marks
-from tap_ros.recording.reading import reading_of
-from tap_ros.recording.reading_options import ReadingOptions
+from tap_ros.recording.reading import reading_of, ReadingOptions
 from tap_ros.robots.arm import DEFAULT_ARM
 from tap_ros.text import escaped
 from tqdm import tqdm
@@ -59,7 +58,6 @@ class Options:
     :param recordings: bag folders, folders of bag folders, or .mcap files.
     :param out: folder of the data set; must not exist.
     :param lossless: keep pictures as PNG, bit for bit, instead of videos (VP9).
-    :param fps: frames a second; 0: as the stamps say, rounded.
     :param marks: file of marks (see `mark`); each ends a subtask.
     """
 
@@ -67,7 +65,6 @@ class Options:
     out: Folder
     marks: File = ''
     lossless: Flag = False
-    fps: int = 0
     reading: ReadingOptions = ReadingOptions()
 
 
@@ -77,8 +74,6 @@ def run(args: Options) -> None:
 
     :raises TapError: for recordings that cannot be read, and a folder that is there already.
     """
-    if not 0 <= args.fps <= 1000:
-        raise ConfigError(f'--fps {args.fps}: expected 1 to 1000, or 0')
     out = Path(args.out)
     if out.exists():
         raise ConfigError(f'--out {escaped(out)}: is there already; name a new folder')
@@ -88,7 +83,7 @@ def run(args: Options) -> None:
     with storage_errors(part):
         shutil.rmtree(part, ignore_errors=True)
         try:
-            features = export(store, part, args.lossless, args.fps, marks)
+            features = export(store, part, args.lossless, marks)
             part.rename(out)
         finally:
             shutil.rmtree(part, ignore_errors=True)
@@ -96,7 +91,7 @@ def run(args: Options) -> None:
           f'{", ".join(name for name in features if "." in name or name == ACTION)}')
 
 
-def export(store: EpisodeStore, folder: Path, lossless: bool = False, fps: int = 0,
+def export(store: EpisodeStore, folder: Path, lossless: bool = False,
            marks: Mapping[int, Sequence[Mark]] | None = None) -> dict[str, Any]:
     """
     Write a data set.
@@ -104,24 +99,21 @@ def export(store: EpisodeStore, folder: Path, lossless: bool = False, fps: int =
     :param store: EpisodeStore.
     :param folder: a new one.
     :param lossless: pictures as PNG instead of videos.
-    :param fps: frames a second; 0: as the stamps say.
     :param marks: of episodes; the middle of each is the last frame of a subtask.
     :return: its features, as in info.json.
     :raises RecordingError: when frames lack what LeRobot needs.
     """
-    if not fps:
-        steps = np.concatenate([np.diff(store[i].stamps) for i in range(len(store))])
-        fps = max(round(1e9 / float(np.median(steps))), 1) if len(steps) else 1
+    steps = np.concatenate([np.diff(episode.stamps) for episode in store])
+    fps = max(round(1e9 / float(np.median(steps))), 1) if len(steps) else 1
     vectors = _vectors(store)
     tasks = {task: number for number, task in enumerate(dict.fromkeys(
-        store[i].task or 'unknown' for i in range(len(store))))}
+        episode.task or 'unknown' for episode in store))}
     episode = np.repeat(np.arange(len(store)), store.lengths)
     frame = np.concatenate([np.arange(count) for count in store.lengths])
     numbers = {
         **vectors, 'timestamp': frame.astype(np.float32) / np.float32(fps), 'frame_index': frame,
         'episode_index': episode, 'index': np.arange(len(frame)),
-        'task_index': np.repeat([tasks[store[i].task or 'unknown'] for i in range(len(store))],
-                                store.lengths)}
+        'task_index': np.repeat([tasks[one.task or 'unknown'] for one in store], store.lengths)}
     names: dict[str, dict[str, int]] = {'task': tasks}
     if marks is not None:
         names['subtask'], numbers[SUBTASK] = _subtasks(store, marks)
@@ -138,7 +130,7 @@ def export(store: EpisodeStore, folder: Path, lossless: bool = False, fps: int =
 
 def _vectors(store: EpisodeStore) -> dict[str, np.ndarray]:
     """Return what every frame knows, (frames, numbers) float32 by name."""
-    episodes = [store[i] for i in range(len(store))]
+    episodes = list(store)
     found = {ACTION: np.concatenate([e.actions for e in episodes])}
     states = np.concatenate([e.grippers for e in episodes])
     if np.isfinite(states).all():

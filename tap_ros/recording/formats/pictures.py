@@ -13,7 +13,6 @@ from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 import shutil
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 import warnings
 
@@ -22,14 +21,13 @@ import numpy as np
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.files import only_writer, storage_errors
 from tap_ros.images.crop import Crop
-from tap_ros.options import default_text, Folder, Topic
-from tap_ros.recording.bags import find_bags
+from tap_ros.options import default_text, Folder
 from tap_ros.recording.damage import describe, Loss
 from tap_ros.recording.episode import Episode, RecordingWarning
 from tap_ros.recording.file_bytes import what_else
-from tap_ros.recording.foreign import video_packets, VIDEOS
+from tap_ros.recording.foreign import VIDEOS
 from tap_ros.recording.metadata import natural
-from tap_ros.recording.reading_options import Part
+from tap_ros.recording.reading import Part
 from tap_ros.recording.writer import EpisodeWriter, write_metadata
 from tap_ros.text import escaped, listing
 from tqdm import tqdm
@@ -67,17 +65,15 @@ class Options(Target):
     """
     Options of the command: one video is one demonstration.
 
-    :param paths: video files of one camera, in the order of the demonstrations, folders that hold
-        some at any depth, or bags with packets of video.
+    :param paths: video files of one camera, in the order of the demonstrations, or folders that
+        hold some at any depth.
     :param camera: name of the files, without ending, where folders hold those of several.
-    :param image_topic: of the packets, where a bag has several.
     :param fps: frames a second; 0: as the videos say.
     :param task: what is done in them, as text.
     """
 
     paths: Paths
     camera: Annotated[str, conf.arg(metavar='NAME', help_behavior_hint=default_text)] = ''
-    image_topic: Topic = ''
     fps: float = 0.0
     task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
 
@@ -99,9 +95,7 @@ def run(args: Options) -> None:
         for number, path in enumerate(files):
             with lacking.passing_over('video', escaped(path.name)):
                 seconds, frames = zip(*(
-                    (at, args.cut.image(frame)) for at, frame in (
-                        video_frames(path) if path.suffix.lower() in VIDEOS else
-                        _bag_frames(path, args.image_topic))))
+                    (at, args.cut.image(frame)) for at, frame in video_frames(path)))
                 episode = make_episode(
                     frames, np.arange(len(frames)) / args.fps if args.fps else seconds,
                     task=args.task, seed=number)
@@ -218,17 +212,6 @@ def write_bag(target: Target, episodes: Iterable[Episode], count: int | None = N
     return f'{escaped(out)}: {done} episodes, {frames} frames of {size[1]}x{size[0]} pixels'
 
 
-def _bag_frames(path: Path, topic: str) -> Iterator[tuple[float, np.ndarray]]:
-    """Decode the packets of video in a bag, as video_frames; times are those of the log."""
-    with TemporaryDirectory(prefix='tap_ros_video_') as folder:
-        for bag in find_bags(path):
-            times, stream = video_packets(bag, topic)
-            file = Path(folder, 'packets.video')
-            file.write_bytes(stream)
-            for at, (_, frame) in zip(times, video_frames(file)):
-                yield at, frame
-
-
 def video_frames(path: Path) -> Iterator[tuple[float, np.ndarray]]:
     """
     Decode a video: by OpenCV, or by PyAV where that cannot and PyAV is installed.
@@ -247,7 +230,7 @@ def video_frames(path: Path) -> Iterator[tuple[float, np.ndarray]]:
         period = 1 / (capture.get(cv2.CAP_PROP_FPS) or 25)
         while good:
             at = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            last = at if at > last else last + period  # a stream of packets has no times
+            last = at if at > last else last + period  # some containers have no times
             yield last, np.ascontiguousarray(frame[..., ::-1])
             good, frame = capture.read()
         return

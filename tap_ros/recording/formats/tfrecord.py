@@ -17,14 +17,16 @@ import math
 from pathlib import Path
 import re
 import struct
-from typing import Annotated
+from typing import Annotated, Any
 
+from google.protobuf.empty_pb2 import Empty  # type: ignore[import-untyped]
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+from google.protobuf.unknown_fields import UnknownFieldSet  # type: ignore[import-untyped]
 import google_crc32c
 import numpy as np
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.images.encodings import decompress
 from tap_ros.options import default_text
-from tap_ros.recording.channels import read_protobuf
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
 from tap_ros.recording.metadata import natural
@@ -177,11 +179,22 @@ def parse_example(data: bytes) -> dict[str, list[bytes]]:
     :raises ValueError: when the bytes are no such message.
     """
     found = {}
-    for features in read_protobuf(data).get(1, []):
-        for entry in map(read_protobuf, read_protobuf(features).get(1, [])):
-            lists = [one for value in entry.get(2, []) for one in read_protobuf(value).get(1, [])]
+    for features in _fields(data).get(1, []):
+        for entry in map(_fields, _fields(features).get(1, [])):
+            lists = [one for value in entry.get(2, []) for one in _fields(value).get(1, [])]
             found[str(entry[1][0], 'utf-8')] = [
-                value for one in lists for value in read_protobuf(one).get(1, [])]
+                value for one in lists for value in _fields(one).get(1, [])]
+    return found
+
+
+def _fields(data: bytes) -> dict[int, list[Any]]:
+    """Return the fields of a protobuf message by number: integers, or bytes."""
+    found: dict[int, list[Any]] = {}
+    try:
+        for one in UnknownFieldSet(Empty.FromString(data)):
+            found.setdefault(one.field_number, []).append(one.data)
+    except DecodeError as error:
+        raise ValueError('it holds no tf.train.Example') from error
     return found
 
 
