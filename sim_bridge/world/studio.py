@@ -250,6 +250,7 @@ def _wood(size: int = 256, planks: int = 7) -> np.ndarray:
     return np.clip(255 * bright[..., None] * (0.92, 0.68, 0.46), 0, 255).astype(np.uint8)
 
 
+@lru_cache(4)
 def _sees_table(camera: Camera) -> np.ndarray:
     """Say which samples of a picture look at the table's top: bool (H, W), of all samples."""
     fine = camera.resized(SAMPLES * camera.width, SAMPLES * camera.height)
