@@ -25,8 +25,8 @@ paper worlds: export OMP_NUM_THREADS ?= 1
 .PHONY: help demo explore test test-all paper worlds faults build lint bench ros2 clean
 
 help:
-	@echo 'make demo    push objects to where a goal picture shows them, predict a stack'
-	@echo '             SCENES=20: that many of each task; ARGS=...: more options of the demo'
+	@echo 'make demo    push objects to a goal picture, directly and via the predicted subgoal'
+	@echo '             SCENES=20: that many of order2; ARGS=...: more options of the demo'
 	@echo 'make explore a page in the browser: move objects of the goal picture, see what is predicted'
 	@echo '             and planned, push; ARGS="--task push3"'
 	@echo 'make test    the tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'

@@ -212,7 +212,7 @@ class Table(OneCamera):
             object_poses=poses, robot_mask=mask, arm_joints=joints)
 
     def observer_picture(self) -> np.ndarray:
-        """Take a picture from the side, for people: uint8 (360, 480, 3) rgb."""
+        """Take a picture from the side, for people: uint8 (300, 400, 3) rgb."""
         if self._observer is None:
             self._observer = Studio(OBSERVER, self.arm, links=True)
         self._observer.use(

@@ -170,9 +170,13 @@ class TrainedCrop:
         :param size: its (height, width).
         :param name: how errors call it, for example 'goal'.
         :return: Crop; one that changes nothing for a picture that has the network's size already.
+            Where the training cut nothing, squares of a multiple of that size are scaled.
         :raises ImageError: when it is of another size and cannot be cut as in training.
         """
-        given = tuple(size)
+        given, (height, width) = tuple(size), self.size
+        square = height == width and given[0] == given[1]
+        if not self.crop and square and given[0] > height and given[0] % height == 0:
+            return Crop(size=height)
         if not self.crop or (given == self.size and given != self.camera_size):
             return Crop()
         if given != self.camera_size and self.crop.part not in ('', CENTRE):

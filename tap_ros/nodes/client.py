@@ -52,6 +52,7 @@ SERVICES: dict[str, tuple[Any, str, str]] = {  # type, name, the node that offer
     'record': (SetBool, 'recorder/record', 'recorder_node'),
     'get': (GetParameters, 'predictor_node/get_parameters', 'predictor_node'),
     'set': (SetParameters, 'predictor_node/set_parameters', 'predictor_node'),
+    'set_planner': (SetParameters, 'visual_mpc_node/set_parameters', 'visual_mpc_node'),
     'change': (ChangeState, 'predictor_node/change_state', 'predictor_node')}
 READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'tracker_node': 'select',
          'recorder_node': 'record'}

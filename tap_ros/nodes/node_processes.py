@@ -27,10 +27,12 @@ class NodeProcesses:
     SIGTERM and SIGHUP, as of a terminal that is closed, leave the block, too.
 
     :param log_folder: folder of the logs, made if it is not there.
+    :param namespace: of the nodes, such as '/left'.
     """
 
-    def __init__(self, log_folder: str | Path) -> None:
+    def __init__(self, log_folder: str | Path, namespace: str = '') -> None:
         self._folder = Path(log_folder)
+        self._remap = ['-r', f'__ns:={namespace}'] if namespace else []
         self._folder.mkdir(parents=True, exist_ok=True)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -41,7 +43,7 @@ class NodeProcesses:
         :param name: one of NODE_CLASSES.
         :param parameters: its ROS parameters.
         """
-        command = [sys.executable, '-m', 'tap_ros.nodes', name, '--ros-args']
+        command = [sys.executable, '-m', 'tap_ros.nodes', name, '--ros-args', *self._remap]
         if parameters:  # in a file that others cannot read: a token is no argument for all to see
             file = self._folder / f'{name}.yaml'
             file.touch(mode=0o600)

@@ -1,8 +1,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The demo in a world of others, and laws of its page, table and film."""
+"""The demo with real nodes, at the table and in a world of others; laws of its page and film."""
 
-import base64
 from dataclasses import replace
 import io
 import re
@@ -10,83 +9,99 @@ import re
 import numpy as np
 from PIL import Image, ImageSequence
 import pytest
+from tap_ros.messages.subgoals import Subgoal
 from tap_ros.nodes.demo import command
-from tap_ros.nodes.demo.report import (
+from tap_ros.nodes.demo.film import (
+    film,
     FRAME_MS,
     GAP,
-    HEIGHT,
+    GOAL,
+    HEAD,
     HOLD_MS,
-    results_table,
     Run,
-    SceneRuns,
-    SMALL,
-    write_film,
-    write_report,
+    Scene,
+    SIDE,
+    START_MS,
 )
+from tap_ros.nodes.demo.report import gains, results_table, shown, summary, write_report
 from tap_ros.recording.cache import open_recordings
 
-
-@pytest.fixture
-def scenes():
-    rng = np.random.default_rng(0)
-
-    def picture():
-        return rng.integers(0, 255, (16, 16, 3), np.uint8)
-
-    def run(end):
-        return Run([picture() for _ in range(4)], np.linspace(0.2, end, 4)[:, None].repeat(2, 1),
-                   'ended <early> & well', 500.0)
-    maps = np.zeros((2, 16, 16))
-    maps[:, 4, 5] = 1
-    return [SceneRuns(
-        'push2', seed, picture(), picture(), np.ones((2, 2)), np.full((2, 2), 9.0), picture(),
-        maps, {'direct': run(0.11), 'subgoal': run(0.05)}) for seed in (7, 8)]
+GREYS = {'direct': (0, 60, 120, 180), 'subgoal': (240, 90)}  # one run is shorter
+START, GOALS = np.array([[20.0, 40.0], [90.0, 40.0]]), np.array([[20.0, 100.0], [20.0, 40.0]])
 
 
-def test_the_page_is_one_file_with_everything_inside(scenes, tmp_path):
-    side = [np.full((24, 32, 3), grey, np.uint8) for grey in (0, 80, 160, 240)]
-    scenes[1].runs['direct'] = replace(scenes[1].runs['direct'], side=side)
-    scenes.append(replace(scenes[0], task='grasp', runs={}, expert=side))  # nothing was planned
-    path = tmp_path / 'report.html'
-    assert results_table(scenes[:2]).splitlines()[2].split() == [
-        'push2', '7', '20.0', '11.0', '5.0']
-    write_report(path, scenes, 'made by a test', {'command': 'a <b>', 'date': 'today'})
+def scene(seed=7, direct=0.11, task='order2'):
+    """Return a Scene in which the first object has to go first; a run is a few greys long."""
+    def run(mode, end, *subgoals):
+        count = len(GREYS[mode])
+        return Run(
+            np.linspace(0.2, end, count)[:, None].repeat(2, 1),
+            [np.full((128, 160, 3), grey, np.uint8) for grey in GREYS[mode]],
+            np.tile(START, (count, 1, 1)), [0, *[GOAL] * (count - 2)] if subgoals else
+            [GOAL] * (count - 1), subgoals, 'ended <early> & well', 500.0)
+    first_moved = Subgoal(np.full((32, 32, 3), 200, np.uint8), np.zeros((2, 32, 32), np.float32),
+                          (np.array([GOALS[0], START[1]]) + 0.5) / 4 - 0.5, np.ones(2), 0, 1)
+    return Scene(task, seed, np.full((128, 128, 3), 30, np.uint8), START, GOALS, GOALS, (0, 1),
+                 {'direct': run('direct', direct), 'subgoal': run('subgoal', 0.03, first_moved)})
+
+
+def test_what_a_subgoal_decides_is_read_from_where_it_shows_the_objects():
+    one = scene()
+    told, = one.runs['subgoal'].subgoals
+    assert one.numbers == ['1', '2'] and one.decided(told) == '1 first'
+    assert replace(one, order=(1, 0)).decided(told) == '2 first'  # numbers are the right order
+    last_moved = replace(told, expected_pixels=(np.array([START[0], GOALS[1]]) + 0.5) / 4 - 0.5)
+    assert one.decided(last_moved) == '2 first'
+
+
+def test_rows_are_means_over_scenes_and_say_how_sure_the_gain_is():
+    scenes = [scene(seed, direct) for seed, direct in ((7, 0.11), (8, 0.05), (9, 0.03))]
+    row, = summary(scenes)
+    assert row.cm == pytest.approx((19 / 3, 3)) and row.nearer.value == pytest.approx(10 / 3)
+    assert row.reached == (1, 3) and row.more.value == pytest.approx(200 / 3)
+    assert row.nearer.low == pytest.approx(0) and row.nearer.high == pytest.approx(8)
+    task, together = summary([*scenes, scene(7, 0.03, 'order3')])[::2]
+    assert (task.scenes, together.scenes) == (3, 4)
+    assert results_table(summary(scenes)).splitlines()[2].split()[:4] == [
+        'order2', '3', '6.3', '3.0']
+    assert [gains(one) for one in scenes] == [True, True, False]
+    assert list(shown(scenes[::-1])) == [
+        'order2 8: the first scene of this task that succeeds only via the subgoal']
+
+
+def test_the_page_is_one_file_with_everything_inside(tmp_path):
+    path, scenes = tmp_path / 'report.html', [scene(), scene(7, 0.03, '<order3>')]
+    write_report(path, scenes, shown(scenes), 'made by a test', {'command': 'a <b>'})
     page = path.read_text()
-    assert '<dt>command</dt><dd>a &lt;b&gt;</dd><dt>date</dt><dd>today</dd>' in page
-    rows = re.findall(r'<tr class="(\w*)"><th scope="row">(.*?)</th>(.*?)</tr>', page)
-    assert [(kind, label, re.findall('<td>(.*?)</td>', cells)) for kind, label, cells in rows] == [
-        ('', 'push2 7', ['20.0', '11.0', '5.0']), ('', 'push2 8', ['20.0', '11.0', '5.0']),
-        ('mean', 'push2, mean of 2', ['20.0', '11.0', '5.0'])]
-    assert re.findall('<h2>(.*)</h2>', page) == ['push2 7', 'push2 8', 'grasp 7']
-    assert page.count('src="data:image/') == page.count('<img ')
-    assert 'http' not in page and '<early>' not in page and '&lt;early&gt; &amp;' in page
-    films = re.findall('data:image/webp;base64,([^"]*)"', page)
-    assert len(films) == 2
-    for data in films:
-        film = Image.open(io.BytesIO(base64.b64decode(data)))
-        greys = [np.asarray(frame.convert('L'), int).mean()
-                 for frame in ImageSequence.Iterator(film)]
-        assert np.abs(np.subtract(greys, [0, 80, 160, 240])).max() < 8
+    assert '<dt>command</dt><dd>a &lt;b&gt;</dd>' in page
+    assert re.findall('<th scope="row">(.*?)</th>', page) == ['order2', '&lt;order3&gt;',
+                                                            'together']
+    assert re.findall('<h2>(.*)</h2>', page) == ['order2 7', '&lt;order3&gt; 7']
+    assert page.count('src="data:image/') == page.count('<img ') == 2 + 2 * 4
+    assert 'http' not in page and page.count('predicted: 1 first') == 2 * 2
 
 
-def test_the_film_shows_each_run_to_its_end_and_stops_there(scenes, tmp_path):
-    path = tmp_path / 'demo.webp'
-    greys = {'direct': (0, 60, 120, 180), 'subgoal': (240, 90)}  # one run is shorter
-    for scene in scenes:
-        for mode, run in scene.runs.items():
-            pictures = [np.full((16, 32, 3), grey, np.uint8) for grey in greys[mode]]
-            scene.runs[mode] = replace(run, side=pictures)
-    write_film(path, scenes)
-    film, shown, milliseconds = Image.open(path), [], 0
-    centres = [SMALL + GAP + i * (2 * HEIGHT + GAP) + HEIGHT for i in (0, 1)]
-    for frame in ImageSequence.Iterator(film):
-        pixels = np.array(frame.convert('L'), int)[-4]  # a row that no mark reaches
-        shown.append(tuple(pixels[centres]))
-        milliseconds += frame.info['duration']
-    expected = [(0, 240), (60, 90), (120, 90), (180, 90)] * len(scenes)
-    assert np.abs(np.subtract(shown, expected)).max() <= 6
-    assert milliseconds == len(scenes) * (3 * FRAME_MS + HOLD_MS)
-    assert film.info['loop'] == 0  # for ever
+def test_the_film_shows_each_run_to_its_end_and_what_it_heads_for():
+    data = film(scene())
+    shown, milliseconds = [], []
+    for frame in ImageSequence.Iterator(Image.open(io.BytesIO(data))):
+        pixels = np.array(frame.convert('L'), int)
+        top, bottom = pixels[[2 * (GAP + HEAD) + SIDE - 5, -5]]
+        shown.append((top[-4], bottom[-4], top[4], bottom[4]))
+        milliseconds.append(frame.info['duration'])
+    expected = [(0, 240, 30, 200), (60, 90, 30, 200), (120, 90, 30, 200), (180, 90, 30, 200)]
+    assert np.abs(np.subtract(shown, expected)).max() <= 8
+    assert milliseconds == [START_MS, FRAME_MS, FRAME_MS, HOLD_MS]
+
+
+@pytest.mark.slow
+def test_real_nodes_push_tracked_objects_of_two_tasks_with_one_start(tmp_path, capsys):
+    assert command.run(command.Options(
+        scenes=1, tasks=('push2', 'order2'), step_budget=2, out=str(tmp_path / 'demo'))) == 0
+    ends = re.findall(r'(\w+) 2000000 .* in 2 steps .* in 2 steps', capsys.readouterr().out)
+    assert ends == ['push2', 'order2']
+    assert {path.name for path in (tmp_path / 'demo').iterdir()} == {
+        'logs', 'recording', 'push2.webp', 'order2.webp', 'report.html'}
 
 
 @pytest.mark.slow
@@ -96,12 +111,9 @@ def test_real_nodes_push_in_a_world_of_others_that_says_how_it_ended(tmp_path, c
     assert command.run(command.Options(
         scenes=1, tasks=('push-v3',), world='metaworld', robot_mask='arm', step_budget=1,
         out=str(folder))) == 0
-    said = capsys.readouterr().out
-    assert re.search(r'direct .* in 1 steps.*\n    subgoal .* in 1 steps', said)
-    assert (folder / 'demo.webp').stat().st_size and (folder / 'report.html').stat().st_size
-    episodes = list(open_recordings(folder / 'recording' / 'push-v3'))[-2:]
-    assert [(len(one), one.task, one.outcome) for one in episodes] == [
-        (2, 'push-v3', 'failure')] * 2
-    for one in episodes:
-        moved = one.grippers[1, :3] - one.grippers[0, :3]
-        np.testing.assert_allclose(moved, one.actions[0, :3], atol=0.02)
+    assert re.search(r'direct .* in 1 steps.*subgoal .* in 1 steps', capsys.readouterr().out)
+    assert (folder / 'push-v3.webp').stat().st_size and (folder / 'report.html').stat().st_size
+    one = open_recordings([folder / 'recording'])[-1]
+    assert (len(one), one.task, one.outcome) == (2, 'push-v3', 'failure')
+    moved = one.grippers[1, :3] - one.grippers[0, :3]
+    np.testing.assert_allclose(moved, one.actions[0, :3], atol=0.02)

@@ -3,249 +3,127 @@
 """
 The demo: real nodes in processes of their own push objects to where a goal picture shows them.
 
-Each scene is pushed twice: directly, and via the subgoal that predict_subgoal answers. Everything
-goes through the topics, services and actions that any client would use. Where a gripper is needed
-the subgoal is predicted only, from true pixels; nothing here plans grasps.
+Each scene is pushed twice, directly and via the subgoal that predict_subgoal answers, by two sets
+of nodes side by side. Everything goes through the topics, services and actions that any client
+would use, in lock-step: the same seeds end the same, however busy the machine is.
 
-The objects that are pushed are tracked: a click on each in the first picture, here at its true
-pixel, and another in the goal picture on what is not found there. Ground truth only measures.
+The objects are tracked: a click on each in the first picture, here at its true pixel, and another
+in the goal picture on what is not found there. Ground truth only measures, and draws for people.
 """
 
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 import math
 import os
 from pathlib import Path
 import platform
+import re
 import shlex
 import sys
 import time
-from typing import Annotated, Any, Literal, TYPE_CHECKING
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from sim_bridge.collect import TABLE
-from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.tasks import get_task, run_episode, task_names
+from sim_bridge.tasks.tasks import get_task, sample_scene, task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, LOOKS, OBSERVER
-from tap_msgs.msg import ObjectStates
+from tap_msgs.msg import ObjectStates, Subgoal
 from tap_ros.contract import ROBOT_MASKS, step_budget
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.messages.images import decode_image, decode_mask
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
+from tap_ros.messages.subgoals import decode_subgoal
 from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.client import Client, positions_of, request_fields, subgoals_of, View
-from tap_ros.nodes.demo.report import (
-    results_table,
-    Run,
-    SceneRuns,
-    write_film,
-    write_report,
-)
+from tap_ros.nodes.client import Client, positions_of, View
+from tap_ros.nodes.demo.film import GOAL, Run, Scene
+from tap_ros.nodes.demo.report import MODES, results_table, shown, summary, write_report
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.options import Flag, Folder, one_of
-from tap_ros.planning.mpc_config import FIRST_SCENE
 from tap_ros.plugins import names
-from tap_ros.robots.arm import DEFAULT_ARM
+from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 from tap_ros.tracking.protocols import LOST
 from tap_ros.training.robot_mask import nearest_free
 from tap_ros.weights import DEFAULT_PREDICTOR, PREDICTORS
-from tqdm import tqdm
 from tyro import conf
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
-    from tap_ros.messages.subgoals import Subgoal
-
-USUAL_TASKS = ('push2', 'order2', 'stack2')
+FIRST_SCENE = 2_000_000  # seeds from here on are in no recording, no training and no table
+USUAL_TASKS = ('order2', 'order3')
 OTHERS_OBJECTS = 1  # of tasks of other worlds
 BUDGETS = f'{step_budget(2)} and {step_budget(3)}'  # of two and of three objects
-MODES = ('direct', 'subgoal')
+CAMERA_SIZE = 256  # px of the camera's pictures; networks are shown what they were trained on
 TOLD = {  # by whether objects are tracked
-    True: 'Objects that are pushed are tracked from a click on each in the first picture (here '
-          'its true pixel), and found in the goal picture; the ground truth of the simulator only '
-          'measures the distances.',
+    True: 'Objects are tracked from a click on each in the first picture (here its true pixel) '
+          'and found in the goal picture; the ground truth of the simulator only measures '
+          'distances and draws numbers and arrows.',
     False: 'Object pixels at every step, and the distances, are ground truth of the simulator.'}
-STEP_TIMEOUT_S = 15.0  # of one step of a run, far more than planning takes
+REPEATS = ('All runs are in lock-step: the same seeds end the same on a busy machine, only the '
+           'seconds differ. Another processor can differ in the last digits of a plan.')
+CALL_S, STEP_S = 60.0, 15.0  # that a call, and one step of a run, may take, far more than usual
 FOUND_S = 10.0  # that the tracker may take to find the objects of a goal
-TOPICS = {'camera/image_raw': Image, 'camera/robot_mask': Image, 'observer/image_raw': Image,
-          'plan/overlay': Image}
+CLICKS, SLIP = 5, 0.015  # tries to click; how far beside the first the others are, of a picture
+
+
+class Refused(TapError):
+    """The tracker cannot tell an object from the table."""
 
 
 class Watch:
     """
-    Keep every camera picture of a scene, the objects in it, and what else is shown for people.
+    Keep what is seen of a scene, by topic and stamp.
 
-    :param node: rclpy Node that another thread spins.
+    :param client: whose node another thread spins.
     :param tracked: whether objects and goal/objects are the tracker's, and the truth is beside.
+    :param view: topic of the pictures that people are shown.
     :ivar truth: topic of the true objects; true_goal: of those of the goal.
     """
 
-    def __init__(self, node: 'Node', tracked: bool) -> None:
-        self.tracked, beside = tracked, 'truth/' if tracked else ''
-        self.truth, self.true_goal = f'{beside}objects', f'{beside}goal/objects'
-        latched = dict.fromkeys(['goal/objects', self.true_goal], ObjectStates)
-        streams = {**TOPICS, self.truth: ObjectStates}
+    def __init__(self, client: Client, tracked: bool, view: str) -> None:
+        beside = 'truth/' if tracked else ''
+        self.truth, self.true_goal, self.view = f'{beside}objects', f'{beside}goal/objects', view
+        streams = {view: Image, self.truth: ObjectStates}
+        latched = {'subgoal': Subgoal, 'goal/objects': ObjectStates, self.true_goal: ObjectStates}
+        if tracked:
+            streams['camera/robot_mask'] = Image
         self._kept: dict[str, dict[int, Any]] = {topic: {} for topic in {**streams, **latched}}
+        self._timeout_s = client.timeout_s
         for topics, qos in ((streams, STREAM), (latched, LATCHED)):
             for topic, kind in topics.items():
-                node.create_subscription(kind, topic, partial(self._keep, topic), qos)
+                client.node.create_subscription(kind, topic, partial(self._keep, topic), qos)
 
-    def at(self, topic: str, stamp_ns: int, timeout_s: float) -> Any | None:
-        """Return the message of a stamp with objects, None where it does not come in time."""
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
-            found = self._kept[topic].get(stamp_ns)
-            if found is not None and found.objects:
-                return found
-            time.sleep(0.05)
-        return None
+    def clear(self) -> None:
+        """Forget the scenes before."""
+        for kept in self._kept.values():
+            kept.clear()
 
-    def since(self, first_ns: int, *topics: str) -> list[tuple[Any, ...]]:
-        """Return the messages that came on all of some topics, in order of their stamps."""
-        kept = [dict(self._kept[topic]) for topic in topics]
-        return [tuple(messages[stamp] for messages in kept)
-                for stamp in sorted(set.intersection(*map(set, kept))) if stamp >= first_ns]
+    def at(self, topic: str, stamp_ns: int, timeout_s: float = 0.0) -> Any | None:
+        """Return the message of a stamp, None where it does not come in time."""
+        self.until(lambda: stamp_ns in self._kept[topic], timeout_s)
+        return self._kept[topic].get(stamp_ns)
 
-    def pictures(self, first_ns: int, topic: str) -> list[np.ndarray]:
-        """Return those of one topic, uint8 (H, W, 3)."""
-        return [decode_image(image, topic) for image, in self.since(first_ns, topic)]
+    def since(self, first_ns: int, count: int, *topics: str) -> list[tuple[Any, ...]]:
+        """Return the first messages on all of some topics from a stamp on, in their order."""
+        def found() -> list[tuple[Any, ...]]:
+            kept = [dict(self._kept[topic]) for topic in topics]
+            return [tuple(messages[stamp] for messages in kept)
+                    for stamp in sorted(set.intersection(*map(set, kept))) if stamp >= first_ns]
+        self.until(lambda: len(found()) >= count)
+        return found()[:count]
+
+    def until(self, done: Callable[[], bool], timeout_s: float = 0.0) -> None:
+        """Wait until something has come."""
+        deadline = time.monotonic() + (timeout_s or self._timeout_s)
+        while not done() and time.monotonic() < deadline:
+            time.sleep(0.02)
 
     def _keep(self, topic: str, message: Any) -> None:
         self._kept[topic][to_nanoseconds(message.header.stamp)] = message
-
-
-def begin(client: Client, watch: Watch, task: str, seed: int) -> tuple[View, View, dict[str, Any]]:
-    """
-    Start a scene; where objects are tracked, stand in for the user who clicks on them.
-
-    :return: the first picture and the goal, with the objects as the nodes know them and with true
-        positions; goal pixels by name if the goal has objects that the tracker did not find.
-    """
-    start, goal = client.reset(task, seed, objects=not watch.tracked)
-    placed: dict[str, Any] = {}
-    if watch.tracked:
-        start, goal, placed = click(client, watch, start, goal)
-    return start, goal, placed
-
-
-def click(client: Client, watch: Watch, start: View,
-          goal: View) -> tuple[View, View, dict[str, Any]]:
-    """Click on each object in the first picture, and on those not found in the goal picture."""
-    true, wanted = (watch.at(topic, view.stamp_ns, client.timeout_s) for topic, view in (
-        (watch.truth, start), (watch.true_goal, goal)))
-    if true is None or wanted is None:
-        raise TapError(f'{watch.truth}: nothing came; start sim_node with objects:=tracked, or '
-                       'the demo with --objects truth')
-    names, clicks = decode_objects(true, watch.truth)
-    for mask, in watch.since(start.stamp_ns, 'camera/robot_mask'):  # what is hidden: beside it
-        clicks = nearest_free(clicks, decode_mask(mask))
-    deadline, found = time.monotonic() + client.timeout_s, None
-    while found is None:
-        try:  # right after a reset the tracker may not have heard of the scene yet
-            client.select(dict(zip(names, clicks.tolist())))
-            found = watch.at('goal/objects', goal.stamp_ns, FOUND_S)
-        except CallError:
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.2)
-    places = dict(zip(*decode_objects(wanted, watch.true_goal)))
-    told = dict(zip(*decode_objects(found, 'goal/objects')))
-    lost = [one.name for one, state in zip(found.objects, found.states) if state == LOST]
-    if lost:
-        print(f'    {", ".join(lost)} not found in the goal picture: clicked there', flush=True)
-    goal_pixels = told | {name: places[name] for name in lost}
-    start = replace(client.camera(start.stamp_ns - 1), positions=positions_of(true))
-    goal = replace(goal, names=names, pixels=np.array([goal_pixels[name] for name in names]),
-                   positions=positions_of(wanted))
-    return start, goal, goal_pixels if lost else {}
-
-
-def predict(client: Client, placed: dict[str, Any]) -> 'Subgoal':
-    """Ask for a subgoal as a person would by hand: empty but for what was clicked in the goal."""
-    deadline = time.monotonic() + client.timeout_s
-    fields = request_fields(tuple(placed), goal_objects=list(placed.values()) or None)
-    while True:
-        try:
-            subgoal = subgoals_of(client.call('predict', **fields))[0]
-            if len(subgoal.object_maps):
-                return subgoal
-        except CallError:  # right after the start it may not have heard of the simulator yet
-            if time.monotonic() > deadline:
-                raise
-        time.sleep(0.2)
-
-
-def push(client: Client, watch: Watch, mode: str, seed: int, step_budget: int,
-         goal: View, placed: dict[str, Any]) -> Run:
-    """Have the arm push until the goal is reached or the budget spent; return the Run."""
-    planning_ms = [math.nan]
-    reaching = client.reach(mode=mode, step_budget=step_budget, seed=seed, goal_pixels=placed,
-                            timeout_s=client.timeout_s + STEP_TIMEOUT_S * step_budget)
-    with tqdm(total=step_budget, desc=f'    {mode:<8}', unit='step', leave=False) as bar:
-        for feedback in reaching:
-            planning_ms.append(feedback.planning_ms)
-            bar.set_postfix_str(
-                f'to the {feedback.stage}, {feedback.expected_distance:.1f} px expected')
-            bar.update(feedback.step - bar.n)
-    result = reaching.result()
-    # An object that is lost on the way ends the run, and not the demo.
-    if result.end != 'succeeded' and not (watch.tracked and len(planning_ms) > 1):
-        raise TapError(f'reach_goal ({mode}): {result.message}')
-    seen = watch.since(goal.stamp_ns, 'camera/image_raw', watch.truth)
-    return Run(
-        frames=[decode_image(image, 'camera/image_raw') for image, _ in seen],
-        distances=np.array([np.linalg.norm(positions_of(objects) - goal.positions, axis=1)
-                            for _, objects in seen]),
-        message=result.message, planning_ms=float(np.nanmedian(planning_ms)),
-        side=watch.pictures(goal.stamp_ns, 'observer/image_raw'),
-        plans=watch.pictures(goal.stamp_ns, 'plan/overlay'))
-
-
-def run_scene(client: Client, watch: Watch, task: str, seed: int, step_budget: int,
-              world: dict[str, str], gripping: bool) -> SceneRuns:
-    """
-    Predict a subgoal of one scene; push it in every mode, or show how the expert does it.
-
-    :param step_budget: the most steps of a run.
-    :param world: options of the world, of the table those of the Simulator.
-    :param gripping: whether the task needs the gripper; then nothing is pushed.
-    :return: SceneRuns.
-    """
-    runs: dict[str, Run] = {}
-    start, goal, placed = begin(client, watch, task, seed)
-    subgoal = predict(client, placed)
-    for mode in () if gripping else MODES:
-        if runs:
-            _, goal, placed = begin(client, watch, task, seed)
-        begun = time.monotonic()
-        run = runs[mode] = push(client, watch, mode, seed, step_budget, goal, placed)
-        print(f'    {mode:<8} {100 * run.distances[0].mean():5.1f} -> '
-              f'{100 * run.distances[-1].mean():5.1f} cm in {len(run.frames) - 1} steps, '
-              f'{time.monotonic() - begun:.0f} s ({run.planning_ms:.0f} ms a plan)', flush=True)
-    return SceneRuns(
-        task=task, seed=seed, start=start.image, goal=goal.image, start_pixels=start.pixels,
-        goal_pixels=goal.pixels, subgoal=subgoal.image, object_maps=subgoal.object_maps,
-        runs=runs,
-        side_goal_pixels=None if 'world' in world else OBSERVER.project(goal.positions),
-        expert=() if runs else film_expert(task, seed, world))
-
-
-def film_expert(task: str, seed: int, world: dict[str, Any]) -> list[np.ndarray]:
-    """Return pictures from the side of the expert doing a task, without ROS."""
-    simulator = Simulator(task, **world)
-    try:
-        _, actions, _ = run_episode(simulator, seed)
-        simulator.reset(seed)
-        pictures = [simulator.observer_picture()]
-        for action in actions:
-            simulator.step(action)
-            pictures.append(simulator.observer_picture())
-        return pictures
-    finally:
-        simulator.close()
 
 
 @dataclass(frozen=True)
@@ -253,26 +131,26 @@ class Options:
     """
     Options of the demo.
 
-    :param scenes: how many of each task.
-    :param seed: of the first scene of each task.
+    :param scenes: how many of each task; half as many of three objects, which take twice as long.
+    :param seed: of the first scene of each task; the others follow, none is left out.
     :param world: another world, such as metaworld with the task push-v3; its object is pushed by
         weights that were trained there.
     :param predictor: weights, shipped or a file; empty: those of the task.
     :param forward_model: weights of the planner.
     :param robot_mask: what is taken out of pictures, as it was in the training of the weights.
     :param objects: where they come from: tracked, from a click on each in the first picture, or
-        truth, the simulator; so it is in another world, and where a gripper is needed.
+        truth, the simulator; so it is in another world.
     :param look: of the world, see sim_node.
     :param arm: at the table, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
     :param attach: use nodes that run already, for example those of demo.launch.py.
     """
 
-    scenes: int = 2
+    scenes: int = 8
     seed: int = FIRST_SCENE
     tasks: Annotated[tuple[str, ...], conf.arg(
-        help='what is to be done in them; none named: push2, order2 and stack2, or with attach '
-             f'push2; of the table {", ".join(task_names())}.')] = ()
+        help='what is to be done in them; none named: order2 and order3, or with attach push2; of '
+             'the table those that push.')] = ()
     world: Annotated[str, one_of(names('tap_ros.worlds'))] = TABLE
     predictor: str = ''
     forward_model: str = 'push'
@@ -285,94 +163,272 @@ class Options:
     out: Folder = 'runs/demo'
     attach: Flag = False
 
+    @property
+    def tracked(self) -> bool:
+        """Whether objects are tracked."""
+        return self.objects == 'tracked' and self.world == TABLE
+
+    @property
+    def plan(self) -> list[tuple[str, int]]:
+        """Return the task and the seed of each scene."""
+        tasks = self.tasks or (('push2',) if self.attach else USUAL_TASKS)
+        return [(task, self.seed + i) for task in tasks
+                for i in range(max(1, self.scenes // max(1, self.num_objects(task) - 1)))]
+
+    def num_objects(self, task: str) -> int:
+        """Return how many objects are pushed."""
+        return get_task(task).num_objects if self.world == TABLE else OTHERS_OBJECTS
+
+    def check(self) -> None:
+        """Raise ConfigError for what cannot be run."""
+        if self.scenes < 1 or self.step_budget < 0:
+            raise ConfigError('scenes must be at least 1, and step-budget 0 or more')
+        if self.world != TABLE and not self.tasks:
+            raise ConfigError(f'world {self.world}: name its tasks, as --tasks push-v3')
+        if len(set(self.tasks)) < len(self.tasks):
+            raise ConfigError(f'tasks: {" ".join(self.tasks)}: name each once')
+        pushing = [task for task in task_names() if get_task(task).kind == 'push']
+        for task in self.tasks if self.world == TABLE else ():
+            if task not in pushing:
+                raise ConfigError(f'task {task}: is not one of those that push, '
+                                  f'{", ".join(pushing)}; see it with explore --task {task}')
+
+
+class Lane:
+    """
+    A set of nodes that runs scenes in some modes, in a thread of its own.
+
+    :param folder: of the logs and the recording.
+    :param modes: of MODES.
+    :param namespace: of the nodes.
+    """
+
+    def __init__(self, args: Options, folder: Path, modes: tuple[str, ...],
+                 namespace: str = '') -> None:
+        self._args, self._modes, self._task = args, modes, ''
+        self.client = Client(namespace, CALL_S)
+        self.watch = Watch(self.client, args.tracked, 'observer/image_raw' if args.world == TABLE
+                           and not args.attach else 'camera/image_raw')
+        self.pool = ThreadPoolExecutor(1, 'lane')
+        self.processes = NodeProcesses(folder / 'logs' / '-'.join(modes), namespace)
+        self._recording = folder / 'recording'
+
+    def start(self) -> None:
+        """Start the nodes."""
+        args, table = self._args, self._args.world == TABLE
+        start, subgoals = self.processes.start, 'subgoal' in self._modes
+        world: dict[str, Any] = {'look': args.look, 'arm': args.arm, 'observer': True} if (
+            table) else {'world': args.world}
+        if args.tracked:
+            world |= {'objects': 'tracked', 'image_size': CAMERA_SIZE}
+        self._task, _ = args.plan[0]
+        if subgoals:
+            start('recorder_node', folder=self._recording)
+        start('sim_node', lock_step=True, task=self._task, **world)
+        if args.tracked:
+            start('tracker_node')
+        if subgoals:
+            start('predictor_node', robot_mask=args.robot_mask, weights=self._weights(self._task))
+        start('visual_mpc_node', weights=args.forward_model, robot_mask=args.robot_mask,
+              preset='quick', subgoal_rounds=self._rounds(self._task))
+
+    def wait_until_ready(self) -> None:
+        """Wait until the nodes are ready, those that were started or those that run already."""
+        if self._args.attach:
+            self.client.wait_until_ready('sim_node', 'predictor_node', 'visual_mpc_node',
+                                         *['tracker_node'] * self._args.tracked)
+        else:
+            self.processes.wait_until_ready()
+
+    def run(self, task: str, seed: int) -> Scene | Refused:
+        """Push the objects of a scene in every mode of this lane, unless clicks are refused."""
+        if task != self._task and not self._args.attach:
+            self._change(task)
+        try:
+            scenes = [self._push(mode, task, seed) for mode in self._modes]
+        except Refused as error:
+            return error
+        return replace(scenes[0], runs={k: v for scene in scenes for k, v in scene.runs.items()})
+
+    def _weights(self, task: str) -> str:
+        return self._args.predictor or (task if task in PREDICTORS else DEFAULT_PREDICTOR)
+
+    def _rounds(self, task: str) -> int:
+        """Return how often a subgoal is predicted: while more than one object is to be moved."""
+        return max(1, self._args.num_objects(task) - 1)
+
+    def _change(self, task: str) -> None:
+        """Go on with another task."""
+        if 'subgoal' in self._modes and self._weights(task) != self._weights(self._task):
+            self.client.use_weights(self._weights(task))
+        self.client.call('set_planner', parameters=[
+            Parameter('subgoal_rounds', value=self._rounds(task)).to_parameter_msg()])
+        self._task = task
+
+    def _push(self, mode: str, task: str, seed: int) -> Scene:
+        """Start a scene and have the arm push until its goal is reached or the budget spent."""
+        args, client, watch = self._args, self.client, self.watch
+        watch.clear()
+        start, goal = client.reset(task, seed, objects=not args.tracked)
+        placed: dict[str, Any] = {}
+        if args.tracked:
+            start, goal, placed = click(client, watch, seed, start, goal)
+        budget = args.step_budget or step_budget(args.num_objects(task))
+        reaching = client.reach(mode=mode, step_budget=budget, seed=seed, goal_pixels=placed,
+                                timeout_s=client.timeout_s + STEP_S * budget)
+        told = list(reaching)
+        result = reaching.result()
+        # An object that is lost on the way ends the run, and not the demo.
+        if result.end != 'succeeded' and not (args.tracked and told):
+            raise TapError(f'reach_goal ({mode}): {result.message}')
+        heading = [_heading(feedback.stage) for feedback in told]
+        seen = watch.since(start.stamp_ns, result.steps + 1, watch.view, watch.truth)
+        subgoals = watch.since(start.stamp_ns, max(heading, default=GOAL) + 1, 'subgoal')
+        positions = np.array([positions_of(objects) for _, objects in seen])
+        aside = watch.view.startswith('observer')
+        return Scene(
+            task, seed, goal.image, start.pixels, goal.pixels,
+            OBSERVER.project(goal.positions) if aside else goal.pixels,
+            right_order(task, seed, args.arm) if args.world == TABLE else (), {mode: Run(
+                np.linalg.norm(positions - goal.positions, axis=-1),
+                [decode_image(image, watch.view) for image, _ in seen],
+                OBSERVER.project(positions) if aside else np.array(
+                    [decode_objects(objects, watch.truth)[1] for _, objects in seen]),
+                heading,
+                [decode_subgoal(one, start.names, (one.image.height, one.image.width))
+                 for one, in subgoals] if mode == 'subgoal' else [],
+                result.message,
+                float(np.median([feedback.planning_ms for feedback in told] or [math.nan])))})
+
+
+def _heading(stage: str) -> int:
+    """Return which subgoal a stage that feedback names is, or GOAL."""
+    number = re.search(r'\d+', stage)
+    return GOAL if stage == 'goal' else int(number[0]) - 1 if number else 0
+
+
+def right_order(task: str, seed: int, arm: str) -> tuple[int, ...]:
+    """Return the only order of the objects that works; () where any does."""
+    if not get_task(task).ordered:
+        return ()
+    limits = get_arm(arm)
+    return tuple(sample_scene(get_task(task), seed, 1.0, limits.low, limits.high).order)
+
+
+def click(client: Client, watch: Watch, seed: int, start: View,
+          goal: View) -> tuple[View, View, dict[str, Any]]:
+    """
+    Stand in for the user: click on each object, and on those not found in the goal picture.
+
+    Where a click is refused, others are tried beside it.
+
+    :return: the first picture and the goal, with the objects as the nodes know them, the goal with
+        true positions; goal pixels by name if the goal has objects that the tracker did not find.
+    :raises Refused: after CLICKS tries.
+    """
+    true, wanted = (watch.at(topic, view.stamp_ns) for topic, view in (
+        (watch.truth, start), (watch.true_goal, goal)))
+    if true is None or wanted is None:
+        raise TapError(f'{watch.truth}: nothing came; start sim_node with objects:=tracked, or '
+                       'the demo with --objects truth')
+    names, clicks = decode_objects(true, watch.truth)
+    mask = watch.at('camera/robot_mask', start.stamp_ns)
+    hidden = np.zeros(start.image.shape[:2], np.uint8) if mask is None else decode_mask(mask)
+    rng, tries, places = np.random.default_rng(seed), 0, clicks
+    deadline, found = time.monotonic() + client.timeout_s, None
+    while found is None:
+        try:  # right after a reset the tracker may not have heard of the scene yet
+            client.select(dict(zip(names, nearest_free(places, hidden).tolist())))
+            found = watch.at('goal/objects', goal.stamp_ns, FOUND_S)
+        except CallError as error:
+            if 'click on an object' in str(error):
+                tries += 1
+                places = clicks + rng.normal(0, SLIP * len(start.image), clicks.shape)
+                if tries == CLICKS:
+                    raise Refused(str(error)) from error
+            elif time.monotonic() > deadline:
+                raise
+            else:
+                time.sleep(0.2)
+    true_goals = dict(zip(*decode_objects(wanted, watch.true_goal)))
+    told = dict(zip(*decode_objects(found, 'goal/objects')))
+    lost = [one.name for one, state in zip(found.objects, found.states) if state == LOST]
+    goal_pixels = told | {name: true_goals[name] for name in lost}
+    start = client.camera(start.stamp_ns - 1)
+    goal = replace(goal, names=names, pixels=np.array([goal_pixels[name] for name in names]),
+                   positions=positions_of(wanted))
+    return start, goal, goal_pixels if lost else {}
+
 
 def run(args: Options) -> int:
     """
-    Run the demo and leave a recording, logs and a page.
+    Run the demo and leave a recording, logs, a film and a page.
 
     :param args: Options.
     :return: exit code.
     """
-    if args.scenes < 1 or args.step_budget < 0:
-        raise ConfigError('scenes must be at least 1, and step-budget 0 or more')
-    tasks = args.tasks or (USUAL_TASKS[:1] if args.attach else USUAL_TASKS)
-    if args.world != TABLE and not args.tasks:
-        raise ConfigError(f'world {args.world}: name its tasks, as --tasks push-v3')
-    if len(set(tasks)) < len(tasks):
-        raise ConfigError(f'tasks: {" ".join(tasks)}: name each once')
+    args.check()
+    os.environ.setdefault('OMP_NUM_THREADS', '1')  # of the nodes, which share the cores
     folder = new_folder(args.out)
-    begin = time.monotonic()
-    scenes = [scene for task in tasks for scene in run_task(args, task, folder)]
-    seconds = time.monotonic() - begin
-    pushed = [scene for scene in scenes if scene.runs]
+    print('waiting for the nodes that run already' if args.attach else
+          f'starting nodes; their logs are in {folder / "logs"}', flush=True)
+    begin, scenes = time.monotonic(), list[Scene]()
+    left_out = list[str]()
+    for (task, seed), scene in zip(args.plan, run_scenes(args, folder)):
+        if isinstance(scene, Refused):
+            left_out.append(f'{task} {seed}')
+            print(f'  {task} {seed}   left out: {scene}', flush=True)
+            continue
+        scenes.append(scene)
+        print(f'  {scene.task} {scene.seed}   ' + '   '.join(
+            f'{name} {run.final_cm:5.1f} cm in {len(run.distances) - 1} steps'
+            for mode, name in MODES.items() for run in [scene.runs[mode]]), flush=True)
+    if not scenes:
+        raise TapError('no scene could be run')
+    films = shown(scenes)
+    for (task, _), film in zip(dict(args.plan).items(), films.values()):
+        (folder / f'{task}.webp').write_bytes(film)
+        print(f'film       {folder / task}.webp')
     write_report(
-        folder / 'report.html', scenes,
-        f'Tasks {", ".join(tasks)}, seeds {args.seed} to {args.seed + args.scenes - 1} of each, '
-        f'at most {_budget(args, tasks[0])} steps of a push, {seconds:.0f} s in all. '
-        f'{TOLD[any(_tracked(args, task) for task in tasks)]}', {
+        folder / 'report.html', scenes, films,
+        f'Scenes from seed {args.seed} on, which are in no recording, training or table. Left '
+        f'out, as the tracker refused the clicks: {", ".join(left_out) or "none"}. '
+        f'{TOLD[args.tracked]} {REPEATS}', {
             'date': time.strftime('%Y-%m-%d %H:%M'),
+            'time': f'{time.monotonic() - begin:.0f} s',
             'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
             'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'})
-    if pushed:
-        write_film(folder / 'demo.webp', pushed)
-        print(f'\n{results_table(pushed)}\n')
-        print(f'film       {folder / "demo.webp"}')
+    print(f'\n{results_table(summary(scenes))}\n')
     if not args.attach:
         print(f'recording  {folder / "recording"}')
     print(f'page       {folder / "report.html"}')
+    print(f'time       {time.monotonic() - begin:.0f} s')
     return 0
 
 
-def run_task(args: Options, task: str, folder: Path) -> list[SceneRuns]:
-    """Run the scenes of one task with nodes of its own, or with those that run already."""
-    with NodeProcesses(folder / 'logs' / task) as processes, Client() as client:
-        tracked, gripping = _tracked(args, task), _gripping(args, task)
-        watch = Watch(client.node, tracked)
-        world = {'look': args.look, 'arm': args.arm} if args.world == TABLE else {
-            'world': args.world}
-        if args.attach:
-            print(f'{task}: waiting for the nodes that run already', flush=True)
-            client.wait_until_ready(
-                'sim_node', 'predictor_node', *['tracker_node'] * tracked,
-                *([] if gripping else ['visual_mpc_node']))
-        else:
-            print(f'{task}: starting nodes; their logs are in {folder / "logs" / task}',
-                  flush=True)
-            processes.start('recorder_node', folder=folder / 'recording' / task)
-            processes.start('sim_node', lock_step=True, task=task, observer=args.world == TABLE,
-                            objects='tracked' if tracked else 'truth', **world)
-            if tracked:
-                processes.start('tracker_node')
-            processes.start(
-                'predictor_node', robot_mask=args.robot_mask, weights=args.predictor or (
-                    task if task in PREDICTORS else DEFAULT_PREDICTOR))
-            if not gripping:
-                processes.start('visual_mpc_node', weights=args.forward_model,
-                                robot_mask=args.robot_mask)
-            processes.wait_until_ready()
-        scenes = []
-        for i in range(args.scenes):
-            print(f'  scene {args.seed + i} ({i + 1} of {args.scenes})', flush=True)
-            scenes.append(run_scene(
-                client, watch, task, args.seed + i, _budget(args, task), world, gripping))
-            processes.check()
-        return scenes
-
-
-def _tracked(args: Options, task: str) -> bool:
-    """Return whether objects are tracked."""
-    return args.objects == 'tracked' and args.world == TABLE and not _gripping(args, task)
-
-
-def _gripping(args: Options, task: str) -> bool:
-    """Return whether a task needs the gripper; of other worlds what is pushed is tried alone."""
-    return args.world == TABLE and get_task(task).gripping
-
-
-def _budget(args: Options, task: str) -> int:
-    """Return the most steps of one run."""
-    count = get_task(task).num_objects if args.world == TABLE else OTHERS_OBJECTS
-    return args.step_budget or step_budget(count)
+def run_scenes(args: Options, folder: Path) -> Iterator[Scene | Refused]:
+    """Run all scenes, both modes at the same time unless the nodes run already."""
+    lanes = [Lane(args, folder, tuple(MODES))] if args.attach else [
+        Lane(args, folder, ('subgoal',)), Lane(args, folder, ('direct',), '/direct')]
+    with ExitStack() as stack:  # nodes end first, which ends what waits for them
+        for lane in lanes:
+            stack.enter_context(lane.client)
+            stack.callback(lane.pool.shutdown, cancel_futures=True)
+        for lane in lanes:
+            stack.enter_context(lane.processes)
+            if not args.attach:
+                lane.start()
+        for lane in lanes:
+            lane.wait_until_ready()
+        running = [[lane.pool.submit(lane.run, *scene) for scene in args.plan] for lane in lanes]
+        for futures in zip(*running):
+            found = [future.result() for future in futures]
+            for lane in lanes:
+                lane.processes.check()
+            runs = {k: v for scene in found if isinstance(scene, Scene)
+                    for k, v in scene.runs.items()}
+            yield next((scene for scene in found if isinstance(scene, Refused)), None) or replace(
+                found[0], runs={mode: runs[mode] for mode in MODES})
 
 
 def new_folder(wanted: str | Path) -> Path:

@@ -1,193 +1,136 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the demo leaves of its scenes: a table, a self-contained HTML page, a film."""
+"""What the demo says of its scenes: a table of each task, and a self-contained HTML page."""
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 import io
 from itertools import groupby
 from pathlib import Path
-from types import MappingProxyType
+from typing import NamedTuple
 
-import cv2
 from jinja2 import Environment
 import numpy as np
 from PIL import Image
+from tap_ros.evaluation.intervals import Interval, mean_interval
 from tap_ros.files import write_atomically
-from tap_ros.images.drawing import (
-    enlarge,
-    film_strip,
-    grid,
-    OBJECT_COLOURS,
-    overlay,
-    png_bytes,
-)
+from tap_ros.nodes.demo.film import film, order_in_words, Scene
 
-SCALE = 4
-SMALL = 128  # pixels, side of goal and subgoal, one above the other on the left of the film
-GAP, HEAD = 8, 24  # pixels between panels of the film, and above them for the names
-HEIGHT = 2 * SMALL + HEAD  # of a run's picture beside both
-FRAME_MS, HOLD_MS = 100, 1800  # of a film: of each frame, and of the end of a scene
-QUALITY = 70  # of films, 0 to 100
-MODE_NAMES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
+MODES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
 
 
-@dataclass(frozen=True)
-class Run:
-    """One attempt at a scene."""
+class Row(NamedTuple):
+    """Some scenes together; intervals of 95% are a paired bootstrap over scenes."""
 
-    frames: list[np.ndarray]  # T + 1 pictures (H, W, 3) uint8
-    distances: np.ndarray  # (T + 1, K) metres from each object to its goal
-    message: str  # how the planner said that it ended
-    planning_ms: float  # median time of one plan
-    side: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 from the side, if there are any
-    plans: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 of what the planner considered
+    label: str
+    scenes: int
+    cm: tuple[float, float]  # final distance, direct and via the subgoal
+    nearer: Interval  # cm, by the subgoal
+    reached: tuple[int, int]  # scenes in which every object ended near its goal
+    more: Interval  # of them in points, by the subgoal
 
-
-@dataclass(frozen=True)
-class SceneRuns:
-    """A scene, the subgoal predicted for it, and the attempts, if any."""
-
-    task: str
-    seed: int
-    start: np.ndarray  # (H, W, 3) uint8
-    goal: np.ndarray
-    start_pixels: np.ndarray  # (K, 2)
-    goal_pixels: np.ndarray
-    subgoal: np.ndarray  # (H, W, 3) uint8
-    object_maps: np.ndarray  # (K, H, W)
-    runs: dict[str, Run]  # by mode
-    side_goal_pixels: np.ndarray | None = None  # (K, 2) in pictures from the side
-    expert: Sequence[np.ndarray] = ()  # pictures (H, W, 3) uint8 from the side of its own attempt
+    def texts(self) -> list[str]:
+        """Return the cells of a table."""
+        share = [f'{100 * n / self.scenes:.0f}%' for n in self.reached]
+        return [self.label, str(self.scenes), *(f'{cm:.1f}' for cm in self.cm),
+                '{:+.1f} ({:+.1f} to {:+.1f})'.format(*self.nearer), *share,
+                '{:+.0f} ({:+.0f} to {:+.0f})'.format(*self.more)]
 
 
-def final_distances(scenes: Sequence[SceneRuns]) -> Iterator[tuple[str, np.ndarray]]:
-    """
-    Yield how far from their goals the objects ended, of each scene and as the mean of a task.
-
-    :param scenes: SceneRuns with the same modes, those of a task together.
-    :return: iterator of a label, and cm, mean over the objects: nothing done, then each mode.
-    """
-    for task, group in groupby(scenes, lambda scene: scene.task):
-        kept = []
-        for scene in group:
-            ends = [run.distances[-1].mean() for run in scene.runs.values()]
-            start = next(iter(scene.runs.values())).distances[0].mean()
-            kept.append(100 * np.array([start, *ends]))
-            yield f'{scene.task} {scene.seed}', kept[-1]
-        yield f'{task}, mean of {len(kept)}', np.mean(kept, 0)
+COLUMNS = ('task', 'scenes', 'cm, direct', 'via', 'nearer by', 'success, direct', 'via', 'more by')
 
 
-def results_table(scenes: Sequence[SceneRuns]) -> str:
-    """Return final_distances as lines of text."""
-    head = f'{"final mean distance, cm":<26}' + ''.join(
-        f'{name:>12}' for name in ('do nothing', *scenes[0].runs))
-    return '\n'.join([head, '-' * len(head), *(
-        f'{label:<26}' + ''.join(f'{d:>12.1f}' for d in distances)
-        for label, distances in final_distances(scenes))])
+def summary(scenes: Sequence[Scene]) -> list[Row]:
+    """Return a Row of each task, those of a task being together, and of all if there are many."""
+    groups = [(task, list(group)) for task, group in groupby(scenes, lambda scene: scene.task)]
+    if len(groups) > 1:
+        groups.append(('together', list(scenes)))
+    return [_row(label, group) for label, group in groups]
 
 
-def write_report(path: str | Path, scenes: Sequence[SceneRuns], note: str = '',
-                 facts: Mapping[str, str] = MappingProxyType({})) -> None:
+def _row(label: str, scenes: Sequence[Scene]) -> Row:
+    runs = [[scene.runs[mode] for mode in MODES] for scene in scenes]
+    cm = np.array([[run.final_cm for run in pair] for pair in runs])
+    reached = np.array([[run.reached for run in pair] for pair in runs])
+    return Row(label, len(scenes), tuple(cm.mean(0).tolist()), mean_interval(cm[:, 0] - cm[:, 1]),
+               tuple(reached.sum(0).tolist()),
+               mean_interval(100.0 * (reached[:, 1].astype(int) - reached[:, 0])))
+
+
+def in_words(row: Row) -> str:
+    """Say what came of some scenes."""
+    direct, via = row.reached
+    sure = 'its interval excludes zero' if row.nearer.low > 0 else 'which chance may explain'
+    return (f'Via the predicted subgoal {via} of {row.scenes} scenes succeed, directly {direct}; '
+            f'objects end {row.nearer.value:.1f} cm nearer to their goals '
+            f'({row.nearer.low:.1f} to {row.nearer.high:.1f}), {sure}.')
+
+
+def results_table(rows: Sequence[Row]) -> str:
+    """Return rows as lines of text."""
+    cells = [list(COLUMNS), *(row.texts() for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells)]
+    lines = ['  '.join(text.rjust(width) for text, width in zip(line, widths)) for line in cells]
+    return '\n'.join([lines[0], '-' * len(lines[0]), *lines[1:]])
+
+
+def write_report(path: str | Path, scenes: Sequence[Scene], films: Mapping[str, bytes],
+                 note: str, facts: Mapping[str, str]) -> None:
     """
     Write the page; everything is inside the one file.
 
     :param path: of the HTML file.
-    :param scenes: list of SceneRuns.
-    :param note: a sentence on how the numbers were made.
-    :param facts: what made the page: name and value, such as date, commit and command.
+    :param scenes: list of Scene.
+    :param films: WebP films by their captions.
+    :param note: how the numbers were made.
+    :param facts: what made the page: name and value, such as date and command.
     """
+    rows = summary(scenes)
     template = Path(__file__).with_name('report.html').read_text()
-    pushed = [scene for scene in scenes if scene.runs]
     write_atomically(path, Environment(autoescape=True).from_string(template).render(
-        rows=list(final_distances(pushed)),
-        modes=[MODE_NAMES[mode] for mode in pushed[0].runs] if pushed else (),
-        note=note, facts=facts, scenes=[
-            (f'{scene.task} {scene.seed}', list(_figures(scene))) for scene in scenes]))
+        words=in_words(rows[-1]), columns=COLUMNS, rows=[row.texts() for row in rows], note=note,
+        facts=facts, films=[(caption, _uri(data)) for caption, data in films.items()],
+        scenes=[(f'{scene.task} {scene.seed}', list(_stills(scene))) for scene in scenes]))
 
 
-def write_film(path: str | Path, scenes: Sequence[SceneRuns]) -> None:
+def shown(scenes: Sequence[Scene]) -> dict[str, bytes]:
     """
-    Write the scenes one after the other: direct beside via the subgoal, seen from the side.
+    Return a film of each task, by its caption.
 
-    :param path: of the WebP file.
-    :param scenes: list of SceneRuns with the same modes; crosses mark where objects should end.
+    Shown is the first scene that succeeds via the subgoal alone, the first of all if none does.
     """
-    pictures, times = [], list[int]()
-    for scene in scenes:
-        left = np.concatenate([
-            _panel(scene.goal, SMALL, 'goal', scene.goal_pixels),
-            _panel(scene.subgoal, SMALL, 'predicted subgoal', ())])
-        views = {mode: run.side if len(run.side) else run.frames
-                 for mode, run in scene.runs.items()}
-        length = max(map(len, views.values()))
-        for t in range(length):
-            panels = [left]
-            for mode, run in scene.runs.items():
-                distances, picture = (values[min(t, len(values) - 1)]
-                                      for values in (run.distances, views[mode]))
-                goals = scene.side_goal_pixels if len(run.side) else scene.goal_pixels
-                panels += [np.full((len(left), GAP, 3), 255, np.uint8), _panel(
-                    picture, HEIGHT, f'{MODE_NAMES[mode]}: {100 * distances.mean():.1f} cm',
-                    () if goals is None else goals)]
-            pictures.append(np.concatenate(panels, axis=1))
-        times += [FRAME_MS] * (length - 1) + [HOLD_MS]
-    write_atomically(path, _film(pictures, times))
+    films = {}
+    for task, group in groupby(scenes, lambda scene: scene.task):
+        first, *others = group
+        scene = next((one for one in (first, *others) if gains(one)), first)
+        films[f'{task} {scene.seed}: the first scene of this task that succeeds only via the '
+              'subgoal' if gains(scene) else f'{task} {scene.seed}: the first scene'] = film(scene)
+    return films
 
 
-def _panel(picture: np.ndarray, height: int, name: str,
-           goals: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
-    """Return a picture of a height under its name, with crosses at goals (u, v)."""
-    scale = height / len(picture)
-    picture = cv2.resize(picture, (round(scale * picture.shape[1]), height),
-                         interpolation=cv2.INTER_NEAREST)
-    for k, (u, v) in enumerate((np.asarray(goals).reshape(-1, 2) + 0.5) * scale):
-        cv2.drawMarker(picture, (int(u), int(v)), OBJECT_COLOURS[k % len(OBJECT_COLOURS)],
-                       cv2.MARKER_TILTED_CROSS, 10, 2, cv2.LINE_AA)
-    head = np.full((HEAD, picture.shape[1], 3), 255, np.uint8)
-    cv2.putText(head, name, (0, HEAD - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (34, 34, 34), 1,
-                cv2.LINE_AA)
-    return np.concatenate([head, picture])
+def gains(scene: Scene) -> bool:
+    """Tell whether a scene succeeds via the subgoal alone."""
+    return scene.runs['subgoal'].reached and not scene.runs['direct'].reached
 
 
-def _film(pictures: Sequence[np.ndarray], times: Sequence[int] = ()) -> bytes:
-    """Return an animated WebP of pictures and ms that begins anew for ever."""
-    first, *others = (Image.fromarray(picture) for picture in pictures)
+def _stills(scene: Scene) -> Iterator[tuple[str, str]]:
+    """Yield (caption, data URI) of start, subgoals, and the ends of both runs."""
+    runs = scene.runs
+    yield order_in_words(scene) if scene.order else 'start, and where to', _still(
+        scene.seen('subgoal', 0))
+    for i, subgoal in enumerate(runs['subgoal'].subgoals[:1]):
+        yield f'predicted: {scene.decided(subgoal)}', _still(scene.headed(i))
+    for mode, name in MODES.items():
+        run = runs[mode]
+        yield (f'{name}: {run.final_cm:.1f} cm after {len(run.distances) - 1} steps'
+               f'{"" if run.reached else ", failed"}', _still(scene.seen(mode, -1)))
+
+
+def _still(picture: np.ndarray) -> str:
     buffer = io.BytesIO()
-    first.save(buffer, 'webp', save_all=True, append_images=others, quality=QUALITY, loop=0,
-               duration=list(times) or [FRAME_MS] * len(others) + [HOLD_MS])
-    return buffer.getvalue()
+    Image.fromarray(picture).save(buffer, 'webp', quality=80)
+    return _uri(buffer.getvalue())
 
 
-def _prediction(scene: SceneRuns) -> list[tuple[str, np.ndarray]]:
-    """Return (caption, picture) of start, goal, subgoal and object maps."""
-    maps = overlay(
-        scene.start // 3, scene.object_maps, SCALE, scene.start_pixels, scene.goal_pixels)
-    return [
-        ('start', enlarge(scene.start, SCALE)), ('goal', enlarge(scene.goal, SCALE)),
-        ('predicted subgoal', enlarge(scene.subgoal, SCALE)),
-        (f'its object maps: {len(scene.object_maps)} colours; circles mark the starts, crosses '
-         'the goals', maps)]
-
-
-def _figures(scene: SceneRuns) -> Iterator[tuple[str, str]]:
-    """Yield (caption, data URI) of all that the page shows of a scene."""
-    films = [('the expert, seen from the side', scene.expert)]
-    for mode, run in scene.runs.items():
-        films += [(f'{MODE_NAMES[mode]}, seen from the side', run.side),
-                  (f'{MODE_NAMES[mode]}: ways that the planner considered; bold: the chosen one; '
-                   'crosses: where it pushes to', run.plans)]
-    for caption, pictures in films:
-        if len(pictures):
-            yield caption, _uri('webp', _film(pictures))
-    for caption, picture in _prediction(scene):
-        yield caption, _uri('png', png_bytes(picture))
-    for mode, run in scene.runs.items():
-        yield (f'{MODE_NAMES[mode]}: {100 * run.distances[-1].mean():.1f} cm after '
-               f'{len(run.frames) - 1} steps, median planning time {run.planning_ms:.0f} ms. '
-               f'{run.message}', _uri('png', png_bytes(grid([film_strip(run.frames)], scale=2))))
-
-
-def _uri(kind: str, data: bytes) -> str:
-    return f'data:image/{kind};base64,{base64.b64encode(data).decode()}'
+def _uri(data: bytes) -> str:
+    return f'data:image/webp;base64,{base64.b64encode(data).decode()}'
