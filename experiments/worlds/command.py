@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import cv2
-from experiments.pages import render, share
+from experiments.pages import render
 from experiments.worlds.trained import (
     held_out_of,
     mark,
@@ -222,7 +222,7 @@ def page(rows):
             lengths[task] = f"{row['frames']:.0f}, {row['bottleneck_frames']:.1f}"
         line = tables[kind].setdefault(task, {
             'task': task.removeprefix('aside/').replace('/', ' '), FRAMES: lengths[task]})
-        line[method] = f"{share(hit.values())}, {near['value']:.0%}"
+        line[method] = f"{hit['value']:.0%}, {near['value']:.0%}"
         found[kind].setdefault(method, []).append(
             any(value['value'] >= least for value, least in zip((hit, near), FOUND)))
     for kind, lines in tables.items():
