@@ -14,6 +14,7 @@ from catkin_pkg.package import parse_package
 from packaging.requirements import Requirement
 import setuptools.build_meta  # noqa: F401  setup.py sees that it is pip who asks
 from tap_ros.contract import NODE_CLASSES
+from tap_ros.messages.topics import TOPICS
 
 ROOT = Path(__file__).parents[2]
 # Imported name: the key by which rosdep knows it.
@@ -83,6 +84,12 @@ def test_executables_launch_files_and_parameters_are_installed():
     for pattern in ('config/*.yaml', 'config/layouts/*', 'launch/*.launch.py'):
         here = {path.name for path in ROOT.glob(pattern)}
         assert here and here <= {path.name for path in share.glob(pattern)}
+
+
+def test_the_layout_for_recordings_shows_only_what_is_recorded():
+    layout = (ROOT / 'config' / 'layouts' / 'tap_ros.json').read_text()
+    shown = set(re.findall(r'"(/[a-z_/]+)', layout))
+    assert len(shown) > 6 and shown <= {topic.recorded for topic in TOPICS}
 
 
 def test_manifests_are_valid_and_of_one_version():
