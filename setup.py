@@ -53,7 +53,7 @@ setup(
     # colcon takes what package.xml names: of apt's packages some are no distributions.
     install_requires=REQUIRED if 'setuptools.build_meta' in sys.modules else ['setuptools'],
     extras_require={  # what only some commands need; `colcon test` runs pytest because of the last
-        'tfrecord': ['google-crc32c'],
+        'tfrecord': ['google-crc32c', 'protobuf'],
         'explorer': ['websockets'],
         'hub': ['huggingface_hub'],
         'lerobot': ['pyarrow'],

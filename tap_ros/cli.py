@@ -83,7 +83,7 @@ COMMANDS: dict[str, tuple[str, Module]] = {
                 'tap_ros.evaluation.inspect_files'),
 }
 EXTRAS = {  # what only some commands need, and what pip calls it
-    'google': 'google-crc32c', 'google_crc32c': 'google-crc32c',
+    'google': 'google-crc32c protobuf', 'google_crc32c': 'google-crc32c protobuf',
     'huggingface_hub': 'huggingface_hub', 'pandas': 'pandas', 'pyarrow': 'pyarrow', 'ray': 'ray',
     'websockets': 'websockets'}
 PROG = 'python -m tap_ros'

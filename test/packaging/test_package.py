@@ -28,7 +28,8 @@ ROSDEP_KEYS = {
     'tqdm': 'python3-tqdm',
     'yaml': 'python3-yaml',
 }
-DISTRIBUTIONS = {'PIL': 'pillow', 'cv2': 'opencv-python-headless', 'yaml': 'pyyaml'}  # other names
+DISTRIBUTIONS = {  # other names
+    'PIL': 'pillow', 'cv2': 'opencv-python-headless', 'google': 'protobuf', 'yaml': 'pyyaml'}
 ROS_PACKAGES = {'tf2_ros': 'tf2_ros_py'}  # of modules with another name
 
 
