@@ -4,13 +4,10 @@
 
 from importlib import import_module
 from pathlib import Path
-import threading
 
-import pytest
 from rclpy.context import Context
 from rclpy.node import Node
 from tap_ros.contract import CLIMB_LIMIT, MOVE_LIMIT, NODE_CLASSES
-from tap_ros.nodes.calls import CallError, in_executor
 from tap_ros.nodes.run import configure_fast_dds, LOCALHOST, PROFILE, SUBNET
 import yaml
 
@@ -72,15 +69,3 @@ def test_what_the_user_has_chosen_is_kept():
         configure_fast_dds(variables)
         assert variables.get(PROFILE) == (profile and str(profile)), given
         assert variables.get(discovery) == reach, given
-
-
-def test_a_function_is_called_in_the_thread_that_spins(client):
-    thread = in_executor(client, threading.current_thread, 10.0)
-    assert thread.name == 'spinner'
-    with pytest.raises(ZeroDivisionError):
-        in_executor(client, lambda: 1 / 0, 10.0)
-    assert in_executor(client, threading.current_thread, 10.0) is thread, 'it spins on'
-    idle = Node('idle', context=client.context)
-    with pytest.raises(CallError, match='idle is not spun'):
-        in_executor(idle, threading.current_thread, 10.0)
-    idle.destroy_node()

@@ -4,7 +4,7 @@
 
 from contextlib import contextmanager, ExitStack
 import http.client
-from itertools import count, product
+from itertools import count
 import json
 import math
 import socket
@@ -129,23 +129,6 @@ def test_foreign_pages_and_foreign_names_that_lead_here_are_refused():
     assert not any(map(is_loopback, ('0.0.0.0', '192.168.0.1', 'localhost.evil.example', '')))
 
 
-def status(server, target, *headers):
-    """Return the status of the answer to raw bytes; None where the connection is just closed."""
-    with socket.create_connection(('127.0.0.1', server.port), 10.0) as connection:
-        connection.sendall(b'\r\n'.join([b'GET ' + target + b' HTTP/1.1', *headers, b'', b'']))
-        answer = b''.join(iter(lambda: connection.recv(4096), b''))
-    return int(answer.split(None, 2)[1]) if answer else None
-
-
-def test_malformed_addresses_and_headers_are_refused_and_the_page_is_served_after_them():
-    with serving() as server:
-        for target, host, origin in product(
-                (b'/', b'//[', b'/?token=%ED%A0%80', b'/socket?token=\xff', b'http://[', b'*'),
-                (b'localhost', b'[::1', b'\xff', b'localhost:99999999', b''),
-                (b'http://[', b'null', b'\xed\xa0\x80')):
-            found = status(server, target, b'Host: ' + host, b'Origin: ' + origin)
-            assert found is None or 400 <= found < 500, (target, host, origin)
-        assert status(server, b'/', b'Host: localhost') == 200
 
 
 def test_a_token_is_asked_for_by_page_and_socket_and_stands_in_the_address():
@@ -178,7 +161,6 @@ def test_addresses_that_cannot_be_had_are_named_and_what_ends_frees_its_port():
 
 # Commands and distances, without sockets
 
-GOALS = {'a': (0.0, 0.0, 0.0, 10.0, 10.0), 'b': (1.0, 0.0, 0.0, 20.0, 10.0)}
 NUMBERS = {'samples': 3, 'levels': 2, 'seed': 1}
 PREDICT, REACH = {'do': 'predict', **NUMBERS}, {'do': 'reach', 'mode': 'direct', **NUMBERS}
 RESET = {'do': 'reset', 'task': 'push2', 'seed': 7}
@@ -187,26 +169,17 @@ CUP = {'name': 'cup', 'u': 3, 'v': 4.5}
 SELECT = {'do': 'select', 'objects': [CUP, {**CUP, 'name': 'ring'}]}
 
 
-def at(x, **places):
-    """Return two objects, the first at x metres and x pixels from its goal."""
-    return {'a': (x, 0.0, 0.0, 10.0 + x, 10.0), 'b': GOALS['b'], **places}
 
 
 def test_distances_are_centimetres_or_pixels_where_a_pose_is_unknown():
+    goals = {'a': (0.0, 0.0, 0.0, 10.0, 10.0)}
     distances = Distances()
     for moment, x in ((1.0, 0.2), (1.5, 0.3), (1.5, 0.1)):  # equal time replaces
-        distances.add(moment, at(x), GOALS)
-    assert distances.shown() == {'unit': 'cm', 'names': ['a', 'b'], 'times': [1.0, 1.5],
-                                 'values': [[20.0, 10.0], [0.0, 0.0]]}
-    distances.add(0.5, at(0.4), GOALS)
-    assert distances.shown()['times'] == [0.5], 'time that goes back begins anew'
-    distances.add(2.0, at(4.0, b=(*(math.nan,) * 3, 20.0, 13.0)), GOALS)
-    shown = distances.shown()
-    assert shown['unit'] == 'px' and shown['values'] == [[4.0], [3.0]], 'units are not mixed'
-    distances.add(3.0, at(0.2), {'a': GOALS['a']})
-    assert distances.shown()['names'] == ['a'], 'without a goal there is no distance'
-    distances.add(4.0, at(0.2), {})
-    assert distances.shown()['times'] == []
+        distances.add(moment, {'a': (x, 0.0, 0.0, 12.0, 10.0)}, goals)
+    assert distances.shown() == {
+        'unit': 'cm', 'names': ['a'], 'times': [1.0, 1.5], 'values': [[20.0, 10.0]]}
+    distances.add(0.5, {'a': (*3 * [math.nan], 12.0, 10.0)}, goals)  # time goes back
+    assert distances.shown() == {'unit': 'px', 'names': ['a'], 'times': [0.5], 'values': [[2.0]]}
 
 
 def test_a_command_reads_as_it_is_meant_and_what_makes_no_sense_is_refused_by_the_fields_name():

@@ -6,20 +6,17 @@ from collections import Counter
 from pathlib import Path
 import re
 
-from diagnostic_msgs.msg import DiagnosticArray
 from loop import SEED
 from mcap.reader import make_reader
 import numpy as np
 from processes import LocalNode, until
 import pytest
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from tap_ros.contract import NODE_CLASSES
 from tap_ros.errors import TapError
 from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.predictor.node import PredictorNode
-from tap_ros.nodes.topics import STREAM
 from tap_ros.recording.cache import open_recordings
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL, PREDICTORS
 import yaml
@@ -28,24 +25,6 @@ pytestmark = pytest.mark.slow
 FOLDER = Path(__file__).parents[2] / 'config' / 'layouts'
 MOVED = {'object_1': (14.5, 44.25)}
 
-
-def test_every_node_tells_how_it_is(loop):
-    loop.reset()
-    loop.client.call('predict')
-    told = {}
-    loop.node.create_subscription(
-        DiagnosticArray, '/diagnostics',
-        lambda array: told.update({status.name: status for status in array.status}), STREAM)
-    wanted = [*(f'{name}: service' for name in NODE_CLASSES
-                if name not in ('robot_mask_node', 'tracker_node', 'explorer_node')),
-              'visual_mpc_node: /joint_states', 'predictor_node: /goal/image',
-              'sim_node: /arm/delta_twist_cmds', 'recorder_node: /objects']
-    assert until(lambda: all(name in told for name in wanted))
-    told = {name: {pair.key: pair.value for pair in told[name].values} for name in wanted}
-    assert told['visual_mpc_node: /joint_states']['status'] == 'OK'
-    assert float(told['recorder_node: /objects']['rate_hz']) > 1  # sent again in lock-step
-    assert told['predictor_node: service']['queue'] == '0'
-    assert float(told['predictor_node: service']['predict_subgoal p50_ms']) > 0
 
 
 def test_all_viewers_show_topics_of_the_nodes_as_they_are_offered(loop):

@@ -14,7 +14,6 @@ from rclpy.qos import qos_profile_sensor_data, ReliabilityPolicy
 from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
-from tap_ros.errors import TapError
 from tap_ros.nodes.calls import call
 from tap_ros.nodes.recorder.node import RecorderNode
 from tap_ros.nodes.ros_messages import encode_image
@@ -150,10 +149,3 @@ def test_topics_of_any_type_can_be_recorded_and_where_the_arm_stands(client, rec
     stood = UR10E.mount
     assert read_mount(tmp_path / 'bag') == ArmMount(
         Mount((0.25, *stood.position[1:]), stood.yaw, stood.tool), 0.5)
-
-
-def test_a_bad_start_names_the_parameter(record):
-    for parameters, words in (({'compression': 'rar'}, 'compression.*rar.*zstd, lz4, none'),
-                              ({'folder': '/proc/nowhere'}, '/proc/nowhere.*cannot be made')):
-        with pytest.raises(TapError, match=words):
-            record(**parameters)

@@ -4,19 +4,17 @@
 
 from geometry_msgs.msg import TwistStamped
 import numpy as np
-from processes import Client, LocalNode, Newest, NodeProcess, until
+from processes import Client, Newest, NodeProcess, until
 import pytest
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
-from sim_bridge.ros.sim_node import SimNode
 from sim_bridge.simulator import Simulator
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode, ObjectStates
 from tap_msgs.srv import StepScene
 import tap_ros
-from tap_ros.errors import TapError
 from tap_ros.messages.images import decode_image
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError
@@ -272,11 +270,3 @@ def test_tf_has_the_camera_and_the_arm(rig):
     assert image.header.frame_id == 'camera_optical_frame'
     arm = moving.wait(10, lambda m: m.transforms[0].header.stamp == image.header.stamp)
     assert len(arm.transforms) == 6
-
-
-def test_a_bad_parameter_is_named():
-    for parameters, words in (({'task': 'juggle'}, 'task.*juggle.*push2, push3'),
-                              ({'seed': -1}, 'seed.*Min: 0.*-1'),
-                              ({'image_size': 64.5}, 'image_size.*64.5.*INTEGER')):
-        with pytest.raises(TapError, match=words):
-            LocalNode(SimNode, **parameters)

@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The simulator's services of simulation_interfaces: what they promise, and that pausing holds."""
+"""The simulator's services of simulation_interfaces: what they promise."""
 
 from copy import deepcopy
 from operator import attrgetter
@@ -8,13 +8,11 @@ import re
 
 from made_bags import decode_gripper
 import numpy as np
-from processes import Client, NodeProcess, until
+from processes import Client, NodeProcess
 import pytest
-from std_msgs.msg import Float64
 from tap_msgs.msg import Episode
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import call
-from tap_ros.nodes.topics import STREAM
 from test_sim_node import PERIOD_NS
 from test_sim_node import Rig as SimRig
 
@@ -36,18 +34,13 @@ SEED = 4
 class Rig(SimRig):
     """Also its standard services, by name."""
 
-    def __init__(self, node, process, lock_step):
+    def __init__(self, node, process):
         super().__init__(node, process)
-        self.lock_step = lock_step
-        self.gripper = node.create_publisher(Float64, 'gripper/command', STREAM)
-        self.clients = {name: node.create_client(kind, f'sim_node/{name}') for name, kind in (
-            ('get_simulator_features', srv.GetSimulatorFeatures),
-            ('get_entities', srv.GetEntities), ('get_entities_states', srv.GetEntitiesStates),
-            ('get_entity_state', srv.GetEntityState),
-            ('set_entity_state', srv.SetEntityState), ('reset_simulation', srv.ResetSimulation),
-            ('get_simulation_state', srv.GetSimulationState),
-            ('set_simulation_state', srv.SetSimulationState),
-            ('step_simulation', srv.StepSimulation))}
+        self.clients = {name: node.create_client(
+            getattr(srv, name.title().replace('_', '')), f'sim_node/{name}') for name in (
+                'get_simulator_features', 'get_entities', 'get_entities_states',
+                'get_entity_state', 'set_entity_state', 'reset_simulation',
+                'get_simulation_state', 'set_simulation_state', 'step_simulation')}
         assert all(client.wait_for_service(20) for client in self.clients.values())
 
     def ask(self, name, **fields):
@@ -73,12 +66,10 @@ class Rig(SimRig):
         return to_nanoseconds(self.ask(
             'get_entity_state', entity='object_0').state.header.stamp)
 
-    def begin(self, state=PAUSED):
-        """Have the first scene at its start; return picture, objects and joints."""
+    def begin(self):
+        """Have the first scene at its start, paused; return picture, objects and joints."""
         self.set_state(STOPPED)
-        assert self.code('reset_simulation') == OK
-        if state != STOPPED:
-            assert self.set_state(state) == OK
+        assert self.code('reset_simulation') == self.set_state(PAUSED) == OK
         return self.seen(self.stamp())
 
     def seen(self, stamp):
@@ -86,25 +77,15 @@ class Rig(SimRig):
         return [topic.wait(20, lambda m: to_nanoseconds(m.header.stamp) == stamp)
                 for topic in (self.image, self.objects, self.joints)]
 
-    def refusal(self, picture):
-        """Return why a command that answered this picture was refused."""
-        return self.refusals.wait(
-            20, lambda m: m.header.stamp == picture.header.stamp).message
 
-    def command(self, header, **move):
-        """Send a command for arm and gripper."""
-        self.gripper.publish(Float64(data=1.0))
-        self.send(stamp=header.stamp, **move)
-
-
-@pytest.fixture(scope='module', params=['real time', 'lock-step'])
-def rig(request, tmp_path_factory):
+@pytest.fixture(scope='module')
+def rig(tmp_path_factory):
     process = NodeProcess(
         'sim_node', tmp_path_factory.mktemp('sim') / 'log.txt',
-        {'seed': SEED, 'lock_step': str(request.param == 'lock-step').lower()})
+        {'seed': SEED, 'lock_step': True})
     try:
         with Client() as node:
-            rig = Rig(node, process.wait_for('ready'), request.param == 'lock-step')
+            rig = Rig(node, process.wait_for('ready'))
             yield rig
             # Quitting is answered, then the episode and the process end.
             assert rig.set_state(QUITTING) == OK
@@ -162,11 +143,11 @@ def test_an_entity_that_is_put_elsewhere_is_seen_there_and_an_absurd_state_is_re
     assert 0 < stamp - to_nanoseconds(before.header.stamp) < PERIOD_NS
     image, objects, _ = rig.seen(stamp)
     assert objects.objects[1].pose == free.pose and image.data != before.data
-    if rig.lock_step:
-        assert rig.set_state(PLAYING) == OK
-        rig.command(before.header, x=0.05)  # for what was seen before
-        assert 'the newest is stamped' in rig.refusal(before)
-        assert rig.set_state(PAUSED) == OK
+    assert rig.set_state(PLAYING) == OK
+    rig.send(x=0.05, stamp=before.header.stamp)  # for what was seen before
+    assert 'the newest is stamped' in rig.refusals.wait(
+        20, lambda m: m.header.stamp == before.header.stamp).message
+    assert rig.set_state(PAUSED) == OK
 
 
 def test_steps_pass_only_when_paused_and_as_many_as_were_asked_for(rig):
@@ -221,41 +202,3 @@ def test_a_reset_starts_the_first_or_the_present_scene_and_no_clock_goes_back(ri
         assert rig.code('reset_simulation', 'clock', scope=scope) == UNSUPPORTED
     start = rig.marks[-1]
     assert (start.event, start.seed) == (Episode.START, SEED)
-
-
-def test_paused_nothing_moves_and_no_command_is_made_up_for(rig):
-    image, _, joints = rig.begin()
-    before = decode_gripper(joints)
-    rig.command(image.header, x=0.08)
-    rig.process.wait_for('gripper/command ignored: the simulation is paused')
-    assert 'paused' in rig.refusal(image)
-    # Two requests wait for one that takes long; the command comes while the first of them is
-    # carried out, and so is taken after the second, with which time passes again.
-    stamp = rig.stamp()
-    step, play = rig.clients['step_simulation'], rig.clients['set_simulation_state']
-    request = srv.StepSimulation.Request(steps=100)
-    waiting = [step.call_async(request)]
-    rig.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > stamp + PERIOD_NS)
-    waiting.append(step.call_async(request))
-    waiting.append(play.call_async(srv.SetSimulationState.Request(
-        state=SimulationState(state=PLAYING))))
-    newest = rig.image.wait(
-        30, lambda m: to_nanoseconds(m.header.stamp) > stamp + 105 * PERIOD_NS)
-    rig.command(newest.header, x=0.08)
-    assert all(until(future.done, 60) for future in waiting)
-    assert all(future.result().result.result == OK for future in waiting)
-    assert 'paused' in rig.refusal(newest)
-    if not rig.lock_step:
-        rig.image.wait(30, lambda m: to_nanoseconds(m.header.stamp) > stamp + 205 * PERIOD_NS)
-    assert rig.set_state(PAUSED) == OK
-    *_, joints = rig.seen(rig.stamp())
-    np.testing.assert_allclose(decode_gripper(joints), before, atol=1e-3)
-    if rig.lock_step:  # nor what was commanded before a pause
-        *_, joints = rig.begin(PLAYING)
-        rig.gripper.publish(Float64(data=1.0))
-        rig.client.pause(True)
-        assert rig.code('step_simulation', steps=2) == OK
-        assert rig.set_state(PLAYING) == OK
-        rig.step(2)
-        *_, after = rig.seen(rig.stamp())
-        np.testing.assert_allclose(decode_gripper(after), decode_gripper(joints), atol=1e-3)

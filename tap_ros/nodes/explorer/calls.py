@@ -9,16 +9,17 @@ import threading
 import time
 from typing import Any, TYPE_CHECKING
 
+from tap_msgs.action import ReachGoal
 from tap_ros.errors import TapError
 from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
 from tap_ros.nodes.calls import CallError, Reaching
 from tap_ros.nodes.client import Client
+from tap_ros.nodes.explorer.goal import simulated
 from tap_ros.nodes.services import internal_error, log_error
 from tap_ros.text import escaped, listing
 from tap_ros.weights import PREDICTORS
 
 if TYPE_CHECKING:
-    from tap_msgs.action import ReachGoal
     from tap_ros.nodes.explorer.node import ExplorerNode
 
 TIMEOUT_S = 20.0  # of a service
@@ -93,7 +94,8 @@ class ExplorerCalls:
     Carries out the commands of browsers, each in a thread of its own; one goal at a time.
 
     :param node: that another thread spins; what happens is told it.
-    :ivar stage: what the goal in progress is doing, '' without one.
+    :ivar running: whether a goal that a browser asked for is in progress.
+    :ivar stage: what that goal is doing, '' without one.
     """
 
     def __init__(self, node: 'ExplorerNode') -> None:
@@ -102,14 +104,9 @@ class ExplorerCalls:
         self._lock = threading.Lock()
         self._waiting = 0
         self._goal: Reaching | None = None
-        self._running = self._cancelled = self._ending = False
+        self.running = self._cancelled = self._ending = False
         self.stage = ''
         self._pool = ThreadPoolExecutor(4, 'explorer')
-
-    @property
-    def running(self) -> bool:
-        """Whether a goal that a browser asked for is in progress."""
-        return self._running
 
     def offered(self, service: str) -> bool:
         """Return whether a node offers a service, such as 'reset', 'set_goal' and 'select'."""
@@ -124,7 +121,7 @@ class ExplorerCalls:
         do, fields = parse_command(text)
         with self._lock:
             if do == 'cancel':
-                if not self._running:
+                if not self.running:
                     raise CommandError('there is no goal to cancel')
                 self._cancelled = True  # also one that is about to begin
                 if self._goal is not None and self._node.executor is not None:
@@ -133,9 +130,9 @@ class ExplorerCalls:
             if self._waiting >= WAITING:
                 raise CommandError('busy: earlier commands wait for their answers; try again')
             if do == 'reach':
-                if self._running:
+                if self.running:
                     raise CommandError('a goal is in progress; cancel it or wait for its end')
-                self._running, self._cancelled = True, False
+                self.running, self._cancelled = True, False
             self._waiting += 1
         self._pool.submit(self._carry_out, do, fields)
 
@@ -146,7 +143,7 @@ class ExplorerCalls:
         if goal is not None:
             goal.handle.cancel_goal_async()
         deadline = time.monotonic() + END_S
-        while self._running and executor is not None and time.monotonic() < deadline:
+        while self.running and executor is not None and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)  # nobody else does any more
         self._pool.shutdown(wait=False, cancel_futures=True)
 
@@ -166,10 +163,10 @@ class ExplorerCalls:
             with self._lock:
                 self._waiting -= 1
                 if do == 'reach':
-                    self._running, self._goal, self.stage = False, None, ''
+                    self.running, self._goal, self.stage = False, None, ''
 
     def _reset(self, task: str, seed: int) -> None:
-        response = self._client.call('reset', give_up=self._is_ending, task=task, seed=seed)
+        response = self._client.call('reset', give_up=lambda: self._ending, task=task, seed=seed)
         self._node.tell(f'reset: {escaped(response.message)}')
         if task in PREDICTORS and self._client.is_ready('predict'):
             weights = self._client.weights()
@@ -182,29 +179,37 @@ class ExplorerCalls:
 
     def _select(self, objects: list[dict[str, Any]]) -> None:
         response = self._client.call(
-            'select', give_up=self._is_ending, names=[one['name'] for one in objects],
+            'select', give_up=lambda: self._ending, names=[one['name'] for one in objects],
             u=[float(one['u']) for one in objects], v=[float(one['v']) for one in objects])
         self._node.show_selection(response, followed=True)
         self._node.tell(f'following {listing(one.name for one in response.objects)}')
 
     def _propose(self) -> None:
-        response = self._client.call('select', give_up=self._is_ending, propose=True)
+        response = self._client.call('select', give_up=lambda: self._ending, propose=True)
         self._node.show_selection(response, followed=False)
         self._node.tell(f'{len(response.objects)} objects proposed')
 
     def _move(self, name: str, u: float, v: float) -> None:
-        if simulated := self._node.simulated(name, u, v):
-            self._client.set_goal(simulated)
+        node, moved = self._node, {}
+        if self.offered('set_goal'):
+            moved = simulated(name, (u, v), node.places('goal_objects'),
+                              node.places('true_goals'), node.size('goal')['width'])
+        if moved:
+            self._client.set_goal(moved)
         else:
-            self._node.place(name, u, v)
-        self._node.tell(f'goal: {escaped(name)} to pixel {u:.1f}, {v:.1f}')
+            node.goal.place(name, (u, v), {
+                kind: message for kind, (message, _) in node.newest.copy().items()})
+        node.tell(f'goal: {escaped(name)} to pixel {u:.1f}, {v:.1f}')
 
     def _photograph(self) -> None:
-        self._node.photograph()
+        if self.offered('reset'):
+            raise CallError('photograph: the simulator takes its goal pictures itself')
+        told = bool({'objects', 'goal_objects'} & set(self._node.newest))
+        self._node.goal.photograph(told and not self.offered('select'))
         self._node.tell('goal: what the camera sees now')
 
     def _predict(self, samples: int, levels: int, seed: int) -> None:
-        response = self._client.call('predict', give_up=self._is_ending, num_samples=samples,
+        response = self._client.call('predict', give_up=lambda: self._ending, num_samples=samples,
                                      recursion_depth=levels, seed=seed)
         self._node.show_answer(response)
         self._node.tell(f'predicted in {response.model_time_ms:.0f} ms: '
@@ -213,14 +218,14 @@ class ExplorerCalls:
     def _reach(self, mode: str, samples: int, levels: int, seed: int) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self.stage = f'{words}: waiting for the planner'
-        if self._is_cancelled():
+        if self._cancelled:
             raise CallError(f'{words}: cancelled before it began')
         goal = self._client.reach(
             mode=mode, num_samples=samples, recursion_depth=levels, seed=seed,
             on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
         with self._lock:
             self._goal = goal
-        if self._is_cancelled():  # meanwhile
+        if self._cancelled:  # meanwhile
             goal.cancel()
         self._node.tell(f'{words}: begun')
         try:
@@ -231,12 +236,6 @@ class ExplorerCalls:
         end = 'cancelled' if result.end == 'cancelled' else escaped(result.message, 1000)
         self._node.tell(f'{words}: {end} ({result.steps} steps)')
 
-    def _is_cancelled(self) -> bool:
-        return self._cancelled
-
-    def _is_ending(self) -> bool:
-        return self._ending
-
-    def _on_feedback(self, feedback: 'ReachGoal.Feedback') -> None:
+    def _on_feedback(self, feedback: ReachGoal.Feedback) -> None:
         self.stage = (f'step {feedback.step}, to the {escaped(feedback.stage, 60)}, plan in '
                       f'{feedback.planning_ms:.0f} ms')

@@ -21,11 +21,10 @@ from tap_ros.errors import TapError
 from tap_ros.images.drawing import grid, overlay, png_bytes
 from tap_ros.messages.images import is_empty
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.client import subgoals_of
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.explorer.calls import ExplorerCalls
-from tap_ros.nodes.explorer.goal import GoalByHand, simulated
+from tap_ros.nodes.explorer.goal import GoalByHand
 from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.explorer.shown import (
     Distances,
@@ -61,13 +60,16 @@ class ExplorerNode(Node):
 
     Pictures are encoded only while a browser is connected, the newest of each kind. A goal that
     was begun goes on when browsers leave; it is cancelled when this node ends.
+
+    :ivar newest: {kind: newest message, when it was received}.
+    :ivar goal: GoalByHand.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__('explorer_node', **options)
         self.params = declare_parameters(self)
         self._lock = threading.Lock()
-        self._newest: dict[str, tuple[Any, float]] = {}  # kind -> message, when it came
+        self.newest: dict[str, tuple[Any, float]] = {}  # kind -> message, when it came
         self._changed: set[str] = set()  # kinds whose newest message was not shown yet
         self._sizes: dict[str, tuple[int, int]] = {}  # (width, height) before it is made smaller
         self._distances = Distances()
@@ -80,7 +82,7 @@ class ExplorerNode(Node):
         self._sheet_stamp: Any = None  # of the picture whose subgoals are shown side by side
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
         self._selections = 0  # answers of select_objects
-        self._goal = GoalByHand(self)
+        self.goal = GoalByHand(self)
         self._calls = ExplorerCalls(self)
         self._server = ExplorerServer(
             self._calls.do, self.params['host'], self.params['port'], self.params['token'])
@@ -122,25 +124,25 @@ class ExplorerNode(Node):
             if counted:
                 self._service.received(topic)
             with self._lock:
-                before, _ = self._newest.get(name, (None, 0.0))
+                before, _ = self.newest.get(name, (None, 0.0))
                 if name == 'goal' and is_empty(message):  # it was taken back
-                    self._newest.pop('goal', None)
+                    self.newest.pop('goal', None)
                     self._server.put('goal', b'')
                     return
                 if name == 'goal' and before not in (None, message):
                     self._forget_plans()
                 if name in ('subgoal', 'plan') and self._is_old(message):
                     return
-                self._newest[name] = message, reception_time(info)
+                self.newest[name] = message, reception_time(info)
                 self._changed.add(name)
             if name in ('camera', 'objects'):
-                self._goal.moments.put(name, message, reception_time(info))
+                self.goal.moments.put(name, message, reception_time(info))
         return AdaptiveSubscription(self, kind, topic, keep, qos)
 
     def _forget_plans(self) -> None:
         """Show no more what was predicted and planned for another goal."""
         for kind in ('subgoal', 'plan'):
-            self._newest.pop(kind, None)
+            self.newest.pop(kind, None)
             self._changed.discard(kind)
             self._server.put(kind, b'')
         self._note = ''
@@ -186,33 +188,6 @@ class ExplorerNode(Node):
             self._server.put('subgoal', png_bytes(sheet))
         self._note = f'{len(subgoals)} subgoals' if len(subgoals) > 1 else ''
 
-    def photograph(self) -> None:
-        """
-        Publish the camera's newest picture as the goal, with the objects in it.
-
-        :raises CallError: when that cannot be done.
-        """
-        if self._calls.offered('reset'):
-            raise CallError('photograph: the simulator takes its goal pictures itself')
-        told = bool({'objects', 'goal_objects'} & set(self._newest))
-        self._goal.photograph(told and not self._calls.offered('select'))
-
-    def simulated(self, name: str, u: float, v: float) -> dict[str, tuple[float, float]]:
-        """Return what the simulator is to put where, as goal.simulated; {}: nothing."""
-        if not self._calls.offered('set_goal'):
-            return {}
-        return simulated(name, (u, v), self._places('goal_objects'), self._places('true_goals'),
-                         self._size('goal')['width'])
-
-    def place(self, name: str, u: float, v: float) -> None:
-        """
-        Publish goal objects of which this one is at another pixel, of the picture of 'movable'.
-
-        :raises CallError: when there is no such object.
-        """
-        self._goal.place(name, (u, v), {
-            kind: message for kind, (message, _) in self._newest.copy().items()})
-
     def show_selection(self, response: SelectObjects.Response, followed: bool) -> None:
         """
         Show outlines of objects that are followed from now on, or that are proposed.
@@ -248,11 +223,11 @@ class ExplorerNode(Node):
         # Before the log: how a run ended is told first, so that who sees no run sees how it ended.
         running, watched = self._calls.running, self._server.browsers
         with self._lock:
-            newest = dict(self._newest)
+            newest = dict(self.newest)
             changed = self._changed if watched else self._changed - {*PICTURES}
             self._changed = self._changed - changed
             log, log_count, problem = list(self._log), self._log_count, self._problem
-        objects, goals = self._places('objects'), self._places('goal_objects')
+        objects, goals = self.places('objects'), self.places('goal_objects')
         if 'goal_objects' in changed:
             self._distances.clear()
         if 'objects' in changed and objects and goals:
@@ -275,11 +250,11 @@ class ExplorerNode(Node):
             'plans': not simulator or not grips(self._task),
             'tracker': self._calls.offered('select'), 'observer': self._observed,
             'movable': self._movable(bool(objects), bool(goals), 'goal' in newest),
-            'camera': {**self._size('camera'),
+            'camera': {**self.size('camera'),
                        'objects': listed(objects, newest.get('objects')),
                        'targets': listed({n: goals[n] for n in objects if n in goals}),
                        'note': silence(now, newest.get('camera'))},
-            'goal': {**self._size('goal'), 'objects': listed(goals, newest.get('goal_objects')),
+            'goal': {**self.size('goal'), 'objects': listed(goals, newest.get('goal_objects')),
                      'pictured': 'goal' in newest,
                      'note': '' if 'goal' in newest else 'none yet'},
             'subgoal_note': self._note, 'problem': problem,
@@ -289,9 +264,9 @@ class ExplorerNode(Node):
             'log': log, 'log_count': log_count}))
         self._server.put('history', json.dumps({'kind': 'history', **self._distances.shown()}))
 
-    def _places(self, name: str) -> dict[str, Place]:
+    def places(self, name: str) -> dict[str, Place]:
         """Return the places of objects by name; empty where they cannot be used."""
-        message, _ = self._newest.get(name, (ObjectStates(), 0.0))
+        message, _ = self.newest.get(name, (ObjectStates(), 0.0))
         try:
             return places_of(message, name)
         except TapError as error:
@@ -315,7 +290,8 @@ class ExplorerNode(Node):
             self._note = ''
         self._server.put(kind, picture_bytes(image, kind == 'plan'))
 
-    def _size(self, kind: str) -> dict[str, int]:
+    def size(self, kind: str) -> dict[str, int]:
+        """Return width and height of the newest picture of a kind; 0 without one."""
         width, height = self._sizes.get(kind, (0, 0))
         return {'width': width, 'height': height}
 
