@@ -32,7 +32,7 @@ help:
 	@echo 'make test    the tests, in two processes; JOBS=4: in four; ARGS="-k warp": only those'
 	@echo 'make test-all also the tests that take minutes each'
 	@echo "make paper   make the paper's prediction results again, in docs/results: hours; can be"
-	@echo '             interrupted, goes on; SCALE=full for a large GPU, JOBS=4, ARGS=--list'
+	@echo '             interrupted, goes on; JOBS=4, ARGS=--list'
 	@echo 'make worlds  demonstrations of other simulators, and who finds their bottlenecks; goes on'
 	@echo 'make faults  inject every fault into real nodes and disks, in docs/results: four hours;'
 	@echo '             ARGS="-k silent": only those; ARGS="--share 0.1": a tenth of the trials'
@@ -59,7 +59,7 @@ test-all: build
 	@$(ENTER); $(DOMAIN); python -m pytest -n $(or $(JOBS),2) $(ARGS)
 
 paper: build
-	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(if $(SCALE),--scale $(SCALE)) $(ARGS)
+	@$(ENTER); python -m tap_ros paper --jobs $(or $(JOBS),2) $(ARGS)
 
 worlds: build
 	@$(ENTER); python -m tap_ros worlds --jobs $(or $(JOBS),2) $(ARGS)

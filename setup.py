@@ -39,8 +39,8 @@ setup(
     python_requires='>=3.11',
     packages=find_packages(include=['tap_ros', 'tap_ros.*', 'sim_bridge', 'sim_bridge.*']),
     package_data={
-        NAME: ['*.pyi', 'nodes/demo/*.html', 'nodes/explorer/page/*', 'nodes/*.xml',
-               'prediction/page/*', 'py.typed', 'weights/*.md', 'weights/*.png',
+        NAME: ['*.pyi', 'evaluation/*.html', 'nodes/demo/*.html', 'nodes/explorer/page/*',
+               'nodes/*.xml', 'prediction/page/*', 'py.typed', 'weights/*.md', 'weights/*.png',
                'weights/*.safetensors'],
         'sim_bridge': ['py.typed']},
     data_files=[
@@ -55,7 +55,6 @@ setup(
     extras_require={  # what only some commands need; `colcon test` runs pytest because of the last
         'tfrecord': ['google-crc32c', 'protobuf'],
         'explorer': ['websockets'],
-        'hub': ['huggingface_hub'],
         'lerobot': ['pyarrow'],
         'ray': ['ray'],
         'test': ['pytest'],

@@ -43,8 +43,8 @@ FILE = ROOT / 'test' / 'golden.json'
 SAMPLE = ROOT / 'bags' / 'sample_push2'
 QUICK = [str(SAMPLE), '--steps', '10', '--batch-size', '4', '--test-fraction', '0.3', '--threads',
          '1', '--device', 'cpu']
-PREDICTOR = ['predictor', *QUICK, '--precision', 'float32', '--base-width', '4', '--outer-power',
-             '0.5', '--start-crop', '0', '--progress-margin', '0']
+PREDICTOR = ['predictor', *QUICK, '--precision', 'float32', '--base-width', '4', '--start-crop',
+             '0', '--progress-margin', '0']
 PAPER = [*PREDICTOR, '--decoder', 'separate', '--no-skips']
 TRAININGS = {  # options of `train`
     'relative': [*PREDICTOR, '--selection', 'relative', '--start-crop', '0.3'],

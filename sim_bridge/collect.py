@@ -8,7 +8,7 @@ files do not depend on the number of workers. A finished file has its final name
 collection goes on with the files that are not there yet.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 import json
 import math
@@ -110,7 +110,7 @@ def run(args: Options) -> None:
 
 
 def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
-            progress: bool = True, stop: Callable[[], bool] = lambda: False) -> dict[str, Any]:
+            progress: bool = True) -> dict[str, Any]:
     """
     Collect a recording, or go on with one that was interrupted.
 
@@ -118,10 +118,9 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
     :param config: CollectConfig.
     :param engine: Engine; on a cluster the folder is one that all its machines share.
     :param progress: show a progress bar.
-    :param stop: asked before each file; once it says True, no other begins.
     :return: dict of episodes, frames, seconds (wall, and of acting and writing, summed over
         workers), success rate, mean final distance in metres, of the episodes collected by this
-        call, and whether the recording is whole now.
+        call.
     :raises ConfigError: when the folder holds a recording made with other settings.
     :raises EngineError: when worker processes are killed again and again.
     :raises StorageError: when the disk is full, or another process is collecting there. Files
@@ -133,9 +132,8 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
         _check_settings(folder, config)
         for left in folder.glob('*.part'):  # by a process that was killed
             left.unlink()
-        result = _collect_missing(folder, config, engine, progress, stop)
-        if result['whole']:
-            write_metadata(folder)
+        result = _collect_missing(folder, config, engine, progress)
+        write_metadata(folder)
     return result
 
 
@@ -168,8 +166,8 @@ def _make(config: CollectConfig) -> World:
                       **options if config.world == TABLE else {})
 
 
-def _collect_missing(folder: Path, config: CollectConfig, engine: Engine, progress: bool,
-                     stop: Callable[[], bool]) -> dict[str, Any]:
+def _collect_missing(folder: Path, config: CollectConfig, engine: Engine,
+                     progress: bool) -> dict[str, Any]:
     """Collect the files that are not there yet; see collect."""
     shards = range(-(-config.episodes // config.episodes_per_file))
     missing = [i for i in shards if not _is_whole(folder, config, i)]
@@ -178,7 +176,7 @@ def _collect_missing(folder: Path, config: CollectConfig, engine: Engine, progre
              for i in missing]
     total = sum(len(_episodes(config, i)) for i in missing)
     with tqdm(total=total, unit='episode', disable=not progress) as bar:
-        for _, get in run_tasks(tasks, engine, stop):
+        for _, get in run_tasks(tasks, engine):
             done.append(get())
             _note_bottlenecks(folder, done[-1]['bottlenecks'])
             bar.update(len(done[-1]['outcomes']))
@@ -191,8 +189,7 @@ def _collect_missing(folder: Path, config: CollectConfig, engine: Engine, progre
         'success_rate': _mean([outcome == 'success' for outcome in every('outcomes')]),
         'mean_final_distance': _mean(every('distances')),
         'seconds': {'wall': time.perf_counter() - start, 'act': sum(every('act')),
-                    'write': sum(every('write'))},
-        'whole': len(done) == len(missing)}
+                    'write': sum(every('write'))}}
 
 
 def _mean(values: Sequence[float]) -> float:

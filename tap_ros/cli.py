@@ -75,16 +75,12 @@ COMMANDS: dict[str, tuple[str, Module]] = {
         'planning': ('time of a plan', 'experiments.bench.planning'),
         'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
     }),
-    'hub': ('share trained weights on the Hugging Face Hub', {
-        'push': ('upload weights with their model card', 'tap_ros.hub:push'),
-        'pull': ('download weights and check them', 'tap_ros.hub:pull'),
-    }),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
 }
 EXTRAS = {  # what only some commands need, and what pip calls it
     'google': 'google-crc32c protobuf', 'google_crc32c': 'google-crc32c protobuf',
-    'huggingface_hub': 'huggingface_hub', 'pandas': 'pandas', 'pyarrow': 'pyarrow', 'ray': 'ray',
+    'pandas': 'pandas', 'pyarrow': 'pyarrow', 'ray': 'ray',
     'websockets': 'websockets'}
 PROG = 'python -m tap_ros'
 

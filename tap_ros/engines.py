@@ -32,7 +32,6 @@ from tap_ros.text import escaped
 from tyro import conf
 
 TRIES = 3  # of a task whose worker is killed
-POLL_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -83,17 +82,13 @@ class Work:
 Workers: TypeAlias = tuple[Callable[[Work], 'Future[Any]'], int, tuple[type[Exception], ...]]
 
 
-def run_tasks(
-        tasks: Iterable[Work], engine: Engine = LOCAL, stop: Callable[[], bool] = lambda: False,
-        tick: Callable[[], object] = lambda: None,
-) -> Iterator[tuple[Work, Callable[[], Any]]]:
+def run_tasks(tasks: Iterable[Work],
+              engine: Engine = LOCAL) -> Iterator[tuple[Work, Callable[[], Any]]]:
     """
     Run tasks, in their order as far as there are workers.
 
     :param tasks: iterable of Work.
     :param engine: Engine.
-    :param stop: asked before each task; once it says True, no other begins.
-    :param tick: called about twice a second meanwhile.
     :return: generator of (Work, get), in the order in which they end: get() returns what the
         task returned, or raises what it raised. Tasks in progress are ended where the generator
         is closed or interrupted.
@@ -106,12 +101,10 @@ def run_tasks(
         return
     with (_ray if engine.name == 'ray' else _pool)(engine) as (begin, room, died):
         while waiting or running:
-            while waiting and len(running) < room and not stop():
+            while waiting and len(running) < room:
                 task = waiting.popleft()
                 running[begin(task)] = task
-            if not running:
-                return
-            for future in wait(running, POLL_S, FIRST_COMPLETED).done:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
                 task = running.pop(future)
                 if isinstance(future.exception(), died):
                     lost[id(task)] += 1
@@ -123,7 +116,6 @@ def run_tasks(
                         f'{task.name}: its worker process was killed {TRIES} times, perhaps for '
                         'want of memory; start again with fewer workers: what is done is kept'))
                 yield task, partial(_result, future)
-            tick()
 
 
 def _result(future: 'Future[Any]') -> Any:

@@ -38,10 +38,6 @@ class WeightsError(TapError):
     """A weights file is missing, damaged, or made for something else."""
 
 
-class HubError(TapError):
-    """The Hugging Face Hub cannot be reached, or refuses what it was asked for."""
-
-
 class SceneError(TapError):
     """A task, seed or scene cannot be set up, or an action cannot be applied."""
 

@@ -101,20 +101,6 @@ def only_writer(folder: str | Path) -> Iterator[None]:
         os.close(handle)
 
 
-@contextmanager
-def locked(path: str | Path, wait: bool = False) -> Iterator[bool]:
-    """
-    Hold a lock as long as the context lasts; it ends with the process, however that ends.
-
-    :param path: of a file to lock, made if it is not there.
-    :param wait: whether to wait until it is free.
-    :return: context manager of a bool: whether this process has it.
-    """
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with open(path, 'a') as file:
-        yield _lock(file.fileno(), wait)
-
-
 def _lock(handle: int, wait: bool) -> bool:
     """Lock an open file or folder; say whether it could be."""
     try:

@@ -22,13 +22,13 @@ SHOWN = {  # one of those with the same options
     tuple(re.findall(r'--\S+', command)) or command: command.strip() for page in PAGES
     for command in re.findall(r'-m tap_ros ([^`\n;|]+?)(?: #.*)?(?=[`\n;])', page.read_text())
     if '...' not in command and '--tyro' not in command}.values()
-IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --scale full --list', 'bench',
+IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --list', 'bench',
                    'bench planning']
 
 
 @cache
 def kinds():
-    """Return the options of each command by its words, such as 'hub push'."""
+    """Return the options of each command by its words, such as 'train forward'."""
     _find_experiments()
     flat = {}
     for name, (_, module) in COMMANDS.items():
@@ -123,9 +123,9 @@ def test_words_that_are_wrong_are_named(line, named, capsys):
 
 
 def test_help_comes_without_what_takes_long_to_import():
-    for command, allowed in (('', ()), ('evaluate', ()), ('train predictor', ()), ('hub push', ()),
+    for command, allowed in (('', ()), ('evaluate', ()), ('train predictor', ()),
                              ('evaluate planning', ('mujoco',))):
-        slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard', 'huggingface_hub'} - {*allowed}
+        slow = {'torch', 'mujoco', 'rclpy', 'cv2', 'tensorboard'} - {*allowed}
         run = subprocess.run([sys.executable, '-c', (
             'import atexit, sys; from tap_ros.cli import main; '
             f'atexit.register(lambda: print("slow:", {slow} & set(sys.modules))); '

@@ -62,14 +62,6 @@ def test_the_task_of_a_killed_worker_is_run_again_and_given_up_in_the_end(tmp_pa
     assert len(list(folders[1].iterdir())) == TRIES
 
 
-def test_after_a_stop_no_task_begins():
-    begun = []
-    tasks = [Work(str(i), square, (i,)) for i in range(9)]
-    for task, _ in run_tasks(tasks, Engine(workers=1), stop=lambda: len(begun) == 2):
-        begun.append(task.name)
-    assert begun == ['0', '1']
-
-
 def test_an_interrupted_run_leaves_no_worker(tmp_path):
     script = ('import signal, sys; sys.path[:0] = sys.argv[2:]\n'
               'from test_engines import write_slowly\n'

@@ -13,7 +13,7 @@ import tempfile
 import time
 from typing import Annotated
 
-from tap_ros.options import Bags, Flag
+from tap_ros.options import Bags
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
@@ -42,7 +42,6 @@ class Options:
     :param batch_size: as for train.
     :param threads: as for train.
     :param device: as for train.
-    :param compile: as for train.
     """
 
     recordings: Bags = ('bags/sample_push2',)
@@ -52,7 +51,6 @@ class Options:
     batch_size: int = TrainingConfig.batch_size
     threads: int = TrainingConfig.threads
     device: str = TrainingConfig.device
-    compile: Flag = False
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ def run(args):
                 'selection': 'absolute', 'margin': 0, 'goal_picture': 'last', 'start_crop': 0.0,
                 'decoder': 'separate', 'skips': False, 'base_width': args.base_width,
                 'batch_size': args.batch_size, 'device': args.device, 'threads': args.threads,
-                'compile': args.compile, 'save_every': 10 ** 9, **row})
+                'save_every': 10 ** 9, **row})
             cost = time_step(config, args.steps)
         rate, efficiency = (args.batch_size / each for each in (cost.seconds, cost.cpu_seconds))
         first = first or efficiency
@@ -101,7 +99,7 @@ def time_step(config, steps):
     Time a step of training, all that belongs to it included.
 
     :param config: TrainingConfig, of a run that has not begun.
-    :param steps: how many to average over, after as many to warm up and to compile.
+    :param steps: how many to average over, after as many to warm up.
     :return: Cost.
     """
     times = {}

@@ -1,32 +1,21 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""The plots: forward scatter (Fig. 4), and bottlenecks over when they come."""
+"""The plot of bottlenecks over when they come, and what all plots share."""
 
 import io
 
-from experiments.paper.names import COPIES, method_order, short_name, variant_of
-from experiments.paper.published import FORWARD_GRASP, TIMED_TITLES, TITLES
-from experiments.paper.rows import lower_hull, select
+from experiments.paper.names import COPIES, method_order, short_name
+from experiments.paper.published import TIMED_TITLES
+from experiments.paper.rows import select
 from experiments.paper.runs import OURS
 from matplotlib.figure import Figure
 import numpy as np
-from sim_bridge.tasks.tasks import get_task
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; one for each family of methods.
 COLOURS = {'copy': '#8c8c8c', 'fix': '#0072b2', 'min': '#e69f00', 'genmin': '#d55e00',
            'ours': '#009e73', 'vae': '#cc79a7'}
 INK = '#333333'
 _WIDTH = 9.0  # inches
-
-
-def file_name(name, scale):
-    """
-    Name a picture of the results.
-
-    :param name: what it shows.
-    :param scale: the small one's pictures carry no mark.
-    """
-    return f'{name}.png' if scale == 'small' else f'{name}-{scale}.png'
 
 
 def family(method):
@@ -82,74 +71,11 @@ def _spread(positions, gap):
     return result
 
 
-def forward_scatter(rows, task='grasp'):
-    """
-    Draw error against match-step in forward prediction, ours beside the authors' (Fig. 4).
-
-    :param rows: of rows.as_frame, of one scale.
-    :param task: whose.
-    :return: bytes of a PNG, or None without such rows.
-    """
-    own = select(rows, task, 'forward')
-    own = own[~own['method'].isin(COPIES)]
-    errors, steps = (own[own['metric'] == metric].set_index('method')
-                     for metric in ('min_l1', 'match_step'))
-    ours = {}  # a panel for each variant: errors are compared with fix of the same one
-    for method in errors.index.intersection(steps.index):
-        error, step, variant = errors.loc[method], steps.loc[method], variant_of(method)
-        ours.setdefault(variant, {})[short_name(method.removesuffix(variant))] = (
-            step['value'], error['value'], step, error)
-    if not ours:
-        return None
-    panels = [('ours' if variant == OURS else f"ours, the paper's network {variant}".strip(),
-               ours[variant]) for variant in sorted(ours)]
-    if task == 'grasp':
-        panels.append(("the authors'", {
-            name: (*point, None, None) for name, point in FORWARD_GRASP.items()}))
-    figure, axes = new_figure(3.9, len(panels))
-    for axis, (title, points) in zip(axes[0], panels):
-        _scatter(axis, points, get_task(task).num_frames)
-        axis.set_title(f'{TITLES[task]}: {title}', fontsize=10, loc='left', color=INK)
-        axis.set_xlabel('match-step (frames from the start)', fontsize=9, color=INK)
-    axes[0, 0].set_ylabel('min l1, forward', fontsize=9, color=INK)
-    return to_png(figure)
-
-
-def _scatter(axis, points, frames):
-    """Draw one panel: a point for each method, and the lower hull of the fixed-time ones."""
-    methods = sorted(points, key=method_order)
-    high = 1.18 * max(points[m][1] for m in methods)
-    fixed = [points[m][:2] for m in methods if family(m) == 'fix']
-    if fixed:
-        at = np.linspace(min(fixed)[0], max(fixed)[0], 200)
-        axis.plot(at, lower_hull(at, fixed), color=COLOURS['fix'], alpha=0.25, zorder=1)
-    for m in methods:
-        x, y, step, error = points[m]
-        colour = COLOURS[family(m)]
-        if step is not None:
-            axis.errorbar(
-                x, y, [[y - error['ci_low']], [error['ci_high'] - y]],
-                [[x - step['ci_low']], [step['ci_high'] - x]],
-                color=colour, elinewidth=0.8, alpha=0.5, zorder=2)
-        axis.plot(x, y, 's' if family(m) == 'fix' else 'o', color=colour, markersize=6,
-                  markeredgecolor='white', markeredgewidth=0.6, zorder=3)
-    heights = _spread([points[m][1] for m in methods], 0.05 * high)
-    for m, height in zip(methods, heights):  # in a column: beside the points they would overlap
-        axis.annotate(
-            m, points[m][:2], (1.06 * frames, height), fontsize=8, color=COLOURS[family(m)],
-            va='center', annotation_clip=False, arrowprops={
-                'arrowstyle': '-', 'color': COLOURS[family(m)], 'alpha': 0.35, 'linewidth': 0.7,
-                'shrinkA': 1, 'shrinkB': 4})
-    axis.set_xlim(0, frames)
-    axis.set_ylim(0, high)
-    axis.grid(color='#f0f0f0')
-
-
 def timing(rows):
     """
     Draw the bottleneck frequency of methods over when the bottleneck comes.
 
-    :param rows: of rows.as_frame, of one scale.
+    :param rows: of rows.as_frame.
     :return: bytes of a PNG, or None without such rows.
     """
     found = {}

@@ -1,18 +1,16 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
-Pictures of predictions in the paper's format (Figs. 5, 6 and 9), headings drawn in.
+A picture of predictions in the paper's format (Figs. 5, 6 and 9), headings drawn in.
 
-The episodes are the first held-out ones, whatever they look like. Only runs whose weights are at
-hand can be shown.
+The episodes are the first held-out ones, whatever they look like.
 """
 
 from pathlib import Path
 
-from experiments.paper.figures import COLOURS, family, file_name, INK
+from experiments.paper.figures import COLOURS, family, INK
 from experiments.paper.names import method_order, variant_of
-from experiments.paper.published import TITLES
-from experiments.paper.runs import OURS
+from experiments.paper.runs import OURS, SCALE
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
@@ -24,68 +22,50 @@ from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
 from tap_ros.prediction.predictor import load_network
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training.split import split_episodes, TEST_FRACTION
+from tap_ros.training.split import split_episodes
 import torch
 
+TASK, MODE, TITLE = 'pick_place', 'bidirectional', 'Pick-and-place, bidirectional'
 EPISODES = 3
-MATCHED = ('genmin-wo-gan+skips', 'genmin', 'genmin4-wo-gan+skips', 'genmin4')
+MATCHED = ('genmin-wo-gan+skips', 'genmin')
 _DPI = 100
 
 
-def write_grids(folder, runs, weights, recordings='bags'):
+def write_picture(places, runs):
     """
-    Write a picture of every task of Table 1 and mode, of networks with new pixels.
+    Write the picture of pick-and-place: what each method predicts, with new pixels.
 
-    A picture that is there stays where weights of a method that it should show are not at hand.
-    Of several seeds the first one at hand is shown.
+    One that is there stays where weights of a method, or the recording that they were scored on,
+    are not at hand.
 
-    :param folder: to write PNG files to.
-    :param runs: dicts as results.load_runs returns them, of one scale.
-    :param weights: folder with <run>/predictor.safetensors.
-    :param recordings: folder with the recordings of each task, where those that a run was trained
-        on are no longer.
+    :param places: sweep.Places.
+    :param runs: dicts as results.load_runs returns them.
     """
-    runs = [run for run in runs if run['task'] in TITLES and run['new_pixels']
-            and variant_of(run['method']) in ('', OURS) and run.get('recursion', 1) == 1]
-    for task, mode in sorted({(run['task'], run['mode']) for run in runs}):
-        same = sorted((run for run in runs if (run['task'], run['mode']) == (task, mode)),
-                      key=lambda run: (method_order(run['method']), run['seed']))
-        paths = {}
-        for run in same:
-            path = Path(weights) / run['name'] / 'predictor.safetensors'
-            if path.exists():
-                paths.setdefault(run['method'], path)
-        target = Path(folder) / file_name(f'{task}-{mode}', same[0]['scale'])
-        episodes = paths and _held_out(same, recordings)
-        if episodes and (not target.exists() or paths.keys() >= {run['method'] for run in same}):
-            headings, rows = _panels(mode, {
-                method: load_network(path)[0] for method, path in paths.items()}, *episodes)
-            write_atomically(target, png_bytes(draw(f'{TITLES[task]}, {mode}', headings, rows)))
-
-
-def _held_out(runs, recordings):
-    """Return (store, indices of the first held-out episodes, goal picture), or None."""
-    run = runs[0]
-    own = run['config'].get('recordings', ())
-    paths = [path for path in own if Path(path).exists()]
-    paths = paths or [Path(recordings) / run['task']]
-    if not Path(paths[0]).exists():
-        return None
-    store = open_recordings(paths)
-    _, held_out = split_episodes(store, run['config'].get('test_fraction', TEST_FRACTION))
-    # Of other recordings the pictures would not be those that the scores are of.
-    if not len(held_out) or store.data_hash not in {run['data']['hash'] for run in runs}:
-        return None
-    return store, held_out[:EPISODES], run['evaluation'].get('goal_picture', 'last')
+    weights = {}
+    for run in sorted(runs, key=lambda run: (method_order(run['method']), run['seed'])):
+        if (run['task'], run['mode']) == (TASK, MODE) and variant_of(run['method']) in (
+                '', OURS) and run.get('recursion', 1) == 1:
+            weights.setdefault(run['method'], (
+                Path(places.runs, SCALE, run['name'], 'predictor.safetensors'), run))
+    if not weights or not all(path.exists() for path, _ in weights.values()):
+        return
+    run = next(iter(weights.values()))[1]
+    store = open_recordings([places.recording(TASK)])
+    _, held_out = split_episodes(store, run['config']['test_fraction'])
+    if len(held_out) and store.data_hash == run['data']['hash']:
+        headings, rows = _panels({method: load_network(path)[0]
+                                  for method, (path, _) in weights.items()},
+                                 store, held_out[:EPISODES])
+        write_atomically(Path(places.results, f'{TASK}-{MODE}.png'),
+                         png_bytes(draw(TITLE, headings, rows)))
 
 
 @torch.inference_mode()
-def _panels(mode, networks, store, episodes, goal_picture):
+def _panels(networks, store, episodes):
     """Show inputs, the output of each method, and the match of genmin; return headings, rows."""
-    batch = make_batch(store, episodes, Sampling(
-        goal_picture=goal_picture, forward=mode == 'forward'))
+    batch = make_batch(store, episodes, Sampling(goal_picture='last'))
     context = batch.context.numpy()
-    headings = [(text, INK) for text in ('start', 'goal')[:context.shape[1]]]
+    headings = [(text, INK) for text in ('start', 'goal')]
     rows, matched = [list(pictures) for pictures in context], None
     for method, network in networks.items():
         size = network.config.latent_size  # z: the sample that the scores count as the first

@@ -7,8 +7,6 @@ The range of the paper's l1 errors is not known, and its world, cameras and trai
 others than ours: only how its methods stand to each other carries over.
 """
 
-TITLES = {'grasp': 'Grasping', 'pick_place': 'Pick-and-place', 'push2': 'Pushing two objects',
-          'push3': 'Pushing three objects', 'stack2': 'Stacking two blocks'}
 # Of recordings whose bottleneck comes at another time.
 TIMED_TITLES = {'push2_early': 'early', 'push2_middle': 'in the middle', 'push2_late': 'late',
                 'push2_mixed': 'any of these'}
@@ -36,14 +34,6 @@ TABLE_2 = {
     ('push3', 'fix'): (17.6, 0.6), ('push3', 'genmin'): (12.9, 0.7)}
 # How much lower genmin's error is than fix's (section 4).
 GAINS = {'grasp': 0.21, 'pick_place': 0.265, 'push2': 0.532}
-
-# Fig. 4: forward prediction of grasps, method -> (match-step, min l1), from the authors' plotting
-# script; the figure itself prints no numbers.
-FORWARD_GRASP = {
-    'fix0.25': (3.2, 0.0309), 'fix0.50': (6.5, 0.0325), 'fix0.75': (6.5, 0.0439),
-    'fix1.00': (7.9, 0.0441), 'min': (2.2, 0.0212), 'genmin30': (2.6, 0.0215),
-    'genmin10': (3.8, 0.0257), 'genmin7': (4.9, 0.0276), 'genmin4': (5.6, 0.0283),
-    'genmin2': (7.3, 0.0314), 'genmin0.5': (8.4, 0.0339)}
 
 # Appendix E: share of predictions within 2 px of a bottleneck, pushing two objects.
 BOTTLENECK_2PX = {'genmin': 0.58, 'fix': 0.0}

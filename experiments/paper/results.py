@@ -1,6 +1,6 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Results from finished runs: the numbers as data, plots and pictures."""
+"""Results from finished runs: the numbers as data, a plot and a picture."""
 
 from collections import Counter
 import json
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from experiments.paper import figures
 from experiments.paper.names import COPIES
-from experiments.paper.pictures import write_grids
+from experiments.paper.pictures import write_picture
 from experiments.paper.rows import as_frame, group_runs, make_rows
 from experiments.paper.runs import label
 from tap_ros.errors import ConfigError
@@ -68,18 +68,16 @@ def on_same_episodes(runs):
     return kept, [run for run in runs if run not in kept]
 
 
-def write_results(folder='docs/results', runs='runs/paper', recordings='bags', pictures=True):
+def write_results(places, pictures=True):
     """
-    Write prediction.csv, its plots, and pictures where weights are at hand.
+    Write prediction.csv, the plot of timing, and a picture where weights are at hand.
 
-    :param folder: to write to; the runs' numbers are in its subfolder runs/<scale>.
-    :param runs: folder with runs' weights: <scale>/<name>/predictor.safetensors.
-    :param recordings: folder with the recordings, one for each task.
-    :param pictures: whether to make the pictures of predictions again.
+    :param places: sweep.Places.
+    :param pictures: whether to make the picture of predictions again.
     :return: rows of prediction.csv.
     :raises ConfigError: if there are no finished runs, or one cannot be read.
     """
-    folder = Path(folder)
+    folder = Path(places.results)
     loaded = load_runs(folder / 'runs')
     if not loaded:
         raise ConfigError(f'{folder / "runs"}: there are no finished runs; make some with '
@@ -89,16 +87,9 @@ def write_results(folder='docs/results', runs='runs/paper', recordings='bags', p
         print('scored on other episodes, left out: ' + ', '.join(run['name'] for run in left_out))
     rows = as_frame(make_rows(group_runs(kept)))
     write_atomically(folder / 'prediction.csv', rows.to_csv(index=False))
-    for scale in sorted({run['scale'] for run in kept}):
-        own = rows[rows['scale'] == scale]
-        for name, png in (('forward_scatter', figures.forward_scatter(own)),
-                          ('timing', figures.timing(own))):
-            path = folder / figures.file_name(name, scale)
-            if png is not None:
-                write_atomically(path, png)
-            else:
-                path.unlink(missing_ok=True)
-        if pictures:
-            write_grids(folder, [run for run in kept if run['scale'] == scale],
-                        Path(runs) / scale, recordings)
+    png = figures.timing(rows)
+    if png is not None:
+        write_atomically(folder / 'timing.png', png)
+    if pictures:
+        write_picture(places, kept)
     return rows

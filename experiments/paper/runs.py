@@ -1,49 +1,20 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Which trainings the paper's results need, at which scale, and in which order.
+"""Which trainings the paper's results need, of what size, and in which order."""
 
-'small' is for two CPU cores, 'full' is the paper's for one large GPU.
-"""
-
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-import shlex
 
 from experiments.paper.recordings import held_out_share, RECORDINGS, SHIFTED, TIMED
 from sim_bridge.tasks.tasks import get_task
-from tap_ros.errors import ConfigError
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.training_config import TrainingConfig
 
 SINGLE = ('grasp', 'pick_place', 'push2')  # the tasks of Table 1
-EPOCHS = 200  # of the paper (appendix C)
 MAIN_SEEDS = (0, 1, 2)
-
-
-@dataclass(frozen=True)
-class Scale:
-    """
-    How large everything is.
-
-    :param steps: length of a training; 0: the paper's epochs.
-    :param settings: of every training, beside the method's own.
-    """
-
-    steps: int = 0
-    settings: dict = field(default_factory=dict)
-
-
-SCALES = {
-    'small': Scale(
-        steps=2500,
-        settings={'base_width': 16, 'batch_size': 24, 'threads': 1, 'save_every': 1250}),
-    'full': Scale(
-        settings={'base_width': 32, 'batch_size': 64, 'learning_rate': 1e-4,
-                  'discriminator_rate': 1e-4, 'precision': 'bfloat16', 'compile': True,
-                  'save_every': 5000}),
-}
-
+SCALE = 'small'  # in results: of two CPU cores, where the paper had a GPU
+STEPS = 2500  # of a training
+_SMALL = {'base_width': 16, 'batch_size': 24, 'threads': 1, 'save_every': 1250}
 # As in the paper: every frame between the inputs is a target, the error is its own mean.
 _PAPER = {'margin': 0, 'goal_picture': 'last', 'progress_margin': 0.0, 'start_crop': 0.0,
           'decoder': 'separate', 'skips': False}
@@ -114,24 +85,18 @@ class PaperRun:
     :param mode: 'bidirectional' or 'forward'.
     :param method: see prediction.methods.
     :param new_pixels: whether the network may paint; if not, it has object maps.
-    :param scale: name in SCALES.
     :param seed: of the training.
     :param recursion: levels of Eq. 3.
     :param variant: one of VARIANTS, other settings than the method's own.
-    :param episodes: how many to collect instead of the scale's; 0: those.
-    :param steps: length of the training instead of the scale's; 0: that.
     """
 
     task: str
     mode: str
     method: str
     new_pixels: bool = True
-    scale: str = 'small'
     seed: int = 0
     recursion: int = 1
     variant: str = ''
-    episodes: int = 0
-    steps: int = 0
 
     @property
     def name(self):
@@ -146,21 +111,14 @@ class PaperRun:
         return label(self.method, self.variant, self.recursion)
 
     @property
-    def num_episodes(self):
-        """How many episodes to collect."""
-        return self.episodes or RECORDINGS[self.task].episodes[self.scale]
-
-    @property
     def num_steps(self):
         """Length of the training."""
-        usual = SCALES[self.scale].steps or self._steps_of(EPOCHS)
-        return self.steps or round(usual * LONG.get(self.variant, 1))
+        return round(STEPS * LONG.get(self.variant, 1))
 
     @property
     def beginning(self):
         """Name of the shipped weights that it begins with, '' for fresh ones."""
-        # Shipped networks have the width of 'small'.
-        fresh = self.scale != 'small' or self.variant in ('', '+skips+scratch')
+        fresh = self.variant in ('', '+skips+scratch')
         return '' if fresh else FINE_TUNED.get(self.task, '')
 
     @property
@@ -171,11 +129,7 @@ class PaperRun:
     @property
     def command(self):
         """The command that makes this run."""
-        words = ['python', '-m', 'tap_ros', 'paper', '--scale', self.scale, '--only', self.name]
-        for option, value in (('--seeds', self.seed), ('--episodes', self.episodes),
-                              ('--steps', self.steps)):
-            words += [option, str(value)] if value else []
-        return shlex.join(words)
+        return f'python -m tap_ros paper --only {self.name}'
 
     def config(self, recordings, runs):
         """
@@ -186,7 +140,7 @@ class PaperRun:
         :return: TrainingConfig.
         """
         pushing = get_task(RECORDINGS[self.task].task).kind == 'push'
-        settings = {**SCALES[self.scale].settings, **_PAPER, **({} if pushing else _GRIPPING)}
+        settings = {**_SMALL, **_PAPER, **({} if pushing else _GRIPPING)}
         method = method_fields(self.method)
         if method['selection'] == 'progress':
             settings |= _PROGRESS | (_PROGRESS_PUSHING if pushing else {})
@@ -198,38 +152,20 @@ class PaperRun:
         return TrainingConfig(
             recordings=(str(Path(recordings) / self.task),), out=str(self.folder(runs)),
             mode=self.mode, **method, new_pixels=self.new_pixels, seed=self.seed,
-            test_fraction=held_out_share(self.num_episodes), recursion=self.recursion,
+            test_fraction=held_out_share(self.task), recursion=self.recursion,
             steps=self.num_steps, initial_weights=self.beginning, **settings)
 
     def folder(self, runs):
         """Return the Path of this run's folder in the folder of all runs."""
-        return Path(runs) / self.scale / self.name
-
-    def _steps_of(self, epochs):
-        """Turn passes over the episodes into steps."""
-        return max(1, round(
-            epochs * self.num_episodes / SCALES[self.scale].settings['batch_size']))
+        return Path(runs) / SCALE / self.name
 
 
-def paper_runs(scale, seeds=(), episodes=0, steps=0):
-    """
-    List all runs of a scale, the most important first.
-
-    :param scale: name in SCALES.
-    :param seeds: of the trainings; none: MAIN_SEEDS of the main rows, 0 of the others. All runs of
-        the first seed come before those of the second.
-    :param episodes: how many to collect of each recording instead of the scale's; 0: those.
-    :param steps: length of each training instead of the scale's; 0: that.
-    :return: list of PaperRun.
-    :raises ConfigError: for an unknown scale.
-    """
-    if scale not in SCALES:
-        raise ConfigError(f'scale: expected one of {", ".join(SCALES)}, got {scale!r}')
+def paper_runs():
+    """List all runs, the most important first; further seeds of the main rows come last."""
     rows = []
 
     def add(tasks, methods, mode='bidirectional', variant='', main=False, **options):
-        rows.extend((PaperRun(task, mode, method, scale=scale, episodes=episodes, steps=steps,
-                              variant=variant, **options), main)
+        rows.extend((PaperRun(task, mode, method, variant=variant, **options), main)
                     for task in tasks for method in methods)
 
     relative = ['genmin-wo-gan+relative']
@@ -277,5 +213,5 @@ def paper_runs(scale, seeds=(), episodes=0, steps=0):
     add(['push2'], ['genmin+progress', 'genmin'], variant=OURS, new_pixels=False)
     add(['push2'], ['genmin-wo-gan'], variant='+skips+margin', new_pixels=False)
     add(['push2'], ['genmin-wo-gan+progress'], variant='+skips+edge', new_pixels=False)
-    return [replace(run, seed=seed) for seed in seeds or MAIN_SEEDS for run, main in rows
-            if seeds or main or not seed]
+    return [replace(run, seed=seed) for seed in MAIN_SEEDS for run, main in rows
+            if main or not seed]

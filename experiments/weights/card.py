@@ -5,7 +5,7 @@
 import json
 from pathlib import Path
 
-from experiments.pages import interval, render
+from experiments.pages import render
 import numpy as np
 import pandas as pd
 from tap_ros.evaluation.intervals import mean_interval
@@ -133,8 +133,9 @@ def tabulate(scores):
             continue  # of a bottleneck the hand is no part
         known = [line.get(name, [np.nan] * 3) for line in lines.values()]
         if np.isfinite(np.array(known, float)).any():
-            table[title] = interval(
-                pd.DataFrame(known, columns=['value', 'ci_low', 'ci_high']), digits)
+            table[title] = [
+                '{:.{n}f} ({:.{n}f} to {:.{n}f})'.format(*row, n=digits)
+                if np.isfinite(row).all() else None for row in known]
     return table
 
 

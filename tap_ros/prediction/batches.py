@@ -170,8 +170,7 @@ def fixed_time(fraction: float, end: int, first: int, last: int) -> int:
 
 def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
                sampling: Sampling = Sampling(), frames: Frames | None = None,
-               rng: np.random.Generator | None = None, part: slice = slice(None),
-               filled: 'Filled | None' = None,
+               rng: np.random.Generator | None = None, filled: 'Filled | None' = None,
                preference: Sequence[np.ndarray] | None = None) -> Batch:
     """
     Gather context pictures and targets.
@@ -180,17 +179,13 @@ def make_batch(store: 'EpisodeStore', episodes: Sequence[int] | np.ndarray,
     :param sampling: Sampling; by default all frames between the first and the last.
     :param frames: where the pictures come from, see training/frames.py; None: the store.
     :param rng: numpy Generator; needed only where something is drawn.
-    :param part: slice of the episodes whose pictures are gathered; the others only count for what
-        is drawn and for T.
     :param filled: with a robot mask, where targets and video come from; see training/inpainted.py.
     :param preference: of every episode of the store w of its frames, (levels, T).
     :return: Batch.
     """
     rng = rng or np.random.default_rng(0)
     rows = [_choose(store, i, sampling, rng) for i in episodes]
-    T = max(len(row.times) for row in rows)
-    rows, episodes = rows[part], episodes[part]
-    B = len(rows)
+    B, T = len(rows), max(len(row.times) for row in rows)
     times, shown = np.zeros((B, T), np.int64), np.zeros((B, T), np.int64)
     valid = np.zeros((B, T), bool)
     for b, row in enumerate(rows):
@@ -293,10 +288,6 @@ class Augmentation:
         gain = 1 + brightness * rng.uniform(-1, 1, (batch_size, 3))
         return cls(torch.from_numpy(flips), torch.from_numpy(order),
                    torch.from_numpy(gain.astype(np.float32)))
-
-    def part(self, part: slice) -> 'Augmentation':
-        """Return that of a slice of the episodes."""
-        return Augmentation(self.flip[part], self.order[part], self.gain[part])
 
     def to(self, device: torch.device | str) -> 'Augmentation':
         """Copy everything to a device."""

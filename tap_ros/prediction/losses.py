@@ -59,18 +59,15 @@ def l1_errors(images: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
     return distances / 255
 
 
-def match_step(selection_error: torch.Tensor,
-               valid: torch.Tensor | None = None) -> torch.Tensor:
+def match_step(selection_error: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """
     Pick the target with the least selection error, the argmin of Eq. 5.
 
     :param selection_error: (B, T), E'_t.
-    :param valid: bool (B, T), False where an episode is padded; None: all are valid.
+    :param valid: bool (B, T), False where an episode is padded.
     :return: int64 (B,), indices into T; never a padded one.
     """
-    if valid is not None:
-        selection_error = selection_error.masked_fill(~valid, math.inf)
-    return selection_error.argmin(1)
+    return selection_error.masked_fill(~valid, math.inf).argmin(1)
 
 
 def recursive_loss(losses: Sequence[torch.Tensor], counts: Sequence[int]) -> torch.Tensor:
@@ -127,7 +124,7 @@ def bell(position: torch.Tensor) -> torch.Tensor:
     return torch.exp(math.log(2 / 3) * position ** 2)
 
 
-def picture_progress(copy_error: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:
+def picture_progress(copy_error: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
     """
     Say how far a frame is on the way from start to goal, by what the pictures show.
 
@@ -136,19 +133,18 @@ def picture_progress(copy_error: torch.Tensor, valid: torch.Tensor | None = None
     paper, whose preference is over time: the bottleneck of an episode need not be at its middle.
 
     :param copy_error: (B, 2, T), errors of start and goal picture against the targets.
-    :param valid: bool (B, T), False where an episode is padded; None: all are valid.
+    :param valid: bool (B, T), False where an episode is padded.
     :return: (B, T), -1 to 1 for valid targets.
     """
     to_start, to_goal = copy_error.unbind(1)
     progress = (to_start - to_goal) / (to_start + to_goal).clamp(min=_MIN_COPY_DISTANCE)
-    valid = torch.ones_like(progress, dtype=torch.bool) if valid is None else valid
     low = progress.masked_fill(~valid, math.inf).amin(1, keepdim=True)
     high = progress.masked_fill(~valid, -math.inf).amax(1, keepdim=True)
     return 2 * (progress - low) / (high - low).clamp(min=_MIN_COPY_DISTANCE) - 1
 
 
 def beside_context(progress: torch.Tensor, margin: float,
-                   valid: torch.Tensor | None = None) -> torch.Tensor:
+                   valid: torch.Tensor) -> torch.Tensor:
     """
     Say which targets show too little of the way from start to goal, or too much, to be matched.
 
@@ -158,13 +154,11 @@ def beside_context(progress: torch.Tensor, margin: float,
 
     :param progress: (B, T), -1 to 1, see picture_progress.
     :param margin: what is left out at both ends of the range, 0 to 1; 0: nothing.
-    :param valid: bool (B, T), False where an episode is padded; None: all are valid.
+    :param valid: bool (B, T), False where an episode is padded.
     :return: bool (B, T); never the valid target whose progress is nearest to 0.
     """
     outside = progress.abs() > 1 - margin
-    from_middle = progress.abs()
-    if valid is not None:
-        from_middle = from_middle.masked_fill(~valid, math.inf)
+    from_middle = progress.abs().masked_fill(~valid, math.inf)
     return outside.scatter(1, from_middle.argmin(1, keepdim=True), False)
 
 

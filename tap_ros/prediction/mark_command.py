@@ -16,9 +16,9 @@ from pathlib import Path
 import threading
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 from tap_ros.errors import ConfigError, TapError
+from tap_ros.images.drawing import png_bytes
 from tap_ros.options import File
 from tap_ros.prediction.marks import features_of
 from tap_ros.prediction.preference import learn_preference, LEAST_FRAMES
@@ -127,88 +127,90 @@ class Marking:
         return self._features[i]
 
 
-def make_server(marking: Marking, port: int = 0) -> ThreadingHTTPServer:
+class Server(ThreadingHTTPServer):
     """
-    Make the server of the page; its server_port says where it is.
+    Serves the page; its server_port says where.
 
     :raises ConfigError: for a port that cannot be used.
     """
-    class Handler(BaseHTTPRequestHandler):
-        """Answers `/state`, `/frame/EPISODE/FRAME`, the page's files, and `/mark` that marks."""
 
-        def do_GET(self) -> None:
-            """Answer what only shows."""
-            if not self._is_own():
-                return
-            path, *numbers = self.path.strip('/').split('/')
-            if self.path in _PAGE:
-                name, kind = _PAGE[self.path]
-                self._send(files('tap_ros.prediction').joinpath('page', name).read_bytes(), kind)
-            elif path == 'state':
-                self._send_state()
-            elif path == 'frame' and len(numbers) == 2 and all(map(str.isdecimal, numbers)):
-                self._send_frame(*map(int, numbers))
-            else:
-                self._send(b'There is nothing here.', 'text/plain', HTTPStatus.NOT_FOUND)
+    def __init__(self, marking: Marking, port: int = 0) -> None:
+        self.marking = marking
+        try:
+            super().__init__((_HOST, port), Handler)
+        except (OSError, OverflowError) as error:
+            raise ConfigError(f'port {port}: cannot be listened at ({error}); choose another, or '
+                              '0 for any that is free') from error
 
-        def do_POST(self) -> None:
-            """Mark what the page asks for."""
-            if not self._is_own():
-                return
-            try:
-                size = int(self.headers.get('Content-Length', 0))
-                asked = json.loads(self.rfile.read(min(size, _LARGEST)))
-                marking.mark(asked['episode'], asked['frames'])
-            except (LookupError, TypeError, ValueError, TapError) as error:
-                self._send(str(error).encode(), 'text/plain', HTTPStatus.BAD_REQUEST)
-            else:
-                self._send_state()
+    def handle_error(self, *_: object) -> None:
+        """Say nothing of browsers that go away."""
 
-        def _is_own(self) -> bool:
-            """Return whether our own page asks, under the name of this machine alone."""
-            host, origin = self.headers.get('Host', ''), self.headers.get('Origin')
-            own = host.rpartition(':')[0] in (_HOST, 'localhost') and origin in (
-                None, f'http://{host}')
-            if not own:
-                self._send(b'This page may not be used from there.', 'text/plain',
-                           HTTPStatus.FORBIDDEN)
-            return own
 
-        def _send_state(self) -> None:
-            self._send(json.dumps(marking.state()).encode(), 'application/json')
+class Handler(BaseHTTPRequestHandler):
+    """Answers `/state`, `/frame/EPISODE/FRAME`, the page's files, and `/mark` that marks."""
 
-        def _send_frame(self, episode: int, t: int) -> None:
-            if episode >= len(marking.store) or t >= marking.store.lengths[episode]:
-                self._send(b'', 'text/plain', HTTPStatus.NOT_FOUND)
-                return
-            frame = np.ascontiguousarray(marking.store.frames(episode)[t][..., ::-1])
-            self._send(cv2.imencode('.png', frame)[1].tobytes(), 'image/png')
+    server: Server
 
-        def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
-            self.send_response(status)
-            for name, value in (('Content-Type', f'{kind}; charset=utf-8'),
-                                ('Content-Length', str(len(body))),
-                                ('Content-Security-Policy', _POLICY),
-                                ('X-Content-Type-Options', 'nosniff'),
-                                ('Cache-Control', 'no-store')):
-                self.send_header(name, value)
-            self.end_headers()
-            self.wfile.write(body)
+    def do_GET(self) -> None:
+        """Answer what only shows."""
+        path, *numbers = self.path.strip('/').split('/')
+        if not self._is_own():
+            self._refuse(HTTPStatus.FORBIDDEN, 'This page may not be used from there.')
+        elif self.path in _PAGE:
+            name, kind = _PAGE[self.path]
+            self._send(files('tap_ros.prediction').joinpath('page', name).read_bytes(), kind)
+        elif path == 'state':
+            self._send_state()
+        elif path == 'frame' and len(numbers) == 2 and all(map(str.isdecimal, numbers)):
+            self._send_frame(*map(int, numbers))
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, 'There is nothing here.')
 
-        def log_message(self, *_: object) -> None:
-            """Print nothing."""
+    def do_POST(self) -> None:
+        """Mark what the page asks for."""
+        if not self._is_own():
+            self._refuse(HTTPStatus.FORBIDDEN, 'This page may not be used from there.')
+            return
+        try:
+            size = int(self.headers.get('Content-Length', 0))
+            asked = json.loads(self.rfile.read(min(size, _LARGEST)))
+            self.server.marking.mark(asked['episode'], asked['frames'])
+        except (LookupError, TypeError, ValueError, TapError) as error:
+            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+        else:
+            self._send_state()
 
-    class Server(ThreadingHTTPServer):
-        """Says nothing of browsers that go away."""
+    def _is_own(self) -> bool:
+        """Return whether our own page asks, under the name of this machine alone."""
+        host, origin = self.headers.get('Host', ''), self.headers.get('Origin')
+        return host.rpartition(':')[0] in (_HOST, 'localhost') and origin in (
+            None, f'http://{host}')
 
-        def handle_error(self, *_: object) -> None:
-            """Print nothing."""
+    def _send_state(self) -> None:
+        self._send(json.dumps(self.server.marking.state()).encode(), 'application/json')
 
-    try:
-        return Server((_HOST, port), Handler)
-    except (OSError, OverflowError) as error:
-        raise ConfigError(f'port {port}: cannot be listened at ({error}); choose another, or 0 '
-                          'for any that is free') from error
+    def _send_frame(self, episode: int, t: int) -> None:
+        store = self.server.marking.store
+        if episode >= len(store) or t >= store.lengths[episode]:
+            self._refuse(HTTPStatus.NOT_FOUND, 'There is no such frame.')
+        else:
+            self._send(png_bytes(store.frames(episode)[t]), 'image/png')
+
+    def _refuse(self, status: HTTPStatus, why: str) -> None:
+        self._send(why.encode(), 'text/plain', status)
+
+    def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self.send_response(status)
+        for name, value in (('Content-Type', f'{kind}; charset=utf-8'),
+                            ('Content-Length', str(len(body))),
+                            ('Content-Security-Policy', _POLICY),
+                            ('X-Content-Type-Options', 'nosniff'), ('Cache-Control', 'no-store')):
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
 
 
 def run(args: Options) -> None:
@@ -219,7 +221,7 @@ def run(args: Options) -> None:
     """
     path = Path(args.marks) if args.marks else beside(args.recordings[0])
     store = open_recordings(args.recordings, reading=reading_of(args.reading))
-    server = make_server(Marking(store, args.recordings, path), args.port)
+    server = Server(Marking(store, args.recordings, path), args.port)
     print(f'open http://{_HOST}:{server.server_port} in a browser; marks go to {escaped(path)}; '
           'Ctrl-C ends', flush=True)
     with server:

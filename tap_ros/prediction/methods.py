@@ -19,7 +19,8 @@ _NAME = re.compile(r'(?P<loss>fix|min|genmin)(?P<number>\d+(\.\d+)?)?'
                    r'(?P<model>-wo-gan|-vae-gan|-vae)?(\+(?P<selection>relative|progress|still|marks))?')
 # Settings of earlier versions, and the value at which they did nothing.
 _GONE = {'bell_edge': 2 / 3, 'changed_weight': 0.0, 'match_temperature': 0.0, 'match_share': 0.5,
-         'flow_scale': 16.0, 'max_frames': 0, 'pretrain_steps': 0}
+         'flow_scale': 16.0, 'max_frames': 0, 'pretrain_steps': 0, 'outer_power': 1.0,
+         'compile': False, 'discriminator_rate': 2e-4}
 
 
 def method_fields(name: str) -> dict[str, Any]:

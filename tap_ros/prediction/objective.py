@@ -16,7 +16,7 @@ from tap_ros.prediction.losses import (
     total,
 )
 from tap_ros.prediction.networks import Prediction, PredictorNetwork
-from tap_ros.prediction.selection import outer_error, selection_errors, Targets
+from tap_ros.prediction.selection import selection_errors, Targets
 from tap_ros.prediction.training_config import ObjectiveSettings
 from tap_ros.prediction.training_networks import (
     discriminator_loss,
@@ -25,7 +25,7 @@ from tap_ros.prediction.training_networks import (
     Recognition,
     sample_latent,
 )
-from tap_ros.training.devices import ALONE, Autocast, Processes
+from tap_ros.training.devices import Autocast
 import torch
 
 
@@ -63,25 +63,21 @@ class Draws:
     other: torch.Tensor
 
     @classmethod
-    def make(cls, batch: Batch, latent_size: int, seed: int, step: int,
-             processes: Processes = ALONE) -> Self:
+    def make(cls, batch: Batch, latent_size: int, seed: int, step: int) -> Self:
         """
         Draw those of a step, on the batch's device, the same ones whenever asked.
 
-        :param batch: batches.Batch, this process's part of it.
+        :param batch: batches.Batch.
         :param latent_size: of z.
         :param seed: of the training; step: number of the step.
-        :param processes: Processes that share the batch.
         :return: Draws.
         """
         rng = np.random.default_rng([seed, 4, step])
         B, T = batch.times.shape
-        B *= processes.count
         draws = (rng.standard_normal((B, T, latent_size), np.float32),
                  rng.standard_normal((B, latent_size), np.float32),
                  rng.random((B, T), np.float32))
-        part = processes.part(B)
-        return cls(*(torch.from_numpy(draw[part]).to(batch.times.device) for draw in draws))
+        return cls(*(torch.from_numpy(draw).to(batch.times.device) for draw in draws))
 
 
 @dataclass(frozen=True)
@@ -118,9 +114,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
         the same - log D_{t*}(c, G(c, z ~ p)) - log D'_{t*}(c, G(c, z ~ q))  both (Eq. 10)
 
     each with its weight. The GAN's terms stand at the matched frame, as in Eq. 10, and are left
-    out of the choice. With an outer power below 1 the outer error is E_t ** power, which is not in
-    the paper. The mean of E_t is as low for a blend of two possible bottlenecks as for either of
-    them; a concave function of it is lowest at one of them, so that the network commits itself.
+    out of the choice.
 
     :param draws: Draws; needed with GAN or VAE.
     :param autocast: makes the context manager to run the networks in.
@@ -150,7 +144,7 @@ def predictor_loss(networks: Networks, batch: Batch, augmentation: Augmentation 
         prediction = networks.predictor(context, z)
     measured = targets.measured(context)
     match = targets.match(prediction.image, measured)
-    parts['error'] = outer_error(targets.outer_l1(prediction.image, match), config).mean()
+    parts['error'] = targets.l1(prediction.image, match).mean()
     judged = None
     if networks.discriminator is not None:
         assert draws is not None, "t' is drawn"
@@ -242,7 +236,7 @@ def _recursive_loss(networks: Networks, prediction: Prediction, targets: Targets
             between = replace(between, end=end, last=torch.where(
                 left[:, None], matched - 1, batch.last))
         match = targets.match(prediction.image, measured, between)
-        errors = outer_error(targets.outer_l1(prediction.image, match), config)
+        errors = targets.l1(prediction.image, match)
         losses.append(errors[left].mean())
         counts.append(int(left.sum().item()))
     return recursive_loss(losses, counts)
@@ -272,13 +266,13 @@ def _frame_posterior_loss(networks: Networks, targets: Targets, context: torch.T
             prediction = networks.predictor(
                 context, sample_latent(mean, log_variance, draws.posterior[:, t]))
         divergences.append(kl_divergence(mean, log_variance))
-        errors.append(targets.outer_l1(prediction.image, step))
+        errors.append(targets.l1(prediction.image, step))
     divergences, errors = torch.stack(divergences, 1), torch.stack(errors, 1)  # B, T
     whole = (kl_weight * divergences + errors).detach()
     match = match_step(selection_errors(
         whole, lambda: targets.errors(measured), batch, config), batch.valid)
     nats, error = (values.gather(1, match[:, None]).mean()
-                   for values in (divergences, outer_error(errors, config)))
+                   for values in (divergences, errors))
     parts = {'kl': kl_weight * nats, 'error': error}
     return Outcome(total(parts.values()), match,
                    {name: value.detach() for name, value in parts.items()}, nats=nats.detach())

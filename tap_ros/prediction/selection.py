@@ -11,8 +11,6 @@ from tap_ros.prediction.batches import Augmentation, Batch
 from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
-_POWER_OFFSET = 1e-4  # keeps the slope of a power finite at an error of 0
-
 
 def selection_errors(error: torch.Tensor, copy_error: Callable[[], torch.Tensor], batch: Batch,
                      config: ObjectiveSettings) -> torch.Tensor:
@@ -108,12 +106,6 @@ class Targets:
             images = self.augmentation.undo(images)
         return losses.l1_errors(self.batch.visible(images), self.batch.targets.movedim(-1, 2))
 
-    def outer_l1(self, image: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+    def l1(self, image: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Return the l1 errors (B,) of predictions (B, 3, H, W) at targets (B,) of T."""
         return losses.l1_error(self.visible(image), self.frame(step))
-
-
-def outer_error(error: torch.Tensor, config: ObjectiveSettings) -> torch.Tensor:
-    """Raise l1 errors to the configured power; not in the paper, see objective.predictor_loss."""
-    power = config.outer_power
-    return error if power == 1 else (error + _POWER_OFFSET) ** power

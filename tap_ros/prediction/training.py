@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 import contextlib
 from dataclasses import asdict
 from functools import partial
-import math
 from typing import Any
 
 import numpy as np
@@ -36,23 +35,18 @@ from tap_ros.recording.cache import EpisodeStore
 from tap_ros.recording.marks import read_marks
 from tap_ros.training import run
 from tap_ros.training.checkpoints import TrainingState
-from tap_ros.training.devices import (
-    Autocast,
-    make_autocast,
-    pick_precision,
-    Processes,
-    share_batch_norm,
-)
+from tap_ros.training.devices import Autocast, make_autocast, pick_precision
 from tap_ros.training.frames import Frames, MappedFrames, ResidentFrames
 from tap_ros.training.inpainted import fill, Filled
 import torch
 
+DISCRIMINATOR_RATE = 2e-4  # their learning rate at its highest
 _SHOWN = 8  # episodes in a sample picture
 Item = tuple[int, Batch, Augmentation]  # of a step
 
 
-def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | None = None,
-          progress: bool = True, after_step: Callable[[int], object] | None = None) -> str:
+def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = True,
+          after_step: Callable[[int], object] | None = None) -> str:
     """
     Train a predictor, or go on with a run that was interrupted, see run.run.
 
@@ -60,13 +54,13 @@ def train(config: TrainingConfig, stop_at: int | None = None, minutes: float | N
 
     :raises WeightsError: if the initial weights cannot be used, or the checkpoint is damaged.
     """
-    return run.run(config, 'predictor', _prepare, stop_at=stop_at, minutes=minutes,
-                   progress=progress, after_step=after_step)
+    return run.run(config, 'predictor', _prepare, stop_at=stop_at, progress=progress,
+                   after_step=after_step)
 
 
 def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
     """Make the networks of a run, what they are trained on and how."""
-    config, store, processes, device = this.config, this.store, this.processes, this.device
+    config, store, device = this.config, this.store, this.device
     if config.patience and not len(this.held_out):
         raise ConfigError('patience: nothing is held out to see improvement by; give --held-out, '
                           'a --test-fraction above 0, or leave --patience out')
@@ -74,8 +68,6 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
     if config.initial_weights and not this.checkpoint.exists():
         _begin_with(network, config.initial_weights)
     helpers = _helpers(config, network.config, store)
-    for module in (network, *helpers.values()):
-        share_batch_norm(module, processes)
     state = this.begin(network, helpers, lambda old: {**DEFAULTS, **todays_settings(old)})
     state.precision = state.precision or pick_precision(config.precision, device)
     autocast = make_autocast(state.precision, device)
@@ -85,25 +77,20 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
     frames = make_frames(store)
     filled = fill(store, config.robot_mask, make_frames, this.progress)
     preference, about = _learn(this)
-    processes.wait()  # before the first one writes a checkpoint
-    compiled: Callable[[Any], Any] = (
-        torch.compile if config.compile else lambda module: module)
-    networks = Networks(compiled(state.network), **{
-        name: compiled(helper) for name, helper in state.helpers.items()})
+    networks = Networks(state.network, **dict(state.helpers.items()))
 
     def step(item: Item) -> Callable[[], run.Numbers]:
         number, batch, augmentation = item
         batch, augmentation = batch.to(device), augmentation.to(device)
-        draws = Draws.make(batch, config.latent_size, config.seed, number, processes)
-        outcome, norm = _step(state, networks, batch, augmentation, draws, config, processes,
-                              autocast)
-        return lambda: _values(outcome, batch, processes) | {'gradient_norm': norm.item()}
+        draws = Draws.make(batch, config.latent_size, config.seed, number)
+        outcome, norm = _step(state, networks, batch, augmentation, draws, config, autocast)
+        return lambda: _values(outcome, batch) | {'gradient_norm': norm.item()}
 
     return run.Course(
-        state, partial(_batches, store, frames, filled, this.training, config, processes,
+        state, partial(_batches, store, frames, filled, this.training, config,
                        preference=preference), step,
         partial(_score, this, state, frames, filled, preference, autocast),
-        (config.learning_rate, config.discriminator_rate), about, config.patience)
+        (config.learning_rate, DISCRIMINATOR_RATE), about, config.patience)
 
 
 def _learn(this: run.Run) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
@@ -116,28 +103,26 @@ def _learn(this: run.Run) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
     marks = read_marks(config.marks, store)
     learned = learn_marks(store, marks, this.training, config.recursion, config.forward,
                           config.robot_mask)
-    if this.processes.first:
-        tell(learned.about)
+    tell(learned.about)
     return prefer(store, learned.preferences, config.robot_mask), {'marks': {
         'sha256': marks.digest, 'levels': learned.about,
         'preferences': [preference.to_json() for preference in learned.preferences]}}
 
 
 def _step(state: TrainingState[PredictorNetwork], networks: Networks, batch: Batch,
-          augmentation: Augmentation, draws: Draws, config: TrainingConfig, processes: Processes,
+          augmentation: Augmentation, draws: Draws, config: TrainingConfig,
           autocast: Autocast) -> tuple[Outcome, torch.Tensor]:
     """Do one step of the predictor, then one of the discriminators; return (Outcome, norm)."""
     state.network.train()
     state.helpers.train()
     judges = [judge for judge in (networks.discriminator, networks.posterior_discriminator)
-              if judge is not None]  # a compiled network has no truth value
+              if judge is not None]
     for judge in judges:
         judge.requires_grad_(False)
     outcome = predictor_loss(networks, batch, augmentation, config, draws, autocast,
                              kl_share(state.step, config.steps, config.kl_warmup))
     state.optimizers[0].zero_grad()
     outcome.loss.backward()
-    processes.average_gradients(state.optimizers[0].param_groups[0]['params'])
     norm = state.clip_gradients(config.gradient_clip)
     state.optimizers[0].step()
     if outcome.judged is not None:
@@ -146,14 +131,13 @@ def _step(state: TrainingState[PredictorNetwork], networks: Networks, batch: Bat
         loss = discriminators_loss(outcome.judged, autocast)
         state.optimizers[1].zero_grad()
         loss.backward()
-        processes.average_gradients(state.optimizers[1].param_groups[0]['params'])
         state.optimizers[1].step()
         outcome.parts['discriminators'] = loss.detach()
     return outcome, norm
 
 
 def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episodes: np.ndarray,
-             config: TrainingConfig, processes: Processes, first: int, last: int,
+             config: TrainingConfig, first: int, last: int,
              preference: list[np.ndarray] | None = None) -> Iterator[Item]:
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
     whole = config.latent == 'vae' and config.posterior == 'video'
@@ -161,15 +145,14 @@ def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episode
         config.margin, config.num_targets, config.min_crop, config.start_crop,
         config.goal_picture, config.forward, config.only_fraction, int(config.gan),
         config.video_frames if whole else 0, config.fill_context)
-    part = processes.part(config.batch_size)
 
     def make(step: int) -> Item:
         rng = np.random.default_rng([config.seed, 2, step])
         chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
-        batch = make_batch(store, chosen, sampling, frames, rng, part, filled, preference)
+        batch = make_batch(store, chosen, sampling, frames, rng, filled, preference)
         augmentation = Augmentation.draw(
             len(chosen), config.flip, config.colour, config.brightness, rng)
-        return step, batch, augmentation.part(part)
+        return step, batch, augmentation
 
     with ThreadPoolExecutor(1) as pool:
         ahead = [pool.submit(make, step) for step in range(first, min(first + 2, last))]
@@ -179,17 +162,14 @@ def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episode
             yield ahead.pop(0).result()
 
 
-def _values(outcome: Outcome, batch: Batch, processes: Processes) -> dict[str, float]:
-    """Return what the curves show of a step, by name: means over the whole batch."""
+def _values(outcome: Outcome, batch: Batch) -> dict[str, float]:
+    """Return what the curves show of a step, by name."""
     fraction = batch.times.gather(1, outcome.match[:, None]) / batch.end
     values = {'loss': outcome.loss, 'match_fraction': fraction.mean(),
-              'match_fraction_square': fraction.square().mean(),
+              'match_fraction_std': fraction.std(correction=0),
               **{f'loss_{name}': value for name, value in outcome.parts.items()},
               **({} if outcome.nats is None else {'nats': outcome.nats})}
-    means = processes.mean(torch.stack([value.detach().float() for value in values.values()]))
-    shown: dict[str, float] = dict(zip(values, means.tolist()))
-    variance = shown.pop('match_fraction_square') - shown['match_fraction'] ** 2
-    return shown | {'match_fraction_std': math.sqrt(max(variance, 0))}
+    return {name: value.item() for name, value in values.items()}
 
 
 def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames,

@@ -49,13 +49,12 @@ class ObjectiveSettings:
         did best.
     :param progress_margin: with selection progress, frames whose progress is within this of that
         of the start or the goal picture are not matched, see losses.beside_context; 0..0.95.
-    :param outer_power: power of the outer error; 1 in the paper, see objective.predictor_loss.
     :param recursion: levels of Eq. 3; 1: none. The GAN's and the VAE's terms stand at the first.
     :param gan_weight: of the GAN's terms beside the l1 error on [0, 1].
     :param kl_weight: of the KL divergence beside it.
-    :param free_nats: KL divergence up to this, in the mean over a process's part of the batch,
-        costs nothing; 0, the paper: all of it costs, and z may be ignored (posterior collapse). As
-        free bits (arXiv:1606.04934), of the whole z.
+    :param free_nats: KL divergence up to this, in the mean over the batch, costs nothing; 0, the
+        paper: all of it costs, and z may be ignored (posterior collapse). As free bits
+        (arXiv:1606.04934), of the whole z.
     :param kl_warmup: share of the training in which the KL divergence costs nothing, and over
         which its weight then rises, so that z is of use before it has a price (as in
         arXiv:1602.02282); 0, the paper: never.
@@ -74,7 +73,6 @@ class ObjectiveSettings:
     fraction: float = 0.5
     beta: float = 4.0
     progress_margin: float = 0.5
-    outer_power: float = 1.0
     recursion: int = 1
     gan_weight: float = 5e-5
     kl_weight: float = 1e-4
@@ -165,24 +163,20 @@ class PredictorOptimizer(OptimizerSettings):
     """
     How the weights are moved, and in which precision; beta1 of Adam is 0.5 with a GAN, else 0.9.
 
-    :param discriminator_rate: the discriminators' learning rate at its highest.
     :param precision: 'float32', 'bfloat16' (autocast), or 'auto': bfloat16 on a GPU, and on a CPU
         that has instructions for it. The choice stays for the whole run.
-    :param compile: use torch.compile; slow to start, results differ in the last digits.
     :param patience: end after so many steps without a smaller error of the held-out episodes,
         relative to copying at the frame that is matched, and keep the weights that had the
         smallest; 0: go on to the last step.
     """
 
-    discriminator_rate: float = 2e-4
     precision: Precision = 'auto'
-    compile: bool = False
     patience: int = 0
 
 
 _RANGES = {
     'fraction': (1e-6, 1), 'beta': (1e-6, math.inf), 'progress_margin': (0, 0.95),
-    'outer_power': (0.1, 1), 'recursion': (1, math.inf), 'gan_weight': (0, math.inf),
+    'recursion': (1, math.inf), 'gan_weight': (0, math.inf),
     'kl_weight': (0, math.inf), 'free_nats': (0, math.inf), 'kl_warmup': (0, 0.5),
     'posterior_std': (0.01, 1), 'margin': (0, math.inf), 'num_targets': (0, math.inf),
     'min_crop': (1e-6, 1), 'start_crop': (0, 0.9), 'brightness': (0, 0.9), 'fill_context': (0, 1),

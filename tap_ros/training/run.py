@@ -8,7 +8,7 @@ and a score are.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 import hashlib
 import json
@@ -28,7 +28,7 @@ from tap_ros.recording.bags import check_first_picture, find_bags
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.reading import reading_of
 from tap_ros.training.checkpoints import load_checkpoint, save_checkpoint, start, TrainingState
-from tap_ros.training.devices import device_name, joined, pick_device, Processes
+from tap_ros.training.devices import device_name, pick_device
 from tap_ros.training.inpainted import with_masks
 from tap_ros.training.split import split_episodes, warn_if_few
 from tap_ros.training.weights import save_weights
@@ -51,7 +51,6 @@ class Run:
     :param kind: of the weights file, 'predictor' or 'forward_model'.
     :param training: indices of the episodes to train on; held_out: of those to score.
     :param data_hash: of the recordings and of marks on them.
-    :param processes: Processes that train together.
     """
 
     config: Any
@@ -60,7 +59,6 @@ class Run:
     store: EpisodeStore
     training: np.ndarray
     held_out: np.ndarray
-    processes: Processes
     progress: bool
     data_hash: str
 
@@ -121,7 +119,7 @@ class Course(Generic[Trained, Item]):
 
 
 def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
-        min_frames: int = 3, stop_at: int | None = None, minutes: float | None = None,
+        min_frames: int = 3, stop_at: int | None = None,
         progress: bool = True, after_step: Callable[[int], object] | None = None) -> str:
     """
     Train a network, or go on with a run that was interrupted.
@@ -134,7 +132,6 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
     :param prepare: makes the Course.
     :param min_frames: episodes with fewer are left out.
     :param stop_at: stop (and save) at this step instead of the last.
-    :param minutes: stop (and save) after so many minutes; None: never.
     :param progress: whether to show a progress bar.
     :param after_step: called with the number of steps done, after each of them.
     :return: path of the weights file.
@@ -146,28 +143,24 @@ def run(config: Any, kind: str, prepare: Callable[[Run], Course[Trained, Item]],
     """
     device = pick_device(config.device)
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
-    deadline = float('inf') if minutes is None else time.monotonic() + 60 * minutes
-    with joined(device) as processes:
-        progress = progress and processes.first
-        reading = reading_of(config)
-        paths = paths_of(config)
-        check_first_picture(paths, reading, f'the {kind.replace("_", " ")}')
-        store = open_recordings(paths, progress=progress, reading=reading)
-        with _run_folder(config.out) if processes.first else nullcontext():
-            parts = with_masks(store, split_episodes(
-                store, config.test_fraction, min_frames, config.held_out), config.robot_mask)
-            if not len(parts[0]):
-                raise RecordingError('recordings: all that --held-out leaves is too short to '
-                                     'train on; name others')
-            if config.held_out and not len(parts[1]):
-                raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
-                                     'by itself; name whole bags, not files of a split one')
-            warn_if_few(parts[1])
-            torch.manual_seed(config.seed)
-            this = Run(config, kind, device, store, *parts, processes, progress,
-                       _data_hash(store, getattr(config, 'marks', '')))
-            _train(this, prepare(this), min(config.steps, stop_at or config.steps), deadline,
-                   after_step)
+    reading = reading_of(config)
+    paths = paths_of(config)
+    check_first_picture(paths, reading, f'the {kind.replace("_", " ")}')
+    store = open_recordings(paths, progress=progress, reading=reading)
+    with _run_folder(config.out):
+        parts = with_masks(store, split_episodes(
+            store, config.test_fraction, min_frames, config.held_out), config.robot_mask)
+        if not len(parts[0]):
+            raise RecordingError('recordings: all that --held-out leaves is too short to '
+                                 'train on; name others')
+        if config.held_out and not len(parts[1]):
+            raise RecordingError(f'--held-out {" ".join(config.held_out)}: holds no episode '
+                                 'by itself; name whole bags, not files of a split one')
+        warn_if_few(parts[1])
+        torch.manual_seed(config.seed)
+        this = Run(config, kind, device, store, *parts, progress,
+                   _data_hash(store, getattr(config, 'marks', '')))
+        _train(this, prepare(this), min(config.steps, stop_at or config.steps), after_step)
     return str(Path(config.out) / f'{kind}.safetensors')
 
 
@@ -187,14 +180,14 @@ def paths_of(config: Any) -> list[str]:
     return [*config.recordings, *(path for path in config.held_out if not files(path) <= known)]
 
 
-def _train(run: Run, course: Course[Trained, Item], last: int, deadline: float,
+def _train(run: Run, course: Course[Trained, Item], last: int,
            after_step: Callable[[int], object] | None) -> None:
     """Do the steps up to the last; see run."""
     config, state = run.config, course.state
     bar = tqdm(total=config.steps, initial=state.step, unit='step', disable=not run.progress,
                desc=run.kind.replace('_', ' '))
-    curves = SummaryWriter(config.out, purge_step=state.step) if run.processes.first else None
-    with _first_interrupt() as interrupted, curves or nullcontext(), bar:
+    curves = SummaryWriter(config.out, purge_step=state.step)
+    with _first_interrupt() as interrupted, curves, bar:
         began = time.monotonic() - state.seconds
         batches = course.batches(state.step, last) if course.patient else ()
         for step, item in enumerate(batches, start=state.step):
@@ -206,19 +199,14 @@ def _train(run: Run, course: Course[Trained, Item], last: int, deadline: float,
             bar.update()
             if state.step % config.log_every == 0:
                 shown = {**numbers(), 'learning_rate': state.optimizers[0].param_groups[0]['lr']}
-                if curves is not None:
-                    for name, value in shown.items():
-                        curves.add_scalar(f'train/{name}', value, state.step)
+                for name, value in shown.items():
+                    curves.add_scalar(f'train/{name}', value, state.step)
                 bar.set_postfix({name: f'{shown[name]:.4f}' for name in list(shown)[:2]})
             if after_step is not None:
                 after_step(state.step)
-            if curves is not None:
-                course.keep_the_best(config.steps)
-            stopped = run.processes.agree(
-                interrupted.is_set() or time.monotonic() > deadline or not course.patient,
-                run.device)
-            if curves is not None and (
-                    state.step % config.save_every == 0 or state.step == last or stopped):
+            course.keep_the_best(config.steps)
+            stopped = interrupted.is_set() or not course.patient
+            if state.step % config.save_every == 0 or state.step == last or stopped:
                 state.seconds = time.monotonic() - began
                 _report(run, course, curves)  # first: one that is killed in between reports again
                 save_checkpoint(run.checkpoint, state, asdict(config), run.data_hash)

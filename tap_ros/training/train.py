@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from difflib import get_close_matches
 from importlib import import_module
-import os
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -150,5 +149,4 @@ def run_training(model: Model, args: TrainOptions) -> None:
     settings = settings_of(args)
     weights = train(settings.pop('recordings'), settings.pop('out'), model,
                     args.recipe or DEFAULT[model], **settings)
-    if not int(os.environ.get('LOCAL_RANK', 0)):
-        print(weights)
+    print(weights)

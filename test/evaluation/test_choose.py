@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The selections that `train predictor --choose` tries, and what it says of them."""
 
+from dataclasses import replace
 import re
 import shlex
 from typing import get_args
@@ -10,7 +11,7 @@ from made_episodes import move_squares, write_bag
 import numpy as np
 import pytest
 from tap_ros.cli import main, read
-from tap_ros.evaluation.choose import _decide, Candidate
+from tap_ros.evaluation.trials import decide, Trial
 from tap_ros.prediction.methods import Selection
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.marks import write_marks
@@ -55,25 +56,14 @@ def test_all_selections_are_tried_and_marks_that_are_held_out_choose(bags, tmp_p
                 {'marks': marks} if name == 'marks' else {})
 
 
-def test_without_marks_a_person_chooses_and_what_cannot_be_trained_is_left_out(
-        bags, tmp_path, capsys):
-    bag, held_out, _ = bags
-    assert main(['train', 'predictor', bag, *TINY, held_out, '--mode', 'forward', '--selection',
-                 'absolute', '--out', str(tmp_path), '--recursion', '2', '--choose']) == 0
-    assert 'look at the page' in capsys.readouterr().out
-    page = (tmp_path / 'choose.html').read_text()
-    assert re.findall('<h2>(.*?)</h2>', page) == ['absolute', 'relative', 'still']
-    assert 'held-out marks' not in page
-
-
 def test_of_selections_that_differ_by_less_than_chance_it_is_said():
     def tried(**hits):
-        return [Candidate(name, b'', f'train {name}', np.arange(12) < count)
+        return [Trial(name, '', np.arange(12) < count, f'train {name}')
                 for name, count in hits.items()]
 
-    assert _decide(tried(fix=0, relative=2, marks=12))[0].endswith('(76%, 100%)')
-    first, command = _decide(tried(fix=0, relative=9, marks=10))
+    assert decide(tried(fix=0, relative=2, marks=12))[0].endswith('(76%, 100%)')
+    first, command = decide(tried(fix=0, relative=9, marks=10))
     assert first.startswith('marks hits most') and first.endswith('not told from: relative')
     assert command == 'train marks'
-    few = [one._replace(hits=one.hits[:4]) for one in tried(fix=0, marks=4)]
-    assert 'too few' in _decide(few)[0] and len(_decide(few)) == 1
+    few = [replace(one, hits=one.hits[:4]) for one in tried(fix=0, marks=4)]
+    assert 'too few' in decide(few)[0] and len(decide(few)) == 1

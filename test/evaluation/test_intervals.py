@@ -6,18 +6,8 @@ import numpy as np
 import pytest
 from tap_ros.evaluation.intervals import (
     bootstrap,
-    mean_interval,
     share_interval,
 )
-
-
-def test_intervals_of_means_are_those_of_the_normal_law():
-    values = np.random.default_rng(1).normal(3, 2, 400)
-    value, low, high = mean_interval(values)
-    assert value == pytest.approx(values.mean())
-    error = 1.96 * values.std() / 20
-    assert low == pytest.approx(value - error, abs=0.03)
-    assert high == pytest.approx(value + error, abs=0.03)
 
 
 def test_shares_have_wilsons_interval_also_at_both_ends():

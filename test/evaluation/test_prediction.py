@@ -191,17 +191,6 @@ def network(**options):
     return made
 
 
-@pytest.mark.parametrize('latent_size', [0, 8])
-def test_numbers_do_not_depend_on_the_batch(monkeypatch, latent_size):
-    made = network(latent_size=latent_size)
-    together = evaluate(made, EPISODES, range(3))
-    monkeypatch.setattr('tap_ros.evaluation.prediction._BATCH', 1)
-    alone = evaluate(made, EPISODES, range(3))
-    for method, scores in together.items():
-        assert alone[method].min_l1 == pytest.approx(scores.min_l1, abs=1e-4)
-        assert alone[method].bottleneck == pytest.approx(scores.bottleneck, abs=1e-3)
-
-
 def test_forward_scores_count_the_last_frame_and_have_no_goal_to_copy():
     class CopiesTheEnd(torch.nn.Module):
         """Knows the last frame of the first episode."""

@@ -19,7 +19,6 @@ from tap_ros.planning.visual_mpc import VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor
 from tap_ros.training.robot_mask import FreeView
 from tap_ros.weights import DEFAULT_PREDICTOR, FORWARD_MODEL
-import torch
 
 SMALL = VisualMPCConfig(search=SearchConfig(16, 1, 4), proposals=8, batch_size=16, threads=1)
 DIRECT, SHIPPED = parse_method('direct'), parse_method('shipped')
@@ -98,42 +97,6 @@ def test_networks_are_shown_what_nodes_would_show(mpc, predictor):
     np.testing.assert_array_equal(witness.shown[1], first.fill(goal.image, goal.robot_mask))
     assert (expected[-1] != run.frames[-1]).any()
     studio.close()
-
-
-def go_behind(simulator, seed):
-    """Bring the gripper down behind object 0; return what is seen and where to push (2,)."""
-    seen = simulator.reset(seed)
-    target = seen.object_poses[0, :2]
-    along = -target / np.linalg.norm(target)  # towards the middle of the table
-    behind = target - 0.13 * along
-    for _ in range(14):
-        gap = behind - seen.gripper[:2]
-        seen = simulator.step([*gap, 0.13 - seen.gripper[2], 0])
-        if np.abs(gap).max() < 0.005:
-            break
-    return simulator.step([0, 0, 0.012 - seen.gripper[2], 0]), along
-
-
-@torch.inference_mode()
-def foresee(model, seen, actions):
-    """Return the expected pixels (N, K, 2) of the objects after actions (N, T, 4)."""
-    gripper = torch.from_numpy(seen.gripper)[None]
-    start = model.begin(to_float(seen.image)[None], gripper)
-    maps = model.table.seed_maps(torch.from_numpy(seen.object_pixels))
-    *_, last = model.carried_maps(start, gripper, maps, torch.from_numpy(actions))
-    return (last.flatten(2) @ model.table.pixels().flatten(0, 1)).numpy()
-
-
-def test_the_true_model_foresees_what_then_happens(simulator, mpc):
-    seen, along = go_behind(simulator, 30)
-    actions = np.zeros((2, 6, 4), np.float32)
-    actions[0, :, :2] = 0.035 * along
-    foreseen = foresee(TrueModel(mpc.model.table, simulator), seen, actions)
-    for action in actions[0]:
-        after = simulator.step(action)
-    assert np.linalg.norm(after.object_pixels - seen.object_pixels, axis=1).max() > 2
-    assert np.abs(foreseen[0] - after.object_pixels).max() < 0.3
-    assert np.abs(foreseen[1] - seen.object_pixels).max() < 0.3
 
 
 def test_planning_with_the_true_model_runs_and_repeats(simulator, mpc):

@@ -70,17 +70,6 @@ def test_the_video_is_the_whole_episode(store):
     assert np.array_equal(batch.video[1], store.frames(4)[[0, 2, 3, 5, 7, 8, 10]])
 
 
-def test_pieces_of_episodes_are_pieces(store):
-    rng = np.random.default_rng(0)
-    batch = make_batch(store, [4] * 30, Sampling(min_crop=0.4), rng=rng)
-    frames = store.frames(4)
-    assert batch.end.min() == 4 and batch.end.max() <= 10
-    for b in range(30):
-        starts = [t for t in range(len(frames)) if np.array_equal(frames[t], batch.context[b, 0])]
-        assert any(np.array_equal(frames[(t + batch.end[b]).item()], batch.context[b, 1])
-                   for t in starts if t + batch.end[b] < len(frames))
-
-
 def test_a_beginning_of_at_most_the_share_given_is_left_out(store):
     rng = np.random.default_rng(0)
     sampling = Sampling(start_crop=0.5, goal_picture='recorded')

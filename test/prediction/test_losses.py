@@ -22,13 +22,6 @@ from tap_ros.prediction.losses import (
 import torch
 
 
-def test_padding_is_never_chosen():
-    error = torch.rand(6, 9, generator=torch.Generator().manual_seed(0))
-    error[:, 3:] = -1
-    valid = torch.arange(9).expand(6, 9) < 3
-    assert match_step(error, valid).equal(error[:, :3].argmin(1))
-
-
 def test_error_of_black_against_white_is_1_and_frames_may_be_bytes():
     black, white = -torch.ones(2, 3, 8, 8), torch.ones(2, 3, 8, 8)
     assert l1_error(black, white).equal(torch.ones(2))
@@ -63,18 +56,24 @@ def distances(B=5, T=7, seed=0):
     return torch.stack([0.2 * way + 0.01, 0.2 * (1 - way) + 0.01], 1)
 
 
+def every(error):
+    """Return that no frame is padded, of errors (B, ..., T)."""
+    return torch.ones(len(error), error.shape[-1], dtype=torch.bool)
+
+
 def test_progress_goes_from_minus_1_to_1_whatever_the_pace_and_reversed():
     slow = distances()
-    progress = picture_progress(slow)
+    progress = picture_progress(slow, every(slow))
     assert progress[:, [0, -1]].tolist() == [pytest.approx([-1, 1], abs=1e-5)] * 5
     assert (progress.diff() > 0).all()
-    reverse = picture_progress(slow.flip(1, 2))
+    reverse = picture_progress(slow.flip(1, 2), every(slow))
     assert torch.allclose(reverse, -progress.flip(1), atol=1e-5)
     held = slow.repeat_interleave(torch.tensor([4, 1, 1, 1, 1, 1, 6]), 2)  # waits at both ends
-    assert torch.allclose(picture_progress(held)[:, [0, 4, 5, 6, 7, 8, 9]], progress, atol=1e-5)
+    found = picture_progress(held, every(held))[:, [0, 4, 5, 6, 7, 8, 9]]
+    assert torch.allclose(found, progress, atol=1e-5)
     way = torch.tensor([[0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9, 1]])  # most of it is late
     error = torch.stack([way, 1 - way], 1) + 0.01
-    assert bell(picture_progress(error)).argmax().item() == 6
+    assert bell(picture_progress(error, every(error))).argmax().item() == 6
 
 
 def test_padding_is_not_on_the_way_and_no_way_at_all_is_finite():
@@ -82,9 +81,10 @@ def test_padding_is_not_on_the_way_and_no_way_at_all_is_finite():
     valid[:, 5:] = False
     padded = error.clone()
     padded[:, :, 5:] = torch.tensor([[9.0], [0.0]])
-    assert picture_progress(padded, valid)[:, :5].equal(picture_progress(error[..., :5]))
+    assert picture_progress(padded, valid)[:, :5].equal(
+        picture_progress(error[..., :5], valid[:, :5]))
     for error in (torch.full((2, 2, 1), 0.1), torch.zeros(2, 2, 4)):
-        assert bell(picture_progress(error)).isfinite().all()
+        assert bell(picture_progress(error, every(error))).isfinite().all()
 
 
 def test_what_shows_too_little_or_too_much_of_the_way_is_beside_the_context():
@@ -95,7 +95,7 @@ def test_what_shows_too_little_or_too_much_of_the_way_is_beside_the_context():
         [True, True, True, True, False, True, True]]  # one is left, the nearest to the middle
     valid[1, 4] = False
     assert not beside_context(progress, 0.5, valid)[1, :4].all()
-    assert not beside_context(progress, 0).any()
+    assert not beside_context(progress, 0, valid).any()
 
 
 def test_copying_is_worth_1_everywhere_also_where_hardly_anything_changed():
@@ -104,8 +104,9 @@ def test_copying_is_worth_1_everywhere_also_where_hardly_anything_changed():
     assert relative_to_copying(copy_error.amin(1), copy_error, ones).allclose(ones)
     # A prediction half as wrong as copying in the middle wins over less error beside the start.
     error = torch.tensor([[0.08, 0.1, 0.3]])
-    assert match_step(error).item() == 0
-    assert match_step(relative_to_copying(error, copy_error, ones)).item() == 1
+    assert match_step(error, every(error)).item() == 0
+    assert match_step(
+        relative_to_copying(error, copy_error, ones), every(error)).item() == 1
     little = torch.tensor([[0.001, 0.0005]])
     assert relative_to_copying(little, little[:, None], torch.ones(1, 2)).allclose(torch.ones(2))
     # A frame equal to the context does not break the choice.

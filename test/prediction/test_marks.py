@@ -11,10 +11,9 @@ from urllib.request import Request, urlopen
 from made_episodes import make_episode, write_bag
 import numpy as np
 import pytest
-from tap_ros.cli import main
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.batches import make_batch, Sampling
-from tap_ros.prediction.mark_command import make_server, Marking
+from tap_ros.prediction.mark_command import Marking, Server
 from tap_ros.prediction.marks import chance, learn_marks
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.objective import Networks, predictor_loss
@@ -156,18 +155,6 @@ def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_p
         learn_marks(store, read_marks(marks, store), np.array([23]), 1, False, 'none')
 
 
-def test_the_option_alone_chooses_them(bag, marks, tmp_path, capsys):
-    out = tmp_path / 'run'
-    assert main(['train', 'predictor', str(bag), '--out', str(out), '--marks', str(marks),
-                 '--recipe', 'debug']) == 0
-    settings = json.loads((out / 'config.json').read_text())
-    assert settings['selection'] == 'marks'
-    assert 'by a random frame in' in capsys.readouterr().err
-    assert main(['train', 'predictor', str(bag), '--marks', str(tmp_path / 'none'),
-                 '--threads', '1', '--out', str(tmp_path / 'b')]) == 1
-    assert str(tmp_path / 'none') in capsys.readouterr().err
-
-
 def test_by_chance_a_mark_is_hit_as_often_as_it_is_wide():
     assert chance((4, 4), 12) == 0.3 and chance((1, 1), 12) == 0.2
     assert chance((3, 6), 12, 0) == 0.4
@@ -177,7 +164,7 @@ def test_by_chance_a_mark_is_hit_as_often_as_it_is_wide():
 def page(bag, store, tmp_path):
     """Serve the page; return what asks it, and the file it writes."""
     path = tmp_path / 'marks.json'
-    server = make_server(Marking(store, [str(bag)], path))
+    server = Server(Marking(store, [str(bag)], path))
     thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
 

@@ -5,7 +5,6 @@
 from dataclasses import replace
 
 import pytest
-from tap_ros.errors import ConfigError
 from tap_ros.prediction.networks import PredictorConfig, PredictorNetwork
 import torch
 
@@ -73,28 +72,6 @@ def test_every_weight_gets_a_gradient(config):
     assert without == []
 
 
-def set_outputs(network, bias):
-    """Let the shared decoder answer the same everywhere."""
-    end = network.shared_decoder.end
-    with torch.no_grad():
-        end.weight.zero_()
-        end.bias.copy_(torch.tensor(bias))
-
-
-@OURS
-def test_outputs_of_the_shared_decoder_are_flow_then_masks_then_new_pixels(config):
-    network, context = PredictorNetwork(config).eval(), contexts(2)
-    flow, start, goal, painted = [0.0] * 4, [30.0, 0, 0], [0, 30.0, 0], [0, 0, 30.0]
-    for masks, expected in ((start, context[:, 0]), (goal, context[:, 1])):
-        set_outputs(network, flow + masks + [0.0] * 3)
-        assert network(context).image.allclose(expected, atol=1e-5)
-    set_outputs(network, flow + painted + [9.0, -9.0, 0.0])
-    colour = torch.tensor([1.0, -1.0, 0.0])[:, None, None].expand(2, 3, 64, 64)
-    assert network(context).image.allclose(colour, atol=1e-5)
-    set_outputs(network, [0.125, 0.0, 0.0, 0.0] + start + [0.0] * 3)  # 2 pixels to the right
-    assert network(context).image[..., :-2].allclose(context[:, 0, ..., 2:], atol=1e-5)
-
-
 @OURS
 def test_one_pixel_reaches_the_outputs_past_the_code_by_skips_alone(config):
     network = PredictorNetwork(config).eval()
@@ -106,11 +83,3 @@ def test_one_pixel_reaches_the_outputs_past_the_code_by_skips_alone(config):
     moved = (network(context).flow != network(changed).flow).any(2).any(1)[0]
     assert moved[5, 60] == config.skips and moved.any() == config.skips
     assert not moved.all()  # skips tell what is near
-
-
-def test_impossible_shapes_are_refused_by_name():
-    for name, value in (('image_size', 40), ('image_size', 8), ('image_size', 0),
-                        ('base_width', 0), ('latent_size', -1), ('decoder', 'none'),
-                        ('skips', True)):
-        with pytest.raises(ConfigError, match=name):
-            PredictorConfig(**{name: value})

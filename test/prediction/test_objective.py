@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.images.pixels import to_float
-from tap_ros.prediction import selection
 from tap_ros.prediction.batches import Augmentation, Batch
 from tap_ros.prediction.losses import bell_preference, l1_error
 from tap_ros.prediction.methods import method_fields
@@ -18,7 +17,6 @@ from tap_ros.prediction.objective import (
     Networks,
     predictor_loss,
 )
-from tap_ros.prediction.selection import selection_errors
 from tap_ros.prediction.training_config import ObjectiveSettings
 import torch
 
@@ -250,34 +248,6 @@ def test_recursion_goes_on_from_its_own_prediction_and_leaves_that_alone(mode, s
     # A frame on the other side is no target of the second level.
     wrong = Moving(frames[:, 2], frames[:, 4 - second])
     assert predictor_loss(Networks(wrong), batch, None, config).loss > 0.1
-
-
-def test_the_preference_of_a_level_lies_between_its_own_inputs(monkeypatch):
-    batch, seen = make_batch(T=9), []
-
-    def choose(error, copy_error, batch, config):
-        seen.append(bell_preference(batch.times, batch.first, batch.last))
-        return selection_errors(error, copy_error, batch, config)
-
-    frames = to_float(batch.targets)
-    network = Moving(frames[:, 6], frames[:, 3])  # times 7 and 4
-    monkeypatch.setattr(selection, 'selection_errors', choose)
-    predictor_loss(Networks(network), batch, None,
-                   replace(CONFIG, **method_fields('genmin-wo-gan'), recursion=2))
-    assert seen[0].argmax(1).tolist() == [4] * 4  # time 5 of 1 to 9
-    assert seen[1].argmax(1).tolist() == [2] * 4  # 3.5 of 1 to 6; the first of two
-
-
-def test_padding_changes_no_selection_error():
-    whole, copy_error = make_batch(T=6), torch.rand(4, 2, 6)
-    padded = replace(whole, valid=whole.times <= 4)
-    short = replace(whole, targets=whole.targets[:, :4], times=whole.times[:, :4],
-                    valid=whole.valid[:, :4])
-    for kind in ('absolute', 'progress', 'relative'):
-        config = replace(CONFIG, selection=kind)
-        found = selection_errors(torch.ones(4, 6), lambda: copy_error, padded, config)[:, :4]
-        expected = selection_errors(torch.ones(4, 4), lambda: copy_error[..., :4], short, config)
-        assert found.allclose(expected), kind
 
 
 def test_progress_prefers_half_way_in_the_pictures_and_leaves_out_what_shows_an_input():

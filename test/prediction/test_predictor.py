@@ -26,11 +26,6 @@ def predictor():
     return SubgoalPredictor(lively_network())
 
 
-@pytest.fixture(scope='module')
-def forward():
-    return SubgoalPredictor(lively_network(num_context=1))
-
-
 def differ(a, b):
     """Return the mean absolute difference of two pictures, from 0 to 255."""
     return np.abs(a.astype(int) - b).mean()
@@ -82,21 +77,6 @@ def test_going_forward_each_prediction_is_the_next_context():
     assert np.abs(chain[2].expected_pixels - chain[0].expected_pixels).max() > 0.2
 
 
-@pytest.mark.parametrize('num_context', [1, 2])
-def test_samples_differ_by_z_repeat_by_seed_and_say_where_they_belong(num_context):
-    predictor = SubgoalPredictor(lively_network(num_context=num_context, latent_size=8))
-    goal = (GOAL,) if num_context == 2 else ()
-    chains = predictor.predict(START, *goal, num_samples=3, recursion_depth=2, seed=5)
-    assert [subgoal.sample for subgoal in chains] == [0, 0, 1, 1, 2, 2]
-    assert [subgoal.level for subgoal in chains] == ([1, 2] if num_context == 1 else [2, 1]) * 3
-    firsts = [subgoal for subgoal in chains if subgoal.level == 1]
-    assert all(differ(a.image, b.image) > 5 for a, b in zip(firsts, firsts[1:]))
-    same = predictor.predict(START, *goal, num_samples=3, recursion_depth=1, seed=5)
-    assert all(differ(a.image, b.image) < 0.1 for a, b in zip(firsts, same))
-    again = predictor.predict(START, *goal, num_samples=3, recursion_depth=2, seed=5)
-    assert all(np.array_equal(a.image, b.image) for a, b in zip(chains, again, strict=True))
-
-
 @pytest.mark.parametrize('num_context, latent_size', [(1, 0), (2, 8)])
 def test_questions_answered_together_are_answered_as_alone(num_context, latent_size):
     predictor = SubgoalPredictor(lively_network(num_context=num_context, latent_size=latent_size))
@@ -112,6 +92,8 @@ def test_questions_answered_together_are_answered_as_alone(num_context, latent_s
         alone = predictor.predict(
             question.start, question.goal, question.start_pixels, question.goal_pixels,
             question.num_samples, question.recursion_depth, question.seed)
+        if latent_size and question.num_samples > 1 and question.recursion_depth == 1:
+            assert differ(alone[0].image, alone[-1].image) > 5  # by z
         for one, other in zip(alone, together, strict=True):
             assert (one.sample, one.level) == (other.sample, other.level)
             assert differ(one.image, other.image) < 0.1

@@ -17,7 +17,6 @@ from tap_ros.prediction.predictor import load_network, SubgoalPredictor
 from tap_ros.prediction.training import kl_share, train
 from tap_ros.prediction.training_config import TrainingConfig
 from tap_ros.recording.cache import open_recordings
-from tap_ros.training.devices import pick_precision, Processes
 from tap_ros.training.frames import MappedFrames
 from tap_ros.training.weights import load_tensors, load_weights
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -52,8 +51,7 @@ def curve(folder, name):
     {**method_fields('genmin-vae-gan'), 'kl_warmup': 0.5, 'posterior_std': 0.1,
      'num_targets': 3, 'min_crop': 0.6},
     {**method_fields('genmin4'), 'mode': 'forward', 'recursion': 2, 'decoder': 'separate',
-     'skips': False},
-    {**method_fields('genmin-vae'), 'posterior': 'frame', 'num_targets': 2}])
+     'skips': False}])
 def test_two_steps_and_two_more_equal_four(config, tmp_path, values):
     config = replace(config, **values)
     train(config, progress=False)
@@ -123,16 +121,6 @@ def test_a_run_leaves_what_is_needed_to_repeat_it(config):
         2, 4}
 
 
-def test_several_processes_need_a_gpu_each_and_an_equal_part_of_the_batch(config, monkeypatch):
-    monkeypatch.setenv('WORLD_SIZE', '2')
-    with pytest.raises(ConfigError, match='device: 2 processes train on a GPU each, not on cpu'):
-        train(replace(config, device='cpu'), progress=False)
-    with pytest.raises(ConfigError, match='batch_size: 5 episodes cannot be divided among 2'):
-        Processes(0, 2).part(5)
-    assert [Processes(rank, 2).part(6) for rank in (0, 1)] == [slice(0, 3), slice(3, 6)]
-    assert pick_precision('auto', torch.device('cuda')) == 'bfloat16'
-
-
 def test_the_price_of_z_rises():
     shares = [kl_share(step, 100, 0.4) for step in range(100)]
     assert shares[:41] == [0] * 41 and shares[60] == 0.5 and shares[80:] == [1] * 20
@@ -141,7 +129,7 @@ def test_the_price_of_z_rises():
 
 def test_settings_that_make_no_sense_or_do_nothing_are_refused_by_name(config):
     for values in (
-            {'recordings': ()}, {'loss': 'max'}, {'outer_power': 2.0}, {'goal_picture': 'none'},
+            {'recordings': ()}, {'loss': 'max'}, {'goal_picture': 'none'},
             {'steps': 0}, {'fraction': 1.5}, {'selection': 'progress', 'mode': 'forward'},
             {'recursion': 2, 'loss': 'fix'}, {'posterior': 'frame', 'latent': 'vae', 'gan': True},
             {'posterior': 'frame'}, {'posterior': 'frame', 'free_nats': 1.0, 'latent': 'vae'},
@@ -152,35 +140,20 @@ def test_settings_that_make_no_sense_or_do_nothing_are_refused_by_name(config):
         train(replace(config, device='nonsense'), progress=False)
 
 
-def test_the_command_line_sets_every_field_and_one_needs_no_held_out_episodes(config, capsys):
-    assert main([
-        'train', 'predictor', *config.recordings, '--out', config.out, '--steps', '1',
-        '--no-flip', '--base-width', '4', '--batch-size', '2', '--loss', 'min', '--new-pixels',
-        '--test-fraction', '0', '--threads', '1']) == 0
-    assert capsys.readouterr().out.strip() == f'{config.out}/predictor.safetensors'
-    settings = json.loads(Path(config.out, 'config.json').read_text())
-    assert settings['loss'] == 'min' and settings['new_pixels'] and not settings['flip']
-    assert json.loads(Path(config.out, 'scores.json').read_text()) == {}
-    assert torch.isfinite(weights(config)[HEAD]).all()
-
-
 def test_each_setting_reaches_the_loss_or_the_step(config):
     def first(**options):
         run = replace(config, steps=1, warmup=0, log_every=1, **options)
         train(run, progress=False)
         Path(run.out, 'checkpoint.safetensors').unlink()
-        found = {name: curve(run.out, name)[1] for name in ('loss', 'gradient_norm')}
+        loss = curve(run.out, 'loss')[1]
         for file in Path(run.out).glob('events*'):
             file.unlink()
-        return found, load_tensors(Path(run.out, 'predictor.safetensors'))[0]['head.0.weight']
+        return loss, load_tensors(Path(run.out, 'predictor.safetensors'))[0]['head.0.weight']
 
-    plain, weight = first()
-    again, same = first()
-    assert again == plain and same.equal(weight)
-    for options in ({'outer_power': 0.5}, {'recursion': 2}, {'loss': 'min'},
-                    {'loss': 'fix', 'fraction': 0.2}, {'selection': 'absolute'}, {'seed': 1}):
-        assert first(**options)[0]['loss'] != pytest.approx(plain['loss'], rel=1e-6), options
-    for options in ({'gradient_clip': 1e-12}, {'learning_rate': 1e-4}, {'average_decay': 0.0}):
+    plain, weight = first(test_fraction=0.0)  # one needs no held-out episodes
+    for options in ({'recursion': 2}, {'loss': 'fix', 'fraction': 0.2}, {'seed': 1}):
+        assert first(**options)[0] != pytest.approx(plain, rel=1e-6), options
+    for options in ({'gradient_clip': 1e-12}, {'average_decay': 0.0}):
         assert not first(**options)[1].equal(weight), options
 
 
@@ -195,8 +168,7 @@ def test_what_is_taken_from_episodes_is_what_the_settings_say(config, store, mon
         settings = replace(config, **{'goal_picture': 'last', 'margin': 0, 'start_crop': 0.0,
                                       **options})
         return [item[1:] for item in training._batches(
-            store, MappedFrames(store), None, np.arange(len(store)), settings, Processes(), 0,
-            count)]
+            store, MappedFrames(store), None, np.arange(len(store)), settings, 0, count)]
 
     monkeypatch.setattr(training, 'make_batch', make)
     same = {'margin': 2, 'num_targets': 3, 'min_crop': 0.7, 'start_crop': 0.2,

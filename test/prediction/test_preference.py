@@ -17,7 +17,6 @@ from tap_ros.prediction.preference import (
     RIDGE,
     SIZE,
     SPREAD,
-    still,
 )
 
 CALM = FEATURES.index('speed')
@@ -86,13 +85,6 @@ def test_features_are_bounded_and_the_same_for_a_darker_camera():
     assert abs(found[:, CALM].argmin() - pause) <= 1
     np.testing.assert_allclose(describe(frames // 2 + 10), found, atol=0.05)
     assert np.isfinite(describe(np.zeros((3, 8, 8, 3), np.uint8))).all()  # nothing ever moves
-
-
-def test_still_prefers_the_pause():
-    for seed in range(8):
-        frames, pause = demonstration(seed)
-        w = still(describe(frames))
-        assert abs(w.argmax() - pause) <= 1 and w.max() == 1 and w.min() > 0
 
 
 def test_what_is_hidden_changes_nothing():

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predictors by name: the baseline of recorded keyframes, and one of another package."""
 
-from dataclasses import replace
 
 import cv2
 from made_episodes import move_squares
@@ -41,21 +40,6 @@ def test_a_recorded_task_is_answered_with_its_own_frame_half_way():
         earlier, later = ask(predictor, episode, recursion_depth=2)
         assert (later.image == subgoal.image).all() and (later.level, earlier.level) == (1, 2)
         assert (earlier.image == episode.frames[halfway(episode.frames, t)]).all()
-
-
-def test_objects_are_found_in_any_order_and_those_without_a_place_stay():
-    predictor, episode = NearestKeyframe(EPISODES), EPISODES[0]
-    usual, = ask(predictor, episode)
-    pixels = episode.object_pixels[0][::-1]
-    turned, = predictor.predict(episode.frames[0], episode.frames[-1], pixels, pixels)
-    assert (turned.expected_pixels == usual.expected_pixels[::-1]).all()
-    more = np.concatenate([episode.object_pixels[0], [[3.0, 4.0]]]).astype(np.float32)
-    found, = predictor.predict(episode.frames[0], episode.frames[-1], more, more)
-    assert (found.expected_pixels[:2] == usual.expected_pixels).all()
-    assert found.expected_pixels[2].tolist() == [3, 4]
-    unknown = replace(episode, object_pixels=np.full_like(episode.object_pixels, np.nan))
-    found, = ask(NearestKeyframe([unknown]), episode)
-    assert (found.expected_pixels == episode.object_pixels[0]).all()
 
 
 class Copying(Predictor):

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the queue of requests: each is answered once, whatever happens to the others."""
 
-from collections import Counter
 import threading
 
 import pytest
@@ -61,20 +60,6 @@ def made():
     for rig in rigs:
         rig.go.set()
         rig.queue.close()
-
-
-def test_every_request_of_many_threads_is_answered_once_and_its_own_way(made):
-    rig = made(max_waiting=1000)
-    rig.go.set()
-    threads = [threading.Thread(target=lambda first=100 * i: [rig.put(n) for n in range(
-        first, first + 100)]) for i in range(1, 9)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    found = rig.wait(800)
-    assert found == {n: -n for n in range(100, 900)}
-    assert set(Counter(one for one, _ in rig.answers).values()) == {1}
 
 
 def test_what_waits_is_answered_together_within_the_limits_and_beyond_them_refused(made):

@@ -93,21 +93,6 @@ def test_an_object_that_the_flow_jumps_over_arrives_with_what_is_around_it():
         assert (expected_pixels(warped.maps)[0] - torch.tensor([expected, 8.0])).norm() < 1
 
 
-def test_each_object_of_each_picture_is_found_as_if_it_were_alone():
-    pixels = torch.tensor([[[10.0, 8.0], [20.0, 12.0], [3.0, 4.0]], [[4.0, 8.0], [10.0, 3.0],
-                                                                     [25.0, 9.0]]])
-    maps = one_hot_maps(pixels, SIZE)[:, None].expand(2, 2, 3, *SIZE)
-    flow = constant_flow(0, 0).repeat(2, 1, 1, 1, 1)
-    flow[:, :, 0] = torch.where(torch.arange(30.0) >= 10, 1.0, -1.0)  # over the 1st and the 5th
-    masks = masks_for([0.5, 0.5]).expand(2, -1, -1, -1, -1)
-    together = warp_object_maps(maps, flow, masks)
-    assert (together.mass < 0.05).sum() == 2
-    for b in range(2):
-        for k in range(3):
-            alone = warp_object_maps(maps[b:b + 1, :, k:k + 1], flow[:1], masks[:1])
-            assert together.maps[b, k].allclose(alone.maps[0, 0])
-
-
 def test_masks_choose_the_context_of_an_object_that_stays_where_it_was_if_all_avoid_it():
     start, goal, maps = start_and_goal()
     for weights, expected in (([1.0, 0.0], start), ([0.0, 1.0], goal),

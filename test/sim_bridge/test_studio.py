@@ -8,14 +8,11 @@ from itertools import pairwise
 import mujoco
 import numpy as np
 import pytest
-from sim_bridge.collect import collect, CollectConfig
 from sim_bridge.simulator import Simulator
-from sim_bridge.tasks.tasks import run_episode
 from sim_bridge.world.camera import Camera
 from sim_bridge.world.looks import LOOKS, OBSERVER
 from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import KinematicsError
-from tap_ros.recording.cache import open_recordings
 from tap_ros.robots.ur10e import UR10E
 
 TASKS = ('push2', 'pick_place')
@@ -110,15 +107,3 @@ def test_the_camera_projects_as_mujoco_does_and_back(camera):
         places = camera.on_table(pixels, height)
         points = np.column_stack([places, np.broadcast_to(height, 10)])
         np.testing.assert_allclose(camera.project(points), pixels, atol=1e-9)
-
-
-def test_a_recording_carries_the_masks_of_its_pictures(tmp_path):
-    collect(tmp_path / 'bag', CollectConfig(
-        task='pick_place', episodes=1, look='arm', appearance='random'), progress=False)
-    episode, = open_recordings(tmp_path / 'bag')
-    simulator = Simulator('pick_place', 64, 'arm', 'random')
-    observations, *_ = run_episode(simulator, 0)
-    assert np.array_equal(episode.frames, [o.image for o in observations])
-    assert np.array_equal(episode.robot_masks, [o.robot_mask for o in observations])
-    assert np.array_equal(episode.goal_mask, observations[-1].robot_mask)
-    simulator.close()

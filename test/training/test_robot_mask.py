@@ -7,7 +7,7 @@ import dataclasses
 from made_episodes import cover, make_episode, write_bag
 import numpy as np
 import pytest
-from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASKS
+from tap_ros.contract import ROBOT_MASK_ARM, ROBOT_MASK_FREE, ROBOT_MASK_HAND
 from tap_ros.errors import RecordingError
 from tap_ros.recording.cache import open_recordings
 from tap_ros.recording.episode import RecordingWarning
@@ -27,26 +27,12 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv('TAP_ROS_CACHE', str(tmp_path / 'cache'))
 
 
-def still(T=9, seed=0):
-    """Make an episode in which nothing moves; return it and the one with a robot before it."""
-    episode = make_episode(seed, T=T)
-    scene = np.repeat(episode.frames[:1], T, 0)
-    episode = dataclasses.replace(episode, frames=scene, goal_frame=scene[0])
-    return episode, cover(episode)
-
-
 def random_masks(T, seed=0):
     """Draw masks that hide most, and some pixels always or never."""
     values = [ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM]
     masks = np.random.default_rng(seed).choice(values, (T, 8, 12)).astype(np.uint8)
     masks[:, 0], masks[:, 1] = ROBOT_MASK_ARM, ROBOT_MASK_FREE
     return masks
-
-
-def test_the_hand_stays_with_arm_and_goes_with_all():
-    masks = np.array([ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM], np.uint8)
-    assert [hidden_pixels(masks, name).tolist() for name in ROBOT_MASKS] == [
-        [False, False, False], [False, False, True], [False, True, True]]
 
 
 @pytest.mark.parametrize('robot_mask', ['arm', 'all'])

@@ -1,0 +1,171 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a trained run scores on the episodes of its task that training held out."""
+
+from dataclasses import asdict, dataclass
+import time
+
+from experiments.paper.runs import SCALE
+import numpy as np
+from tap_ros.errors import ConfigError
+from tap_ros.evaluation.bottleneck import bottleneck_share, MIN_MOTION, target_bottlenecks
+from tap_ros.evaluation.prediction import evaluate
+from tap_ros.evaluation.samples import score_samples
+from tap_ros.evaluation.shown import ShownScorer
+from tap_ros.images.pixels import to_float
+from tap_ros.prediction.batches import make_batch, Sampling
+from tap_ros.prediction.losses import l1_errors, match_step
+from tap_ros.prediction.predictor import load_network
+from tap_ros.recording.cache import open_recordings
+from tap_ros.training.devices import pick_device
+from tap_ros.training.split import split_episodes
+from tap_ros.training.weights import stored_digest
+from tap_ros.weights import find_predictor
+import torch
+
+LEVELS = 2  # of recursion
+_BATCH = 64
+_DIGITS = 5
+
+
+def score(run, config, weights, places):
+    """
+    Score a trained run on the episodes of its task that training held out.
+
+    :param run: PaperRun.
+    :param config: its TrainingConfig.
+    :param weights: path of the weights.
+    :param places: Places.
+    :return: dict for a JSON file: what the run was, and a number for each held-out episode.
+    :raises ConfigError: if no episode was held out.
+    """
+    network, about = load_network(weights, pick_device(config.device))
+    store = open_recordings(list(config.recordings), progress=False)
+    _, held_out = split_episodes(store, config.test_fraction)
+    if not len(held_out):
+        raise ConfigError(f'{config.recordings[0]}: no episode of it is held out; collect more')
+    began = time.perf_counter()
+    scores = {method: _rounded(value) for method, value in
+              evaluate(network, store, held_out).items()}
+    hashes = {}
+    if run.shifted:
+        scores['shifted'], hashes = _shifted(run, network, store, held_out, places)
+    if config.new_pixels and config.mode == 'bidirectional' and config.latent == 'none':
+        scores['recursion'] = [_rounded(level) for level in score_recursion(
+            network, store, held_out)]
+    if not config.new_pixels:
+        scores['bottleneck_at'] = _rounded_list(
+            [bottleneck_share(store[i]) for i in held_out])
+    if config.loss == 'fix' and config.mode == 'bidirectional':
+        scores['target_bottleneck'] = _rounded_list(
+            target_bottlenecks([store[i] for i in held_out], config.fraction, 'last'))
+    if network.config.latent_size:
+        samples = _rounded(score_samples(network, store, held_out))
+        for name in [name for name in samples if name.startswith('spread')]:
+            scores[f'sample_{name}'] = samples.pop(name)
+        scores['best_of_100'] = samples
+    seconds = round(time.perf_counter() - began, 1)
+    return {
+        'name': run.name, 'task': run.task, 'mode': run.mode, 'method': run.method,
+        'new_pixels': run.new_pixels, 'seed': run.seed, 'scale': SCALE,
+        'recursion': run.recursion, 'variant': run.variant, 'command': run.command,
+        'config': asdict(config),
+        'data': {'hash': store.data_hash, 'episodes': about['episodes'],
+                 'held_out': len(held_out),
+                 'shifted': hashes,
+                 **({'initial_weights': stored_digest(find_predictor(config.initial_weights))}
+                    if config.initial_weights else {})},
+        'training': {name: about[name]
+                     for name in ('steps', 'seconds', 'machine', 'torch', 'python')},
+        'evaluation': {'margin': 0, 'goal_picture': 'last', 'seconds': seconds, **scores}}
+
+
+def _shifted(run, network, store, held_out, places):
+    """
+    Score on other looks of scenes, and on goal pictures with the arm elsewhere.
+
+    :return: the scores, and the hashes of the recordings of other looks, by their names.
+    """
+    scores, hashes = {'arm_elsewhere': evaluate(
+        network, store, [i for i in held_out if store[i].goal_frame is not None],
+        goal_picture='recorded')}, {}
+    for name in run.shifted:
+        other = open_recordings([str(places.recording(name))], progress=False)
+        scores[name], hashes[name] = evaluate(network, other, range(len(other))), other.data_hash
+    return {name: {method: _rounded(value) for method, value in found.items()
+                   if method != 'copy-start'} for name, found in scores.items()}, hashes
+
+
+def _rounded(scores):
+    """Turn a dataclass of arrays into lists of few digits, None for NaN."""
+    return {name: _rounded_list(values) for name, values in vars(scores).items()}
+
+
+def _rounded_list(values):
+    return [None if np.isnan(x) else round(float(x), _DIGITS) if x % 1 else int(x)
+            for x in values]
+
+
+@dataclass(frozen=True)
+class LevelScores:
+    """
+    Measurements of the predictions of one level for N episodes.
+
+    :param min_l1: (N,), error against the best matching frame between start and goal.
+    :param match_step: (N,), the time of that frame.
+    :param way: (N,), which share of their way the objects have behind them in that frame, 0 to 1;
+        NaN where none moves MIN_MOTION pixels or positions are unknown.
+    :param hand: (N,), how much of the hand is shown, see shown.ShownScorer; NaN where unknown.
+    :param objects: (N,), likewise of the objects.
+    """
+
+    min_l1: np.ndarray
+    match_step: np.ndarray
+    way: np.ndarray
+    hand: np.ndarray
+    objects: np.ndarray
+
+
+@torch.inference_mode()
+def score_recursion(network, store, episodes):
+    """
+    Measure each level of recursion (Eq. 3, Fig. 7); the first is the prediction itself.
+
+    :param network: Predictor in eval mode, without z, with start and goal as context.
+    :param store: the EpisodeStore.
+    :param episodes: indices of at least one episode, each of at least 3 frames.
+    :return: list of LevelScores, the first level first.
+    """
+    device = next(network.parameters()).device
+    rows = [[] for _ in range(LEVELS)]
+    for at in range(0, len(episodes), _BATCH):
+        chosen = episodes[at:at + _BATCH]
+        batch = make_batch(store, chosen, Sampling(goal_picture='last')).to(device)
+        context = to_float(batch.context)
+        scorers = [ShownScorer(store[i]) for i in chosen]
+        for level in rows:
+            image = network(context).image
+            context = torch.stack([context[:, 0], image.clamp(-1, 1)], 1)
+            errors = l1_errors(batch.visible(image[:, None]), batch.targets.movedim(-1, 2))[:, 0]
+            match = match_step(errors, batch.valid)[:, None]
+            times = batch.times.gather(1, match)[:, 0].tolist()
+            pictures = ((image + 1) / 2).movedim(1, -1).cpu().numpy()
+            level.extend(
+                (error, time, way_behind(store[i].object_pixels, time),
+                 *scorer.score(picture, time)) for i, error, time, scorer, picture in zip(
+                    chosen, errors.gather(1, match)[:, 0].tolist(), times, scorers, pictures))
+    return [LevelScores(*map(np.array, zip(*level))) for level in rows]
+
+
+def way_behind(pixels, time):
+    """
+    Say which share of their way the moved objects of an episode have behind them.
+
+    :param pixels: (T, K, 2), (u, v) of the objects; NaN where unknown.
+    :param time: number of a frame.
+    :return: float 0..1, the mean over the objects that move; NaN where none does.
+    """
+    way = np.linalg.norm(pixels[-1] - pixels[0], axis=-1)
+    behind = np.linalg.norm(pixels[time] - pixels[0], axis=-1)[way >= MIN_MOTION]
+    moved = np.minimum(behind / way[way >= MIN_MOTION], 1)
+    return float(moved.mean()) if len(moved) else np.nan
