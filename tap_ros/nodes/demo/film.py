@@ -149,10 +149,10 @@ def _frame(scene: Scene, t: int) -> np.ndarray:
 
 def order_in_words(scene: Scene) -> str:
     """Say which order works, and why."""
-    numbers = [str(i + 1) for i in range(len(scene.order))]
-    why = ' and '.join(f'{one} stands where {other} has to go'
-                       for one, other in zip(numbers, numbers[1:]))
-    return f'Only the order {", ".join(numbers)} works: {why}'
+    numbers = ', '.join(str(i + 1) for i in range(len(scene.order)))
+    return f'Only the order {numbers} works: ' + (
+        '1 stands where 2 has to go' if len(scene.order) == 2 else
+        'each stands where the next has to go')
 
 
 def _panels(scene: Scene, mode: str, t: int) -> np.ndarray:
@@ -166,11 +166,11 @@ def _panels(scene: Scene, mode: str, t: int) -> np.ndarray:
 def _title(scene: Scene, mode: str, t: int) -> tuple[str, str, tuple[int, int, int], int]:
     """Return what stands above a run: left, right, and the colour of that; the width."""
     run, width = scene.runs[mode], _panels(scene, mode, 0).shape[1]
-    name = 'Directly to the goal picture'
+    name = 'Direct: straight to the goal picture'
     if run.subgoals:
         heading = run.heading_at(t)
         name = ('Subgoal done, now the goal picture' if heading == GOAL else
-                f'Via the predicted subgoal: {scene.decided(run.subgoals[heading])}')
+                f'Predicted subgoal: {scene.decided(run.subgoals[heading])}')
     if t < len(run.distances) - 1:
         return name, f'{100 * run.distances[t].mean():.0f} cm to go', INK, width
     return name, (f'reached: {run.final_cm:.0f} cm' if run.reached

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 from tap_ros.evaluation.intervals import Interval, mean_interval
 from tap_ros.files import write_atomically
-from tap_ros.nodes.demo.film import film, order_in_words, Scene
+from tap_ros.nodes.demo.film import film, Scene
 
 MODES = {'direct': 'direct', 'subgoal': 'via the subgoal'}
 
@@ -37,7 +37,8 @@ class Row(NamedTuple):
                 '{:+.0f} ({:+.0f} to {:+.0f})'.format(*self.more)]
 
 
-COLUMNS = ('task', 'scenes', 'cm, direct', 'via', 'nearer by', 'success, direct', 'via', 'more by')
+COLUMNS = ('task', 'scenes', 'final cm, direct', 'via', 'nearer by', 'success, direct', 'via',
+           'more by, points')
 
 
 def summary(scenes: Sequence[Scene]) -> list[Row]:
@@ -114,16 +115,15 @@ def gains(scene: Scene) -> bool:
 
 
 def _stills(scene: Scene) -> Iterator[tuple[str, str]]:
-    """Yield (caption, data URI) of start, subgoals, and the ends of both runs."""
+    """Yield (caption, data URI) of start, first subgoal, and the ends of both runs."""
     runs = scene.runs
-    yield order_in_words(scene) if scene.order else 'start, and where to', _still(
-        scene.seen('subgoal', 0))
+    yield 'start', _still(scene.seen('subgoal', 0))
     for i, subgoal in enumerate(runs['subgoal'].subgoals[:1]):
         yield f'predicted: {scene.decided(subgoal)}', _still(scene.headed(i))
     for mode, name in MODES.items():
         run = runs[mode]
-        yield (f'{name}: {run.final_cm:.1f} cm after {len(run.distances) - 1} steps'
-               f'{"" if run.reached else ", failed"}', _still(scene.seen(mode, -1)))
+        yield (f'{name}: {run.final_cm:.1f} cm, {"reached" if run.reached else "failed"}',
+               _still(scene.seen(mode, -1)))
 
 
 def _still(picture: np.ndarray) -> str:
