@@ -13,9 +13,12 @@ from experiments.planning.following import Follower
 import numpy as np
 from tap_ros.contract import GOAL_TOLERANCE
 from tap_ros.errors import ConfigError, TrackingError
+from tap_ros.planning.action_sequences import DOWN
+from tap_ros.planning.cost import BLOCKED
 from tap_ros.planning.hierarchy import choose_sample, Target, targets_by
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.reach import Aim, End, Reach, ReachConfig, Seen
+from tap_ros.planning.visual_mpc import SHORT
 from tap_ros.training.robot_mask import FreeView, trained_robot_mask
 
 
@@ -45,6 +48,15 @@ class PlannedEpisode:
         """Return the mean distance in pixels from what the planner was given to the truth."""
         true = np.array([seen.object_pixels for seen in self.observations])
         return float(np.linalg.norm(self.tracked - true, axis=-1).mean())
+
+    def blocked(self):
+        """Return how many descents met something at one place, at most."""
+        hand = np.array([seen.gripper[:3] for seen in self.observations])
+        missing = hand[1:, 2] - hand[:-1, 2] - self.actions[:, 2]
+        met = (self.actions[:, 2] < 0) & (hand[1:, 2] > DOWN) & (missing > SHORT)
+        places = hand[1:][met, :2]
+        near = np.linalg.norm(places[:, None] - places, axis=-1) < BLOCKED
+        return int(near.sum(1).max(initial=0))
 
 
 def run_episode(simulator, mpc, method, step_budget, seed, predictor=None,

@@ -202,9 +202,9 @@ def run_scene(job, seed):
     Run a job on one scene.
 
     :return: dict of seed, final_cm (mean over objects), objects_cm and steps; of pushing also
-        switches, plan_ms (median) and, without true object pixels, tracking_error_px and why
-        nothing was planned (refused), or no more (aborted), if so; of stacking success,
-        first_right, moves and seconds.
+        switches, blocked (descents that met something at one place, at most), plan_ms (median)
+        and, without true object pixels, tracking_error_px and why nothing was planned (refused),
+        or no more (aborted), if so; of stacking success, first_right, moves and seconds.
     :raises PlanningError: if it cannot be planned; the message names task, method and scene.
     """
     begin = time.perf_counter()
@@ -219,6 +219,7 @@ def run_scene(job, seed):
         return scene | {'success': run.success, 'first_right': run.first_right,
                         'moves': len(run.moves), 'seconds': round(time.perf_counter() - begin, 2)}
     scene['switches'] = [int(step) for step in run.switches]
+    scene['blocked'] = run.blocked()
     scene['plan_ms'] = (round(float(np.median(run.planning_ms)), 1) if len(run.planning_ms)
                         else None)
     if job.method.tracking != 'ground_truth':

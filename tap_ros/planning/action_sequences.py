@@ -38,6 +38,7 @@ FIRST_STD = 0.04  # m per control period, of x and y in the first Gaussian
 PUSH_LIMIT = 0.05  # m per control period, of a displacement while the gripper is low
 PACE = 0.9  # of the limits is used by proposals, so that the search can still add to it
 VERTICAL = 0.06  # m, a change of height beyond which the arm does not move sideways meanwhile
+TURNS = 0.2, 0.8  # rad, from the way to the goal to that of a push; where it begins out of reach
 DOWN = LOW + 0.02  # m; a gripper that is not lifted and higher than this stands upon something
 
 
@@ -161,13 +162,22 @@ def landings(actions: np.ndarray, gripper: np.ndarray) -> np.ndarray:
     """
     Find where, (N, 2) metres, the gripper comes down: passes DOWN; NaN if it does not.
 
+    The arm goes no farther than the edge of the workspace.
+
     :param actions: (N, HORIZON, 4); gripper: (4,).
     """
-    path = gripper[:3] + actions[..., :3].astype(np.float64).cumsum(1)  # (N, HORIZON, 3)
-    before = path[..., 2] - actions[..., 2]
-    down = (before > DOWN) & (path[..., 2] <= DOWN)
+    path, height = np.empty((*actions.shape[:2], 2)), gripper[2] + actions[..., 2].cumsum(1)
+    here = np.broadcast_to(gripper[:2], path[:, 0].shape)
+    for t in range(path.shape[1]):
+        path[:, t] = here = inside(here + actions[:, t, :2])
+    down = (height - actions[..., 2] > DOWN) & (height <= DOWN)
     first = down.argmax(1)
     return np.where(down.any(1)[:, None], path[np.arange(len(path)), first, :2], np.nan)
+
+
+def inside(places: np.ndarray) -> np.ndarray:
+    """Return places (..., 2) m, those outside the workspace at its edge."""
+    return places.clip(WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])
 
 
 def gripper_after(gripper: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -197,13 +207,16 @@ def push_proposals(shape: SequenceShape, gripper: np.ndarray, objects: np.ndarra
         return np.zeros((0, SIZE))
     proposals = []
     for k in rng.choice(len(objects), count, p=weights / weights.sum()):
-        angle = np.arctan2(*gaps[k][::-1]) + rng.normal(0, 0.2)
-        along = np.array([np.cos(angle), np.sin(angle)])
-        aside = rng.normal(0, 0.025) * np.array([-along[1], along[0]])
-        start = objects[k] - rng.uniform(0.12, 0.15) * along + aside
+        for spread in TURNS:
+            angle = np.arctan2(*gaps[k][::-1]) + rng.normal(0, spread)
+            along = np.array([np.cos(angle), np.sin(angle)])
+            aside = rng.normal(0, 0.025) * np.array([-along[1], along[0]])
+            start = objects[k] - rng.uniform(0.13, 0.16) * along + aside
+            if (start == inside(start)).all():
+                break
         # the gripper stops where the object's near side should end
         end = start + (distances[k] + rng.normal(0.07, 0.03)) * along
-        proposals.append(_go_and_push(shape, gripper, start, end, objects[k], along))
+        proposals.append(_go_and_push(shape, gripper, inside(start), end, objects[k], along))
     return np.stack(proposals)
 
 

@@ -13,13 +13,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
+from tap_ros.contract import WORKSPACE_HIGH
 from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.table import pixel_points
 import torch
 
 NEAR = 3.0  # px; an object nearer to its goal is finished
 BLOCKED = 0.06  # m around where the 4 cm of the gripper met something; a bar is about as wide
+LEG = 0.02  # m beyond the clearance that the legs of an object may reach
+EDGE = 0.01  # m to the edge of the workspace from what is at it
 LAST_WEIGHT = 10.0  # of the horizon's last step, as the authors' planner has; the others have 1
 
 
@@ -67,15 +69,17 @@ class PlanCost:
         :param landings: (N, 2) metres, NaN for none; objects: (K, 2).
         :param blocked: (B, 2), where the gripper met something; dearer than any push gains.
         :return: (N,) pixels: 0, or 100 (1000 where blocked) and 10 for every centimetre that is
-            missing.
+            missing; the latter alone within LEG of the clearance, and where the workspace ends:
+            nothing is farther there, so narrow places are tried.
         """
         costs = np.zeros(len(landings))
         if self.clearance:
-            held = landings.clip(WORKSPACE_LOW[:2], WORKSPACE_HIGH[:2])  # the arm goes no farther
-            for ends, places, room, least in ((landings, objects, self.clearance, 100),
-                                              (held, blocked, BLOCKED, 1000)):
-                gap = np.linalg.norm(ends[:, None] - places, axis=-1).min(1, initial=np.inf)
-                costs += np.where(gap < room, least + 1000 * (room - gap), 0)
+            edge = (np.abs(landings) > WORKSPACE_HIGH[0] - EDGE).any(1)
+            for places, near, least, room in (
+                    (objects, np.where(edge, BLOCKED, self.clearance), 100, self.clearance + LEG),
+                    (blocked, BLOCKED, 1000, BLOCKED)):
+                gap = np.linalg.norm(landings[:, None] - places, axis=-1).min(1, initial=np.inf)
+                costs += np.where(gap < near, least, 0) + 1000 * np.fmax(room - gap, 0)
         return costs
 
 

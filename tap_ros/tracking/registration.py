@@ -14,7 +14,7 @@ from tap_ros.tracking.search import locate
 from tap_ros.tracking.silhouette import centre, silhouette
 from tap_ros.tracking.template import Matcher, Pose, Template
 
-LEAST_FIT, MOST_COST = 0.4, 0.4  # else not found
+LEAST_SURE = 0.9  # confidence, else not found
 CHANGED = 8.0  # distance of colours
 LEAST_CHANGED = 60  # px of the working picture
 KEPT = 0.1  # weight of places where nothing changed
@@ -55,7 +55,7 @@ def register(first: Picture, picture: Picture, plane: Plane,
     states, outlines = [LOST] * len(objects), [np.zeros((0, 2))] * len(objects)
     for k, (pose, key) in found.items():
         confidence[k] = probability(pose.fit, pose.cost, pose.seen)
-        if pose.fit > LEAST_FIT and pose.cost < MOST_COST:
+        if confidence[k] > LEAST_SURE:
             states[k] = SEEN
             pixels[k] = plane.enlarge(plane.middle_pixels(pose.place))
             outlines[k] = plane.enlarge(plane.top_pixels(key.outlined(pose.place, pose.angle)))

@@ -16,9 +16,9 @@ from tap_ros.robots.silhouette import PinholeCamera
 from tap_ros.tracking.confidence import doubt, probability
 from tap_ros.tracking.mean_shift import mean_shift
 from tap_ros.tracking.picture import Picture
-from tap_ros.tracking.plane import Plane
+from tap_ros.tracking.plane import Plane, TOP
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
-from tap_ros.tracking.registration import MOST_COST, register
+from tap_ros.tracking.registration import register
 from tap_ros.tracking.search import locate
 from tap_ros.tracking.silhouette import clicked, middle, RADIUS, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template
@@ -26,7 +26,9 @@ from tap_ros.tracking.template import Matcher, Pose, Template
 REACH, TURN = 0.05, 0.5  # m, rad, in one control period
 REST, REST_TURN = 0.012, 0.1  # the same, of what the hand is not near to
 HAND_FAR, HAND_HIGH = 0.22, 0.1  # m: a hand farther off, or higher, moves nothing
+HAND_HALF = 0.02  # m, half as wide as the fingers are
 GOOD, GOOD_COST = 0.7, 0.35  # fit of what is believed; cost up to which no other is tried
+MOST_COST = 0.4  # of what is found far from where it was
 NEW_COST, NEW_ANGLE, NEW_SEEN = 0.25, 0.35, 0.85  # from when on the object is cut out anew
 WAITS = 4  # pictures from one such cut to the next
 BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whether anything moved
@@ -113,6 +115,8 @@ class RigidTracker:
         if one.state == SEEN and one.around is not None and _still(*one.around, picture):
             return
         one.around, one.waits = None, one.waits - 1
+        if one.age and hand is not None:
+            one.place = one.place + _pushed(one, hand)
         matcher = Matcher(picture, self._plane, self._covered(one, picture))
         keys = one.nearest()
         found = self._search(one, keys, matcher, hand)
@@ -221,6 +225,20 @@ def _still(window: tuple[slice, slice], before: Picture, now: Picture) -> bool:
         return False
     apart = cv2.absdiff(before.lab[window], now.lab[window])
     return bool((np.asarray(apart) > SAME).mean() < 0.003)
+
+
+def _pushed(one: _Object, hand: np.ndarray) -> np.ndarray:
+    """Return how far (2,) m the hand has moved an object that nobody saw meanwhile."""
+    way = hand[1, :2] - hand[0, :2]
+    length = float(np.linalg.norm(way))
+    if hand[:, 2].max() > TOP or not length:
+        return np.zeros(2)
+    along, aside = way / length, np.array([-way[1], way[0]]) / length
+    c, s = np.cos(one.angle - one.face.angle), np.sin(one.angle - one.face.angle)
+    points = one.place + one.face.points @ np.array([[c, s], [-s, c]]) - hand[1, :2]
+    met = points[np.abs(points @ aside) < HAND_HALF] @ along
+    met = met[met > -length - HAND_HALF]  # what is behind the hand stays there
+    return along * np.clip(HAND_HALF - met.min(initial=HAND_HALF), 0, length)
 
 
 def _turned(angle: float) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 from tap_ros.tracking.template import Matcher, Pose, Template
 
 PLACES = 6  # that are tried
+TRIED = 4  # turns at each of them that are tried finely
 APART = 0.035  # m from other objects
 EDGE = 0.47  # m, |x| and |y| on a calibrated table
 _TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
@@ -46,11 +47,9 @@ def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (
         places = place + _AROUND
         cost, seen = matcher.score(template, places, _TURNS, thin=3)
         cost[seen < least] = np.inf
-        i, j = np.unravel_index(cost.argmin(), cost.shape)
-        if not np.isfinite(cost[i, j]):
-            continue
-        found = matcher.refine(
-            template, places[j], float(_TURNS[i]) + template.angle, 0.02, 0.3, pull=0)
-        if found is not None and (best is None or found.cost < best.cost):
-            best = found
+        for i in cost.min(1).argsort()[:TRIED]:
+            found = matcher.refine(template, places[cost[i].argmin()],
+                                   float(_TURNS[i]) + template.angle, 0.02, 0.3, pull=0)
+            if found is not None and (best is None or found.cost < best.cost):
+                best = found
     return best

@@ -75,6 +75,15 @@ def test_proposals_end_beyond_the_object_on_its_way_to_the_goal():
     assert (lifted % 3 > 0).any()  # no longer than needed
 
 
+def test_what_is_out_of_reach_is_pushed_from_another_side():
+    objects, goals = np.array([[0.0, 0.4]]), np.array([[0.0, 0.2]])
+    high = np.array([0.0, 0.0, LIFTED, 0], np.float32)
+    proposals = push_proposals(SHAPE, high, objects, goals, 40, np.random.default_rng(0))
+    places = landings(SHAPE.actions(SHAPE.clip(proposals), high[2]), high)
+    assert np.nanmax(np.abs(places)) <= 0.45  # where the arm stops
+    assert (np.abs(places[:, 0]) > 0.08).sum() > 4
+
+
 @pytest.mark.parametrize('limit', [0.02, 0.09, 0.15])
 def test_replanning_with_small_limits_the_gripper_comes_down(limit):
     shape, height = SequenceShape(Limits(climb=limit)), LIFTED

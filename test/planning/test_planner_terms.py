@@ -152,10 +152,13 @@ def test_where_the_gripper_met_something_it_comes_down_again_once_the_object_has
     assert next_plan(0.2, LIFTED, GOALS, NEW).action[2] < 0  # another goal begins anew
 
 
-def test_what_moves_farther_than_the_workspace_comes_down_at_its_edge():
-    blocked, edge = np.array([[0.2, -0.45]]), np.array([[0.2, -0.6], [0.3, -0.6], [0.2, -0.38]])
-    costs = PlanCost(clearance=0.1).of_landings(edge, np.array([[0.0, 0.0]]), blocked)
-    assert costs[0] > 1000 and not costs[1:].any()
+def test_narrow_places_are_tried_only_where_the_workspace_ends():
+    ends = np.array([[0.2, -0.45], [0.3, -0.45], [0.0, 0.115], [0.0, 0.09], [np.nan, np.nan],
+                     [0.0, 0.45], [0.0, 0.41]])
+    costs = PlanCost(clearance=0.1).of_landings(
+        ends, np.array([[0.0, 0.0], [0.0, 0.36]]), np.array([[0.2, -0.45]]))
+    assert costs[0] > 1000 and costs[3] > 100 and costs[6] > 100
+    assert 0 < costs[2] < 100 and 0 < costs[5] < 100 and not costs[[1, 4]].any()
 
 
 def sticks(actions, grippers):

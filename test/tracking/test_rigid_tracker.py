@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of following clicked objects, on pictures of one drawn table."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -66,6 +68,20 @@ def test_what_is_hidden_is_said_to_be_and_found_where_it_comes_out(tracker):
     for _ in range(3):
         found = tracker.update(draw(moved, (0.4, 0)))
     assert found.states == (SEEN, SEEN) and np.abs(found.pixels - moved).max() < 1.5
+
+
+def test_what_the_hand_pushes_unseen_goes_along_with_it(tracker):
+    u, v = STARTS[0]
+    for step in range(10):
+        hand = u - 40 + 8 * step
+        place = max(u, hand + 14 + 3.2)  # halves of the bar and of the fingers, px
+        view = draw(((place, v), STARTS[1]), robot=(place - 40, 60, place + 25, 140))
+        found = tracker.update(replace(view, gripper=np.array([hand, -v, 0.8, 0]) / 160))
+    assert found.states == (HIDDEN, SEEN)
+    assert found.pixels[0] == pytest.approx((place, v), abs=2)
+    view = draw(((place, v), STARTS[1]), robot=(0, 0, 40, 140))
+    assert tracker.update(replace(view, gripper=np.array([0, 0, 16, 0]) / 160)).states == (
+        SEEN, SEEN)
 
 
 def test_what_is_gone_is_unsure_and_then_lost(tracker):
