@@ -215,7 +215,7 @@ class LocalNode:
             self.executor.spin_once(timeout_sec=0.1)
 
     def end(self):
-        """End the node as run_node does; return what its close() returns."""
+        """End the node as run.main does; return what its close() returns."""
         self.running = False
         self._stop.set()
         self._thread.join(20)

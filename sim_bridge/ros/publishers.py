@@ -48,9 +48,9 @@ class ScenePublishers:
     Publishes what is seen of a world.
 
     :param node: rclpy Node.
-    :param world: World; its arm is described once, for those who come later, too.
+    :param world: World; the description of its arm is latched.
     :param observer: publish observer/image_raw, a view from the side, as well.
-    :param tracked: publish objects and goal/objects under truth/: others tell of them.
+    :param tracked: publish objects and goal/objects under truth/: tracker_node publishes its own.
     """
 
     def __init__(self, node: Node, world: World, observer: bool, tracked: bool) -> None:

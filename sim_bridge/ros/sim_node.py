@@ -40,7 +40,7 @@ RESEND_S = 0.2  # in lock-step the newest picture is sent again after so long
 COMMAND_TIMEOUT, MAX_TIMEOUT = 1.0, 60.0  # s that a command is valid, unless its sender says so
 MAX_PERIODS = 100  # of a call that is answered when they have passed: about a second
 OPTIONS = {'look': DEFAULT_LOOK, 'appearance': 'usual', 'arm': DEFAULT_ARM}  # if taken
-LAST_WORDS_S = 1.0  # s that the end of the last episode may take to arrive
+LAST_MARK_S = 1.0  # s that the end mark of the last episode may take to arrive
 
 
 class SimNode(Node):
@@ -48,8 +48,8 @@ class SimNode(Node):
     Steps and renders in the thread that spins, to which the OpenGL context belongs.
 
     Lock-step: a command stamped like the newest image, or unstamped, lets one control period pass.
-    Meanwhile the newest image, and what belongs to it, is sent again and again with the same
-    stamp, so that who waits for it, or comes late, has it.
+    Meanwhile the newest image, and what belongs to it, is sent again every RESEND_S with the same
+    stamp, for nodes that start late.
     Real time: a timer does, with the command that came since the last period, else standing still.
     A command is valid for COMMAND_TIMEOUT, or what arm/command_timeout says, after it came; later
     the arm stands still.
@@ -112,10 +112,10 @@ class SimNode(Node):
             f'ready: task {task}, seed {self.params["seed"]}, {mode}')
 
     def close(self) -> None:
-        """End the episode, and wait a moment for whoever records it."""
+        """End the episode, and wait until its mark has been delivered."""
         self._end_episode()
         self._sim.close()
-        self._episode.wait_for_all_acked(Duration(seconds=LAST_WORDS_S))
+        self._episode.wait_for_all_acked(Duration(seconds=LAST_MARK_S))
 
     # Commands
 
@@ -273,7 +273,7 @@ class SimNode(Node):
         self._step(np.zeros(3))
 
     def _leave_start(self) -> None:
-        """Note that the first scene is no longer at its start, which is what stopped says."""
+        """Leave the state STOPPED, in which the first scene is at its start."""
         if self.state is RunState.STOPPED:
             self.state = RunState.PAUSED
 
@@ -291,7 +291,7 @@ class SimNode(Node):
         """Put an object elsewhere (see Simulator.put_object) and publish what is seen then."""
         ability(self._sim, 'put_object')(name, pose, velocity)
         self._leave_start()
-        self._stamp_ns += 1  # pictures are told apart by their stamps
+        self._stamp_ns += 1  # each picture has a stamp of its own
         self._publish(self._sim.observe())
 
     # Simulation
@@ -347,7 +347,7 @@ class SimNode(Node):
         self._topics.moment(self._sim, observation, self.stamp)
 
     def _publish_goal(self) -> None:
-        # Goals are told apart by their stamps, also where no time has passed between them.
+        # Each goal has a stamp of its own, also where no time has passed since the last one.
         self._goal_ns = max(self._stamp_ns, self._goal_ns + 1)
         self._topics.goal(self._sim.goal(self._hide_arm), to_stamp(self._goal_ns))
 

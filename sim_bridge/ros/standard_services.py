@@ -113,7 +113,7 @@ class StandardServices:
         self._node.set_state(RunState(state))
         if state == RunState.QUITTING:
             self._node.get_logger().info('quitting: set_simulation_state asks for it')
-            signal.raise_signal(signal.SIGTERM)  # which run_node heeds when this is answered
+            signal.raise_signal(signal.SIGTERM)  # which run.main heeds when this is answered
 
     def _on_step(self, request: Any, response: Any) -> None:
         if self._node.state is not RunState.PAUSED:

@@ -22,7 +22,7 @@ from tap_ros.nodes.heartbeat import Liveness
 
 Found = TypeVar('Found')
 
-NEWBORN_S = 0.7  # until others have heard of a node that has just started
+NEWBORN_S = 0.7  # until other nodes have discovered one that has just started
 POLL_S = 0.05  # between two looks at whether a server still lives
 ENDS = {GoalStatus.STATUS_SUCCEEDED: 'succeeded', GoalStatus.STATUS_CANCELED: 'cancelled',
         GoalStatus.STATUS_ABORTED: 'aborted'}
@@ -231,7 +231,7 @@ def _named(server: Liveness | None) -> str:
 
 
 def _expect_alive(name: str, timeout_s: float, server: Liveness | None) -> None:
-    """Raise CallError if a node that was heard before has ended."""
+    """Raise CallError if a node whose heartbeat was received before has ended."""
     if server is not None and not server.wait_until_alive(min(NEWBORN_S, timeout_s)):
         raise CallError(f'{name}: its node, {server.name}, has ended; start it again')
 

@@ -59,7 +59,7 @@ READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'tracker_node': 'sele
 PLANNER = 'visual_mpc_node'
 VIEWS = {'camera': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
          'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
-NOWHERE = (0, 0, 0, 0, 0, 0, 1)  # a pose that says nothing
+NOWHERE = (0, 0, 0, 0, 0, 0, 1)  # pose of an object of which only the pixel is known
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Client:
     def is_ready(self, name: str) -> bool:
         """Tell whether a node ('predictor_node', ...) is ready, or one of SERVICES is offered."""
         if name == PLANNER:
-            self._liveness(PLANNER)  # its heart is heard from now on
+            self._liveness(PLANNER)  # its heartbeat is watched from now on
             return bool(self._planner().server_is_ready())
         service = READY.get(name, name)
         self._liveness(SERVICES[service][2])
@@ -167,7 +167,7 @@ class Client:
         """
         kind, _, server = SERVICES[service]
         client, request = self._service(service), _message(kind.Request, fields)
-        # While a task's model is compiled or an outline is cut, the heart of a node may stop.
+        # Compiling a task's model or cutting outlines may hold up the heartbeat of these nodes.
         watched = None if service in ('reset', 'select') else self._liveness(server)
         response = call(client, request, timeout_s or self.timeout_s, give_up, watched)
         if not getattr(response, 'success', True):

@@ -68,7 +68,8 @@ class Diagnostics:
 
     An input that falls silent, or never comes, is named in the log with the reason and the remedy.
 
-    Of the work: ERROR for some seconds after an error, else WARN while `idle` says why, else OK.
+    Status of the work: ERROR for ERROR_SECONDS after an error, else WARN with the reason while
+    `idle` returns one, else OK.
     Of each input: NotReceived (WARN), Stale (STALE) when its newest message is older than its
     `max_age_s`, or OK.
 
@@ -89,7 +90,7 @@ class Diagnostics:
         self._inputs = {node.resolve_topic_name(topic): Record(RATE_SECONDS, max_age_s)
                         for topic, max_age_s in inputs.items()}
         self._expected = {node.resolve_topic_name(topic) for topic in expected}
-        self._told: set[str] = set()  # topics whose silence has been told
+        self._told: set[str] = set()  # topics whose silence has been logged
         self._work: dict[str, Record] = {}
         self._errors, self._last_error, self._error_time = 0, '', -math.inf
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)

@@ -52,7 +52,7 @@ class LifecycleBase(LifecycleNode):
         super().__init__(name, **options)
         self.active = False
         self._failure: Exception | None = None  # of the last transition
-        self._starting = False  # a failure of autostart is raised, and logged by run_node
+        self._starting = False  # a failure of autostart is raised, and logged by run.main
         self._loaded = self._card = ''
         self._cards = self.create_publisher(String, '~/model_card', LATCHED)
         self.add_on_set_parameters_callback(self._check_loaded)

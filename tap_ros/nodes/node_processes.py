@@ -74,7 +74,7 @@ class NodeProcesses:
         """
         Wait until each node's log says that it is ready.
 
-        :return: what the node that was started last says behind that.
+        :return: the rest of that line in the log of the node that was started last.
         :raises TapError: when a node ends, or is not ready after READY_S.
         """
         deadline, said = time.monotonic() + READY_S, ''

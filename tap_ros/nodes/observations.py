@@ -51,9 +51,9 @@ class Observations:
     simulator or a bag that loops. Then everything earlier is forgotten, and `jumps` counts it.
     A stray that is less far ahead is dropped when the next message continues from the one before.
 
-    A message that repeats the stamp of the one before is as old as that: a driver that hangs sends
-    such ones. It counts as received now only where a clock says that time stands still, as a
-    simulator does that waits for a command.
+    A message that repeats the stamp of the one before keeps the time of reception of that one,
+    since a driver that hangs sends such messages. It counts as received now only while /clock
+    repeats one time, as a simulator does that waits for a command.
 
     :param topics: short names, for example 'image', 'objects'; the first is the one whose stamp
         counts, the others describe it.
@@ -195,12 +195,12 @@ class Observations:
             self._received[topic] = received
 
     def tell_time(self, now_ns: int) -> None:
-        """Take what a clock says."""
+        """Take the time of a message of /clock."""
         self._clock = now_ns, time.monotonic(), now_ns == self._clock[0]
 
     @property
     def time_stands(self) -> bool:
-        """Return whether a clock says, and has said before, that it is the same time."""
+        """Return whether the last two messages of /clock, the newest of them recent, are equal."""
         _, received, same = self._clock
         return same and time.monotonic() - received < CLOCK_S
 

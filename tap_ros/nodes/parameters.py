@@ -109,11 +109,14 @@ def declare_transport(parameters: Parameters) -> None:
 
 
 def declare_arm(parameters: Parameters) -> None:
-    """Declare the arm and its place, for joint states that do not contain the gripper's place."""
+    """Declare arm, mount and gripper opening: used for joint states that lack the gripper's."""
     arm = parameters.declare(
         'arm', DEFAULT_ARM, 'The arm. Heeded, as where it stands, where joint_states has its '
         'joints and not gripper_x.', choices=names('tap_ros.arms'))
     declare_mount(parameters, arm)
+    parameters.declare('fixed_opening', 0.0,
+                       'Opening of the gripper, 0 to 1, where no joint_states has '
+                       'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
 
 
 def declare_mount(parameters: Parameters, arm: str) -> None:
@@ -173,18 +176,11 @@ def pose_matrix(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarr
     return pose
 
 
-def declare_opening(parameters: Parameters) -> None:
-    """Declare the opening of the gripper where no message tells it."""
-    parameters.declare('fixed_opening', 0.0,
-                       'Opening of the gripper, 0 to 1, where no joint_states has '
-                       'gripper_opening; 0 is closed, as for pushing.', low=0.0, high=1.0)
-
-
 def declare_joint_prefix(parameters: Parameters) -> None:
     """Declare what names of joints begin with."""
     parameters.declare('joint_prefix', '',
-                       "What the names of the arm's joints begin with, before "
-                       'shoulder_pan_joint and so on.')
+                       "What the names of the robot's joints begin with in joint_states, "
+                       'before shoulder_pan_joint and so on.')
 
 
 def declared_arm(parameters: Parameters) -> Arm:

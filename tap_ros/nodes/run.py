@@ -42,32 +42,23 @@ class _Ended(BaseException):
 
 def main(name: str = '', args: list[str] | None = None) -> int:
     """
-    Run a node; what all executables of nodes call.
-
-    :param name: one of NODE_CLASSES; by default that of the executable.
-    :param args: as of run_node.
-    :return: exit code.
-    """
-    name = name or Path(sys.argv[0]).name
-    module, node_class = NODE_CLASSES[name].split(':')
-    return run_node(getattr(import_module(module), node_class), name, args)
-
-
-def run_node(node_class: Callable[[], Any], name: str, args: list[str] | None = None) -> int:
-    """
-    Run one node until SIGINT, SIGTERM, or its terminal is closed.
+    Run one node until SIGINT, SIGTERM, or its terminal is closed; what all executables call.
 
     On a signal the running callback is finished and `node.close()` is called before ROS shuts
     down: rclpy's own signal handlers would end the context first, and neither a last command nor a
     last episode mark could be sent. `close` is called whatever ends the node. An exception in a
     callback is logged, and the node goes on.
 
-    :param node_class: made without arguments after rclpy.init; a TapError from it is fatal. Its
-        attribute num_threads says how many threads callbacks have: by default the calling one.
-    :param name: name for the log until the node has one.
+    A TapError of its constructor is fatal. The attribute num_threads of its class says how many
+    threads callbacks have; by default it is the calling one alone.
+
+    :param name: of the node, one of NODE_CLASSES; by default that of the executable.
     :param args: command-line arguments, None for those of the process.
     :return: exit code: 1 when the node could not be started, or when close returns 1.
     """
+    name = name or Path(sys.argv[0]).name
+    module, class_name = NODE_CLASSES[name].split(':')
+    node_class = getattr(import_module(module), class_name)
     stop = threading.Event()
 
     def end(*_: Any) -> None:

@@ -23,7 +23,7 @@ def log_error(node: Node, what: str, error: BaseException) -> None:
 
 
 def internal_error(error: Exception) -> str:
-    """Return what a response says of an unexpected error."""
+    """Return the message of a response to an unexpected error."""
     return f'internal error: {type(error).__name__}: {escaped(error)}'
 
 

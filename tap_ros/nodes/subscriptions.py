@@ -63,7 +63,8 @@ class AdaptiveSubscription:
 
     def adapt(self) -> None:
         """Subscribe anew if the offered quality of service has changed."""
-        offered = [one.qos_profile for one in self._publishers()]
+        offered = [one.qos_profile
+                   for one in self._node.get_publishers_info_by_topic(self.topic)]
         wanted = copy.copy(self._full)
         if any(one.reliability == ReliabilityPolicy.BEST_EFFORT for one in offered):
             wanted.reliability = ReliabilityPolicy.BEST_EFFORT
@@ -101,10 +102,6 @@ class AdaptiveSubscription:
         self.subscription = self._node.create_subscription(
             self._type, self.topic, self._callback, self.qos, callback_group=self._group,
             raw=self._raw)
-
-    def _publishers(self) -> list[Any]:
-        """Return what is known of those who publish."""
-        return self._node.get_publishers_info_by_topic(self.topic)
 
 
 def adapt_regularly(node: Node, subscriptions: Iterable[AdaptiveSubscription],

@@ -19,11 +19,11 @@ from tap_msgs.msg import ObjectStates
 from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.explorer.calls import CommandError, parse_command
+from tap_ros.nodes.explorer.browser_commands import CommandError, parse_command
+from tap_ros.nodes.explorer.display import Distances
 from tap_ros.nodes.explorer.goal import GoalByHand, simulated
 from tap_ros.nodes.explorer.node import ExplorerNode
 from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
-from tap_ros.nodes.explorer.shown import Distances
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
 from tap_ros.nodes.topics import LATCHED, STREAM, to_stamp
 from websockets.exceptions import ConnectionClosed, InvalidStatus

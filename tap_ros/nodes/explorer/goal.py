@@ -12,7 +12,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.nodes.calls import CallError
-from tap_ros.nodes.explorer.shown import Place, SILENT_S
+from tap_ros.nodes.explorer.display import Place, SILENT_S
 from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.ros_messages import encode_objects
 from tap_ros.nodes.topics import LATCHED
@@ -27,7 +27,7 @@ class GoalByHand:
     Publishes goal pictures and goal objects.
 
     :param node: rclpy Node.
-    :ivar moments: Observations of 'camera' and 'objects'; whoever hears them puts them there.
+    :ivar moments: Observations of 'camera' and 'objects'; the node puts them there.
     """
 
     def __init__(self, node: Node) -> None:

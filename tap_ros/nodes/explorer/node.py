@@ -23,10 +23,8 @@ from tap_ros.messages.images import is_empty
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.client import subgoals_of
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.explorer.calls import ExplorerCalls
-from tap_ros.nodes.explorer.goal import GoalByHand
-from tap_ros.nodes.explorer.server import ExplorerServer
-from tap_ros.nodes.explorer.shown import (
+from tap_ros.nodes.explorer.browser_commands import ExplorerCalls
+from tap_ros.nodes.explorer.display import (
     Distances,
     grips,
     listed,
@@ -38,17 +36,19 @@ from tap_ros.nodes.explorer.shown import (
     silence,
     SILENT_S,
 )
+from tap_ros.nodes.explorer.goal import GoalByHand
+from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import declare_transport, Parameters
-from tap_ros.nodes.subscriptions import ADAPT_PERIOD, AdaptiveSubscription
+from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
 from tap_ros.nodes.topics import camera_image, LATCHED, STREAM
 from tap_ros.plugins import names
 from tap_ros.text import escaped
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
 LOG_LINES = 50
+OBSERVER = 'observer/image_raw'
 PICTURES = ('camera', 'goal', 'subgoal', 'plan', 'observer')
-VIEWS = {'plan': 'plan/overlay', 'observer': 'observer/image_raw'}
 NOTHING_SELECTED = json.dumps(
     {'kind': 'selection', 'count': 0, 'followed': True, 'objects': []})
 COLUMNS, MAX_SHOWN = 4, 12  # subgoals of one answer in the page
@@ -77,7 +77,6 @@ class ExplorerNode(Node):
         self._log: deque[str] = deque(maxlen=LOG_LINES)
         self._log_count = 0
         self._task, self._note = self.params['task'], ''
-        self._observed = False
         self._problem: dict[str, Any] = {'count': 0, 'text': ''}
         self._sheet_stamp: Any = None  # of the picture whose subgoals are shown side by side
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
@@ -88,21 +87,20 @@ class ExplorerNode(Node):
             self._calls.do, self.params['host'], self.params['port'], self.params['token'])
         self._server.put('selection', NOTHING_SELECTED)
         kind, topic = camera_image(self.params)
-        self._service = Diagnostics(self, {topic: SILENT_S, 'objects': SILENT_S,
+        self._diagnostics = Diagnostics(self, {topic: SILENT_S, 'objects': SILENT_S,
                                            'goal/image': math.inf, 'goal/objects': math.inf})
-        self._heard = [
-            self._hear(kind, topic, 'camera', STREAM),
-            self._hear(Image, 'goal/image', 'goal', LATCHED),
-            self._hear(Subgoal, 'subgoal', 'subgoal', LATCHED, counted=False),
-            self._hear(ObjectStates, 'objects', 'objects', STREAM),
-            self._hear(ObjectStates, 'goal/objects', 'goal_objects', LATCHED),
-            self._hear(ObjectStates, 'truth/goal/objects', 'true_goals', LATCHED, counted=False),
+        adapt_regularly(self, [
+            self._keep(Image, OBSERVER, 'observer', STREAM, counted=False),
+            self._keep(Image, 'plan/overlay', 'plan', STREAM, counted=False),
+            self._keep(kind, topic, 'camera', STREAM),
+            self._keep(Image, 'goal/image', 'goal', LATCHED),
+            self._keep(Subgoal, 'subgoal', 'subgoal', LATCHED, counted=False),
+            self._keep(ObjectStates, 'objects', 'objects', STREAM),
+            self._keep(ObjectStates, 'goal/objects', 'goal_objects', LATCHED),
+            self._keep(ObjectStates, 'truth/goal/objects', 'true_goals', LATCHED, counted=False),
             AdaptiveSubscription(self, Episode, 'episode', self._on_episode, STREAM),
-            AdaptiveSubscription(self, DiagnosticArray, '/diagnostics', self._nodes.add, STREAM)]
-        self._views: list[AdaptiveSubscription] = []  # drawn only while somebody listens
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD_S, self._show, clock=clock)
-        self.create_timer(ADAPT_PERIOD, self._look_after, clock=clock)
+            AdaptiveSubscription(self, DiagnosticArray, '/diagnostics', self._nodes.add, STREAM)])
+        self.create_timer(PERIOD_S, self._show, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.get_logger().info(f'ready: open {self.url}')
 
     @property
@@ -117,12 +115,12 @@ class ExplorerNode(Node):
 
     # What comes
 
-    def _hear(self, kind: type, topic: str, name: str, qos: Any,
+    def _keep(self, kind: type, topic: str, name: str, qos: Any,
               counted: bool = True) -> AdaptiveSubscription:
         """Keep the newest message of a topic."""
         def keep(message: Any, info: Mapping[str, Any]) -> None:
             if counted:
-                self._service.received(topic)
+                self._diagnostics.received(topic)
             with self._lock:
                 before, _ = self.newest.get(name, (None, 0.0))
                 if name == 'goal' and is_empty(message):  # it was taken back
@@ -150,18 +148,6 @@ class ExplorerNode(Node):
     def _is_old(self, message: Any) -> bool:
         """Tell whether what was made of a picture belongs to an old scene; stamp 0: of a file."""
         return 0 < to_nanoseconds(message.header.stamp) < self._scene_ns
-
-    def _look_after(self) -> None:
-        for heard in self._heard:
-            heard.adapt()
-        if self._server.browsers and not self._views:
-            self._views = [self._hear(Image, topic, name, STREAM, counted=False)
-                           for name, topic in VIEWS.items()]
-        elif not self._server.browsers:
-            for view in self._views:
-                self.destroy_subscription(view.subscription)
-            self._views = []
-        self._observed = self.count_publishers(VIEWS['observer']) > 0
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:
@@ -214,7 +200,7 @@ class ExplorerNode(Node):
         """Say to all browsers what could not be done, and to /diagnostics what we did wrong."""
         self.tell(text)
         if ours:
-            self._service.error(text)
+            self._diagnostics.error(text)
         with self._lock:
             self._problem = {'count': self._problem['count'] + 1, 'text': text}
 
@@ -248,7 +234,8 @@ class ExplorerNode(Node):
             'kind': 'state', 'task': self._task, 'tasks': names('tap_ros.tasks'),
             'simulator': simulator,
             'plans': not simulator or not grips(self._task),
-            'tracker': self._calls.offered('select'), 'observer': self._observed,
+            'tracker': self._calls.offered('select'),
+            'observer': self.count_publishers(OBSERVER) > 0,
             'movable': self._movable(bool(objects), bool(goals), 'goal' in newest),
             'camera': {**self.size('camera'),
                        'objects': listed(objects, newest.get('objects')),

@@ -22,7 +22,6 @@ from tap_ros.nodes.parameters import (
     declare_arm,
     declare_device,
     declare_joint_prefix,
-    declare_opening,
     declare_transport,
     Parameters,
 )
@@ -97,7 +96,6 @@ def declare_parameters(node: Node) -> Parameters:
                        'Seconds; what was received longer ago is not acted upon, so a plan that '
                        'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
     declare_arm(parameters)
-    declare_opening(parameters)
     declare_joint_prefix(parameters)
     parameters.declare('image_timeout', 5.0,
                        'Seconds without a usable observation after which a goal is aborted.',

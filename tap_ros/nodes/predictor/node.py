@@ -94,7 +94,7 @@ class PredictorNode(LifecycleBase):
         """Refuse all waiting requests, and let the running batch end."""
         if self._queue is not None:
             self._queue.close()
-        take_pending_requests(self._service)  # they are told that the node is ending
+        take_pending_requests(self._service)  # each is refused: the node is ending
         self._show()
 
     # Lifecycle
@@ -140,7 +140,7 @@ class PredictorNode(LifecycleBase):
             self._send(send, self._refusal(error))
 
     def _on_timer(self) -> None:
-        """Publish what is new, and take messages: diagnostics tell their age and rate."""
+        """Publish a new subgoal, and take messages so that diagnostics have their age and rate."""
         self._show()
         self._reader.poll()
 

@@ -25,8 +25,8 @@ class RequestQueue(Generic[Request, Answer]):
 
     :param prepare: called first, in the thread, and waited for. It returns the work: a function
         that is called in the same thread with a list of requests that waited, oldest first, and
-        returns their answers in the same order. Where it fails for several, each is tried alone,
-        so that an error reaches nobody but who caused it.
+        returns their answers in the same order. If it fails for a batch, each request is tried
+        alone, so that only those get an error that cause it.
     :param cost: called with a request; how much of a batch it takes.
     :param max_waiting: most requests that wait; what comes beyond is refused at once.
     :param max_together: most requests in one batch.

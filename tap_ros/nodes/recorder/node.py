@@ -14,12 +14,7 @@ from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError
 from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.parameters import (
-    declare_arm,
-    declare_opening,
-    declare_transport,
-    Parameters,
-)
+from tap_ros.nodes.parameters import declare_arm, declare_transport, Parameters
 from tap_ros.nodes.recorder.bags import Bags
 from tap_ros.nodes.ros_messages import message_class
 from tap_ros.nodes.subscriptions import AdaptiveSubscription
@@ -168,7 +163,6 @@ def declare_parameters(node: Node) -> Parameters:
                        choices=['zstd', 'lz4', 'none'])
     declare_transport(parameters)
     declare_arm(parameters)
-    declare_opening(parameters)
     parameters.declare('record_on_start', True,
                        'Record from the start; else from the call of recorder/record on.')
     return parameters

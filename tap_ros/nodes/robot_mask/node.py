@@ -23,6 +23,7 @@ from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import (
     camera_pose,
     declare_camera,
+    declare_joint_prefix,
     declare_mount,
     declared_mount,
     Parameters,
@@ -47,7 +48,7 @@ class RobotMaskNode(Node):
 
     Joints are taken between the joint states before and after the picture, so a mask waits for the
     next joint state. Where the joints, the robot or the camera are not known there is no mask, and
-    log and diagnostics say why: who uses masks then does not use the picture.
+    log and diagnostics have the reason; nodes that use masks ignore the picture.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -181,8 +182,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('urdf', '',
                        'Shape of the robot: a URDF file; the name of an arm: that arm, at '
                        'mount_x and so on; empty: the topic robot_description.')
-    parameters.declare('joint_prefix', '',
-                       'What names in joint_states begin with, before those of the robot.')
+    declare_joint_prefix(parameters)
     parameters.declare('hand_link', '',
                        'Link that is the hand, with all that it carries; empty: there is none, or '
                        'with a named arm its own.')

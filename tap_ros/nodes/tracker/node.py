@@ -32,7 +32,6 @@ from tap_ros.nodes.parameters import (
     declare_arm,
     declare_camera,
     declare_joint_prefix,
-    declare_opening,
     declare_transport,
     declared_arm,
     Parameters,
@@ -447,7 +446,6 @@ def declare_parameters(node: Node) -> Parameters:
     declare_robot_mask(parameters, 'all')
     declare_camera(parameters, f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
     declare_arm(parameters)
-    declare_opening(parameters)
     declare_joint_prefix(parameters)
     parameters.declare('max_silence', 0.35,
                        'Seconds; of a picture without joint states nearer to it than this the '
