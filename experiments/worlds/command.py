@@ -7,7 +7,6 @@ Demonstrations of other simulators, keyframes of them, and predictors trained on
 """
 
 from dataclasses import dataclass
-import json
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -28,7 +27,7 @@ from sim_bridge.collect import BOTTLENECKS_FILE, collect, CollectConfig
 from tap_ros.engines import Engine
 from tap_ros.errors import ConfigError
 from tap_ros.evaluation.intervals import Interval, mean_interval, share_interval
-from tap_ros.files import write_atomically
+from tap_ros.files import write_atomically, write_rows
 from tap_ros.images.drawing import grid
 from tap_ros.options import Flag, Folder
 from tap_ros.prediction.marks import chance
@@ -87,7 +86,7 @@ def run(args):
     if args.tasks == TASKS:
         rows += score_tasks(ASIDE, ('marks',), args, 'aside/')[0]
     out = Path(args.out)
-    write_atomically(out / 'worlds.json', '[' + ',\n'.join(map(json.dumps, rows)) + ']\n')
+    write_rows(out / 'worlds.json', rows)
     write_atomically(out / 'worlds.md', page(rows))
     cv2.imwrite(str(out / 'worlds.png'), grid(strips)[..., ::-1])
     print(out / 'worlds.md')

@@ -25,7 +25,7 @@ from tap_ros.contract import ACTION_LIMIT, step_budget
 from tap_ros.engines import Engine
 from tap_ros.errors import SceneError
 from tap_ros.evaluation.intervals import mean_interval, share_interval
-from tap_ros.files import write_atomically
+from tap_ros.files import write_atomically, write_rows
 from tap_ros.images.drawing import enlarge, grid
 from tap_ros.options import Flag, Folder
 from tap_ros.planning.mpc_config import FIRST_SCENE, VisualMPCConfig
@@ -249,7 +249,7 @@ def write_results(runs, out, args):
     rows = [row for task in args.tasks for rows in read_rows(runs, task).values()
             for row in rows.values() if row]
     table = pd.DataFrame(summarise(rows))
-    write_atomically(out / 'worlds_loop.json', '[' + ',\n'.join(map(json.dumps, rows)) + ']\n')
+    write_rows(out / 'worlds_loop.json', rows)
     strips = [path for task in args.tasks for path in sorted(Path(runs, task).glob('strip_*.png'))]
     if strips:
         cv2.imwrite(str(out / 'worlds_loop.png'), grid([[cv2.imread(str(path))]

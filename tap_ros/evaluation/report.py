@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the command `python -m tap_ros evaluate prediction` does: score, print, write."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 import json
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,11 @@ from tap_ros.prediction.networks import PredictorNetwork
 from tap_ros.prediction.predictor import load_network
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
 from tap_ros.recording.bags import reading_like
-from tap_ros.recording.cache import open_recordings
+from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.marks import read_marks
 from tap_ros.text import listing
 from tap_ros.training.inpainted import fill, with_masks
-from tap_ros.training.robot_mask import trained_robot_mask
+from tap_ros.training.robot_mask import RobotMask, trained_robot_mask
 from tap_ros.training.split import split_episodes, TEST_FRACTION, warn_if_few
 
 _SHOWN = ('min_l1', 'copying_l1', 'changed_l1', 'match_fraction', 'match_fraction_std',
@@ -52,15 +52,8 @@ def run(args: Prediction) -> None:
     if store.image_size != (size, size):
         raise ConfigError(f'{args.weights}: made for {size} pixels a side, '
                           f'the recordings have {store.image_size}; use matching ones')
-    settings = training.get('settings', {})
     robot_mask = trained_robot_mask(training)[0]
-    kept, held_out = with_masks(store, split_episodes(
-        store, settings.get('test_fraction', TEST_FRACTION),
-        held_out=() if args.all else settings.get('held_out', ())), robot_mask)
-    episodes = np.sort(np.concatenate([kept, held_out])) if args.all else held_out
-    if not len(episodes):
-        raise ConfigError('recordings: no episode of them was held out from training; '
-                          'give more of them, or --all')
+    kept, episodes = _choose(args, store, training, robot_mask)
     marks = read_marks(args.marks, store) if args.marks else None
     if marks and not set(marks.episodes) & set(episodes.tolist()):
         raise ConfigError(
@@ -68,14 +61,9 @@ def run(args: Prediction) -> None:
             f'order of the recordings from 0: {listing(episodes)}; or give --all')
     filled = fill(store, robot_mask)
     scores = evaluate(network, store, episodes, goal_picture=args.goal_picture, filled=filled)
-    sources = {(store[i].object_source or 'unknown').replace('_', ' ')
-               for i in episodes if store[i].object_names}
-    count = f'{len(episodes)} episode{"s" if len(episodes) > 1 else ""}'
-    print(f'{count}, goal picture: {args.goal_picture}; l1 on [0, 1]; '
-          + ''.join(f'object positions: {source}; ' for source in sorted(sources))
-          + 'in brackets 95% intervals over the episodes')
+    sources = {store[i].object_source or 'unknown' for i in episodes if store[i].object_names}
+    _print_table(scores, args.goal_picture, sources)
     warn_if_few(episodes)
-    _print_table(scores)
     seen = None
     if len(kept) and not args.all and training.get('data_hash') == store.data_hash:
         seen = evaluate(network, store, kept[:max(len(episodes), _SEEN)],
@@ -109,8 +97,28 @@ def run(args: Prediction) -> None:
                      args.goal_picture, filled, marks)
 
 
-def _print_table(scores: Mapping[str, EpisodeScores]) -> None:
-    """Print a line for each metric, a column for each method."""
+def _choose(args: Prediction, store: EpisodeStore, training: Mapping[str, Any],
+            robot_mask: RobotMask) -> tuple[np.ndarray, np.ndarray]:
+    """Return indices of the episodes that were trained on, and of those to score."""
+    settings = training.get('settings', {})
+    kept, held_out = with_masks(store, split_episodes(
+        store, settings.get('test_fraction', TEST_FRACTION),
+        held_out=() if args.all else settings.get('held_out', ())), robot_mask)
+    episodes = np.sort(np.concatenate([kept, held_out])) if args.all else held_out
+    if not len(episodes):
+        raise ConfigError('recordings: no episode of them was held out from training; '
+                          'give more of them, or --all')
+    return kept, episodes
+
+
+def _print_table(scores: Mapping[str, EpisodeScores], goal_picture: str,
+                 sources: Iterable[str]) -> None:
+    """Print what was scored, and a line for each metric, a column for each method."""
+    count = len(scores['prediction'].min_l1)
+    print(f'{count} episode{"s" if count > 1 else ""}, goal picture: {goal_picture}; l1 on [0, 1];'
+          + ''.join(f' object positions: {source.replace("_", " ")};'
+                    for source in sorted(sources))
+          + ' in brackets 95% intervals over the episodes')
     columns = {method: value.intervals() for method, value in scores.items()}
     print(f'{"":20s}' + ''.join(f'{method:>28s}' for method in columns))
     for name in _SHOWN:
