@@ -3,7 +3,7 @@
 #
 # Both packages, built with ROS 2 Jazzy from apt as in docs/ros.md:
 #   docker build -t tap_ros .
-#   docker run --rm -it tap_ros ros2 launch tap_ros demo.launch.py
+#   docker run --rm -it tap_ros python3 -m tap_ros demo
 # With torch for NVIDIA GPUs, some gigabytes more: docker build --build-arg PIP_ARGS= ...
 FROM ros:jazzy-ros-base
 

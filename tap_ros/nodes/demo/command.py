@@ -45,7 +45,7 @@ from tap_ros.nodes.demo.film import GOAL, Run, Scene
 from tap_ros.nodes.demo.report import MODES, results_table, shown, summary, write_report
 from tap_ros.nodes.node_processes import NodeProcesses
 from tap_ros.nodes.topics import LATCHED, STREAM
-from tap_ros.options import Flag, Folder, one_of
+from tap_ros.options import Folder, one_of
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm
 from tap_ros.tracking.protocols import LOST
@@ -66,6 +66,9 @@ TOLD = {  # by whether objects are tracked
 REPEATS = ('All runs are in lock-step: the same seeds end the same on a busy machine, only the '
            'seconds differ. Another processor can differ in the last digits of a plan.')
 CALL_S, STEP_S = 60.0, 15.0  # that a call, and one step of a run, may take, far more than usual
+# In lock-step nothing moves while a node waits, so a busy machine ends no goal of the planner.
+PATIENT = {'image_timeout': 300.0, 'max_age': 300.0, 'max_silence': 60.0,
+           'predictor_timeout': CALL_S}
 FOUND_S = 10.0  # that the tracker may take to find the objects of a goal
 CLICKS, SLIP = 5, 0.015  # tries to click; how far beside the first the others are, of a picture
 
@@ -143,14 +146,13 @@ class Options:
     :param look: of the world, see sim_node.
     :param arm: at the table, see sim_node.
     :param out: folder for the page, the recording and the logs; a number is added when it exists.
-    :param attach: use nodes that run already, for example those of demo.launch.py.
     """
 
     scenes: int = 8
     seed: int = FIRST_SCENE
     tasks: Annotated[tuple[str, ...], conf.arg(
-        help='what is to be done in them; none named: order2 and order3, or with attach push2; of '
-             'the table those that push.')] = ()
+        help='what is to be done in them; none named: order2 and order3; of the table those that '
+             'push.')] = ()
     world: Annotated[str, one_of(names('tap_ros.worlds'))] = TABLE
     predictor: str = ''
     forward_model: str = 'push'
@@ -161,7 +163,6 @@ class Options:
     step_budget: Annotated[int, conf.arg(
         help=f"most steps of one run; 0: the task's, {BUDGETS}.")] = 0
     out: Folder = 'runs/demo'
-    attach: Flag = False
 
     @property
     def tracked(self) -> bool:
@@ -171,8 +172,7 @@ class Options:
     @property
     def plan(self) -> list[tuple[str, int]]:
         """Return the task and the seed of each scene."""
-        tasks = self.tasks or (('push2',) if self.attach else USUAL_TASKS)
-        return [(task, self.seed + i) for task in tasks
+        return [(task, self.seed + i) for task in self.tasks or USUAL_TASKS
                 for i in range(max(1, self.scenes // max(1, self.num_objects(task) - 1)))]
 
     def num_objects(self, task: str) -> int:
@@ -196,32 +196,30 @@ class Options:
 
 class Lane:
     """
-    A set of nodes that runs scenes in some modes, in a thread of its own.
+    A set of nodes that runs scenes in one mode, in a thread of its own.
 
     :param folder: of the logs and the recording.
-    :param modes: of MODES.
-    :param namespace: of the nodes.
+    :param mode: one of MODES.
     """
 
-    def __init__(self, args: Options, folder: Path, modes: tuple[str, ...],
-                 namespace: str = '') -> None:
-        self._args, self._modes, self._task = args, modes, ''
+    def __init__(self, args: Options, folder: Path, mode: str) -> None:
+        self._args, self._mode, (self._task, _) = args, mode, args.plan[0]
+        namespace = '' if mode == 'subgoal' else f'/{mode}'
         self.client = Client(namespace, CALL_S)
         self.watch = Watch(self.client, args.tracked, 'observer/image_raw' if args.world == TABLE
-                           and not args.attach else 'camera/image_raw')
+                           else 'camera/image_raw')
         self.pool = ThreadPoolExecutor(1, 'lane')
-        self.processes = NodeProcesses(folder / 'logs' / '-'.join(modes), namespace)
+        self.processes = NodeProcesses(folder / 'logs' / mode, namespace)
         self._recording = folder / 'recording'
 
     def start(self) -> None:
         """Start the nodes."""
         args, table = self._args, self._args.world == TABLE
-        start, subgoals = self.processes.start, 'subgoal' in self._modes
+        start, subgoals = self.processes.start, self._mode == 'subgoal'
         world: dict[str, Any] = {'look': args.look, 'arm': args.arm, 'observer': True} if (
             table) else {'world': args.world}
         if args.tracked:
             world |= {'objects': 'tracked', 'image_size': CAMERA_SIZE}
-        self._task, _ = args.plan[0]
         if subgoals:
             start('recorder_node', folder=self._recording)
         start('sim_node', lock_step=True, task=self._task, **world)
@@ -230,25 +228,16 @@ class Lane:
         if subgoals:
             start('predictor_node', robot_mask=args.robot_mask, weights=self._weights(self._task))
         start('visual_mpc_node', weights=args.forward_model, robot_mask=args.robot_mask,
-              preset='quick', subgoal_rounds=self._rounds(self._task))
-
-    def wait_until_ready(self) -> None:
-        """Wait until the nodes are ready, those that were started or those that run already."""
-        if self._args.attach:
-            self.client.wait_until_ready('sim_node', 'predictor_node', 'visual_mpc_node',
-                                         *['tracker_node'] * self._args.tracked)
-        else:
-            self.processes.wait_until_ready()
+              preset='quick', subgoal_rounds=self._rounds(self._task), **PATIENT)
 
     def run(self, task: str, seed: int) -> Scene | Refused:
-        """Push the objects of a scene in every mode of this lane, unless clicks are refused."""
-        if task != self._task and not self._args.attach:
+        """Push the objects of a scene, unless clicks are refused."""
+        if task != self._task:
             self._change(task)
         try:
-            scenes = [self._push(mode, task, seed) for mode in self._modes]
+            return self._push(task, seed)
         except Refused as error:
             return error
-        return replace(scenes[0], runs={k: v for scene in scenes for k, v in scene.runs.items()})
 
     def _weights(self, task: str) -> str:
         return self._args.predictor or (task if task in PREDICTORS else DEFAULT_PREDICTOR)
@@ -259,15 +248,15 @@ class Lane:
 
     def _change(self, task: str) -> None:
         """Go on with another task."""
-        if 'subgoal' in self._modes and self._weights(task) != self._weights(self._task):
+        if self._mode == 'subgoal' and self._weights(task) != self._weights(self._task):
             self.client.use_weights(self._weights(task))
         self.client.call('set_planner', parameters=[
             Parameter('subgoal_rounds', value=self._rounds(task)).to_parameter_msg()])
         self._task = task
 
-    def _push(self, mode: str, task: str, seed: int) -> Scene:
+    def _push(self, task: str, seed: int) -> Scene:
         """Start a scene and have the arm push until its goal is reached or the budget spent."""
-        args, client, watch = self._args, self.client, self.watch
+        args, client, watch, mode = self._args, self.client, self.watch, self._mode
         watch.clear()
         start, goal = client.reset(task, seed, objects=not args.tracked)
         placed: dict[str, Any] = {}
@@ -329,8 +318,7 @@ def click(client: Client, watch: Watch, seed: int, start: View,
     true, wanted = (watch.at(topic, view.stamp_ns) for topic, view in (
         (watch.truth, start), (watch.true_goal, goal)))
     if true is None or wanted is None:
-        raise TapError(f'{watch.truth}: nothing came; start sim_node with objects:=tracked, or '
-                       'the demo with --objects truth')
+        raise TapError(f'{watch.truth}: nothing came')
     names, clicks = decode_objects(true, watch.truth)
     mask = watch.at('camera/robot_mask', start.stamp_ns)
     hidden = np.zeros(start.image.shape[:2], np.uint8) if mask is None else decode_mask(mask)
@@ -370,8 +358,7 @@ def run(args: Options) -> int:
     args.check()
     os.environ.setdefault('OMP_NUM_THREADS', '1')  # of the nodes, which share the cores
     folder = new_folder(args.out)
-    print('waiting for the nodes that run already' if args.attach else
-          f'starting nodes; their logs are in {folder / "logs"}', flush=True)
+    print(f'starting nodes; their logs are in {folder / "logs"}', flush=True)
     begin, scenes = time.monotonic(), list[Scene]()
     left_out = list[str]()
     for (task, seed), scene in zip(args.plan, run_scenes(args, folder)):
@@ -399,36 +386,33 @@ def run(args: Options) -> int:
             'command': shlex.join(['python', '-m', 'tap_ros', *sys.argv[1:]]),
             'machine': f'{platform.machine()}, {os.cpu_count()} CPUs'})
     print(f'\n{results_table(summary(scenes))}\n')
-    if not args.attach:
-        print(f'recording  {folder / "recording"}')
+    print(f'recording  {folder / "recording"}')
     print(f'page       {folder / "report.html"}')
     print(f'time       {time.monotonic() - begin:.0f} s')
     return 0
 
 
 def run_scenes(args: Options, folder: Path) -> Iterator[Scene | Refused]:
-    """Run all scenes, both modes at the same time unless the nodes run already."""
-    lanes = [Lane(args, folder, tuple(MODES))] if args.attach else [
-        Lane(args, folder, ('subgoal',)), Lane(args, folder, ('direct',), '/direct')]
+    """Run all scenes, both modes at the same time."""
+    lanes = [Lane(args, folder, mode) for mode in MODES]
     with ExitStack() as stack:  # nodes end first, which ends what waits for them
         for lane in lanes:
             stack.enter_context(lane.client)
             stack.callback(lane.pool.shutdown, cancel_futures=True)
         for lane in lanes:
             stack.enter_context(lane.processes)
-            if not args.attach:
-                lane.start()
+            lane.start()
         for lane in lanes:
-            lane.wait_until_ready()
+            lane.processes.wait_until_ready()
         running = [[lane.pool.submit(lane.run, *scene) for scene in args.plan] for lane in lanes]
         for futures in zip(*running):
-            found = [future.result() for future in futures]
+            direct, via = (future.result() for future in futures)
             for lane in lanes:
                 lane.processes.check()
-            runs = {k: v for scene in found if isinstance(scene, Scene)
-                    for k, v in scene.runs.items()}
-            yield next((scene for scene in found if isinstance(scene, Refused)), None) or replace(
-                found[0], runs={mode: runs[mode] for mode in MODES})
+            if isinstance(direct, Scene) and isinstance(via, Scene):
+                yield replace(via, runs=direct.runs | via.runs)
+            else:
+                yield direct if isinstance(direct, Refused) else via
 
 
 def new_folder(wanted: str | Path) -> Path:
