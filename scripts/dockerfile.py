@@ -4,11 +4,11 @@
 """
 Run the steps of the Dockerfile by chroot, where there is no docker.
 
-    sudo scripts/dockerfile.py ROOT
+    sudo scripts/dockerfile.py ROOT [NAME=VALUE ...]
 
 ROOT is a folder with a system in it that stands for the image of FROM, such as Ubuntu 24.04 of
 debootstrap with ROS 2 Jazzy, rosdep and a user `ubuntu`; the variables that the image would set
-stand in its /etc/environment. It is changed. The first step that fails ends it.
+stand in its /etc/environment. It is changed. NAME=VALUE is what --build-arg is to docker.
 """
 
 from pathlib import Path
@@ -43,18 +43,18 @@ def copy(root, folder, words):
     subprocess.run(['chroot', root, 'chown', '-R', f'{owner}', str(inside)], check=True)
 
 
-def build(root):
-    """Carry out the Dockerfile in ROOT."""
+def build(root, *arguments):
+    """Carry out the Dockerfile in ROOT, with NAME=VALUE in place of its ARG."""
     user, folder, shell = 'root', '/', ['/bin/sh', '-c']
-    given = Path(root, 'etc', 'environment').read_text().splitlines()
     variables = {'PATH': '/usr/sbin:/usr/bin:/sbin:/bin'} | dict(
-        line.split('=', 1) for line in given if '=' in line)
+        re.findall(r'^(\w+)=(.*)$', Path(root, 'etc', 'environment').read_text(), re.MULTILINE))
     for number, (instruction, rest) in enumerate(steps((CHECKOUT / 'Dockerfile').read_text()), 1):
         print(f'step {number}: {instruction} {rest[:80]}', flush=True)
         if instruction in ('ARG', 'ENV'):
             for word in shlex.split(rest):
                 name, _, value = word.partition('=')
                 variables[name] = re.sub(r'\$(\w+)', lambda found: variables[found[1]], value)
+            variables.update(word.split('=', 1) for word in arguments)
         elif instruction == 'SHELL':
             shell = re.findall('"(.*?)"', rest)
         elif instruction == 'USER':
@@ -72,9 +72,9 @@ def build(root):
 
 
 if __name__ == '__main__':
-    if len(sys.argv) != 2 or not Path(sys.argv[1], 'bin').exists():
+    if len(sys.argv) < 2 or not Path(sys.argv[1], 'bin').exists():
         sys.exit(__doc__)
     try:
-        build(sys.argv[1])
+        build(*sys.argv[1:])
     except subprocess.CalledProcessError as error:
         sys.exit(f'error: this step ended with {error.returncode}')
