@@ -77,7 +77,8 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
     frames = make_frames(store)
     filled = fill(store, config.robot_mask, make_frames, this.progress)
     preference, about = _learn(this)
-    networks = Networks(state.network, **dict(state.helpers.items()))
+    helpers: dict[str, Any] = dict(state.helpers.items())
+    networks = Networks(state.network, **helpers)
 
     def step(item: Item) -> Callable[[], run.Numbers]:
         number, batch, augmentation = item
