@@ -190,7 +190,8 @@ class ExplorerCalls:
         self._node.tell(f'{len(response.objects)} objects proposed')
 
     def _move(self, name: str, u: float, v: float) -> None:
-        node, moved = self._node, {}
+        node = self._node
+        moved: dict[str, tuple[float, float]] = {}
         if self.offered('set_goal'):
             moved = simulated(name, (u, v), node.places('goal_objects'),
                               node.places('true_goals'), node.size('goal')['width'])
