@@ -12,7 +12,7 @@ in the goal picture on what is not found there. Ground truth only measures, and 
 """
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -66,6 +66,7 @@ TOLD = {  # by whether objects are tracked
 REPEATS = ('All runs are in lock-step: the same seeds end the same on a busy machine, only the '
            'seconds differ. Another processor can differ in the last digits of a plan.')
 CALL_S, STEP_S = 60.0, 15.0  # that a call, and one step of a run, may take, far more than usual
+LOOK_S = 1.0  # between two looks whether all nodes run
 # In lock-step nothing moves while a node waits, so a busy machine ends no goal of the planner.
 PATIENT = {'image_timeout': 300.0, 'max_age': 300.0, 'max_silence': 60.0,
            'predictor_timeout': CALL_S}
@@ -406,9 +407,12 @@ def run_scenes(args: Options, folder: Path) -> Iterator[Scene | Refused]:
             lane.processes.wait_until_ready()
         running = [[lane.pool.submit(lane.run, *scene) for scene in args.plan] for lane in lanes]
         for futures in zip(*running):
+            while (looked := wait(futures, LOOK_S, FIRST_EXCEPTION)).not_done:
+                for lane in lanes:
+                    lane.processes.check()
+                for future in looked.done:
+                    future.result()  # raises what has ended it
             direct, via = (future.result() for future in futures)
-            for lane in lanes:
-                lane.processes.check()
             if isinstance(direct, Scene) and isinstance(via, Scene):
                 yield replace(via, runs=direct.runs | via.runs)
             else:
