@@ -67,8 +67,8 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
     network = PredictorNetwork(network_config(config, store.image_size))
     if config.initial_weights and not this.checkpoint.exists():
         _begin_with(network, config.initial_weights)
-    helpers = _helpers(config, network.config, store)
-    state = this.begin(network, helpers, lambda old: {**DEFAULTS, **todays_settings(old)})
+    state = this.begin(network, _helpers(config, network.config, store),
+                       lambda old: {**DEFAULTS, **todays_settings(old)})
     state.precision = state.precision or pick_precision(config.precision, device)
     autocast = make_autocast(state.precision, device)
     # Decoding and copying would be most of the time of a step on a GPU.

@@ -225,8 +225,8 @@ class ExplorerCalls:
             mode=mode, num_samples=samples, recursion_depth=levels, seed=seed,
             on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
         with self._lock:
-            self._goal = goal
-        if self._cancelled:  # meanwhile
+            self._goal, cancelled = goal, self._cancelled
+        if cancelled:  # meanwhile
             goal.cancel()
         self._node.tell(f'{words}: begun')
         try:
