@@ -219,7 +219,8 @@ class ExplorerCalls:
     def _reach(self, mode: str, samples: int, levels: int, seed: int) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self.stage = f'{words}: waiting for the planner'
-        if self._cancelled:
+        cancelled = self._cancelled
+        if cancelled:
             raise CallError(f'{words}: cancelled before it began')
         goal = self._client.reach(
             mode=mode, num_samples=samples, recursion_depth=levels, seed=seed,
