@@ -1,10 +1,9 @@
-#!/usr/bin/env python3
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 """
 Run the steps of the Dockerfile by chroot, where there is no docker.
 
-    sudo scripts/dockerfile.py ROOT [NAME=VALUE ...]
+    sudo python3 scripts/dockerfile.py ROOT [NAME=VALUE ...]
 
 ROOT is a folder with a system in it that stands for the image of FROM, such as Ubuntu 24.04 of
 debootstrap with ROS 2 Jazzy, rosdep and a user `ubuntu`; the variables that the image would set

@@ -75,7 +75,7 @@ def test_the_simulator_tells_where_its_robot_is(sim, client):
         for topic in (image, mask, side, joints))
     assert set(np.unique(decode_mask(shown, 'mask', (64, 64)))) == {
         ROBOT_MASK_FREE, ROBOT_MASK_HAND, ROBOT_MASK_ARM}
-    assert seen.height == 360
+    assert seen.height == 300
     angles = dict(zip(told.name, told.position, strict=True))
     gripper = UR10E.gripper_at([angles[name] for name in UR10E.joints])
     assert np.allclose(gripper, decode_gripper(told)[:3], atol=1e-6)
