@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from tap_ros.contract import WORKSPACE_HIGH
+from tap_ros.contract import WORKSPACE_HIGH, WORKSPACE_LOW
 from tap_ros.planning.action_sequences import HORIZON
 from tap_ros.planning.table import pixel_points
 import torch
@@ -74,7 +74,8 @@ class PlanCost:
         """
         costs = np.zeros(len(landings))
         if self.clearance:
-            edge = (np.abs(landings) > WORKSPACE_HIGH[0] - EDGE).any(1)
+            low, high = np.array(WORKSPACE_LOW[:2]) + EDGE, np.array(WORKSPACE_HIGH[:2]) - EDGE
+            edge = ((landings < low) | (landings > high)).any(1)
             for places, near, least, room in (
                     (objects, np.where(edge, BLOCKED, self.clearance), 100, self.clearance + LEG),
                     (blocked, BLOCKED, 1000, BLOCKED)):
