@@ -3,18 +3,19 @@
 """
 What all tests share.
 
-Modules beside this file (made_episodes, lively) can be imported by every test.
+Modules beside this file (domains, made_episodes, processes) can be imported by every test.
 """
 
 import os
 import signal
 
+from domains import reserve_domain
 from hypothesis import HealthCheck, settings
 import pytest
 
 # Nodes and clients of these tests talk among themselves only, whatever domain is set: two workers
-# in one would hear each other.
-os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+# in one would hear each other, and so would two runs on one machine.
+os.environ['ROS_DOMAIN_ID'] = str(reserve_domain())
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 if 'PYTEST_XDIST_WORKER' in os.environ:  # workers share the cores
     os.environ.setdefault('OMP_NUM_THREADS', '1')

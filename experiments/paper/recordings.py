@@ -44,7 +44,7 @@ RECORDINGS = {
     'stack2': Recording('stack2', 1000),
     'order2': Recording('order2', 700),
     'order3': Recording('order3', 700),
-    'order2_late': Recording('order2', 700, {'timing': 'late'}),
+    **{f'{task}_late': Recording(task, 700, {'timing': 'late'}) for task in ('order2', 'order3')},
     **{f'push2_{timing}': Recording('push2', 700, {'timing': timing}) for timing in TIMINGS},
     **{name: Recording('push2', HELD_OUT, {
         'seed': UNSEEN, 'appearance': name.removeprefix('push2_')}) for name in SHIFTED},

@@ -60,7 +60,8 @@ PAST_VARIANTS = ('+skips+annealed', '+skips+weighted')
 LONG = {'+skips+long': 2, '+skips+rounds': 1.6, '+skips+uncoloured+long': 3.2}  # times the steps
 # Few episodes, in which the objects stand close together: from fresh weights genmin copied the
 # start. All methods begin with the same shipped weights.
-FINE_TUNED = {'order2': 'push2', 'order3': 'push3', 'order2_late': 'push2'}
+FINE_TUNED = {'order2': 'push2', 'order3': 'push3', 'order2_late': 'push2',
+              'order3_late': 'push3'}
 _FINE_TUNED = {'goal_picture': 'mixed', 'start_crop': 0.3}  # as those were trained
 
 
@@ -179,6 +180,7 @@ def paper_runs():
     add(['order2', 'order3'], relative + ['fix-wo-gan'], variant='+skips+rounds', new_pixels=False)
     for variant in (OURS, '+skips+rounds'):
         add(['order2_late'], relative + ['fix-wo-gan'], variant=variant, new_pixels=False)
+    add(['order3_late'], relative + ['fix-wo-gan'], variant='+skips+rounds', new_pixels=False)
     # Table 1 with our network.
     add(SINGLE, l1_rows, variant=OURS, main=True)
     add(['push2'], relative, variant=OURS)

@@ -4,10 +4,11 @@
 
 import os
 
+from domains import reserve_domain
 import pytest
 
 # Apart from the domain of the other tests, whose nodes have the same names.
-LOOP_DOMAIN = str(1 + (os.getpid() + 50) % 100)
+LOOP_DOMAIN = str(reserve_domain())
 
 
 def pytest_itemcollected(item):

@@ -33,7 +33,7 @@ def sim(tmp_path_factory):
         'sim_node', tmp_path_factory.mktemp('sim') / 'log.txt',
         {'lock_step': 'true', 'seed': 3, 'look': 'arm', 'observer': 'true'})
     yield process.wait_for('ready')
-    process.kill()
+    process.end()
 
 
 def test_masks_have_the_stamps_of_the_pictures_and_cover_the_arm(sim, client):

@@ -92,7 +92,7 @@ def rig(tmp_path_factory):
             rig.reset(seed=3)
             yield rig
     finally:
-        process.kill()
+        process.end()
 
 
 def test_everything_about_one_moment_has_the_same_stamp(rig):
@@ -255,7 +255,7 @@ def test_in_real_time_the_clock_runs_unless_paused_and_old_commands_move_nothing
             assert process.end() == 0, process.text
             assert 'Traceback' not in process.text
     finally:
-        process.kill()
+        process.end()
 
 
 def test_tf_has_the_camera_and_the_arm(rig):

@@ -93,7 +93,7 @@ def rig(tmp_path_factory):
             assert rig.marks[-1].event == Episode.END
         assert not re.search('Traceback|RuntimeWarning', process.text), process.text
     finally:
-        process.kill()
+        process.end()
 
 
 def test_features_are_those_of_the_services_that_are_there(rig):

@@ -84,4 +84,4 @@ def test_clicks_and_a_goal_picture_are_enough_and_objects_in_doubt_stop_the_arm(
             assert loop.stopped()
     finally:
         for process in loop.processes.values():
-            process.kill()
+            process.end()

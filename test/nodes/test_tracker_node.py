@@ -77,7 +77,7 @@ def sim(tmp_path_factory):
     process = NodeProcess('sim_node', tmp_path_factory.mktemp('sim') / 'log.txt', {
         'lock_step': 'true', 'image_size': SIZE, 'objects': 'tracked'})
     yield process.wait_for('ready')
-    process.kill()
+    process.end()
 
 
 @pytest.fixture

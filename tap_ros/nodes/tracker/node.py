@@ -71,7 +71,7 @@ class Selection:
     size: tuple[int, int]  # (height, width) of its pictures
     selected_ns: int  # stamp of the picture in which they were clicked
     jumps: int  # of the clock of the stamps until then
-    publishers: dict[str, int]  # of each topic then
+    publishers: frozenset[bytes]  # participants that published the camera's topics then
     stamp_ns: int  # of the newest picture in which they were followed
     received: float  # s, monotonic: when that picture was received
     tracked: Tracked
@@ -203,7 +203,8 @@ class TrackerNode(Node):
         message = self._encode(found, tracked, plane, moment.messages['image'].header)
         self._selection = Selection(
             found, tracker, plane, view.image.shape[:2], moment.stamp_ns, self._sensors.jumps,
-            self._count_publishers(), moment.stamp_ns, moment.received, tracked, message)
+            frozenset().union(*self._publishers().values()), moment.stamp_ns, moment.received,
+            tracked, message)
         self._objects.publish(message)
         self._sensors.wake()  # for the goal
         self.get_logger().info(f'following {listing(found)}')
@@ -382,15 +383,18 @@ class TrackerNode(Node):
         """Say in what way the camera shows another scene than that of a selection, '' if not."""
         if self._sensors.jumps != selection.jumps:
             return 'the clock of its pictures has jumped: another camera, simulator or recording'
-        for topic, count in self._count_publishers().items():
-            if count > max(selection.publishers[topic], 1):
-                return f'{count} nodes publish on {self.resolve_topic_name(topic)} now'
+        for topic, publishers in self._publishers().items():
+            if len(publishers) > 1 and not publishers <= selection.publishers:
+                return (f'{len(publishers)} nodes publish on '
+                        f'{self.resolve_topic_name(topic)} now')
         return ''
 
-    def _count_publishers(self) -> dict[str, int]:
-        """Return how many nodes publish each topic of which there may be but one publisher."""
-        topics = [name for _, name in camera_topics(self.params).values()]
-        return {topic: self.count_publishers(topic) for topic in topics}
+    def _publishers(self) -> dict[str, frozenset[bytes]]:
+        """Return who publishes each topic of which there may be but one publisher."""
+        return {topic: frozenset(
+            bytes(info.endpoint_gid[:12])  # the participant, which is known before all its topics
+            for info in self.get_publishers_info_by_topic(self.resolve_topic_name(topic)))
+            for _, topic in camera_topics(self.params).values()}
 
     def _forget(self, why: str) -> None:
         """Follow nothing any more."""
