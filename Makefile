@@ -68,7 +68,7 @@ faults: build
 	@$(ENTER); $(DOMAIN); python -m pytest -m fault --share 1 --report docs/results test/faults $(ARGS)
 
 bench: build
-	@$(ENTER); $(DOMAIN); python -m tap_ros bench $(ARGS)
+	@$(ENTER); $(DOMAIN); python -m tap_ros bench $(or $(ARGS),all)
 
 lint: build
 	@$(ENTER); ruff check . && mypy

@@ -11,10 +11,12 @@ if its number is at least the paper's; where the aim is `over` something, if the
 """
 
 from functools import cache
+import json
 from pathlib import Path
 import re
 import sys
 
+from experiments.bench.rows import Row
 from experiments.paper.published import BOTTLENECK_2PX, GAINS, TABLE_2
 import pandas as pd
 from tap_ros.errors import ConfigError
@@ -207,26 +209,37 @@ class Tables:
                 for method in ('direct', 'shipped', 'shipped:recursion2')),
                 'to compare', STACKING)
 
+    def speed(self):
+        """List what `make bench` measured."""
+        for row in json.loads((Path(self._folder) / 'speed.json').read_text())['rows']:
+            yield Row(**row).cells
+
     def _find(self, file, **wanted):
         return find(self._folder, file, **wanted)
 
 
-def markdown(lines):
-    """Write lines of claim, paper, here, reached or missed, file as a table."""
-    rows = [('claim', 'paper', 'here', 'aim', 'file'), ('---',) * 5,
-            *((*cells, f'[data]({file})') for *cells, file in lines)]
-    return ''.join(f'| {" | ".join(row)} |\n' for row in rows)
+def markdown(lines, head=('claim', 'paper', 'here', 'aim', 'file')):
+    """Write lines as a table, with a link to its file at the end of each."""
+    if head[-1] == 'file':
+        lines = ((*cells, f'[data]({file})') for *cells, file in lines)
+    return ''.join(f'| {" | ".join(row)} |\n' for row in (head, ('---',) * len(head), *lines))
+
+
+def page_path(name, folder=RESULTS):
+    """Return where a page is."""
+    return Path(folder).parent / 'speed.md' if name == 'speed' else Path(folder) / f'{name}.md'
 
 
 def filled(name, folder=RESULTS):
-    """Return a page of results, 'prediction', 'planning' or 'stacking', with its table anew."""
-    text = (Path(folder) / f'{name}.md').read_text()
-    table = markdown(getattr(Tables(folder), name)())
+    """Return a page, 'prediction', 'planning', 'stacking' or 'speed', with its table anew."""
+    text = page_path(name, folder).read_text()
+    head = {'head': ('what', 'here', 'ratio', 'aim', 'what limits it')} if name == 'speed' else {}
+    table = markdown(getattr(Tables(folder), name)(), **head)
     if not MARKS.search(text):
         raise ConfigError(f'{name}.md: expected <!-- table --> and <!-- end -->')
     return MARKS.sub(lambda found: found[1] + table + found[2], text)
 
 
 if __name__ == '__main__':
-    for page in sys.argv[1:] or ('prediction', 'planning', 'stacking'):
-        write_atomically(RESULTS / f'{page}.md', filled(page))
+    for page in sys.argv[1:] or ('prediction', 'planning', 'stacking', 'speed'):
+        write_atomically(page_path(page), filled(page))

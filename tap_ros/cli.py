@@ -16,7 +16,7 @@ import os
 from pathlib import Path
 import signal
 import sys
-from typing import Annotated, Any, cast, TypeAlias
+from typing import Annotated, Any, TypeAlias
 import warnings
 
 from tap_ros import leave_at_once
@@ -68,12 +68,13 @@ COMMANDS: dict[str, tuple[str, Module]] = {
     'demo': ('push objects via a subgoal, with real nodes', 'tap_ros.nodes.demo.command'),
     'explore': ('see and try all nodes on a page in the browser',
                 'tap_ros.nodes.explorer.command'),
-    'bench': ('measure speed; without a name, all of it', {
+    'bench': ('measure speed', {
         'collect': ('speed of collecting', 'experiments.bench.collect'),
         'recording': ('speed of reading recordings', 'experiments.bench.recording'),
         'training': ('speed of training the predictor', 'experiments.bench.training'),
         'planning': ('time of a plan', 'experiments.bench.planning'),
         'service': ('time of an answer of the predictor node', 'experiments.bench.nodes.service'),
+        'all': ('one after the other, into a file', 'experiments.bench.everything'),
     }),
     'inspect': ('show what a recording or a weights file holds',
                 'tap_ros.evaluation.inspect_files'),
@@ -88,11 +89,6 @@ PROG = 'python -m tap_ros'
 @dataclass(frozen=True)
 class Unread:
     """Options of a command that was not asked for."""
-
-
-@dataclass(frozen=True)
-class All:
-    """Options of all benchmarks, one after the other: none."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -142,7 +138,7 @@ def read(arguments: Sequence[str]) -> tuple[Run, Any]:
     """
     words = list(arguments)
     completion = bool(words) and words[0].startswith('--tyro-')
-    runs: dict[Any, Run] = {All: _run_all}
+    runs: dict[Any, Run] = {}
     kinds = [_command(name, *about, None if completion else words, runs)
              for name, about in COMMANDS.items()]
     # What is completed is a name that a shell can look up, not three words.
@@ -168,9 +164,6 @@ def _command(name: str, summary: str, module: Module, words: list[str] | None,
     if isinstance(module, dict):
         rest = words and words[1:] if asked else []
         kinds = [_command(word, *about, rest, runs) for word, about in module.items()]
-        if name == 'bench':
-            kinds.append(Annotated[All, conf.subcommand(
-                'all', description='one after the other', is_default=True)])
         kind = reduce(or_, kinds)
     elif not asked:
         kind = Unread
@@ -203,11 +196,3 @@ def _find_experiments() -> None:
                           'of its repository, after `make build`')
     if str(checkout) not in sys.path:
         sys.path.append(str(checkout))
-
-
-def _run_all(_: All) -> None:
-    """Run every benchmark with its default options."""
-    for word in cast(dict[str, Any], COMMANDS['bench'][1]):
-        print(f'== bench {word}', flush=True)
-        run, options = read(['bench', word])
-        run(options)

@@ -22,7 +22,7 @@ SHOWN = {  # one of those with the same options
     tuple(re.findall(r'--\S+', command)) or command: command.strip() for page in PAGES
     for command in re.findall(r'-m tap_ros ([^`\n;|]+?)(?: #.*)?(?=[`\n;])', page.read_text())
     if '...' not in command and '--tyro' not in command}.values()
-IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --list', 'bench',
+IN_THE_MAKEFILE = ['demo --scenes 20', 'paper --jobs 2 --list', 'bench all',
                    'bench planning']
 
 

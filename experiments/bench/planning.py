@@ -1,20 +1,27 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Benchmark of planning: the time of one plan, at the start and while pushing."""
+"""Benchmark of planning: the time of a plan, where it goes, and the solvers side by side."""
 
-from dataclasses import dataclass
-import os
+from dataclasses import dataclass, replace
+import time
 
+from experiments.bench.rows import Row, show
 import numpy as np
 from sim_bridge.simulator import Simulator
 from tap_ros.contract import CLEAR
 from tap_ros.errors import PlanningError
+from tap_ros.evaluation.intervals import mean_interval
+from tap_ros.images.pixels import to_float
 from tap_ros.options import ShippedFile
 from tap_ros.planning.action_sequences import HORIZON
-from tap_ros.planning.mpc_config import FIRST_SCENE, PRESETS, with_preset
+from tap_ros.planning.mpc_config import FIRST_SCENE, PRESETS, with_preset, with_samples
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
 from tap_ros.weights import FORWARD_MODEL
+import torch
+from torch.profiler import profile, ProfilerActivity
+
+AIM_S = 0.5  # of a plan of the preset `large`
 
 
 @dataclass(frozen=True)
@@ -23,34 +30,44 @@ class Options:
     Options of this benchmark.
 
     :param plans: how many to time.
+    :param scenes: in which the solvers are compared.
     :param weights: of the forward model.
     :param device: cpu or cuda.
     """
 
     plans: int = 15
+    scenes: int = 24
     weights: ShippedFile = str(FORWARD_MODEL)
     device: str = 'cpu'
 
 
 def run(args):
-    """Print the times of plans of each preset."""
+    """Print the times of plans of each preset, and what the solvers find."""
+    measure(args)
+
+
+def measure(args):
+    """Return the rows of this benchmark, which it prints."""
     simulator = Simulator('push2')
     seen = simulator.reset(FIRST_SCENE)
     goal = simulator.goal().object_pixels
-    print(f'one plan, horizon {HORIZON}, two objects, {args.device}'
-          + (f', {len(os.sched_getaffinity(0))} cores' if args.device == 'cpu' else ''))
     planners = {name: VisualMPC.load(args.weights, with_preset(name), args.device)
-                for name in PRESETS}
+                for name in PRESETS if name != 'paper'}
     pushing = push_until_low(simulator, planners['large'], goal)
-    print(f'{"samples x iterations":<34}{"at the start":>20}{"while pushing":>20}')
-    print(f'{"":<34}' + f'{"p50, ms":>10}{"p90, ms":>10}' * 2)
+    rows = []
     for name, mpc in planners.items():
-        times = (time_plans(mpc, seen, goal, args.plans),
-                 time_plans(mpc, pushing, goal, args.plans, warm=True))
-        size = f'{mpc.config.search.num_samples} x {mpc.config.search.num_iterations}'
-        print(f'{f"preset {name}, {size}":<34}' + ''.join(
-            f'{np.median(part):>10.1f}{np.percentile(part, 90):>10.1f}' for part in times))
+        search = mpc.config.search
+        for when, scene, warm in (('at the start', seen, False), ('while pushing', pushing, True)):
+            times, predicting = time_plans(mpc, scene, goal, args.plans, warm)
+            seconds = np.median(times) / 1000
+            steps = search.num_samples * search.num_iterations * HORIZON
+            rows += show([Row(
+                f'plan, preset `{name}`, {when}', f'{seconds:.2f} s, {1e6 * seconds / steps:.0f} '
+                'us a sample-step', times.sum() / predicting.sum(), 'its predictions alone',
+                *(('at most 0.5 s', seconds <= AIM_S) if name == 'large' else ()),
+                limit=where_time_goes(mpc.model, scene) if name == 'large' else '')])
     simulator.close()
+    return rows + show(compare_solvers(args))
 
 
 def push_until_low(simulator, mpc, goal, most=30):
@@ -66,16 +83,78 @@ def push_until_low(simulator, mpc, goal, most=30):
 
 def time_plans(mpc, seen, goal, count, warm=False):
     """
-    Return the times (count,) of plans in ms, after one to warm up.
+    Return the times (count,) of plans in ms, after one to warm up, and of their predictions.
 
     :param warm: every plan but the first begins with the one before.
     """
     times, scene, goal, memory = [], as_scene(seen), mpc.goal(goal), Memory()
+    judge, spent = mpc.rollouts.judge, []
+
+    def timed(*args):
+        begin = time.perf_counter()
+        found = judge(*args)
+        spent[-1] += 1000 * (time.perf_counter() - begin)
+        return found
+
+    mpc.rollouts.judge = timed
     for seed in range(count + 1):
+        spent.append(0.0)
         plan = mpc.plan(scene, goal, memory if warm else Memory(seed))
         memory = plan.memory
         times.append(plan.planning_ms)
-    return np.array(times[1:])
+    mpc.rollouts.judge = judge
+    return np.array(times[1:]), np.array(spent[1:])
+
+
+@torch.inference_mode()
+def where_time_goes(model, seen, count=50):
+    """Return which share of a prediction the kinds of operations take, in words."""
+    table, scene = model.table, as_scene(seen)
+    image = to_float(scene.image)[None].to(table.device)
+    gripper = torch.from_numpy(scene.gripper).float().to(table.device)[None]
+    maps = table.seed_maps(torch.from_numpy(scene.object_pixels).to(table.device))
+    actions = torch.zeros(count, HORIZON, 4, device=table.device)
+    start = model.begin(image, gripper)
+    with profile(activities=[ProfilerActivity.CPU]) as seen_by:
+        list(model.carried_maps(start, gripper.expand(count, 4), maps, actions))
+    times = {event.key: event.self_cpu_time_total for event in seen_by.key_averages()}
+    kinds = {'convolutions': ('conv', 'mkldnn'), 'sampling at points': ('grid_sampl', 'gather',
+                                                                     'index')}
+    shares = {kind: sum(t for key, t in times.items() if any(w in key for w in words))
+              / sum(times.values()) for kind, words in kinds.items()}
+    return ', '.join(f'{kind} {share:.0%} of a prediction' for kind, share in shares.items())
+
+
+def compare_solvers(args):
+    """Return rows: what iCEM costs and finds beside CEM, in first plans of unseen scenes."""
+    default = with_preset('default')
+    ways = {'as many samples': default, 'a third of the samples': with_samples(
+        default, default.search.num_samples // 3)}
+    configs = {('cem', ''): default, **{
+        (solver, name): replace(config, solver=solver)
+        for name, config in ways.items() for solver in ('icem', 'cem')
+        if (solver, config) != ('cem', default)}}
+    planners = {key: VisualMPC.load(args.weights, config, args.device)
+                for key, config in configs.items()}
+    simulator = Simulator('push2')
+    costs, times = ({key: [] for key in planners} for _ in range(2))
+    for seed in range(FIRST_SCENE, FIRST_SCENE + args.scenes):
+        scene, pixels = as_scene(simulator.reset(seed)), simulator.goal().object_pixels
+        for key, mpc in planners.items():
+            plan = mpc.plan(scene, mpc.goal(pixels), Memory(seed))
+            costs[key].append(plan.cost)
+            times[key].append(plan.planning_ms)
+    simulator.close()
+    base = 'cem', ''
+    rows = []
+    for key in list(planners)[1:]:
+        more = mean_interval(np.log(np.divide(costs[key], costs[base])))
+        cost, low, high = np.exp(more)
+        rows.append(Row(
+            f'first plan, `{key[0]}`, {key[1]}', f'cost {cost:.2f} ({low:.2f} to {high:.2f}) '
+            "times `cem`'s, default preset", np.median(times[key]) / np.median(times[base]),
+            "the time of `cem`'s"))
+    return rows
 
 
 def as_scene(seen):

@@ -13,6 +13,7 @@ import tempfile
 import time
 from typing import Annotated
 
+from experiments.bench.rows import Row, show
 from tap_ros.options import Bags
 from tap_ros.prediction.methods import method_fields
 from tap_ros.prediction.training import train
@@ -68,15 +69,14 @@ class Cost:
 
 def run(args):
     """Train in each way for some steps in a temporary folder, and print how fast that was."""
+    measure(args)
+
+
+def measure(args):
+    """Return the rows of this benchmark, which it prints."""
     device = pick_device(args.device)
     torch.set_num_threads(args.threads or len(os.sched_getaffinity(0)))
-    chosen = pick_precision('auto', device)
-    print(f'batch {args.batch_size}, base width {args.base_width}, new pixels, {device.type}'
-          + (f', {torch.get_num_threads()} threads' if device.type == 'cpu' else '')
-          + f'; auto is {chosen}')
-    print(f'{"method":<16}{"decoder":<16}{"precision":<10}{"samples/s":>10}'
-          f'{"samples/CPU s":>15}{"ratio":>7}')
-    first = None
+    first, rows = None, []
     for row in (*LADDER, *map(method_fields, args.methods)):
         with tempfile.TemporaryDirectory() as folder:
             config = TrainingConfig(**{
@@ -88,10 +88,12 @@ def run(args):
             cost = time_step(config, args.steps)
         rate, efficiency = (args.batch_size / each for each in (cost.seconds, cost.cpu_seconds))
         first = first or efficiency
-        precision = pick_precision(config.precision, device)
-        print(f'{config.method:<16}{config.decoder + " + skips" * config.skips:<16}'
-              f'{precision:<10}{rate:>10.0f}{efficiency:>15.0f}{efficiency / first:>7.2f}',
-              flush=True)
+        network = f'{config.decoder} decoder{" with skips" * config.skips}'
+        rows += show([Row(
+            f'train a predictor, `{config.method}`, {network}, '
+            f'{pick_precision(config.precision, device)}', f'{rate:.0f} samples/s',
+            efficiency / first, 'the first row, by CPU time')])
+    return rows
 
 
 def time_step(config, steps):

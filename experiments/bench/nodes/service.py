@@ -19,6 +19,7 @@ import tempfile
 import threading
 import time
 
+from experiments.bench.rows import Row, show
 import numpy as np
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
@@ -72,23 +73,33 @@ class Options:
 
 def run(args):
     """Print the times of single calls, and what many clients get."""
+    measure(args)
+
+
+def measure(args):
+    """Return the rows of this benchmark, which it prints."""
     with tempfile.TemporaryDirectory() as folder, NodeProcesses(folder) as nodes:
         nodes.start('predictor_node')
         with streaming(args.rate) as stream:
-            alone, service = compare_latency(stream, args.rounds, args.calls)
-            for name, times in (('the model alone', alone), (
-                    f'/predict_subgoal, {args.rate:g} pictures/s', service)):
-                p50, p99 = 1e3 * np.percentile(times, (50, 99))
-                print(f'{name:<40}p50 {p50:6.2f} ms   p99 {p99:6.2f} ms   {len(times)} calls')
-            print(f'{"clients":>8}{"answers/s":>11}{"p50, ms":>10}{"p99, ms":>10}'
-                  f'{"busy":>7}{"lost":>7}')
+            alone, service = (1e3 * np.percentile(times, (50, 99)) for times in compare_latency(
+                stream, args.rounds, args.calls))
+            rows = show([Row(
+                'answer of `/predict_subgoal`', f'{service[0]:.1f} ms, 99th percentile '
+                f'{service[1]:.1f} ms', service[0] / alone[0],
+                f'the model alone, {alone[0]:.1f} ms',
+                'at most 1.2 times the model alone and 1 ms',
+                service[0] <= 1.2 * alone[0] + 1)])
+            first = None
             for count in args.clients:
                 load = measure_load(count, args.seconds)
-                p50, p99 = 1e3 * np.percentile(load.latencies, (50, 99)) if len(
-                    load.latencies) else (np.nan, np.nan)
-                print(f'{count:>8}{load.per_second:>11.1f}{p50:>10.1f}{p99:>10.1f}'
-                      f'{load.counts["busy"]:>7}{load.counts["lost"]:>7}', flush=True)
+                first = first or load.per_second
+                rows += show([Row(
+                    f'answers to {count} clients', f'{load.per_second:.0f} a second, '
+                    f'{load.counts["busy"]} told to come later, {load.counts["lost"]} lost',
+                    load.per_second / first, f'{args.clients[0]} client',
+                    *(('at least 3 times', load.per_second >= 3 * first) if count == 16 else ()))])
         nodes.check()
+    return rows
 
 
 def compare_latency(stream, rounds, calls):

@@ -1,0 +1,41 @@
+# Copyright 2026 The tap_ros authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a benchmark measured, as rows of docs/speed.md."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One speed, and the ratio to something that was measured in the same run.
+
+    :param what: was measured.
+    :param here: the number with its unit.
+    :param ratio: of it to `to`.
+    :param to: what else was measured.
+    :param aim: in words; '': none was set.
+    :param reached: whether it is.
+    :param limit: what takes the time.
+    """
+
+    what: str
+    here: str
+    ratio: float
+    to: str
+    aim: str = ''
+    reached: bool = True
+    limit: str = ''
+
+    @property
+    def cells(self):
+        """Return its cells in a table: what, here, ratio, aim, limit."""
+        aim = f'{"reached" if self.reached else "**missed**"}: {self.aim}' if self.aim else ''
+        return self.what, self.here, f'{self.ratio:.2f} x {self.to}', aim, self.limit
+
+
+def show(rows):
+    """Print rows, and return them."""
+    for row in rows:
+        print('; '.join(filter(None, row.cells)).replace('*', ''), flush=True)
+    return rows
