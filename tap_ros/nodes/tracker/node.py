@@ -203,8 +203,8 @@ class TrackerNode(Node):
         message = self._encode(found, tracked, plane, moment.messages['image'].header)
         self._selection = Selection(
             found, tracker, plane, view.image.shape[:2], moment.stamp_ns, self._sensors.jumps,
-            frozenset().union(*self._publishers().values()), moment.stamp_ns, moment.received,
-            tracked, message)
+            frozenset().union(*self._camera_publishers().values()), moment.stamp_ns,
+            moment.received, tracked, message)
         self._objects.publish(message)
         self._sensors.wake()  # for the goal
         self.get_logger().info(f'following {listing(found)}')
@@ -383,13 +383,13 @@ class TrackerNode(Node):
         """Say in what way the camera shows another scene than that of a selection, '' if not."""
         if self._sensors.jumps != selection.jumps:
             return 'the clock of its pictures has jumped: another camera, simulator or recording'
-        for topic, publishers in self._publishers().items():
+        for topic, publishers in self._camera_publishers().items():
             if len(publishers) > 1 and not publishers <= selection.publishers:
                 return (f'{len(publishers)} nodes publish on '
                         f'{self.resolve_topic_name(topic)} now')
         return ''
 
-    def _publishers(self) -> dict[str, frozenset[bytes]]:
+    def _camera_publishers(self) -> dict[str, frozenset[bytes]]:
         """Return who publishes each topic of which there may be but one publisher."""
         return {topic: frozenset(
             bytes(info.endpoint_gid[:12])  # the participant, which is known before all its topics
