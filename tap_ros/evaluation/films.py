@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from tap_ros.errors import ConfigError
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.formats.pictures import video_frames
+from tap_ros.recording.formats.pictures import make_episode, video_frames
 from tap_ros.text import escaped
 
 
@@ -55,10 +55,5 @@ def _film(told: dict[str, Any], folders: Sequence[str | Path]) -> Episode:
         for k, place in enumerate(places):
             if place is not None:
                 pixels[wanted.index(int(number)), k] = place
-    return Episode(
-        frames=np.stack(frames), stamps=np.arange(T, dtype=np.int64) * 10 ** 8,
-        actions=np.zeros((T, 4), np.float32), grippers=np.full((T, 4), np.nan, np.float32),
-        object_names=tuple(told['objects']), object_pixels=pixels,
-        object_poses=np.full((T, K, 7), np.nan), goal_frame=None,
-        goal_pixels=np.full((K, 2), np.nan, np.float32), goal_poses=np.full((K, 7), np.nan),
-        object_source='by hand', task=told['film'])
+    return make_episode(frames, np.arange(T) / 10, tuple(told['objects']), object_pixels=pixels,
+                        object_source='by hand', task=told['film'])

@@ -108,11 +108,8 @@ def _what(path: Path) -> str:
 
 
 def _advice(what: str, command: str, place: Path) -> str:
-    return f'no recording of ROS, but {what}; make one of it: {_command(command, place)}'
-
-
-def _command(name: str, place: Path) -> str:
-    return f'python -m tap_ros {name} {shlex.quote(escaped(place, 400))} --out BAG'
+    return (f'no recording of ROS, but {what}; make one of it: python -m tap_ros {command} '
+            f'{shlex.quote(escaped(place, 400))} --out BAG')
 
 
 def _is_sqlite(path: Path) -> bool:

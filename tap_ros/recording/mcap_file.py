@@ -4,8 +4,7 @@
 MCAP files, read front to back past damage, by the records of the mcap package.
 
 mcap's own readers end at the first record that they do not understand, skip what is cut short and
-unpack what a file claims. Here chunks are read where the summary lists them or, where bytes were
-lost or put in, as far from there as the summary is from its own place. Without a summary the
+unpack what a file claims. Here chunks are read where the summary lists them; without a summary the
 records are read one after the other, so that all that a killed recorder wrote completely is used.
 What cannot be used is noted as a loss.
 """
@@ -40,7 +39,6 @@ OTHERS = 0x80  # opcodes from here on belong to others, and are skipped
 RECORD = struct.Struct('<BQ')  # opcode, length of what follows
 _MESSAGE = struct.Struct('<BQHIQQ')  # opcode, length, channel, sequence, log time, publish time
 _FOOTER = struct.Struct('<BQQQI')  # opcode, length, summary start, summary offsets start, crc
-_DATA_END = RECORD.pack(Opcode.DATA_END, 4)
 _TOPICS: dict[int, type[Schema | ChannelRecord]] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelRecord}
 _DAMAGE = (McapError, struct.error, ValueError, OverflowError)  # mcap's, for damaged bytes
@@ -85,7 +83,6 @@ class McapFile:
         self._newest: int | None = None  # log time so far
         self._counts: Counter[int] = Counter()  # messages read by channel
         self._is_read = False  # to the end
-        self._shift = 0  # bytes by which the summary is not where it should be
         self._end, self._is_without_summary = self.size, False  # of the data
         self._stopped: int | None = None  # the byte from which on records are not understood
         self._summary = self._find_summary()
@@ -148,32 +145,26 @@ class McapFile:
         if (kind, length) != (Opcode.FOOTER, _FOOTER.size - RECORD.size):
             return Summary()
         self._is_without_summary = start == 0
-        behind = self._map.rfind(_DATA_END) + len(_DATA_END) + 4  # where it is, whatever was lost
-        for place in (start, behind):
-            if len(MAGIC) < place <= footer and (
-                    not crc or zlib.crc32(self._data[place:-len(MAGIC) - 4]) == crc):
-                with suppress(*_DAMAGE):
-                    found = _read_summary(self._data[place:])
-                    self._end, self._shift = place, place - start
-                    return found
+        if len(MAGIC) < start <= footer and (
+                not crc or zlib.crc32(self._data[start:-len(MAGIC) - 4]) == crc):
+            with suppress(*_DAMAGE):
+                found = _read_summary(self._data[start:])
+                self._end = start
+                return found
         return Summary()
 
     def _indexed(self) -> Iterator[list[Found]]:
         """Yield the messages of the chunks that the summary lists."""
         entries = {entry.chunk_start_offset: entry for entry in self._summary.chunk_indexes}
         for offset, entry in sorted(entries.items()):
-            first, last = min(entry.message_start_time, FAR), min(entry.message_end_time, FAR)
-            why, found = '', None
-            for place in dict.fromkeys((offset, offset + self._shift)):
-                try:
-                    found = self._read_chunk(place, place + entry.chunk_length, entry)
-                    break
-                except RecordingError as error:
-                    why = why or str(error)
-            if found is None:
-                self.losses.append(Loss(why, 'chunk', offset, first, last))
-            else:
-                yield found
+            try:
+                found = self._read_chunk(offset, offset + entry.chunk_length, entry)
+            except RecordingError as error:
+                times = entry.message_start_time, entry.message_end_time
+                self.losses.append(
+                    Loss(str(error), 'chunk', offset, *(min(time, FAR) for time in times)))
+                continue
+            yield found
 
     def _one_by_one(self) -> Iterator[list[Found]]:
         """Yield the messages of one record after the other."""
@@ -193,8 +184,6 @@ class McapFile:
                 what = 'chunk' if kind == Opcode.CHUNK else 'record'
                 self._pending.append((str(error), what, start))
             yield found
-        if self._stopped is not None and self._end == self.size:
-            yield self._scan(self._rest_of_chunk(self._stopped), is_whole=False)
 
     def _walk(self) -> Iterator[tuple[int, int, int]]:
         """Yield (opcode, start, end) of the records before the summary; note where they stop."""
@@ -225,9 +214,8 @@ class McapFile:
             raise RecordingError(
                 f'it has {end - start} bytes; at most {MAX_CHUNK_BYTES} are accepted')
         chunk = read_record(Chunk, self._data[start + RECORD.size:end], whole=False)
-        size, times = chunk.uncompressed_size, (chunk.message_start_time, chunk.message_end_time)
-        if entry and (size != entry.uncompressed_size or self._shift and times != (
-                entry.message_start_time, entry.message_end_time)):
+        size = chunk.uncompressed_size
+        if entry and size != entry.uncompressed_size:
             raise RecordingError('it is not where the summary says')
         if size > MAX_CHUNK_BYTES:
             raise RecordingError(f'it claims to unpack to {size} bytes; at most '
@@ -241,25 +229,11 @@ class McapFile:
             raise RecordingError('its checksum or size is wrong; restore the file from a copy')
         return self._scan(memoryview(data))
 
-    def _rest_of_chunk(self, start: int) -> memoryview:
-        """Return the records at the beginning of a chunk that the file ends in."""
-        stream = ReadDataStream(BytesIO(self._data[start:start + 100]))
-        try:
-            kind, _, _, _ = stream.read1(), stream.read8(), stream.read8(), stream.read8()
-            size, _ = stream.read8(), stream.read4()
-            name, _ = stream.read_prefixed_string(), stream.read8()
-            if kind != Opcode.CHUNK or size > MAX_CHUNK_BYTES:
-                return memoryview(b'')
-            return memoryview(_unpack(name, self._data[start + stream.count:], size, False))
-        except (*_DAMAGE, zstandard.ZstdError, RuntimeError, RecordingError):
-            return memoryview(b'')
-
-    def _scan(self, data: memoryview, is_whole: bool = True) -> list[Found]:
+    def _scan(self, data: memoryview) -> list[Found]:
         """
         Return the messages among records; take notice of topics.
 
-        :param data: of the records.
-        :param is_whole: raise RecordingError for what is damaged or cut off, else end there.
+        :raises RecordingError: for what is damaged or cut off.
         """
         found: list[Found] = []
         position = 0
@@ -267,8 +241,6 @@ class McapFile:
             while position < len(data):
                 kind, length = RECORD.unpack_from(data, position)
                 end = position + RECORD.size + length
-                if end > len(data) and not is_whole:
-                    break
                 if kind == Opcode.MESSAGE:
                     _, _, number, _, log, publish = _MESSAGE.unpack_from(data, position)
                     if position + _MESSAGE.size > end:
@@ -280,9 +252,8 @@ class McapFile:
                     raise RecordingError(f'it holds a damaged record: opcode {kind}')
                 position = end
         except struct.error as error:
-            if is_whole:
-                raise RecordingError('it holds a damaged record: cut off') from error
-        if is_whole and position != len(data):
+            raise RecordingError('it holds a damaged record: cut off') from error
+        if position != len(data):
             raise RecordingError('it holds a damaged record: wrong length')
         return found
 
@@ -375,13 +346,10 @@ def _read_summary(data: memoryview) -> Summary:
     return summary
 
 
-def _unpack(compression: str, data: bytes | memoryview, size: int,
-            is_whole: bool = True) -> bytes | memoryview:
+def _unpack(compression: str, data: bytes | memoryview, size: int) -> bytes | memoryview:
     """Unpack the data of a chunk, which never takes more memory than it claims."""
     if compression == '':
-        return data[:size] if not is_whole else data
-    if compression == 'zstd' and not is_whole:
-        return zstandard.ZstdDecompressor().stream_reader(data).read(size)
+        return data
     if compression == 'zstd':
         # What the frame says about its size counts more for the decompressor than our limit.
         if zstandard.frame_content_size(data) not in (-1, size):

@@ -23,7 +23,6 @@ import yaml
 
 FILE_NAME, MOUNT_NAME = 'metadata.yaml', 'arm_mount.json'
 MAX_BYTES = 2**23  # of metadata.yaml
-DEEPEST = 50  # levels of it; rosbag2 writes 8
 _UNUSABLE = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError)
 _LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _KEY = 'rosbag2_bagfile_information'
@@ -71,17 +70,6 @@ def bag_information(files: Sequence[dict[str, Any]]) -> dict[str, Any]:
         'custom_data': None,
         'ros_distro': 'jazzy',
     }
-
-
-def from_yaml(text: str | bytes) -> Any:
-    """Return a value; raise ValueError for one so deep that libyaml would end the process."""
-    depth = 0
-    for event in yaml.parse(text, _LOADER):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            raise ValueError(f'it is more than {DEEPEST} levels deep')
-    return yaml.load(text, _LOADER)
 
 
 def to_yaml(value: Any) -> str:
@@ -137,7 +125,7 @@ def bag_files(folder: str | Path) -> list[Path]:
         raise RecordingError(f'{path}: not a regular file')
     try:
         with open(path, 'rb') as stream:
-            information = from_yaml(stream.read(MAX_BYTES))[_KEY]
+            information = yaml.load(stream.read(MAX_BYTES), _LOADER)[_KEY]
         storage, paths = information['storage_identifier'], information['relative_file_paths']
         if not isinstance(paths, list) or not all(isinstance(name, str) for name in paths):
             raise ValueError('relative_file_paths is no list of names')

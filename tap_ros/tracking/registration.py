@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from tap_ros.tracking.confidence import probability
 from tap_ros.tracking.picture import Palette, Picture
 from tap_ros.tracking.plane import Plane
 from tap_ros.tracking.protocols import LOST, SEEN, Tracked, View
@@ -54,7 +53,7 @@ def register(first: Picture, picture: Picture, plane: Plane,
     pixels, confidence = np.full((len(objects), 2), np.nan), np.zeros(len(objects))
     states, outlines = [LOST] * len(objects), [np.zeros((0, 2))] * len(objects)
     for k, (pose, key) in found.items():
-        confidence[k] = probability(pose.fit, pose.cost, pose.seen)
+        confidence[k] = pose.confidence
         if confidence[k] > LEAST_SURE:
             states[k] = SEEN
             pixels[k] = plane.enlarge(plane.middle_pixels(pose.place))

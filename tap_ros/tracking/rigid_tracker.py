@@ -13,13 +13,11 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from tap_ros.robots.silhouette import PinholeCamera
-from tap_ros.tracking.confidence import doubt, probability
-from tap_ros.tracking.mean_shift import mean_shift
 from tap_ros.tracking.picture import Picture
 from tap_ros.tracking.plane import Plane, TOP
 from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, UNSURE, View
 from tap_ros.tracking.registration import register
-from tap_ros.tracking.search import locate
+from tap_ros.tracking.search import locate, mean_shift
 from tap_ros.tracking.silhouette import clicked, middle, RADIUS, silhouette, top_face
 from tap_ros.tracking.template import Matcher, Pose, Template
 
@@ -35,6 +33,8 @@ BESIDE, SAME = 5, 5  # px around an object, and steps of colour, that say whethe
 KEYS = 6  # templates of an object, the first among them
 COLOURFUL = 12.0  # contrast from which an object can be followed by its colours alone
 MOST = (0.5, 1.8)  # of its area, that has to be there then
+# Confidence in the last place of an object: at once, and the factor of each further picture.
+DOUBT = {HIDDEN: (0.88, 0.95), UNSURE: (0.5, 0.9), LOST: (0.5, 0.9)}
 PATIENCE = 2  # pictures in which what should be seen may be missed, before it is lost
 
 
@@ -123,7 +123,7 @@ class RigidTracker:
         pose, key = found if found is not None else (None, keys[0])
         if pose is not None and pose.fit > GOOD:
             one.place, one.angle, one.age, one.shown = pose.place, pose.angle, 0, key
-            one.state, one.confidence = SEEN, probability(pose.fit, pose.cost, pose.seen)
+            one.state, one.confidence = SEEN, pose.confidence
             nearest = min(abs(_turned(other.angle - one.angle)) for other in one.keys)
             one.around = self._window(one), picture
             if one.waits <= 0 and pose.seen > NEW_SEEN and (
@@ -137,7 +137,8 @@ class RigidTracker:
             place, amount = mean_shift(matcher, keys[0], one.place)
             if MOST[0] < amount < MOST[1]:  # lifted, or turned to a side not seen before
                 one.place, one.state = place, UNSURE
-        one.confidence = doubt(one.state, one.age)
+        first, fall = DOUBT[one.state]
+        one.confidence = first * fall ** (one.age - 1)
 
     def _search(self, one: _Object, keys: Sequence[Template], matcher: Matcher,
                 hand: np.ndarray | None) -> tuple[Pose, Template] | None:

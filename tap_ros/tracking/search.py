@@ -1,6 +1,10 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""An object anywhere in a picture: places that have its colours, then poses of its template."""
+"""
+An object anywhere in a picture: places that have its colours, then poses of its template.
+
+And mean shift over its colours, which is coarse, but minds neither height nor sides.
+"""
 
 from collections.abc import Sequence
 
@@ -12,6 +16,7 @@ PLACES = 6  # that are tried
 TRIED = 4  # turns at each of them that are tried finely
 APART = 0.035  # m from other objects
 EDGE = 0.47  # m, |x| and |y| on a calibrated table
+_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.5)
 _TURNS = np.linspace(-np.pi, np.pi, 16, endpoint=False)
 _AROUND = np.stack(np.meshgrid(*[np.linspace(-0.03, 0.03, 5)] * 2), -1).reshape(-1, 2)  # m
 
@@ -53,3 +58,21 @@ def locate(matcher: Matcher, template: Template, avoid: Sequence[np.ndarray] = (
             if found is not None and (best is None or found.cost < best.cost):
                 best = found
     return best
+
+
+def mean_shift(matcher: Matcher, template: Template,
+               place: np.ndarray) -> tuple[np.ndarray, float]:
+    """
+    Follow the colours of an object from a place.
+
+    :return: (2,) the place where they are densest near by; and how much of them is there, as a
+        share of the object's own area.
+    """
+    like = matcher.likeness(template)
+    h, w = like.shape
+    half = min(max(6, round(template.area ** 0.5 * 0.6)), h // 2, w // 2)
+    u, v = matcher.plane.top_pixels(place) - half
+    box = (int(np.clip(u, 0, w - 2 * half)), int(np.clip(v, 0, h - 2 * half)), 2 * half, 2 * half)
+    _, (u, v, width, height) = cv2.meanShift((255 * like).astype(np.uint8), box, _STOP)
+    amount = float(like[v:v + height, u:u + width].sum()) / template.area
+    return matcher.plane.of_top((u + half, v + half)), amount

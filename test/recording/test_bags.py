@@ -101,7 +101,6 @@ def test_metadata_that_cannot_be_used_is_named_in_one_line(bag):
             (begin + 'relative_file_paths: [[a]]', 'not the metadata'),
             (begin + 'relative_file_paths: [push2_0.mcap, push2_0.mcap]', 'a file twice'),
             (begin + 'version: 2001-99-99', 'not the metadata'),
-            (begin + 'version: ' + '[' * 100_000, 'levels deep'),
             (begin + 'relative_file_paths: [..]', 'not there'),
             (begin + f'relative_file_paths: [{"a" * 5000}]', 'not there'),
             (begin + 'relative_file_paths: ["a\\0b\\e[2J\\n"]', 'not')):

@@ -12,38 +12,27 @@ into episodes.
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 import re
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.encodings import decompress
-from tap_ros.options import default_text
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.file_bytes import what_else
-from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
+from tap_ros.recording.formats.pictures import (
+    decoded,
+    Lacking,
+    make_episode,
+    Options,
+    write_bag,
+)
 from tap_ros.recording.metadata import natural
 from tap_ros.text import escaped, listing
-from tyro import conf
 
-
-@dataclass(frozen=True, kw_only=True)
-class Options(Target):
-    """
-    Options of `python -m tap_ros import-arrays`.
-
-    :param paths: HDF5 files, folders of them, or zarr stores.
-    :param camera: NAME of the pictures; needed where there are several cameras.
-    :param fps: frames a second, which the arrays do not tell.
-    :param task: what is done in them, as text.
-    """
-
-    paths: Paths
-    camera: Annotated[str, conf.arg(metavar='NAME', help_behavior_hint=default_text)] = ''
-    fps: float = 10.0
-    task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
+FPS = 10.0  # where nobody says another
 
 
 def run(args: Options) -> None:
@@ -52,29 +41,21 @@ def run(args: Options) -> None:
 
     :raises TapError: for what cannot be read, and a folder that holds something.
     """
-    if not 0 < args.fps <= 1000:
-        raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000')
     files = [file for path in map(Path, args.paths) for file in (
         sorted((file for file in path.rglob('*') if file.suffix in ('.hdf5', '.h5')), key=natural)
         or [path])]
-
     lacking = Lacking()
 
     def episodes() -> Iterator[Episode]:
-        number = 0
+        numbers = count()
         for file in files:
-            name = escaped(file.name)
-            with lacking.passing_over('file', name):
-                for pictures in _episodes(_open(file), args.camera):
-                    frames, rows = [], []
-                    for row, each in enumerate(pictures):
-                        with lacking.passing_over('picture', f'{row} of episode {number}'):
-                            frames.append(args.cut.image(_picture(each)))
-                            rows.append(row)
-                    if frames:
-                        yield make_episode(frames, np.array(rows) / args.fps, task=args.task,
-                                           seed=number)
-                    number += 1
+            with lacking.passing_over('file', escaped(file.name)):
+                for number, pictures in zip(numbers, _episodes(_open(file), args.camera)):
+                    with lacking.passing_over('episode', str(number)):
+                        frames, rows = decoded(pictures, lambda each: args.cut.image(_picture(
+                            each)), lacking, f'episode {number}')
+                        yield make_episode(
+                            frames, rows / (args.fps or FPS), task=args.task, seed=number)
 
     print(write_bag(args, episodes(), lacking=lacking))
 

@@ -12,7 +12,7 @@ episodes.jsonl), data a row a frame. Pictures are files in the rows, or videos, 
 (v2: of one), from which the frame nearest to a row's time is taken.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import json
 from pathlib import Path
@@ -29,6 +29,7 @@ from tap_ros.recording.episode import Episode, OUTCOMES, RecordingWarning
 from tap_ros.recording.file_bytes import what_else
 from tap_ros.recording.formats.pictures import (
     DAMAGE,
+    decoded,
     Lacking,
     make_episode,
     Target,
@@ -143,8 +144,7 @@ class DataSet:
         """
         for row in self.rows:
             with self.lacking.passing_over('episode', escaped(row['episode_index'], 20)):
-                episode = self._episode(row, crop)
-                yield episode
+                yield self._episode(row, crop)
 
     @property
     def _is_video(self) -> bool:
@@ -244,17 +244,18 @@ class DataSet:
 
     def _episode(self, row: dict[str, Any], crop: Crop) -> Episode:
         """Return the episode of a row."""
-        part, frames, kept, size = self._rows_of(row), [], [], (1, 1)
-        for t, picture in enumerate(
-                (self._filmed if self._is_video else self._pictures)(row, part)):
-            if isinstance(picture, str):
-                self.lacking.note(picture, 'picture', f'{t} of episode {row["episode_index"]}')
-            else:
-                frames.append(crop.image(picture))
-                kept.append(t)
-                size = picture.shape[:2]
-        if not frames:
-            raise ValueError('none of its pictures can be used')
+        part, size = self._rows_of(row), (1, 1)
+        cells, show = self._filmed(row, part) if self._is_video else (
+            part[self.camera].to_pylist(),
+            lambda cell: decompress(self._file_of(cell), 'unknown'))
+
+        def decode(cell: Any) -> np.ndarray:
+            nonlocal size
+            picture = show(cell)
+            size = picture.shape[:2]
+            return crop.image(picture)
+
+        frames, kept = decoded(cells, decode, self.lacking, f'episode {row["episode_index"]}')
         T = len(kept)
 
         def numbers(key: str, width: int) -> np.ndarray:
@@ -286,26 +287,22 @@ class DataSet:
         data = cell.get('bytes') if isinstance(cell, dict) else None
         return data or (self.folder / str(cell['path'])).read_bytes()
 
-    def _pictures(self, row: dict[str, Any], part: Any) -> Iterator[np.ndarray | str]:
-        """Yield the picture of each row, or why it cannot be used."""
-        for cell in part[self.camera].to_pylist():
-            try:
-                yield decompress(self._file_of(cell), 'unknown')
-            except DAMAGE as error:
-                yield str(error)
-
-    def _filmed(self, row: dict[str, Any], part: Any) -> Iterator[np.ndarray | str]:
-        """Yield the frame of a video at the time of each row, or why there is none."""
+    def _filmed(self, row: dict[str, Any],
+                part: Any) -> tuple[list[float], Callable[[float], np.ndarray]]:
+        """Return the time of each row in a video, and what returns the frame of a time."""
         path = self._path(self._video_path, row, f'videos/{self.camera}')
         times = self._starts[row['episode_index']] + np.array(part['timestamp'], float).ravel()
         if self._video is None or self._video.path != path or self._video.now[0] > times[0]:
             self._video = _Video(path)
-        for at in times.tolist():
-            seen, picture = self._video.at(at)
+        video = self._video
+
+        def show(at: float) -> np.ndarray:
+            seen, picture = video.at(at)
             if abs(seen - at) > 1 / self.fps:
-                yield f'{path.relative_to(self.folder)} has no frame at {at:.3f} s'
-            else:
-                yield picture
+                raise RecordingError(
+                    f'{path.relative_to(self.folder)} has no frame at {at:.3f} s')
+            return picture
+        return times.tolist(), show
 
 
 class _Video:

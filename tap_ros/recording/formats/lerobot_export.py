@@ -3,9 +3,9 @@
 """
 Export recordings as a LeRobotDataset v3.0.
 
-What it holds: the camera's pictures, actions, the gripper's state and the pixels of objects where
-every frame knows them, the task, marks as subtasks, and, in columns of ours, seed and outcome.
-Goal pictures, poses and robot masks have no place there.
+What it holds: the camera's pictures as PNG files, actions, the gripper's state and the pixels of
+objects where every frame knows them, the task, marks as subtasks, and, in columns of ours, seed
+and outcome. Goal pictures, poses and robot masks have no place there.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,12 +15,11 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-import cv2
 import numpy as np
-from tap_ros.errors import ConfigError, RecordingError, StorageError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.files import storage_errors
 from tap_ros.images.drawing import png_bytes
-from tap_ros.options import Bags, File, Flag, Folder
+from tap_ros.options import Bags, File, Folder
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.formats.lerobot import (
     ACTION,
@@ -41,10 +40,10 @@ from tap_ros.robots.arm import DEFAULT_ARM
 from tap_ros.text import escaped
 from tqdm import tqdm
 
-EPISODES_PER_FILE = 100  # of data, and of a video
+EPISODES_PER_FILE = 100
 FILES_PER_CHUNK = 1000
 _FILE = 'chunk-{chunk_index:03d}/file-{file_index:03d}'
-DATA, VIDEO = f'data/{_FILE}.parquet', f'videos/{{video_key}}/{_FILE}.mp4'
+DATA = f'data/{_FILE}.parquet'
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 _INDEX = {'dtype': 'int64', 'shape': [1], 'names': None}  # feature of a column of numbers
 _SAMPLED_PIXELS = 2**22  # of all pictures, for their statistics
@@ -57,14 +56,12 @@ class Options:
 
     :param recordings: bag folders, folders of bag folders, or .mcap files.
     :param out: folder of the data set; must not exist.
-    :param lossless: keep pictures as PNG, bit for bit, instead of videos (VP9).
     :param marks: file of marks (see `mark`); each ends a subtask.
     """
 
     recordings: Bags
     out: Folder
     marks: File = ''
-    lossless: Flag = False
     reading: ReadingOptions = ReadingOptions()
 
 
@@ -83,7 +80,7 @@ def run(args: Options) -> None:
     with storage_errors(part):
         shutil.rmtree(part, ignore_errors=True)
         try:
-            features = export(store, part, args.lossless, marks)
+            features = export(store, part, marks)
             part.rename(out)
         finally:
             shutil.rmtree(part, ignore_errors=True)
@@ -91,14 +88,13 @@ def run(args: Options) -> None:
           f'{", ".join(name for name in features if "." in name or name == ACTION)}')
 
 
-def export(store: EpisodeStore, folder: Path, lossless: bool = False,
+def export(store: EpisodeStore, folder: Path,
            marks: Mapping[int, Sequence[Mark]] | None = None) -> dict[str, Any]:
     """
     Write a data set.
 
     :param store: EpisodeStore.
     :param folder: a new one.
-    :param lossless: pictures as PNG instead of videos.
     :param marks: of episodes; the middle of each is the last frame of a subtask.
     :return: its features, as in info.json.
     :raises RecordingError: when frames lack what LeRobot needs.
@@ -117,9 +113,9 @@ def export(store: EpisodeStore, folder: Path, lossless: bool = False,
     names: dict[str, dict[str, int]] = {'task': tasks}
     if marks is not None:
         names['subtask'], numbers[SUBTASK] = _subtasks(store, marks)
-    features = _features(store, vectors, lossless, fps)
+    features = _features(store, vectors)
     features |= {f'{key}_index': _INDEX for key in names}
-    rows = list(tqdm(_write_files(store, folder, numbers, lossless, fps), 'exporting', len(store),
+    rows = list(tqdm(_write_files(store, folder, numbers), 'exporting', len(store),
                      unit='episode', delay=1))
     _write_meta(folder, features, names, rows, fps)
     _write_json(folder / 'meta/stats.json', {
@@ -145,20 +141,12 @@ def _vectors(store: EpisodeStore) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(values, np.float32) for name, values in found.items()}
 
 
-def _features(store: EpisodeStore, vectors: dict[str, np.ndarray], lossless: bool,
-              fps: int) -> dict[str, Any]:
+def _features(store: EpisodeStore, vectors: dict[str, np.ndarray]) -> dict[str, Any]:
     """Describe the columns, as info.json has it."""
-    height, width = store.image_size
-    camera: dict[str, Any] = {'dtype': 'image' if lossless else 'video',
-                              'shape': [height, width, 3],
-                              'names': ['height', 'width', 'channels']}
-    if not lossless:
-        camera['info'] = {'video.height': height, 'video.width': width, 'video.channels': 3,
-                          'video.codec': 'vp9', 'video.pix_fmt': 'yuv420p', 'video.fps': fps,
-                          'video.is_depth_map': False, 'has_audio': False}
     names = {**NAMES, OBJECTS: object_columns(store[0].object_names)}
     return {
-        CAMERA: camera,
+        CAMERA: {'dtype': 'image', 'shape': [*store.image_size, 3],
+                 'names': ['height', 'width', 'channels']},
         **{name: {'dtype': 'float32', 'shape': [values.shape[1]], 'names': names[name]}
            for name, values in vectors.items()},
         'timestamp': {'dtype': 'float32', 'shape': [1], 'names': None},
@@ -179,19 +167,16 @@ def _subtasks(store: EpisodeStore,
     return {name: number for number, name in enumerate(names)}, np.concatenate(found)
 
 
-def _write_files(store: EpisodeStore, folder: Path, numbers: dict[str, np.ndarray],
-                 lossless: bool, fps: int) -> Iterator[dict[str, Any]]:
-    """Write data and videos, a row group an episode; yield the rows of meta/episodes."""
+def _write_files(store: EpisodeStore, folder: Path,
+                 numbers: dict[str, np.ndarray]) -> Iterator[dict[str, Any]]:
+    """Write data, a row group an episode; yield the rows of meta/episodes."""
     from pyarrow import parquet
     index = 0  # of the first frame of an episode
     for number in range(-(-len(store) // EPISODES_PER_FILE)):
         place = {'chunk_index': number // FILES_PER_CHUNK, 'file_index': number % FILES_PER_CHUNK}
         path = folder / DATA.format(**place)
         path.parent.mkdir(parents=True, exist_ok=True)
-        video = None if lossless else _open_video(
-            folder / VIDEO.format(video_key=CAMERA, **place), store.image_size, fps)
-        writer, in_video = None, 0
-        first = number * EPISODES_PER_FILE
+        writer, first = None, number * EPISODES_PER_FILE
         for i in range(first, min(first + EPISODES_PER_FILE, len(store))):
             episode, count = store[i], int(store.lengths[i])
             row = {'episode_index': i, 'tasks': [episode.task or 'unknown'], 'length': count,
@@ -199,46 +184,27 @@ def _write_files(store: EpisodeStore, folder: Path, numbers: dict[str, np.ndarra
                    SEED: int(episode.seed), OUTCOME: episode.outcome,
                    'meta/episodes/chunk_index': 0, 'meta/episodes/file_index': 0,
                    **{f'data/{key}': value for key, value in place.items()}}
-            if video is not None:
-                for frame in episode.frames:
-                    video.write(np.ascontiguousarray(frame[..., ::-1]))
-                row |= {f'videos/{CAMERA}/{key}': value for key, value in {
-                    **place, 'from_timestamp': in_video / fps,
-                    'to_timestamp': (in_video + count) / fps}.items()}
             table = _table({name: values[index:index + count] for name, values in numbers.items()},
-                           episode.frames if lossless else None)
+                           episode.frames)
             writer = writer or parquet.ParquetWriter(path, table.schema)
             writer.write_table(table)
-            index, in_video = index + count, in_video + count
+            index += count
             yield row
         if writer:
             writer.close()
-        if video is not None:
-            video.release()
 
 
-def _open_video(path: Path, size: tuple[int, int], fps: int) -> cv2.VideoWriter:
-    """Begin a video of pictures of a size (H, W)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*'vp09'), fps, size[::-1])
-    if not video.isOpened():
-        raise StorageError(f'{path}: OpenCV cannot write this video; use --lossless')
-    return video
-
-
-def _table(numbers: dict[str, np.ndarray], frames: np.ndarray | None) -> Any:
-    """Return the rows of an episode, with frames (T, H, W, 3) as PNG files unless None."""
+def _table(numbers: dict[str, np.ndarray], frames: np.ndarray) -> Any:
+    """Return the rows of an episode, with frames (T, H, W, 3) as PNG files."""
     import pyarrow
-    columns = {
+    pictures = pyarrow.array(
+        [{'bytes': png_bytes(frame), 'path': f'frame-{t:06d}.png'}
+         for t, frame in enumerate(frames)],
+        pyarrow.struct([('bytes', pyarrow.binary()), ('path', pyarrow.string())]))
+    return pyarrow.table({CAMERA: pictures} | {
         name: pyarrow.array(values) if values.ndim == 1 else
         pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(values.ravel()), values.shape[1])
-        for name, values in numbers.items()}
-    if frames is not None:
-        columns = {CAMERA: pyarrow.array(
-            [{'bytes': png_bytes(frame), 'path': f'frame-{t:06d}.png'}
-             for t, frame in enumerate(frames)],
-            pyarrow.struct([('bytes', pyarrow.binary()), ('path', pyarrow.string())])), **columns}
-    return pyarrow.table(columns)
+        for name, values in numbers.items()})
 
 
 def _picture_summary(store: EpisodeStore) -> dict[str, Any]:
@@ -270,8 +236,7 @@ def _write_meta(folder: Path, features: dict[str, Any], names: dict[str, dict[st
         'total_tasks': len(names['task']), 'chunks_size': FILES_PER_CHUNK,
         'data_files_size_in_mb': 100, 'video_files_size_in_mb': 200,
         'splits': {'train': f'0:{len(rows)}'}, 'data_path': DATA,
-        'video_path': VIDEO if features[CAMERA]['dtype'] == 'video' else None,
-        'features': features})
+        'video_path': None, 'features': features})
     episodes = folder / 'meta' / 'episodes' / 'chunk-000' / 'file-000.parquet'
     episodes.parent.mkdir(parents=True)
     parquet.write_table(pyarrow.Table.from_pylist(rows), episodes)

@@ -8,7 +8,7 @@ another meaning.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -63,13 +63,14 @@ class Target:
 @dataclass(frozen=True, kw_only=True)
 class Options(Target):
     """
-    Options of the command: one video is one demonstration.
+    Options of the commands that import pictures.
 
-    :param paths: video files of one camera, in the order of the demonstrations, or folders that
-        hold some at any depth.
-    :param camera: name of the files, without ending, where folders hold those of several.
-    :param fps: frames a second; 0: as the videos say.
-    :param task: what is done in them, as text.
+    :param paths: files, one camera's videos in the order of the demonstrations, or folders that
+        hold some at any depth; zarr stores.
+    :param camera: NAME of the pictures, of videos that of the files without ending; needed where
+        there are several cameras.
+    :param fps: frames a second; 0: as videos say, 10 of arrays and 5 of TFRecord files.
+    :param task: what is done in them, as text; TFRecord files tell it themselves.
     """
 
     paths: Paths
@@ -77,18 +78,19 @@ class Options(Target):
     fps: float = 0.0
     task: Annotated[str, conf.arg(metavar='TEXT', help_behavior_hint=default_text)] = ''
 
+    def __post_init__(self) -> None:
+        """Refuse a rate that no camera has."""
+        if not 0 <= self.fps <= 1000:
+            raise ConfigError(f'--fps {self.fps}: expected more than 0, to 1000, or 0')
+
 
 def run(args: Options) -> None:
     """
-    Import videos, and print what was.
+    Import videos, each a demonstration, and print what was.
 
     :raises TapError: for what cannot be read, and a folder that holds something.
     """
-    if not 0 <= args.fps <= 1000:
-        raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000, or 0')
-
     files = [file for path in args.paths for file in _find_videos(Path(path), args.camera)]
-
     lacking = Lacking()
 
     def episodes() -> Iterator[Episode]:
@@ -96,10 +98,9 @@ def run(args: Options) -> None:
             with lacking.passing_over('video', escaped(path.name)):
                 seconds, frames = zip(*(
                     (at, args.cut.image(frame)) for at, frame in video_frames(path)))
-                episode = make_episode(
+                yield make_episode(
                     frames, np.arange(len(frames)) / args.fps if args.fps else seconds,
                     task=args.task, seed=number)
-                yield episode
 
     print(write_bag(args, episodes(), len(files), lacking))
 
@@ -147,6 +148,25 @@ class Lacking:
                 lines[0] if lines else f'{escaped(out)}: there is no episode to import')
         for line in lines:
             warnings.warn(line, RecordingWarning, stacklevel=3)
+
+
+def decoded(pictures: Iterable[Any], decode: Callable[[Any], np.ndarray], lacking: Lacking,
+            place: str) -> tuple[list[np.ndarray], np.ndarray]:
+    """
+    Decode the pictures of an episode, but those that cannot be used.
+
+    :param place: of the episode, for what is noted as lacking.
+    :return: the pictures, and which ones they are, (T,).
+    :raises ValueError: when there is none.
+    """
+    frames, rows = [], []
+    for row, each in enumerate(pictures):
+        with lacking.passing_over('picture', f'{row} of {place}'):
+            frames.append(decode(each))
+            rows.append(row)
+    if not frames:
+        raise ValueError('none of its pictures can be used')
+    return frames, np.array(rows)
 
 
 def make_episode(frames: Sequence[np.ndarray], seconds: Sequence[float] | np.ndarray,

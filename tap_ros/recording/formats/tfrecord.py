@@ -11,13 +11,12 @@ and the instruction are taken; times are nominal, since records do not tell them
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import count
 import math
 from pathlib import Path
 import re
 import struct
-from typing import Annotated, Any
+from typing import Any
 
 from google.protobuf.empty_pb2 import Empty  # type: ignore[import-untyped]
 from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
@@ -26,29 +25,20 @@ import google_crc32c
 import numpy as np
 from tap_ros.errors import ConfigError, ImageError, RecordingError
 from tap_ros.images.encodings import decompress
-from tap_ros.options import default_text
 from tap_ros.recording.episode import Episode
-from tap_ros.recording.formats.pictures import Lacking, make_episode, Paths, Target, write_bag
+from tap_ros.recording.formats.pictures import (
+    decoded,
+    Lacking,
+    make_episode,
+    Options,
+    write_bag,
+)
 from tap_ros.recording.metadata import natural
 from tap_ros.text import escaped, listing
-from tyro import conf
 
 _FILES = b'\xff\xd8\xff', b'\x89PNG'  # JPEG, PNG
 
-
-@dataclass(frozen=True, kw_only=True)
-class Options(Target):
-    """
-    Options of `python -m tap_ros import-tfrecord`.
-
-    :param paths: .tfrecord files, or folders that hold some at any depth.
-    :param camera: NAME of the pictures; needed where records have those of several cameras.
-    :param fps: frames a second.
-    """
-
-    paths: Paths
-    camera: Annotated[str, conf.arg(metavar='NAME', help_behavior_hint=default_text)] = ''
-    fps: float = 5.0
+FPS = 5.0  # where nobody says another
 
 
 def run(args: Options) -> None:
@@ -57,8 +47,6 @@ def run(args: Options) -> None:
 
     :raises TapError: for records that cannot be read, and a folder that holds something.
     """
-    if not 0 < args.fps <= 1000:
-        raise ConfigError(f'--fps {args.fps}: expected more than 0, to 1000')
     files = [file for path in map(Path, args.paths) for file in (
         sorted(path.rglob('*.tfrecord*'), key=natural) if path.is_dir() else [path])]
     camera, blank, lacking = args.camera, Counter[bool](), Lacking()
@@ -72,19 +60,14 @@ def run(args: Options) -> None:
                 with lacking.passing_over('record', place):
                     features = parse_example(data)
                     camera = _choose(features, camera)
-                    frames, rows = [], []
-                    for row, each in enumerate(_pictures(features, camera)):
-                        with lacking.passing_over('picture', f'{row} of record {place}'):
-                            frames.append(_picture(each))
-                            rows.append(row)
-                    if not frames:
-                        raise ValueError('none of its pictures can be used')
+                    frames, rows = decoded(
+                        _pictures(features, camera), _picture, lacking, f'record {place}')
                     is_blank = _is_blank(frames[0])
                     blank[is_blank] += 1
-                    said = features.get('steps/language_instruction') or [b'']
+                    said = features.get('steps/language_instruction') or [args.task.encode()]
                     if not is_blank:
                         yield make_episode(
-                            list(map(args.cut.image, frames)), np.array(rows) / args.fps,
+                            list(map(args.cut.image, frames)), rows / (args.fps or FPS),
                             task=said[0].decode(errors='replace'), seed=number)
 
     print(f'{write_bag(args, episodes(), lacking=lacking)} of {escaped(camera)}')
