@@ -49,7 +49,7 @@ _EXPORTS = {
     'Client': 'tap_ros.nodes.client',
     'EpisodeWriter': 'tap_ros.recording.writer',
     'ForwardModel': 'tap_ros.planning.protocols',
-    'iter_episodes': 'tap_ros.recording.cache',
+    'iter_episodes': 'tap_ros.recording.reader',
     'open_recordings': 'tap_ros.recording.cache',
     'Predictor': 'tap_ros.prediction.protocol',
     'Simulator': 'sim_bridge.simulator',

@@ -11,8 +11,8 @@ from tap_ros.planning.protocols import Solver as Solver
 from tap_ros.planning.visual_mpc import VisualMPC as VisualMPC
 from tap_ros.prediction.predictor import SubgoalPredictor as SubgoalPredictor
 from tap_ros.prediction.protocol import Predictor as Predictor
-from tap_ros.recording.cache import iter_episodes as iter_episodes
 from tap_ros.recording.cache import open_recordings as open_recordings
+from tap_ros.recording.reader import iter_episodes as iter_episodes
 from tap_ros.recording.writer import EpisodeWriter as EpisodeWriter
 from tap_ros.robots.arm import Arm as Arm
 from tap_ros.training.train import train as train

@@ -155,11 +155,6 @@ def open_recordings(paths: str | Path | Iterable[str | Path], cache_dir: str | P
     return store
 
 
-def iter_episodes(path: str | Path, reading: Reading = AS_RECORDED) -> Iterator[Episode]:
-    """Yield the episodes of a recording; parameters and errors are those of open_recordings."""
-    yield from open_recordings(path, progress=False, reading=reading)
-
-
 def cache_folder() -> Path:
     """Return the folder of the cache: $TAP_ROS_CACHE or ~/.cache/tap_ros."""
     return Path(os.environ.get(ENVIRONMENT) or '~/.cache/tap_ros').expanduser()
