@@ -16,19 +16,16 @@ from pathlib import Path
 import threading
 from typing import Annotated, Any
 
-import numpy as np
 from tap_ros.errors import ConfigError, TapError
 from tap_ros.images.drawing import png_bytes
 from tap_ros.options import File
-from tap_ros.prediction.marks import features_of
-from tap_ros.prediction.preference import learn_preference, LEAST_FRAMES
+from tap_ros.prediction.preference import LEAST_FRAMES
 from tap_ros.recording.cache import EpisodeStore, open_recordings
 from tap_ros.recording.marks import beside, Mark, read_marks, write_marks
 from tap_ros.recording.reading import reading_of, ReadingOptions
 from tap_ros.text import escaped
 from tyro import conf
 
-ENOUGH = 4  # marked demonstrations, from which on the others are proposed by what is learned
 _HOST = '127.0.0.1'
 _LARGEST = 2 ** 16  # bytes of a request
 _PAGE = {'/': ('mark.html', 'text/html'), '/mark.js': ('mark.js', 'text/javascript')}
@@ -74,9 +71,6 @@ class Marking:
         if not self._usable:
             raise ConfigError(f'recordings: no episode has {LEAST_FRAMES} frames; record longer '
                               'ones')
-        self._features: dict[int, np.ndarray] = {}
-        threading.Thread(target=lambda: list(map(self._described, self._usable)),
-                         daemon=True).start()  # nobody waits for it later
 
     def mark(self, episode: int, frames: Sequence[int]) -> None:
         """
@@ -103,28 +97,10 @@ class Marking:
                     'next': self._next()}
 
     def _next(self) -> int | None:
-        """Return the demonstration from whose marks most is to be learned, None if all have."""
+        """Return the demonstration farthest from those that are marked; None if all are."""
         left = [i for i in self._usable if i not in self._marks]
-        if not left or not self._marks:
-            return left[0] if left else None
-        if len(self._marks) < ENOUGH:  # far from those that are marked
-            return max(left, key=lambda i: min(abs(i - marked) for marked in self._marks))
-        marked = sorted(self._marks)
-        learned = learn_preference(
-            [self._described(i) for i in marked],
-            [(self._marks[i][-1][0] + self._marks[i][-1][1]) // 2 for i in marked])
-        doubts = {}
-        for i in left:  # entropy of w, as a share of the largest that it can have
-            share = learned(self._described(i))[1:-1]
-            share = share / share.sum()
-            doubts[i] = -(share * np.log(share)).sum() / np.log(max(len(share), 2))
-        return max(left, key=doubts.__getitem__)
-
-    def _described(self, i: int) -> np.ndarray:
-        """Return the features of an episode."""
-        if i not in self._features:
-            self._features[i] = features_of(self.store, i, 'none')
-        return self._features[i]
+        return max(left, default=None, key=lambda i: min(
+            (abs(i - marked) for marked in self._marks), default=-i))
 
 
 class Server(ThreadingHTTPServer):

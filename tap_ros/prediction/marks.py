@@ -3,7 +3,6 @@
 """What is learned from marks of the bottleneck (recording/marks.py), and how good it is."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 import sys
 from typing import Any, TYPE_CHECKING
 
@@ -15,11 +14,13 @@ from tap_ros.prediction.preference import (
     LEAST_FRAMES,
     leave_one_out,
     Preference,
+    still,
 )
-from tap_ros.recording.marks import Mark, Marks
+from tap_ros.recording.marks import Mark, Marks, read_marks
 from tap_ros.training.robot_mask import hidden_pixels, RobotMask
 
 if TYPE_CHECKING:
+    from tap_ros.prediction.training_config import TrainingConfig
     from tap_ros.recording.cache import EpisodeStore
 
 
@@ -30,17 +31,26 @@ def features_of(store: 'EpisodeStore', i: int, robot_mask: RobotMask) -> np.ndar
                     else hidden_pixels(episode.robot_masks, robot_mask))
 
 
-@dataclass(frozen=True)
-class Learned:
+def weigh(store: 'EpisodeStore', config: 'TrainingConfig',
+          training: np.ndarray) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
     """
-    What is learned from marks.
+    Compute the preference w(t) that a training needs, by stillness or learned from marks.
 
-    :param preferences: of each level of recursion its w(t).
-    :param about: how well a mark is found by what is learned from the others, in each level.
+    :param training: indices of the episodes to train on.
+    :return: w of each episode, see prefer, None if it follows from the time; and what the weights
+        file tells of the marks.
     """
-
-    preferences: Sequence[Preference]
-    about: Sequence[Mapping[str, Any]]
+    if config.selection == 'still':
+        return prefer(store, [still] * config.recursion, config.robot_mask), {}
+    if not config.marks:
+        return None, {}
+    marks = read_marks(config.marks, store)
+    preferences, about = learn_marks(
+        store, marks, training, config.recursion, config.forward, config.robot_mask)
+    tell(about)
+    return prefer(store, preferences, config.robot_mask), {'marks': {
+        'sha256': marks.digest, 'levels': about,
+        'preferences': [preference.to_json() for preference in preferences]}}
 
 
 def prefer(store: 'EpisodeStore', preferences: Sequence[Callable[[np.ndarray], np.ndarray]],
@@ -60,7 +70,8 @@ def prefer(store: 'EpisodeStore', preferences: Sequence[Callable[[np.ndarray], n
 
 
 def learn_marks(store: 'EpisodeStore', marks: Marks, training: np.ndarray, levels: int,
-                forward: bool, robot_mask: RobotMask) -> Learned:
+                forward: bool, robot_mask: RobotMask,
+                ) -> tuple[list[Preference], list[dict[str, Any]]]:
     """
     Learn the preference of each level of recursion from marks, and say how good it is.
 
@@ -68,6 +79,8 @@ def learn_marks(store: 'EpisodeStore', marks: Marks, training: np.ndarray, level
     the first.
 
     :param training: indices of the episodes to train on; marks of others are left out.
+    :return: of each level its preference, and how well a mark is found by what is learned from
+        the others.
     :raises ConfigError: without marks there, or where an episode has not one for each level.
     """
     chosen = sorted(set(marks.episodes) & set(training.tolist()))
@@ -91,7 +104,7 @@ def learn_marks(store: 'EpisodeStore', marks: Marks, training: np.ndarray, level
             facts |= {'found': int(within.sum()), 'random': float(np.mean([
                 chance((t, t), len(one)) for t, one in zip(frames, features)]))}
         about.append(facts)
-    return Learned(preferences, about)
+    return preferences, about
 
 
 def chance(mark: Mark, length: int, tolerance: int = 1) -> float:

@@ -89,33 +89,19 @@ def run(args: Options) -> None:
         raise ConfigError(
             f'--objects and --goal-objects: {len(pixels["start"])} and {len(pixels["goal"])} '
             'positions; give those of the same objects in both pictures')
-    scaled, places, corner = {}, {}, (0, 0)
+    scaled, places, windows = {}, {}, {}
     for name, picture in pictures.items():
-        shape = picture.shape[:2]
-        cut = Crop(args.crop) if args.crop else predictor.camera_crop.of(shape, name)
-        if cut.part:
-            try:
-                left, top, width, height = cut.window(shape)
-            except ImageError as error:
-                raise ImageError(f'{name}: {error}') from error
-            part = Crop(cut.part)
-            inside = part.pixels(pixels[name], shape)
-            if in_picture(pixels[name], shape).all() and not in_picture(
-                    inside, (height, width)).all():
-                raise ImageError(
-                    f'{name}: an object is not in the part that the weights see, {width}x{height} '
-                    f'pixels from column {left}, row {top} on; leave it out in both pictures')
-            pixels[name], pictures[name] = inside, part.image(picture)
-            corner = (left, top) if name == 'start' else corner
-        scaled[name], places[name] = fit(pictures[name], pixels[name], size, name)
+        cut = Crop(args.crop) if args.crop else predictor.camera_crop.of(picture.shape[:2], name)
+        windows[name] = Crop(cut.part).window(picture.shape[:2])
+        scaled[name], places[name] = fit(picture, windows[name], pixels[name], size, name)
     subgoals = predictor.predict(
         scaled['start'], scaled.get('goal'), places['start'], places.get('goal'),
         num_samples=args.samples, recursion_depth=args.recursion, seed=args.seed)
-    factor = np.array(pictures['start'].shape[1::-1]) / size[::-1]
+    left, top, *extent = windows['start']
     for subgoal in subgoals:
         print(f'{_title(subgoal, len(subgoals))}{":" if len(places["start"]) else ""}')
         for k, (where, mass) in enumerate(zip(subgoal.expected_pixels, subgoal.mass), start=1):
-            u, v = (where + 0.5) * factor - 0.5 + corner
+            u, v = (where + 0.5) * extent / size[::-1] - 0.5 + (left, top)
             faint = ', hardly in the picture' if mass < FAINT else ''
             print(f'  object {k} at {u:.1f},{v:.1f} (mass {mass:.2f}{faint})')
     write_atomically(args.out, labelled(scaled, places, subgoals))
@@ -158,27 +144,32 @@ def read_pixels(words: Sequence[str], option: str) -> np.ndarray:
     return np.array(pixels, np.float32).reshape(-1, 2)
 
 
-def fit(picture: np.ndarray, pixels: np.ndarray, size: Sequence[int],
+def fit(picture: np.ndarray, window: Sequence[int], pixels: np.ndarray, size: Sequence[int],
         name: str) -> tuple[np.ndarray, np.ndarray]:
     """
-    Scale a picture, and positions in it, to what the weights take.
+    Cut and scale a picture, and positions in it, to what the weights take.
 
-    :param picture: uint8 (H, W, 3), as wide as high if `size` is.
-    :param pixels: (K, 2), (u, v) in it.
+    :param picture: uint8 (H, W, 3).
+    :param window: left, top, width and height of the part, as wide as high if `size` is.
+    :param pixels: (K, 2), (u, v) in the picture.
     :param size: (height, width).
     :param name: how errors call it.
     :return: uint8 (height, width, 3) and float32 (K, 2).
     :raises ImageError: for another shape, or a position outside.
     """
-    H, W = picture.shape[:2]
+    left, top, W, H = window
     if W * size[0] != H * size[1]:
         raise ImageError(f'{name}: {W}x{H} pixels (width x height); the weights take pictures of '
                          f'the shape {size[1]}x{size[0]}; say which part of it is used, by --crop '
                          'centre or --crop LEFT,TOP,SIDE')
-    if not in_picture(pixels, (H, W)).all():
-        raise ImageError(f'{name}: an object is outside its {W}x{H} pixels; expected column,row '
-                         'in the picture as it is in the file')
-    return resize_image(picture, size), resize_pixels(pixels, (H, W), size)
+    inside = pixels - np.float32([left, top])
+    if not in_picture(inside, (H, W)).all():
+        raise ImageError(
+            f'{name}: an object is outside the part that the weights see, {W}x{H} pixels from '
+            f'column {left}, row {top} on; expected column,row in the picture as it is in the '
+            'file; leave others out in both pictures')
+    return (resize_image(picture[top:top + H, left:left + W], size),
+            resize_pixels(inside, (H, W), size))
 
 
 def labelled(pictures: dict[str, np.ndarray], pixels: dict[str, np.ndarray],

@@ -16,7 +16,7 @@ from tap_ros.images.drawing import grey_panels, grid
 from tap_ros.images.pixels import to_float, to_uint8
 from tap_ros.prediction.batches import Augmentation, Batch, episode_order, make_batch, Sampling
 from tap_ros.prediction.losses import l1_error
-from tap_ros.prediction.marks import learn_marks, prefer, tell
+from tap_ros.prediction.marks import weigh
 from tap_ros.prediction.methods import todays_settings
 from tap_ros.prediction.networks import Prediction, PredictorConfig, PredictorNetwork
 from tap_ros.prediction.objective import (
@@ -27,22 +27,20 @@ from tap_ros.prediction.objective import (
     predictor_loss,
 )
 from tap_ros.prediction.predictor import load_network
-from tap_ros.prediction.preference import still
 from tap_ros.prediction.selection import Targets
 from tap_ros.prediction.training_config import DEFAULTS, TrainingConfig
 from tap_ros.prediction.training_networks import Discriminator, Recognition
-from tap_ros.recording.cache import EpisodeStore
-from tap_ros.recording.marks import read_marks
 from tap_ros.training import run
 from tap_ros.training.checkpoints import TrainingState
 from tap_ros.training.devices import Autocast, make_autocast, pick_precision
-from tap_ros.training.frames import Frames, MappedFrames, ResidentFrames
-from tap_ros.training.inpainted import fill, Filled
+from tap_ros.training.frames import MappedFrames, ResidentFrames
+from tap_ros.training.inpainted import fill
 import torch
 
 DISCRIMINATOR_RATE = 2e-4  # their learning rate at its highest
 _SHOWN = 8  # episodes in a sample picture
 Item = tuple[int, Batch, Augmentation]  # of a step
+Gather = Callable[..., Batch]  # make_batch, of episodes, a Sampling and a numpy Generator
 
 
 def train(config: TrainingConfig, stop_at: int | None = None, progress: bool = True,
@@ -64,11 +62,8 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
     if config.patience and not len(this.held_out):
         raise ConfigError('patience: nothing is held out to see improvement by; give --held-out, '
                           'a --test-fraction above 0, or leave --patience out')
-    network = PredictorNetwork(network_config(config, store.image_size))
-    if config.initial_weights and not this.checkpoint.exists():
-        _begin_with(network, config.initial_weights)
-    state = this.begin(network, _helpers(config, network.config, store),
-                       lambda old: {**DEFAULTS, **todays_settings(old)})
+    network, helpers = _make_networks(this)
+    state = this.begin(network, helpers, lambda old: {**DEFAULTS, **todays_settings(old)})
     state.precision = state.precision or pick_precision(config.precision, device)
     autocast = make_autocast(state.precision, device)
     # Decoding and copying would be most of the time of a step on a GPU.
@@ -76,9 +71,13 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
                    if device.type == 'cuda' else MappedFrames)
     frames = make_frames(store)
     filled = fill(store, config.robot_mask, make_frames, this.progress)
-    preference, about = _learn(this)
-    helpers: dict[str, Any] = dict(state.helpers.items())
-    networks = Networks(state.network, **helpers)
+    preference, about = weigh(store, config, this.training)
+
+    def gather(episodes: np.ndarray, sampling: Sampling,
+               rng: np.random.Generator | None = None) -> Batch:
+        return make_batch(store, episodes, sampling, frames, rng, filled, preference)
+
+    networks = Networks(state.network, **dict[str, Any](state.helpers.items()))
 
     def step(item: Item) -> Callable[[], run.Numbers]:
         number, batch, augmentation = item
@@ -88,26 +87,39 @@ def _prepare(this: run.Run) -> run.Course[PredictorNetwork, Item]:
         return lambda: _values(outcome, batch) | {'gradient_norm': norm.item()}
 
     return run.Course(
-        state, partial(_batches, store, frames, filled, this.training, config,
-                       preference=preference), step,
-        partial(_score, this, state, frames, filled, preference, autocast),
+        state, partial(_batches, gather, this.training, config), step,
+        partial(_score, gather, this, state, autocast),
         (config.learning_rate, DISCRIMINATOR_RATE), about, config.patience)
 
 
-def _learn(this: run.Run) -> tuple[list[np.ndarray] | None, dict[str, Any]]:
-    """Return w of the frames of every episode, and what the weights file tells of the marks."""
+def _make_networks(this: run.Run) -> tuple[PredictorNetwork, dict[str, torch.nn.Module]]:
+    """Make the network, and those that the method needs for its training alone."""
     config, store = this.config, this.store
-    if config.selection == 'still':
-        return prefer(store, [still] * config.recursion, config.robot_mask), {}
-    if not config.marks:
-        return None, {}
-    marks = read_marks(config.marks, store)
-    learned = learn_marks(store, marks, this.training, config.recursion, config.forward,
-                          config.robot_mask)
-    tell(learned.about)
-    return prefer(store, learned.preferences, config.robot_mask), {'marks': {
-        'sha256': marks.digest, 'levels': learned.about,
-        'preferences': [preference.to_json() for preference in learned.preferences]}}
+    check_trainable(store.image_size, 'the predictor')
+    vae, longest = config.latent == 'vae', int(store.lengths.max())
+    shape = PredictorConfig(
+        image_size=store.image_size[0], base_width=config.base_width,
+        num_context=1 if config.forward else 2, latent_size=config.latent_size if vae else 0,
+        new_pixels=config.new_pixels, decoder=config.decoder, skips=config.skips)
+    network, helpers = PredictorNetwork(shape), dict[str, torch.nn.Module]()
+    if config.initial_weights and not this.checkpoint.exists():
+        other, _ = load_network(config.initial_weights)
+        mine, others = asdict(network.config), asdict(other.config)
+        if differing := [f'{name} {others[name]!r} instead of {mine[name]!r}'
+                         for name in mine if mine[name] != others[name]]:
+            raise ConfigError(
+                f'initial_weights: {config.initial_weights} are for another network: '
+                f'{", ".join(differing)}; leave these options out, or begin with other weights')
+        network.load_state_dict(other.state_dict())
+    if vae:
+        images = (config.video_frames if config.posterior == 'video'
+                  else shape.num_context + 1)
+        helpers['recognition'] = Recognition(shape, images, config.posterior_std)
+    if config.gan:
+        helpers['discriminator'] = Discriminator(shape, longest - 1)
+    if config.gan and vae:
+        helpers['posterior_discriminator'] = Discriminator(shape, longest - 1)
+    return network, helpers
 
 
 def _step(state: TrainingState[PredictorNetwork], networks: Networks, batch: Batch,
@@ -137,9 +149,8 @@ def _step(state: TrainingState[PredictorNetwork], networks: Networks, batch: Bat
     return outcome, norm
 
 
-def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episodes: np.ndarray,
-             config: TrainingConfig, first: int, last: int,
-             preference: list[np.ndarray] | None = None) -> Iterator[Item]:
+def _batches(gather: Gather, episodes: np.ndarray, config: TrainingConfig, first: int,
+             last: int) -> Iterator[Item]:
     """Yield (step, Batch, Augmentation), made two steps ahead in another thread."""
     whole = config.latent == 'vae' and config.posterior == 'video'
     sampling = Sampling(
@@ -150,7 +161,7 @@ def _batches(store: EpisodeStore, frames: Frames, filled: Filled | None, episode
     def make(step: int) -> Item:
         rng = np.random.default_rng([config.seed, 2, step])
         chosen = episodes[episode_order(len(episodes), config.batch_size, config.seed, step)]
-        batch = make_batch(store, chosen, sampling, frames, rng, filled, preference)
+        batch = gather(chosen, sampling, rng)
         augmentation = Augmentation.draw(
             len(chosen), config.flip, config.colour, config.brightness, rng)
         return step, batch, augmentation
@@ -173,8 +184,7 @@ def _values(outcome: Outcome, batch: Batch) -> dict[str, float]:
     return {name: value.item() for name, value in values.items()}
 
 
-def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames,
-           filled: Filled | None, preference: list[np.ndarray] | None,
+def _score(gather: Gather, this: run.Run, state: TrainingState[PredictorNetwork],
            autocast: Autocast) -> tuple[run.Numbers, Mapping[str, np.ndarray]]:
     """Score the averaged network, z at 0, where its method matches; show some of all."""
     config, held_out = this.config, this.held_out
@@ -182,13 +192,9 @@ def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames
         config.margin, goal_picture='recorded' if config.goal_picture == 'recorded' else 'last',
         forward=config.forward, fraction=config.only_fraction, fill_context=config.fill_context)
 
-    def batch(episodes: np.ndarray) -> Batch:
-        return make_batch(this.store, episodes, sampling, frames, filled=filled,
-                          preference=preference).to(this.device)
-
     scores, pictures, losses, copied, fractions = {}, {}, [], [], []
     for i in range(0, len(held_out), 64):
-        part = batch(held_out[i:i + 64])
+        part = gather(held_out[i:i + 64], sampling).to(this.device)
         prediction, match = matched(state.average, part, config, autocast)
         frame = to_float(part.targets[torch.arange(len(match), device=match.device), match])
         image = part.visible(prediction.image[:, None])[:, 0]
@@ -203,7 +209,7 @@ def _score(this: run.Run, state: TrainingState[PredictorNetwork], frames: Frames
                   'match_fraction_std': shares.std(correction=0).item()}
     for name, episodes in (('training', this.training), ('held_out', held_out)):
         if len(episodes):
-            shown = batch(episodes[:_SHOWN])
+            shown = gather(episodes[:_SHOWN], sampling).to(this.device)
             pictures[name] = sample_grid(shown, *matched(state.average, shown, config, autocast))
     return scores, pictures
 
@@ -261,47 +267,3 @@ def kl_share(step: int, steps: int, warmup: float) -> float:
     :return: the share, 0 to 1.
     """
     return min(1.0, max(0.0, step / (warmup * steps) - 1)) if warmup else 1.0
-
-
-def network_config(config: TrainingConfig, image_size: tuple[int, int]) -> PredictorConfig:
-    """
-    Say which network a training run needs.
-
-    :param image_size: (height, width) of the recordings.
-    :return: PredictorConfig.
-    :raises ConfigError: if the pictures are not square, or of a size that it cannot have.
-    """
-    check_trainable(image_size, 'the predictor')
-    return PredictorConfig(image_size=image_size[0], base_width=config.base_width,
-                           num_context=1 if config.forward else 2,
-                           latent_size=config.latent_size if config.latent == 'vae' else 0,
-                           new_pixels=config.new_pixels, decoder=config.decoder,
-                           skips=config.skips)
-
-
-def _begin_with(network: PredictorNetwork, weights: str) -> None:
-    """Copy the weights of another training into a fresh network."""
-    other, _ = load_network(weights)
-    if other.config != network.config:
-        mine, others = asdict(network.config), asdict(other.config)
-        raise ConfigError(f'initial_weights: {weights} are for another network: ' + ', '.join(
-            f'{name} {others[name]!r} instead of {mine[name]!r}'
-            for name in mine if mine[name] != others[name])
-            + '; leave these options out, or begin with other weights')
-    network.load_state_dict(other.state_dict())
-
-
-def _helpers(config: TrainingConfig, shape: PredictorConfig,
-             store: EpisodeStore) -> dict[str, torch.nn.Module]:
-    """Make the networks that the method needs for its training alone."""
-    helpers: dict[str, torch.nn.Module] = {}
-    longest = int(store.lengths.max())
-    if config.latent == 'vae':
-        images = (config.video_frames if config.posterior == 'video'
-                  else shape.num_context + 1)
-        helpers['recognition'] = Recognition(shape, images, config.posterior_std)
-    if config.gan:
-        helpers['discriminator'] = Discriminator(shape, longest - 1)
-        if config.latent == 'vae':
-            helpers['posterior_discriminator'] = Discriminator(shape, longest - 1)
-    return helpers

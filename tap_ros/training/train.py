@@ -50,8 +50,7 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
         raise ConfigError(f'model {model!r} is unknown; valid: {", ".join(_TRAINERS)}')
     paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)
     bags = tuple(str(path) for path in paths)
-    config_class, function = (getattr(import_module(module), name) for module, name in (
-        place.split(':') for place in _TRAINERS[model]))
+    config_class, function = _trainer(model)
     known = [field.name for field in fields(config_class)]
     for name in settings:
         if name not in known:
@@ -66,6 +65,12 @@ def train(recordings: str | Path | Sequence[str | Path], out: str | Path = '',
     chosen = find_recipe(model, recipe or recipe_of(model, bags, settings))
     return Path(function(config_class(recordings=bags, out=str(out or f'runs/{model}'), **{
         **_chosen_settings(chosen, settings), **settings})))
+
+
+def _trainer(model: str) -> list[Any]:
+    """Return the class of a model's settings, and the function that trains it."""
+    return [getattr(import_module(module), name) for module, name in (
+        place.split(':') for place in _TRAINERS[model])]
 
 
 def shape_of(model: str, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,7 +151,6 @@ def settings_of(args: TrainOptions) -> dict[str, Any]:
 
 def run_training(model: Model, args: TrainOptions) -> None:
     """Train with the options' settings, and print where the weights are."""
+    config_class, function = _trainer(model)
     settings = settings_of(args)
-    weights = train(settings.pop('recordings'), settings.pop('out'), model,
-                    args.recipe or DEFAULT[model], **settings)
-    print(weights)
+    print(function(config_class(**{**settings, 'out': settings['out'] or f'runs/{model}'})))
