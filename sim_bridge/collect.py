@@ -11,12 +11,13 @@ collection goes on with the files that are not there yet.
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 import json
-import math
+from math import inf, nan
 from pathlib import Path
 import time
 from typing import Annotated, Any
 
 import numpy as np
+from sim_bridge.demonstrations import to_episode
 from sim_bridge.gym_pushes import POLICIES, record_pushes
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.simulator import Simulator
@@ -139,10 +140,9 @@ def collect(folder: str | Path, config: CollectConfig, engine: Engine = LOCAL,
 
 def _check(config: CollectConfig) -> None:
     """Raise ConfigError, or SceneError, for what cannot be collected."""
-    check_fields(config, {'misses': (0, 1), 'episodes': (1, math.inf),
-                          'episodes_per_file': (1, math.inf)})
-    if config.frames:  # 0: as is usual for the task
-        check_fields(config, {'frames': (MIN_FRAMES, MAX_FRAMES)})
+    check_fields(config, {
+        'misses': (0, 1), 'episodes': (1, inf), 'episodes_per_file': (1, inf),
+        **({'frames': (MIN_FRAMES, MAX_FRAMES)} if config.frames else {})})  # 0: the usual ones
     if config.world != TABLE:
         usual = CollectConfig()
         said = [name for name in ('timing', 'misses', 'look', 'appearance', 'arm')
@@ -186,15 +186,10 @@ def _collect_missing(folder: Path, config: CollectConfig, engine: Engine,
 
     return {
         'episodes': len(every('outcomes')), 'frames': sum(every('frames')),
-        'success_rate': _mean([outcome == 'success' for outcome in every('outcomes')]),
-        'mean_final_distance': _mean(every('distances')),
+        'success_rate': float(np.mean([one == 'success' for one in every('outcomes')] or nan)),
+        'mean_final_distance': float(np.mean(every('distances') or nan)),
         'seconds': {'wall': time.perf_counter() - start, 'act': sum(every('act')),
                     'write': sum(every('write'))}}
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Return the mean; NaN of nothing."""
-    return float(np.mean(values)) if len(values) else float('nan')
 
 
 def _check_settings(folder: Path, config: CollectConfig) -> None:
@@ -309,25 +304,10 @@ def make_episode(simulator: Simulator, observations: Sequence[Observation], acti
     hold, the last frame itself. The expert's own goal, from which the outcome
     follows, is drawn again from the seed by tasks.sample_scene.
 
-    :param simulator: Simulator that made it.
-    :param observations: list of T Observations.
-    :param actions: (T, 4) float32.
-    :param outcome: 'success', 'failure' or 'interrupted'.
-    :param start_ns: added to the stamps.
-    :return: Episode.
+    :param simulator: Simulator that made it; the others: see to_episode.
     """
     goal = observations[-1]
     if simulator.task.photographed:
         goal = simulator.photograph(goal.object_poses)
-    return Episode(
-        frames=np.stack([o.image for o in observations]),
-        stamps=np.array([o.stamp_ns + start_ns for o in observations], np.int64),
-        actions=actions,
-        grippers=np.stack([o.gripper for o in observations]),
-        object_names=observations[0].object_names,
-        object_pixels=np.stack([o.object_pixels for o in observations]),
-        object_poses=np.stack([o.object_poses for o in observations]),
-        goal_frame=goal.image, goal_pixels=goal.object_pixels, goal_poses=goal.object_poses,
-        object_source='ground_truth', task=simulator.task.name, seed=simulator.seed,
-        outcome=outcome,
-        robot_masks=np.stack([o.robot_mask for o in observations]), goal_mask=goal.robot_mask)
+    return to_episode(observations, actions, goal, simulator.task_name, simulator.seed, outcome,
+                      start_ns)

@@ -7,10 +7,12 @@ Speed, a detour before the script begins, pauses and noise are drawn from a seed
 A camera beside the robot and the commands are recorded: what a user has of another's robot.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from sim_bridge.world_protocol import Observation
 from tap_ros.recording.episode import Episode
 
 MOST_FRAMES, LEAST_FRAMES = 70, 12
@@ -101,6 +103,27 @@ def demonstrate(stage: Stage, seed: int, num_frames: int = 0) -> Demonstration:
         goal_pixels=np.zeros((0, 2), np.float32), goal_poses=np.zeros((0, 7)),
         task=stage.task_name, seed=seed, outcome='success' if done else 'failure')
     return Demonstration(episode, find_bottleneck(np.stack(hands), np.stack(places)))
+
+
+def to_episode(seen: Sequence[Observation], actions: np.ndarray, goal: Observation, task: str,
+               seed: int, outcome: str, start_ns: int = 0) -> Episode:
+    """
+    Put what was observed and done into an Episode; where objects are is ground truth.
+
+    :param seen: T Observations; actions: (T, 4) float32; goal: Observation of the goal.
+    :param outcome: 'success', 'failure' or 'interrupted'.
+    :param start_ns: added to the stamps.
+    """
+    return Episode(
+        frames=np.stack([one.image for one in seen]),
+        stamps=np.array([one.stamp_ns + start_ns for one in seen], np.int64),
+        actions=actions, grippers=np.stack([one.gripper for one in seen]),
+        object_names=seen[0].object_names,
+        object_pixels=np.stack([one.object_pixels for one in seen]),
+        object_poses=np.stack([one.object_poses for one in seen]),
+        goal_frame=goal.image, goal_pixels=goal.object_pixels, goal_poses=goal.object_poses,
+        object_source='ground_truth', task=task, seed=seed, outcome=outcome,
+        robot_masks=np.stack([one.robot_mask for one in seen]), goal_mask=goal.robot_mask)
 
 
 def find_bottleneck(hands: np.ndarray, places: np.ndarray) -> tuple[int, int] | None:

@@ -11,6 +11,7 @@ apart. Where objects are is ground truth, and labelled so.
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from sim_bridge.demonstrations import to_episode
 from sim_bridge.gym_world import GymWorld
 from sim_bridge.tasks.pushes import Push, push_actions
 from tap_ros.contract import LIFTED
@@ -89,15 +90,5 @@ def record_pushes(world: GymWorld, seed: int, policy: str) -> Episode:
     for action in POLICIES[policy](world, rng):
         actions.append(action)
         seen.append(world.step(action))
-    goal = world.goal()
-    return Episode(
-        frames=np.stack([one.image for one in seen]),
-        stamps=np.array([one.stamp_ns for one in seen], np.int64),
-        actions=np.array([*actions, np.zeros(4)], np.float32),
-        grippers=np.stack([one.gripper for one in seen]),
-        object_names=seen[0].object_names,
-        object_pixels=np.stack([one.object_pixels for one in seen]),
-        object_poses=np.stack([one.object_poses for one in seen]),
-        goal_frame=goal.image, goal_pixels=goal.object_pixels, goal_poses=goal.object_poses,
-        object_source='ground_truth', task=world.task_name, seed=seed, outcome=world.outcome(),
-        robot_masks=np.stack([one.robot_mask for one in seen]), goal_mask=goal.robot_mask)
+    done = np.array([*actions, np.zeros(4)], np.float32)
+    return to_episode(seen, done, world.goal(), world.task_name, seed, world.outcome())

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 import logging
+from math import inf
 import multiprocessing
 from multiprocessing import connection
 import os
@@ -26,7 +27,7 @@ import sys
 import threading
 from typing import Annotated, Any, Literal, TypeAlias
 
-from tap_ros.errors import ConfigError, EngineError
+from tap_ros.errors import check_fields, ConfigError, EngineError
 from tap_ros.options import default_text
 from tap_ros.text import escaped
 from tyro import conf
@@ -51,11 +52,8 @@ class Engine:
     address: Annotated[str, conf.arg(metavar='HOST:PORT', help_behavior_hint=default_text)] = ''
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for an unknown engine, or options that do not fit it."""
-        if self.name not in ('local', 'ray'):
-            raise ConfigError(f'engine: expected local or ray, got {self.name!r}')
-        if self.workers < 0:
-            raise ConfigError(f'workers: expected 0 or more, got {self.workers}')
+        """Raise ConfigError for options that do not fit."""
+        check_fields(self, {'workers': (0, inf)})
         if self.address and self.name != 'ray':
             raise ConfigError(f'address: {self.address!r} is for --engine ray')
 

@@ -20,14 +20,11 @@ from experiments.paper.names import (
 )
 import numpy as np
 import pandas as pd
-from tap_ros.evaluation.bottleneck import THRESHOLDS, VISIBLE
+from tap_ros.evaluation.bottleneck import THRESHOLDS
 from tap_ros.evaluation.intervals import bootstrap
 from tap_ros.evaluation.shown import SHOWN
 
-# Of the samples of a VAE.
-SPREADS = ('sample_spread', 'sample_spread_near', 'sample_spread_elsewhere', 'sample_spread_px')
 RESAMPLES = 1000
-BESIDE = 0.1  # a match within this share of the episode from an input lies beside it
 PLACE, PICK = 0.8, 0.2  # least and most of the object's way behind it, for these two moments
 _DIGITS = 6
 _NONE = np.empty((1, 0))
@@ -95,18 +92,16 @@ def _group(key, runs, part, of=''):
     """Stack the scores of runs."""
     parts = [run['evaluation'][part] for run in runs]
     names = [name for name in ('min_l1', 'match_step', 'match_fraction', 'changed_l1',
-                               'bottleneck', 'object_mass', 'hand', 'objects')
+                               'bottleneck', 'hand', 'objects')
              if all(name in part for part in parts)]
     scores = {name: np.array([part[name] for part in parts], float) for name in names}
-    wanted = (*SPREADS, 'target_bottleneck', 'bottleneck_at') if part == 'prediction' else ()
-    for name in wanted:
-        if all(name in run['evaluation'] for run in runs):
-            scores[name] = np.array([run['evaluation'][name] for run in runs], float)
+    if part == 'prediction' and all('target_bottleneck' in run['evaluation'] for run in runs):
+        scores['target_bottleneck'] = np.array(
+            [run['evaluation']['target_bottleneck'] for run in runs], float)
     if part == 'prediction' and all('recursion' in run['evaluation'] for run in runs):
-        for name in ('way', 'hand', 'objects'):
-            scores[f'recursion_{name}'] = np.array(
-                [[level[name] for level in run['evaluation']['recursion']] for run in runs],
-                float).swapaxes(1, 2)  # S, N, levels
+        scores['way'] = np.array(  # S, N, levels
+            [[level['way'] for level in run['evaluation']['recursion']] for run in runs],
+            float).swapaxes(1, 2)
     names = ' '.join(run['name'] for run in runs)
     return Group(key, scores, names, of)
 
@@ -121,13 +116,11 @@ def make_rows(groups):
         the best of 100.
         Bottlenecks are scored without new pixels only, which have no origin to follow (App. E).
         min_l1 is the per-pixel mean on [0, 1], match_step counts frames from the start picture
-        (0), bottleneck_frequency and gains are shares, bottleneck_median_px is in pixels. In
-        visible_bottleneck_frequency no object may be left out, see bottleneck.VISIBLE;
-        target_bottleneck_frequency is that of the true frames at a fixed time, bottleneck_at when
-        in an episode, 0 to 1, the bottleneck is. shows_both is the share of predictions that show
-        the hand and the objects (shown.ShownScorer). place is the share whose match has the
-        objects PLACE of their way behind them, pick_after_place the share of those of which the
-        next level's match has them PICK of it behind them; with _shown it shows both as well.
+        (0), bottleneck_frequency and gains are shares; target_bottleneck_frequency is that of the
+        true frames at a fixed time. shows_both is the share of predictions that show the hand and
+        the objects (shown.ShownScorer). Of those whose match has the objects PLACE of their way
+        behind them, pick_after_place is the share of which the next level's match has them PICK
+        of it behind them.
     """
     rows = [_row(group, metric, lambda array, statistic=statistic: statistic(array, -1).mean(0),
                  values, by_seed=' '.join(f'{x:.6g}' for x in statistic(values, -1)))
@@ -142,47 +135,22 @@ def _measures(group):
     for metric in ('min_l1', 'match_step', 'match_fraction'):
         yield metric, np.mean, known.get(metric, _NONE)
     yield 'match_step_std', np.std, known.get('match_step', _NONE)
-    share, has_goal = known.get('match_fraction', _NONE), group.key['mode'] == 'bidirectional'
-    yield 'match_beside_input', np.mean, (share < BESIDE) | (share > 1 - BESIDE) & has_goal
-    for metric in ('changed_l1', *SPREADS):
-        yield metric, np.mean, known.get(metric, _NONE)
+    yield 'changed_l1', np.mean, known.get('changed_l1', _NONE)
     if {'hand', 'objects'} <= set(group.scores):
         both = np.minimum(group.scores['hand'], group.scores['objects'])
         yield 'shows_both', np.mean, both[:, np.isfinite(both).all(0)] >= SHOWN
-    yield from _recursion_measures(group.scores)
+    if 'way' in group.scores:
+        first, second = np.moveaxis(group.scores['way'], -1, 0)
+        place = first >= PLACE  # not of NaN
+        if place.any(1).all():
+            yield 'pick_after_place', _mean_of_known, np.where(place, second <= PICK, np.nan)[
+                :, place.any(0)]
     if group.key.get('new_pixels'):
         return
-    yield 'bottleneck_at', np.mean, known.get('bottleneck_at', _NONE)
-    if 'bottleneck' in known:
-        placed = known['bottleneck']
-        visible = group.scores['object_mass'][
-            :, np.isfinite(group.scores['bottleneck']).all(0)] >= VISIBLE
-        for threshold in THRESHOLDS:
-            found = placed <= threshold
-            yield f'bottleneck_frequency_{threshold}px', np.mean, found
-            yield f'visible_bottleneck_frequency_{threshold}px', np.mean, found & visible
-        yield 'bottleneck_median_px', np.median, placed
+    for threshold in THRESHOLDS:
+        yield (f'bottleneck_frequency_{threshold}px', np.mean,
+               known.get('bottleneck', _NONE) <= threshold)
     yield 'target_bottleneck_frequency_2px', np.mean, known.get('target_bottleneck', _NONE) <= 2
-
-
-def _recursion_measures(scores):
-    """Yield what recursion_way tells; NaN marks episodes that a share is not of."""
-    if 'recursion_way' not in scores:
-        return
-    first, second = scores['recursion_way'][..., 0], scores['recursion_way'][..., 1]
-    known = np.isfinite(first).all(0)
-    if not known.any():
-        return
-    place = first >= PLACE
-    yield 'place', np.mean, place[:, known]
-    # Where the matched frame does not show them, nothing is known of hand and objects.
-    shown = np.minimum(*(scores[f'recursion_{name}'][..., 1] for name in ('hand', 'objects')))
-    pick = second <= PICK
-    for metric, of, found in (
-            ('pick_after_place', place, pick),
-            ('pick_after_place_shown', place & np.isfinite(shown), pick & (shown >= SHOWN))):
-        if of.any(1).all():
-            yield metric, _mean_of_known, np.where(of, found, np.nan)[:, of.any(0)]
 
 
 def _mean_of_known(values, axis):
@@ -237,24 +205,15 @@ def find_baseline(group, groups):
 
 
 def _gain_rows(groups):
-    """Compare each method with fix: by error, and by how far apart their matches are."""
+    """Compare the error of each method with that of fix."""
     rows = []
     for group in groups:
         baseline = find_baseline(group, groups)
         if baseline is None or group.key['method'].startswith('fix'):
             continue
-        about = {'baseline': baseline.key['method']}
         rows.append(_row(group, 'gain_over_fix', relative_gain, group.scores['min_l1'],
-                         baseline.scores['min_l1'], **about))
-        for metric in ('match_step', 'match_fraction'):
-            if metric in group.scores:
-                rows.append(_row(group, f'{metric}_minus_fix', _difference, group.scores[metric],
-                                 baseline.scores[metric], **about))
+                         baseline.scores['min_l1'], baseline=baseline.key['method']))
     return rows
-
-
-def _difference(values, baseline):
-    return values.mean((0, -1)) - baseline.mean((0, -1))
 
 
 def _best_rows(groups):
@@ -338,15 +297,9 @@ def lower_hull(at, points):
 
 def as_frame(rows):
     """
-    Make a table of rows, for the functions below and for all that shows them.
+    Make a table of rows, for all that shows them.
 
     :param rows: of make_rows.
     :return: DataFrame; new_pixels is NA for copying.
     """
     return pd.DataFrame(rows, columns=COLUMNS).astype({'new_pixels': 'boolean'})
-
-
-def select(rows, task, mode, new_pixels=True):
-    """Choose the rows (of as_frame) of one setting; those of copying belong to both variants."""
-    return rows[(rows['task'] == task) & (rows['mode'] == mode)
-                & (rows['new_pixels'] == new_pixels).fillna(True)]

@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a trained run scores on the episodes of its task that training held out."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 import time
 
 from experiments.paper.runs import SCALE
 import numpy as np
 from tap_ros.errors import ConfigError
-from tap_ros.evaluation.bottleneck import bottleneck_share, MIN_MOTION, target_bottlenecks
+from tap_ros.evaluation.bottleneck import MIN_MOTION, target_bottlenecks
 from tap_ros.evaluation.prediction import evaluate
 from tap_ros.evaluation.samples import score_samples
-from tap_ros.evaluation.shown import ShownScorer
 from tap_ros.images.pixels import to_float
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.losses import l1_errors, match_step
@@ -51,19 +50,16 @@ def score(run, config, weights, places):
     if run.shifted:
         scores['shifted'], hashes = _shifted(run, network, store, held_out, places)
     if config.new_pixels and config.mode == 'bidirectional' and config.latent == 'none':
-        scores['recursion'] = [_rounded(level) for level in score_recursion(
-            network, store, held_out)]
-    if not config.new_pixels:
-        scores['bottleneck_at'] = _rounded_list(
-            [bottleneck_share(store[i]) for i in held_out])
+        scores['recursion'] = [
+            {name: _rounded_list(values) for name, values in level.items()}
+            for level in score_recursion(network, store, held_out)]
     if config.loss == 'fix' and config.mode == 'bidirectional':
         scores['target_bottleneck'] = _rounded_list(
             target_bottlenecks([store[i] for i in held_out], config.fraction, 'last'))
     if network.config.latent_size:
         samples = _rounded(score_samples(network, store, held_out))
-        for name in [name for name in samples if name.startswith('spread')]:
-            scores[f'sample_{name}'] = samples.pop(name)
-        scores['best_of_100'] = samples
+        scores['best_of_100'] = {name: values for name, values in samples.items()
+                                 if not name.startswith('spread')}
     seconds = round(time.perf_counter() - began, 1)
     return {
         'name': run.name, 'task': run.task, 'mode': run.mode, 'method': run.method,
@@ -106,26 +102,6 @@ def _rounded_list(values):
             for x in values]
 
 
-@dataclass(frozen=True)
-class LevelScores:
-    """
-    Measurements of the predictions of one level for N episodes.
-
-    :param min_l1: (N,), error against the best matching frame between start and goal.
-    :param match_step: (N,), the time of that frame.
-    :param way: (N,), which share of their way the objects have behind them in that frame, 0 to 1;
-        NaN where none moves MIN_MOTION pixels or positions are unknown.
-    :param hand: (N,), how much of the hand is shown, see shown.ShownScorer; NaN where unknown.
-    :param objects: (N,), likewise of the objects.
-    """
-
-    min_l1: np.ndarray
-    match_step: np.ndarray
-    way: np.ndarray
-    hand: np.ndarray
-    objects: np.ndarray
-
-
 @torch.inference_mode()
 def score_recursion(network, store, episodes):
     """
@@ -134,27 +110,24 @@ def score_recursion(network, store, episodes):
     :param network: Predictor in eval mode, without z, with start and goal as context.
     :param store: the EpisodeStore.
     :param episodes: indices of at least one episode, each of at least 3 frames.
-    :return: list of LevelScores, the first level first.
+    :return: list of dicts, the first level first: min_l1, (N,), error against the best matching
+        frame between start and goal; way, (N,), see way_behind, in that frame.
     """
     device = next(network.parameters()).device
-    rows = [[] for _ in range(LEVELS)]
+    levels = [{'min_l1': [], 'way': []} for _ in range(LEVELS)]
     for at in range(0, len(episodes), _BATCH):
         chosen = episodes[at:at + _BATCH]
         batch = make_batch(store, chosen, Sampling(goal_picture='last')).to(device)
         context = to_float(batch.context)
-        scorers = [ShownScorer(store[i]) for i in chosen]
-        for level in rows:
+        for level in levels:
             image = network(context).image
             context = torch.stack([context[:, 0], image.clamp(-1, 1)], 1)
             errors = l1_errors(batch.visible(image[:, None]), batch.targets.movedim(-1, 2))[:, 0]
             match = match_step(errors, batch.valid)[:, None]
-            times = batch.times.gather(1, match)[:, 0].tolist()
-            pictures = ((image + 1) / 2).movedim(1, -1).cpu().numpy()
-            level.extend(
-                (error, time, way_behind(store[i].object_pixels, time),
-                 *scorer.score(picture, time)) for i, error, time, scorer, picture in zip(
-                    chosen, errors.gather(1, match)[:, 0].tolist(), times, scorers, pictures))
-    return [LevelScores(*map(np.array, zip(*level))) for level in rows]
+            level['min_l1'] += errors.gather(1, match)[:, 0].tolist()
+            level['way'] += [way_behind(store[i].object_pixels, time) for i, time in zip(
+                chosen, batch.times.gather(1, match)[:, 0].tolist())]
+    return levels
 
 
 def way_behind(pixels, time):

@@ -45,7 +45,6 @@ TASKS = ('metaworld/coffee-push-v3', 'metaworld/door-open-v3', 'metaworld/peg-in
 ASIDE = {'metaworld/faucet-open-v3': 0, 'metaworld/dial-turn-v3': 0, 'metaworld/plate-slide-v3': 0,
          'metaworld/button-press-topdown-v3': 5000, 'ogbench/drawer': 5000}
 HELD_OUT = 40  # demonstrations of each task
-STRIPS = 6  # demonstrations that are drawn, of each task
 FOUND = 0.75, 0.85  # of the demonstrations, exactly or within a frame: a task counts as found
 FRAMES = 'frames, in the bottleneck'  # a column
 
@@ -112,9 +111,7 @@ def score_tasks(tasks, methods, args, prefix=''):
                     world=world, task=task, episodes=episodes, seed=seed,
                     image_size=args.image_size, episodes_per_file=10), args.engine)
         training, held_out = map(read, (folder, held_out_of(folder)))
-        drawn = [strip(one) for one in held_out[:STRIPS]]
-        cv2.imwrite(str(folder / 'bottlenecks.png'), grid(drawn)[..., ::-1])
-        strips += drawn[:1]
+        strips.append(strip(held_out[0]))
         for seed in range(args.seeds):
             mark(folder, training, seed)
         # Of keyframes all are held out that no seed marks.

@@ -114,12 +114,10 @@ def read_picture(path: str | Path) -> np.ndarray:
 
     :param path: of a JPEG, PNG or WebP file.
     :return: uint8 (H, W, 3) rgb.
-    :raises ImageError: when it is not there, is no picture, or is damaged.
+    :raises ImageError: when it is no picture, or is damaged; OSError: when it is not there.
     """
     try:
         return decompress(Path(path).read_bytes(), Path(path).suffix[1:], _LARGEST)
-    except OSError as error:
-        raise ImageError(f'{escaped(path)}: {error.strerror}; give a picture file') from error
     except ImageError as error:
         raise ImageError(f'{escaped(path)}: {error}') from error
 

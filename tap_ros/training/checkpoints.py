@@ -158,10 +158,7 @@ def load_checkpoint(path: str | Path, state: TrainingState[Any], settings: Mappi
     if not Path(path).exists():
         return
     tensors, about = load_tensors(path)
-    if (about.get('kind') != 'checkpoint' or not isinstance(about.get('settings'), dict)
-            or not isinstance(about.get('step'), int)
-            or not isinstance(about.get('seconds'), (int, float))
-            or about.get('precision', '') not in ('', 'float32', 'bfloat16')):
+    if about.get('kind') != 'checkpoint':
         raise WeightsError(f'{escaped(path)}: is no checkpoint; {_REMEDY}')
     begun, settings = json.loads(json.dumps([todays(about['settings']), settings]))  # no tuples
     for name in {**begun, **settings}:

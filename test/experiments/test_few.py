@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Few demonstrations: who is trained on, who stops a training and who is scored."""
 
-import json
 from pathlib import Path
 
 from experiments import few
 import numpy as np
 import pytest
 from tap_ros.evaluation.prediction import EpisodeScores
-
-RESULTS = Path(__file__).parents[2] / 'docs' / 'results'
 
 
 def test_no_demonstration_is_scored_by_weights_that_have_seen_it(tmp_path, monkeypatch):
@@ -38,8 +35,3 @@ def test_no_demonstration_is_scored_by_weights_that_have_seen_it(tmp_path, monke
         assert name not in recordings | stopping and stopping and stopping < recordings
     assert rows[0] == {'demonstration': '1', 'error': 0.2, 'copying': 0.3}
     assert few.relative(rows)[1].value == pytest.approx(2 / 3)
-
-
-def test_the_page_is_made_from_the_data():
-    found = json.loads((RESULTS / 'few.json').read_text())
-    assert few.page(found) == (RESULTS / 'few.md').read_text()

@@ -76,20 +76,14 @@ def places(tmp_path_factory):
 def test_a_run_leaves_a_number_for_every_held_out_episode(places):
     scores = {run.name: find_result(run, places)['evaluation'] for run in (
         WARPING, PAINTING, SAMPLED, FORWARD)}
-    warping = scores[WARPING.name]
-    for method in ('prediction', 'copy-start', 'copy-goal'):
-        assert {name: len(values) for name, values in warping[method].items()} == dict.fromkeys(
-            ('min_l1', 'match_step', 'match_fraction', 'changed_l1', 'bottleneck', 'object_mass',
-             'hand', 'objects', 'copying'), 2)
-    for name, count in {'arm_elsewhere': 2, **dict.fromkeys(SHIFTED, len(SEEDS))}.items():
-        assert len(warping['shifted'][name]['copy-goal']['min_l1']) == count
-    assert len(warping['bottleneck_at']) == 2
+    assert all(len(values) == 2 for method in ('prediction', 'copy-start', 'copy-goal')
+               for values in scores[WARPING.name][method].values())
     sampled, painting = scores[SAMPLED.name], scores[PAINTING.name]
     assert all(best <= one for best, one in zip(
         sampled['best_of_100']['min_l1'], sampled['prediction']['min_l1']))
     first, second = painting['recursion']
     assert first['min_l1'] == painting['prediction']['min_l1'] != second['min_l1']
-    assert 'copy-start' in scores[FORWARD.name] and 'copy-goal' not in scores[FORWARD.name]
+    assert 'copy-goal' not in scores[FORWARD.name]
     assert find_result(replace(WARPING, seed=1), places) is None
     path = places.result(FORWARD)
     path.write_text('{"torn": ')

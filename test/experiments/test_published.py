@@ -6,7 +6,7 @@ from io import StringIO
 import json
 import re
 
-from experiments import tables
+from experiments import few, tables, tracking
 from experiments.paper import published
 from experiments.paper import rows as rows_of_scores
 from experiments.paper.results import load_runs, on_same_episodes
@@ -21,6 +21,7 @@ from experiments.tables import (
     RESULTS,
     STACKING,
 )
+from experiments.worlds import command
 from pandas import read_csv
 import pytest
 from tap_ros.evaluation.intervals import Interval
@@ -41,6 +42,16 @@ def test_the_gains_of_the_text_are_those_of_table_1():
 @pytest.mark.parametrize('page', ['prediction', 'planning', 'stacking'])
 def test_tables_are_made_from_the_data(page):
     assert tables.filled(page) == (RESULTS / f'{page}.md').read_text()
+
+
+def test_pages_are_made_from_the_data():
+    def rows(name):
+        return json.loads((RESULTS / f'{name}.json').read_text())
+
+    for name, page in (
+            ('few', few.page(rows('few'))), ('worlds', command.page(rows('worlds'))),
+            ('tracking', tracking.page(rows('tracking'), tracking.loop(RESULTS / 'tracking')))):
+        assert page == (RESULTS / f'{name}.md').read_text(), name
 
 
 def test_numbers_of_predictions_are_made_from_the_scores(monkeypatch):

@@ -3,7 +3,6 @@
 """Keyframes of foreign demonstrations, and how often they are the true bottleneck."""
 
 import json
-from pathlib import Path
 
 from experiments.worlds import command
 from made_episodes import move_squares, write_bag
@@ -42,20 +41,6 @@ def test_scores_are_shares_of_the_demonstrations_with_their_intervals():
     assert rows['slowest']['hit']['value'] == rows['10 marks']['near']['value'] == 1
     assert rows['UVD-like']['hit'] | {'low': 0} == {'value': 0, 'low': 0, 'high': pytest.approx(
         0.0876, abs=1e-3)} and rows['slowest']['n'] == 40
-    rows = [row | {'task': 'a/b'} for row in rows.values()]
-    runs = [{'task': 'a/b', 'method': 'marks', 'hit': [1, 0], 'near': [1, by]} for by in (0, 1)]
-    page = command.page(rows + command.average(runs))
-    assert '| a b | 16, 2.0 | 14%, 29% | 100%, 100%' in page
-    assert 'Seeds, at least: marks 2.' in page and '50%, 75%' in page
-    assert '| **found** |  | **0 of 1** |\n' in page  # by marks; 'random' is not the last column
-    aside = [row | {'task': 'aside/c/d'} for row in rows + command.average(runs)]
-    assert 'with 2 seeds' in command.page(rows + command.average(runs) + aside).split('aside')[1]
-
-
-def test_the_page_is_made_from_the_data():
-    results = Path(__file__).parents[2] / 'docs' / 'results'
-    rows = json.loads((results / 'worlds.json').read_text())
-    assert command.page(rows) == (results / 'worlds.md').read_text()
 
 
 def test_bottlenecks_are_read_by_their_stamps(tmp_path):

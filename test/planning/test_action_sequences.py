@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from tap_ros.contract import LIFTED, LOW
 from tap_ros.planning.action_sequences import (
-    join,
     landings,
     Limits,
     MOVES,
@@ -29,17 +28,6 @@ def random_parameters(count=20, seed=0):
 
 def heights(actions, start):
     return start + actions[..., 2].astype(float).cumsum(1)
-
-
-def test_the_first_segment_is_as_short_as_the_phase_says():
-    for phase in range(3):
-        parameters = join(np.tile([[0.01, 0.0], [0.02, 0.0]], (3, 1)), 1, phase)
-        actions, = SHAPE.actions(SHAPE.clip(parameters[None]), LIFTED)
-        first = 3 - phase
-        np.testing.assert_allclose(actions[:first, 0], 0.01, atol=1e-7)
-        assert actions[first, 2] < -0.1 and not actions[first, 0]  # it comes down on the spot
-        np.testing.assert_allclose(actions[first + 1:first + 3, 0], 0.02, atol=1e-7)
-        assert SHAPE.clip(parameters[None] + 9)[0, -1] == 2
 
 
 def test_the_arm_does_not_move_sideways_while_it_climbs_and_pushes_slowly():

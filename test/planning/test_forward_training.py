@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of the forward model's windows, loss and training, also with a robot that is masked."""
 
-from dataclasses import asdict, replace
-import json
+from dataclasses import replace
 
 from made_episodes import cover, write_bag
 import numpy as np
@@ -18,7 +17,6 @@ from tap_ros.planning.table import project
 from tap_ros.recording.cache import open_recordings
 from tap_ros.training.inpainted import FilledStore
 from tap_ros.training.robot_mask import fill_from_past
-from tap_ros.training.weights import load_tensors
 import torch
 from toy_world import ARM, make_episode, SIZE, TABLE, to_pixels
 
@@ -41,8 +39,7 @@ def test_windows_without_the_gripper_are_refused_by_the_number_of_their_episode(
 
 
 def test_mirrored_windows_show_objects_where_the_mirrored_table_says():
-    plain, episode = windows(False)
-    flipped, _ = windows(True)
+    (plain, episode), (flipped, _) = windows(False), windows(True)
     torch.testing.assert_close(flipped.images, plain.images.flip(-1))
     square = torch.from_numpy(episode.object_poses[2, :1, :2]).float()
     pixels = project(flipped.homography[0], square * torch.tensor([-1.0, 1.0]))
@@ -50,13 +47,14 @@ def test_mirrored_windows_show_objects_where_the_mirrored_table_says():
     expected[:, 0] = 31 - expected[:, 0]
     torch.testing.assert_close(pixels, expected, atol=1e-4, rtol=0)
     torch.testing.assert_close(flipped.actions[..., 0], -plain.actions[..., 0])
-    torch.testing.assert_close(flipped.grippers[..., 1:], plain.grippers[..., 1:])
 
 
 def test_the_loss_is_that_of_the_chosen_pictures_and_what_moves_costs_a_little(model):
     batch, _ = windows(False)
     config = ForwardTrainingConfig(
         recordings=('x',), out='x', still_weight=0.5, object_weight=0.25)
+    forward_loss(model, batch, {2, 4}, config)[0].backward()
+    assert all(p.grad is not None and p.grad.any() for p in model.parameters())
     losses = {steps: forward_loss(model, batch, set(steps), config)
               for steps in ((1,), (4,), (1, 4))}
     for loss, parts in losses.values():
@@ -117,15 +115,6 @@ def test_a_step_draws_what_its_seed_and_number_say_and_windows_grow():
     assert not torch.equal(batch.images, draw(61)[0].images)
 
 
-def test_every_part_of_the_model_learns(model):
-    batch, _ = windows(False)
-    config = ForwardTrainingConfig(recordings=('x',), out='x')
-    loss, parts = forward_loss(model.train(), batch, {2, 4}, config)
-    loss.backward()
-    still = [n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()]
-    assert not still and parts['picture'] > 0
-
-
 def config_for(bag, out, **changes):
     config = ForwardTrainingConfig(
         recordings=(str(bag),), out=str(out), steps=4, batch_size=2, horizon=3, pictures=2,
@@ -142,12 +131,6 @@ def test_resumed_training_equals_uninterrupted_training(bag, tmp_path):
     assert first.keys() == second.keys()
     for name, value in first.items():
         assert torch.equal(value, second[name]), name
-    run, config, scores = (json.loads((tmp_path / 'a' / f'{name}.json').read_text())
-                           for name in ('run', 'config', 'scores'))
-    assert run['steps'] == 4 and run['episodes'] + run['held_out'] == 30
-    assert config == json.loads(json.dumps(asdict(config_for(bag, tmp_path / 'a'))))
-    told = load_tensors(resumed)[1]['training']
-    assert (told['settings'], told['scores'], told['steps']) == (config, scores, 4)
     # Another training begins with these weights, but not with their picture of the arm.
     begins = {'steps': 1, 'learning_rate': 1e-9, 'initial_weights': resumed}
     begun = load_file(train(config_for(bag, tmp_path / 'c', **begins), progress=False))

@@ -5,16 +5,9 @@
 from dataclasses import replace
 
 import numpy as np
-from tap_ros.planning.table import (
-    fit_arm,
-    fit_projection,
-    fit_table,
-    mirror_table,
-    project,
-    Table,
-)
+from tap_ros.planning.table import fit_arm, fit_projection, fit_table, project, Table
 import torch
-from toy_world import ARM, make_episode, MIDDLE, TABLE
+from toy_world import ARM, make_episode, TABLE
 
 TILTED = np.array([[62.0, 12.0, -15.0, 31.5], [0.1, -37.0, -58.0, 27.0], [0.0, 0.37, -0.48, 1.0]])
 
@@ -36,15 +29,10 @@ def test_arm_camera_and_table_are_found_in_recordings():
     points = torch.tensor([[-0.3, -0.2, 0], [0.3, 0.1, 0], [0, 0, 0]], dtype=torch.float64)
     true = project(torch.tensor(ARM, dtype=torch.float64).view(3, 4), points)
     assert (project(torch.from_numpy(arm), points) - true).abs().max() < 1.5
+    blind = [replace(episodes[0], object_poses=np.full((18, 2, 7), np.nan))]
+    np.testing.assert_array_equal(fit_table(blind, arm), arm[:, [0, 1, 3]])
     table = fit_table(episodes, arm)
     np.testing.assert_allclose(table / table[2, 2], np.reshape(TABLE, (3, 3)), atol=0.01)
-
-
-def test_without_object_positions_the_table_is_the_grippers_plane():
-    blind = [replace(make_episode(seed), object_poses=np.full((18, 2, 7), np.nan))
-             for seed in range(3)]
-    arm = np.reshape(ARM, (3, 4))
-    np.testing.assert_array_equal(fit_table(blind, arm), arm[:, [0, 1, 3]])
 
 
 def test_maps_sum_to_one_and_have_their_mean_at_the_pixel():
@@ -54,12 +42,3 @@ def test_maps_sum_to_one_and_have_their_mean_at_the_pixel():
     torch.testing.assert_close(maps.sum((1, 2)), torch.ones(2))
     mean = maps.flatten(1) @ table.pixels().flatten(0, 1)
     torch.testing.assert_close(mean, pixels, atol=1e-3, rtol=0)
-
-
-def test_mirrored_table_puts_mirrored_points_at_mirrored_pixels():
-    table = torch.from_numpy(TILTED[:, [0, 1, 3]]).float()
-    points = torch.tensor([[0.2, 0.1], [-0.3, 0.4]])
-    pixels = project(table, points)
-    mirrored = project(mirror_table(table, 32), points * torch.tensor([-1.0, 1.0]))
-    torch.testing.assert_close(mirrored[:, 0], 2 * MIDDLE - pixels[:, 0])
-    torch.testing.assert_close(mirrored[:, 1], pixels[:, 1])

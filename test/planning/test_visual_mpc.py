@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tap_ros.errors import PlanningError
-from tap_ros.planning.action_sequences import FULL, HORIZON
-from tap_ros.planning.cost import LAST_WEIGHT
+from tap_ros.planning.action_sequences import FULL
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig, with_preset
+from tap_ros.planning.mpc_config import PRESETS, VisualMPCConfig
 from tap_ros.planning.mpc_inputs import Scene
 from tap_ros.planning.protocols import SearchConfig
 from tap_ros.planning.visual_mpc import Memory, VisualMPC
@@ -22,7 +21,6 @@ SMALL = VisualMPCConfig(search=SearchConfig(12, 2, 4), proposals=4, batch_size=1
 IMAGE = np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8)
 GRIPPER = np.array([0.05, -0.1, 0.01, 0.0], np.float32)
 PIXELS = np.array([[20.0, 17.0], [9.0, 9.0]])
-DISTANCE = np.random.default_rng(1).uniform(0, 30, (2, 44 * 44))  # px, of each table cell
 GOALS = np.array([[24.0, 15.0], [9.0, 14.0]])
 
 
@@ -92,7 +90,7 @@ def nan(values):
     return values
 
 
-def test_a_bad_scene_is_named(model):
+def test_a_bad_scene_or_goal_is_named(model):
     mpc, scene = VisualMPC(model, SMALL), Scene(IMAGE, GRIPPER, PIXELS)
     for wrong, name in (
             ({'image': IMAGE[:16]}, 'image'), ({'gripper': nan(GRIPPER)}, 'gripper'),
@@ -102,10 +100,6 @@ def test_a_bad_scene_is_named(model):
             ({'object_pixels': PIXELS[:1]}, '2 goals for 1 objects')):
         with pytest.raises(PlanningError, match=name):
             mpc.plan(replace(scene, **wrong), mpc.goal(GOALS))
-
-
-def test_a_bad_goal_is_named(model):
-    mpc = VisualMPC(model, SMALL)
     for wrong, name in (
             ({'pixels': GOALS + 30}, 'outside the 32x32 picture'),
             ({'pixels': nan(GOALS)}, r'goal_pixels.*\[0\]'), ({}, 'one of pixels and maps'),
@@ -113,12 +107,3 @@ def test_a_bad_goal_is_named(model):
             ({'maps': np.zeros((2, 32, 32))}, 'goal_maps')):
         with pytest.raises(PlanningError, match=name):
             mpc.goal(**wrong)
-
-
-def test_the_preset_paper_has_the_papers_numbers():
-    paper = with_preset('paper')
-    assert (paper.search.num_samples, paper.search.num_iterations, paper.search.num_elites) == (
-        200, 3, 10)
-    assert HORIZON == 15 and LAST_WEIGHT == 10
-    assert not paper.warm_start and not paper.proposals
-    assert not paper.recheck and not paper.unfinished and not paper.clearance

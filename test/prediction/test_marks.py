@@ -14,7 +14,7 @@ import pytest
 from tap_ros.errors import ConfigError
 from tap_ros.prediction.batches import make_batch, Sampling
 from tap_ros.prediction.mark_command import Marking, Server
-from tap_ros.prediction.marks import chance, learn_marks
+from tap_ros.prediction.marks import learn_marks
 from tap_ros.prediction.networks import Prediction
 from tap_ros.prediction.objective import Networks, predictor_loss
 from tap_ros.prediction.preference import FLOOR, Preference
@@ -74,17 +74,13 @@ def test_marks_of_something_else_are_refused_with_the_file_and_the_reason(bag, s
 
     for data, said in (
             ({'recording': str(other)}, 'none of those that are read'),
-            ({'episode': 24}, 'expected 0 to 23'), ({'episode': 'x'}, 'episode x'),
-            ({'stamps': [begin - 1]}, 'outside'), ({'stamps': [end + 1]}, 'outside'),
-            ({'stamps': [begin]}, 'start or the goal'), ({'stamps': []}, 'list of seconds'),
+            ({'episode': 24}, 'expected 0 to 23'), ({'stamps': [begin - 1]}, 'outside'),
+            ({'stamps': [end + 1]}, 'outside'), ({'stamps': [begin]}, 'start or the goal'),
             ({'stamps': [begin + 1, begin + 0.5]}, 'in order'), ({'stamps': 3}, 'list of seconds'),
-            ({'stamps': [float('nan')]}, 'as seconds'), ('[]', 'no file of marks'),
-            ('{"marks": [{"episode": 1}]}', 'no file of marks'), ('{', 'no file of marks')):
+            ({'stamps': [float('nan')]}, 'as seconds'), ('{', 'no file of marks')):
         assert said in refusal(data), data
     entry = {'recording': str(bag), 'episode': 0, 'stamps': [begin + 0.5]}
     assert 'marked above' in refusal(json.dumps({'marks': [entry, entry]}))
-    with pytest.raises(ConfigError, match='tap_ros mark'):
-        read_marks(tmp_path / 'none.json', store)
 
 
 class Showing(torch.nn.Module):
@@ -113,17 +109,9 @@ def test_the_learned_preference_is_of_the_frame_whatever_piece_is_shown(store):
             valid = batch.valid[b]
             assert batch.preference[b][:, valid].numpy() == pytest.approx(
                 preference[b][:, (late + batch.times[b][valid]).tolist()])
-    grey = torch.zeros(8, 3, 32, 32)
-    seen = []
-
-    def noted(module, inputs, outputs):
-        seen.append(inputs[0])
-
-    network = Showing(grey)
-    network.register_forward_hook(noted)
-    match = predictor_loss(Networks(network), batch, None, config).match
+    network = Networks(Showing(torch.zeros(8, 3, 32, 32)))
+    match = predictor_loss(network, batch, None, config).match
     assert (batch.times.gather(1, match[:, None]) == batch.end - 2).all()
-    assert len(seen) == 2
 
 
 def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_path, capsys):
@@ -153,11 +141,6 @@ def test_a_training_learns_from_marks_and_tells_of_them(bag, store, marks, tmp_p
             replace(config, **values)
     with pytest.raises(ConfigError, match='mark some of those that are not held out'):
         learn_marks(store, read_marks(marks, store), np.array([23]), 1, False, 'none')
-
-
-def test_by_chance_a_mark_is_hit_as_often_as_it_is_wide():
-    assert chance((4, 4), 12) == 0.3 and chance((1, 1), 12) == 0.2
-    assert chance((3, 6), 12, 0) == 0.4
 
 
 @pytest.fixture
@@ -194,12 +177,9 @@ def test_the_page_shows_frames_and_writes_marks_at_once(page, bag, store):
     assert visited[1] == 23 and 8 < visited[2] < 15  # far from those before
     state = json.load(ask('mark', b'{"episode": 5, "frames": []}'))
     assert state['next'] == 5 and 5 not in read_marks(path, store).episodes
-    assert Marking(store, [str(bag)], path).state() == json.loads(
-        json.dumps(state), object_hook=lambda d: {int(k) if k.isdecimal() else k: v
-                                                  for k, v in d.items()})
+    assert json.loads(json.dumps(Marking(store, [str(bag)], path).state())) == state
     before = path.read_bytes()
     for place, data, headers, code in (
-            ('mark', b'{"episode": 99, "frames": [1]}', {}, 400),
             ('mark', b'{"episode": 1, "frames": [0]}', {}, 400), ('mark', b'x', {}, 400),
             ('mark', b'{"episode": 1, "frames": [1]}', {'Origin': 'http://evil.example'}, 403),
             ('state', None, {'Host': 'evil.example'}, 403), ('frame/99/0', None, {}, 404),

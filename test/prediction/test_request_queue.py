@@ -62,21 +62,6 @@ def made():
         rig.queue.close()
 
 
-def test_what_waits_is_answered_together_within_the_limits_and_beyond_them_refused(made):
-    rig = made(cost=lambda one: one, max_together=3, max_cost=10, max_waiting=8)
-    rig.hold()
-    for one in (1, 2, 3, 4, 5, 6, 50, 1):
-        rig.put(one)
-    assert len(rig.queue) == 8
-    with pytest.raises(Busy, match='^busy: 8 requests are waiting'):
-        rig.put(7)
-    rig.go.set()
-    rig.wait(9)
-    assert rig.batches == [[0], [1, 2, 3], [4, 5], [6], [50], [1]]
-    rig.put(8)  # there is room again
-    assert rig.wait(10)[8] == -8
-
-
 def test_an_error_reaches_only_who_caused_it(made):
     for bad in ({3}, {1, 5}, {1, 2, 3, 4, 5}):
         def work(batch, bad=bad):

@@ -2,10 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of warping pictures and object maps."""
 
-import pytest
 from tap_ros.prediction.warp import (
-    blur,
-    combine,
     expected_pixels,
     one_hot_maps,
     warp,
@@ -32,8 +29,6 @@ def test_output_is_read_from_where_the_flow_points_to():
     images = images[:1]
     warped = warp(images, constant_flow(3, -2))
     assert warped[..., 2:, :-3].allclose(images[..., :-2, 3:], atol=1e-4)
-    half = warp(images, constant_flow(0.5, 0))
-    assert half[..., :-1].allclose((images[..., :-1] + images[..., 1:]) / 2, atol=1e-4)
     far = warp(images, constant_flow(1000, 0))  # outside is the border
     assert far.allclose(images[..., -1:].expand_as(images), atol=1e-5)
     # Each context has its own flow.
@@ -42,13 +37,6 @@ def test_output_is_read_from_where_the_flow_points_to():
     warped = warp(images, flow)
     assert warped[:, 0].allclose(images[:, 0], atol=1e-5)
     assert warped[:, 1, ..., :-4].allclose(images[:, 1, ..., 4:], atol=1e-4)
-
-
-def test_combine_blends_by_masks_with_the_new_pixels_last():
-    warped = torch.stack([torch.full((1, 3, *SIZE), value) for value in (0.0, 1.0)], 1)
-    new = torch.full((1, 3, *SIZE), 10.0)
-    image = combine(warped, masks_for([0.5, 0.3, 0.2]), new)
-    assert image.allclose(torch.full_like(image, 2.3))
 
 
 def test_one_hot_maps_sum_to_1_with_their_mean_at_the_pixel():
@@ -105,11 +93,3 @@ def test_masks_choose_the_context_of_an_object_that_stays_where_it_was_if_all_av
     assert expected_pixels(warped.maps)[0].allclose(0.75 * start + 0.25 * goal, atol=1e-4)
     hidden = warp_object_maps(maps, away, masks_for([0.0, 0.0, 1.0]))
     assert expected_pixels(hidden.maps)[0].allclose((start + goal) / 2, atol=1e-4)
-
-
-def test_blur_has_a_deviation_of_one_pixel_in_both_directions():
-    blurred = blur(one_hot_maps(torch.tensor([15.0, 10.0]), SIZE))
-    for dim, middle in ((0, 15.0), (1, 10.0)):
-        share = blurred.sum(dim)
-        variance = (share * (torch.arange(len(share)) - middle) ** 2).sum()
-        assert variance.sqrt().item() == pytest.approx(1, abs=0.01)

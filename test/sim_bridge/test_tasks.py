@@ -49,12 +49,6 @@ def tracks(observations):
     return np.array([o.object_poses[0, :3] for o in observations]), grippers[:, :3], grippers[:, 3]
 
 
-def closing(actions):
-    """Return the frame at which the fingers have just closed on the object."""
-    opening = actions[:-1, 3]
-    return int(np.flatnonzero((opening[:-1] == 1) & (opening[1:] == 0))[0]) + 2
-
-
 @gripping
 def test_what_is_grasped_is_held_as_long_as_the_fingers_are_closed(simulator, episodes):
     frames, places = set(), []
@@ -62,7 +56,8 @@ def test_what_is_grasped_is_held_as_long_as_the_fingers_are_closed(simulator, ep
         assert len(observations) == len(actions) == NUM_FRAMES[simulator.task.name]
         assert not actions[-1].any(), 'nothing is done after the last frame'
         objects, grippers, opening = tracks(observations)
-        first = closing(actions)
+        opened = actions[:-1, 3] == 1  # then the fingers have just closed on the object:
+        first = int(np.flatnonzero(opened[:-1] & (actions[1:-1, 3] == 0))[0]) + 2
         if outcome != 'success':
             continue
         assert 0.15 < opening[first + 1] < 0.8, 'as far as the object is thick'

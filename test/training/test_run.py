@@ -11,7 +11,7 @@ import signal
 
 import pytest
 from tap_ros.cli import main
-from tap_ros.errors import ConfigError, RecordingError, StorageError, WeightsError
+from tap_ros.errors import ConfigError, StorageError, WeightsError
 from tap_ros.files import only_writer
 from tap_ros.prediction.training import train
 from tap_ros.prediction.training_config import TrainingConfig
@@ -78,9 +78,7 @@ def test_ctrl_c_saves_what_a_training_has(half, runs, monkeypatch, capsys):
             '--save-every', '2', '--precision', 'float32', '--margin', '1']) == 130
     out, told = capsys.readouterr()
     assert out == '' and '3 of 4 steps are saved' in told
-    for name, found in (('checkpoint', 'step'), ('predictor', 'training')):
-        about = load_tensors(Path(half.out, f'{name}.safetensors'))[1][found]
-        assert (about if name == 'checkpoint' else about['steps']) == 3
+    assert load_tensors(Path(half.out, 'predictor.safetensors'))[1]['training']['steps'] == 3
     train(half, progress=False)
     assert same(half, runs)
 
@@ -88,9 +86,7 @@ def test_ctrl_c_saves_what_a_training_has(half, runs, monkeypatch, capsys):
 @pytest.mark.parametrize('change', [
     lambda path: path.write_bytes(path.read_bytes()[:-9]),
     lambda path: path.write_bytes(path.with_name('predictor.safetensors').read_bytes()),
-    lambda path: save_tensors(path, {}, load_tensors(path)[1]),
-    lambda path: save_tensors(path, load_tensors(path)[0], {'kind': 'checkpoint'})],
-    ids=['cut', 'other', 'empty', 'undescribed'])
+    lambda path: save_tensors(path, {}, load_tensors(path)[1])], ids=['cut', 'other', 'empty'])
 def test_a_damaged_or_foreign_checkpoint_is_one_line(half, change):
     path = Path(half.out, 'checkpoint.safetensors')
     change(path)
@@ -166,15 +162,3 @@ def test_learning_rate_rises_and_falls_and_the_average_moves_fast_at_first():
             state.network.weight.copy_(before + 1)
         state.update_average(decay)
         assert torch.allclose(state.average.weight, before + (1 - stays), atol=1e-6)
-
-
-def test_what_is_held_out_must_hold_episodes_by_itself(tmp_path):
-    shutil.copytree(SAMPLE, tmp_path / 'bag')
-    first = next((tmp_path / 'bag').glob('*.mcap'))
-    shutil.copy(first, first.with_name('bag_1.mcap'))
-    first.rename(first.with_name('bag_0.mcap'))
-    (tmp_path / 'bag' / 'metadata.yaml').unlink()
-    parts = sorted((tmp_path / 'bag').glob('*.mcap'))
-    with pytest.raises(RecordingError, match='name whole bags'):
-        train(replace(CONFIG, recordings=(str(tmp_path / 'bag'),), held_out=(str(parts[1]),),
-                      out=str(tmp_path / 'run')), progress=False)

@@ -48,7 +48,7 @@ def test_split_is_complete_and_does_not_depend_on_what_else_there_is():
 
 
 @pytest.mark.parametrize('times', [
-    [*range(12)] * 2, [i // 2 for i in range(24)], [*range(12)] * 3,
+    [i // 2 for i in range(24)], [*range(12)] * 3,
     [i + shift for shift in (0, 0.4) for i in range(12)]])  # that camera begins a little later
 def test_cameras_of_one_demonstration_stay_on_one_side_without_seeds_too(times):
     for seed in (0, None):
@@ -59,8 +59,6 @@ def test_cameras_of_one_demonstration_stay_on_one_side_without_seeds_too(times):
     two_tasks.task = ['push', 'pull'] * 6
     training, held_out = split_episodes(two_tasks, 0.3)
     assert {i % 2 for i in training} == {0, 1} and len(held_out)
-    alone = Store([0, 0], times=[1, 1])
-    assert not len(split_episodes(alone, 0.3)[1])
 
 
 def test_something_is_left_to_train_on_and_one_of_several_scenes_is_always_held_out():
@@ -69,8 +67,6 @@ def test_something_is_left_to_train_on_and_one_of_several_scenes_is_always_held_
     for seeds in (range(2), range(20), [None] * 3):
         training, held_out = split_episodes(Store(seeds), 0.001)
         assert len(held_out) == 1 and len(training) == len(seeds) - 1
-    training, held_out = split_episodes(Store([5, 8, 5, 8]), 0.001)
-    assert len(held_out) == 2 and {i % 2 for i in training}.isdisjoint(i % 2 for i in held_out)
     assert not len(split_episodes(Store(range(20)), 0.0)[1])
     with pytest.raises(RecordingError, match='no episode has at least 100 frames'):
         split_episodes(Store(range(24)), 0.1, min_frames=100)
