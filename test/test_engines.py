@@ -81,8 +81,7 @@ def test_an_interrupted_run_leaves_no_worker(tmp_path):
 
 
 @pytest.mark.parametrize('engine, named', [
-    (('slurm',), 'engine: expected local or ray'), (('local', -1), 'workers'),
-    (('local', 0, 'auto'), 'is for --engine ray')])
+    (('local', -1), 'workers'), (('local', 0, 'auto'), 'is for --engine ray')])
 def test_bad_engines_are_refused(engine, named):
     with pytest.raises(ConfigError, match=named):
         Engine(*engine)

@@ -33,8 +33,6 @@ class Options:
     :param seed: of the first scene; 0: the usual one, in which nothing was trained.
     :param preset: settings of the planner.
     :param solver: what searches the actions.
-    :param plan_samples: samples of an iteration of the search; 0: the preset's.
-    :param plan_iterations: iterations of the search; 0: the preset's.
     :param forward_weights: of the forward model.
     :param device: of the networks: cpu or cuda.
     :param out: for planning.json, stacking.json and the scenes in planning/ and stacking/; an
@@ -52,8 +50,6 @@ class Options:
     engine: Engine = Engine()
     preset: Annotated[str, one_of(PRESETS)] = 'default'
     solver: Annotated[str, one_of(names('tap_ros.solvers'))] = 'cem'
-    plan_samples: int = 0
-    plan_iterations: int = 0
     forward_weights: ShippedFile = str(FORWARD_MODEL)
     device: str = 'cpu'
     out: Folder = 'docs/results'

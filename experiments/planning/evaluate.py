@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs what `python -m tap_ros evaluate planning` asks for, and writes its results."""
 
-from dataclasses import replace
 from pathlib import Path
 import shlex
 
@@ -13,7 +12,7 @@ from experiments.planning.runs import Job, load_results, run_jobs
 from sim_bridge.world.looks import DEFAULT_LOOK
 from tap_ros.errors import ConfigError
 from tap_ros.files import write_rows
-from tap_ros.planning.mpc_config import with_preset, with_samples
+from tap_ros.planning.mpc_config import with_preset
 from tap_ros.weights import find_predictor, FORWARD_MODEL
 
 # What the command paper calls the predictors that methods stand for.
@@ -25,8 +24,7 @@ RUNS = {base + suffix: name + text for base, name in _NAMES.items() for suffix, 
 TRAINED = 'runs/paper/small/{task}-bidirectional-{name}{warp}-s0/predictor.safetensors'
 # Options that change numbers, for the command that makes them again, with what is usual.
 TOLD = (('look', DEFAULT_LOOK), ('seed', 0), ('preset', 'default'), ('solver', 'cem'),
-        ('plan_samples', 0), ('plan_iterations', 0), ('forward_weights', str(FORWARD_MODEL)),
-        ('device', 'cpu'))
+        ('forward_weights', str(FORWARD_MODEL)), ('device', 'cpu'))
 
 
 def evaluate(args):
@@ -68,11 +66,6 @@ def make_jobs(args):
         stacking are left out where there are no weights of them.
     """
     planner = with_preset(args.preset, solver=args.solver)
-    if args.plan_samples:
-        planner = with_samples(planner, args.plan_samples)
-    if args.plan_iterations:
-        planner = replace(planner, search=replace(
-            planner.search, num_iterations=args.plan_iterations))
     named, jobs = {'shipped': '{task}'}, {}
     for text in args.predictor:
         name, found, named[name] = text.partition('=')

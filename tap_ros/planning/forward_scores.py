@@ -20,28 +20,22 @@ MOVED_PIXELS = 2.0  # an object counts at a step when it has moved further than 
 
 def held_out_scores(model: LearnedForwardModel, store: 'Episodes',
                     episodes: np.ndarray) -> dict[str, float]:
-    """Return what a training tells: map_errors, without object pixels picture_errors."""
-    return map_errors(model, store, episodes) or {
-        f'{name}_l1_{t}': float(np.nanmean(values))
-        for t, measured in measure_pictures(model, store, episodes).items()
-        for name, values in measured.items() if np.isfinite(values).any()}
-
-
-def map_errors(model: LearnedForwardModel, store: 'Episodes', episodes: Iterable[int],
-               stride: int = 8, max_windows: int = 400) -> dict[str, float]:
     """
-    Score the maps' expected pixels on recorded episodes, see measure_maps.
+    Return what a training tells.
 
-    :return: dict of `map_error_px_{t}`, `true_simulator_px_{t}`, `nothing_moves_px_{t}`, means
-        over the objects that moved by step t, and `moved_{t}`, how many those are; empty without
-        object pixels.
+    :return: means of measure_maps over the objects that moved by step t, `map_error_px_{t}` and
+        so on, and `moved_{t}`, how many those are; without object pixels those of
+        measure_pictures, `picture_l1_{t}` and so on.
     """
     scores = {}
-    for t, measured in measure_maps(model, store, episodes, stride, max_windows).items():
+    for t, measured in measure_maps(model, store, episodes).items():
         for name, values in measured.items():
             scores[f'{name}_px_{t}'] = float(values.mean())
         scores[f'moved_{t}'] = len(values)
-    return scores
+    return scores or {
+        f'{name}_l1_{t}': float(np.nanmean(values))
+        for t, measured in measure_pictures(model, store, episodes).items()
+        for name, values in measured.items() if np.isfinite(values).any()}
 
 
 @torch.no_grad()

@@ -44,7 +44,14 @@ def _prepare(this: run.Run) -> run.Course[LearnedForwardModel, Item]:
     config, store, training = this.config, this.store, this.training
     network = LearnedForwardModel(model_config(config, store, training))
     if config.initial_weights and not this.checkpoint.exists():
-        _begin_with(network, config.initial_weights)
+        path = FORWARD_MODEL if config.initial_weights == 'push' else config.initial_weights
+        others = LearnedForwardModel.load(path, precision='float32').state_dict()
+        del others['sprite']  # the picture of another arm
+        try:
+            network.load_state_dict(others, strict=False)
+        except RuntimeError as error:  # names the shapes
+            raise ConfigError(
+                f'initial_weights: {path} are for another network: {error}') from error
     state = this.begin(network, {}, lambda settings: {**DEFAULTS, **settings})
     # The picture that is looked at shows what a node would show; see FreeView.
     episodes: Episodes = store if config.robot_mask == 'none' else FilledStore(
@@ -71,17 +78,6 @@ def _prepare(this: run.Run) -> run.Course[LearnedForwardModel, Item]:
             for name, part in parts.items() if len(part)}
 
     return run.Course(state, batches, step, score, (config.learning_rate,))
-
-
-def _begin_with(network: LearnedForwardModel, weights: str) -> None:
-    """Copy the weights of another training into a fresh network, but for the arm's picture."""
-    path = FORWARD_MODEL if weights == 'push' else weights
-    others = LearnedForwardModel.load(path, precision='float32').state_dict()
-    kept = {name: value for name, value in others.items() if name != 'sprite'}
-    try:
-        network.load_state_dict(kept, strict=False)
-    except RuntimeError as error:  # names the shapes
-        raise ConfigError(f'initial_weights: {path} are for another network: {error}') from error
 
 
 def model_config(config: ForwardTrainingConfig, store: EpisodeStore,

@@ -126,8 +126,7 @@ def test_the_command_leaves_numbers_and_films_and_runs_nothing_again(
     out = tmp_path / 'results'
     words = ['evaluate', 'planning', '--tasks', 'push2', 'stack2', '--methods', 'nothing',
              'direct:steps2', 'shipped:carried:steps2', '--scenes', '1',
-             '--out', str(out), '--plan-samples', '8', '--plan-iterations', '1',
-             '--solver', 'icem']
+             '--out', str(out), '--preset', 'quick', '--solver', 'icem']
     assert main(words) == 0
     rows = json.loads((out / 'planning.json').read_text())
     assert {row['method'] for row in rows} == {

@@ -14,7 +14,7 @@ from sim_bridge.simulator import Simulator
 from tap_ros.cli import main
 from tap_ros.planning.carried_tracker import CarriedTracker
 from tap_ros.planning.forward_model import LearnedForwardModel
-from tap_ros.planning.forward_scores import held_out_scores, map_errors
+from tap_ros.planning.forward_scores import held_out_scores
 from tap_ros.recording.cache import open_recordings
 from tap_ros.tracking.protocols import View
 from tap_ros.weights import FORWARD_MODEL
@@ -29,7 +29,7 @@ def model():
 
 def test_object_maps_are_carried_to_where_recorded_pushes_led(model):
     episodes = list(islice(open_recordings(SAMPLE), 6))
-    scores = map_errors(model, episodes, range(len(episodes)))
+    scores = held_out_scores(model, episodes, range(len(episodes)))
     for t in (5, 10, 15):
         assert scores[f'map_error_px_{t}'] < 0.27 * scores[f'nothing_moves_px_{t}']
         assert scores[f'true_simulator_px_{t}'] < 0.02

@@ -120,7 +120,7 @@ def test_a_run_of_other_settings_or_of_another_process_is_not_continued(half):
 
 def test_patience_keeps_the_best_weights_and_ends_when_none_better_come(tmp_path, monkeypatch):
     scores = {1: 3.0, 2: 1.0, 3: 2.0, 4: 2.0, 5: 0.5}
-    monkeypatch.setattr('tap_ros.prediction.training._score', lambda this, state, *_: (
+    monkeypatch.setattr('tap_ros.prediction.training._score', lambda gather, this, state, *_: (
         {'relative': scores.get(state.step, 1.0)}, {}))
     patient = replace(CONFIG, patience=2, steps=9, save_every=1)
     held = {}
