@@ -74,7 +74,7 @@ def panels(networks, store, episodes):
 def draw(columns):
     """Draw columns of pictures uint8 (N, H, W, 3) below their headings; return bytes of a PNG."""
     rows = len(next(iter(columns.values())))
-    figure, axes = new_figure(1 + rows, len(columns), rows)
+    figure, axes = new_figure(1 + 0.9 * rows, len(columns), rows)
     for line, (heading, pictures) in zip(axes.T, columns.items()):
         line[0].set_title(heading.replace('-', '\n-').replace('+', '\n+').replace(' of ', ' of\n'),
                           fontsize=8, color=INK, va='bottom')
