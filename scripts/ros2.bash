@@ -2,8 +2,7 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
 #
-# Build the ros2 command, launch, tf2_msgs and simulation_interfaces into ros2/install, from the
-# official sources; there are no wheels of them. scripts/environment.bash finds them there. The
+# Build the ros2 command, launch and tf2_msgs into ros2/install, from the official sources; there are no wheels of them. scripts/environment.bash finds them there. The
 # Makefile calls this.
 #   ROS2_SOURCES=FOLDER takes the repositories from there: FOLDER/ros2cli and so on, git
 #   repositories with the tags below, or plain copies of such sources. Else they are cloned.
@@ -18,8 +17,7 @@ repositories=(  # owner/name, tag, folders that are needed
   'ros2/launch_ros 0.26.6 launch_ros ros2launch'
   'ros2/rosidl_runtime_py 0.13.1 .'
   'ros2/rcl_interfaces 2.0.2 composition_interfaces'
-  'ros2/geometry2 0.36.4 tf2_msgs'
-  'ros-simulation/simulation_interfaces 1.5.1 .')
+  'ros2/geometry2 0.36.4 tf2_msgs')
 
 # step 'what' command...: run quietly into the log, print one line with the time it took.
 step() {
@@ -81,7 +79,7 @@ mkdir -p ros2/src
 step 'Python packages' pip install --disable-pip-version-check --requirement requirements-ros2.txt \
   --constraint constraints.txt $PIP_ARGS
 step 'sources' get_all
-step 'ros2 command, launch, tf2_msgs, simulation_interfaces' build
+step 'ros2 command, launch, tf2_msgs' build
 rm -rf ros2/build ros2/src
 . scripts/environment.bash
 ros2 --help >/dev/null

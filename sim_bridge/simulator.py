@@ -3,29 +3,16 @@
 """The MuJoCo table with its tasks, a World: reset, step, observe. Knows nothing of ROS."""
 
 from collections.abc import Iterator, Sequence
-import math
 
-import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 from sim_bridge.tasks.tasks import get_task, sample_scene, task_names
 from sim_bridge.world.looks import DEFAULT_LOOK, GRIP_SPREAD
-from sim_bridge.world.table import lifted, OBJECT_QPOS_START, Table
+from sim_bridge.world.table import lifted, Table
 from sim_bridge.world_protocol import Observation
-from tap_ros.contract import WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 from tap_ros.robots.arm import DEFAULT_ARM
-from tap_ros.text import escaped, listing
-
-# Where objects may be put, x, y, z in m: as far as the arm could have pushed or lifted them.
-ROOM_HIGH = np.add(WORKSPACE_HIGH, 0.15)
-ROOM_LOW = ROOM_HIGH * (-1, -1, 0)
-MAX_SPEED = (2.0, 20.0)  # m/s, rad/s
-TOUCH = 0.002  # m that bodies at rest reach into each other
-
-
-class PoseError(SceneError):
-    """An object cannot be put there."""
+from tap_ros.text import listing
 
 
 class Simulator(Table):
@@ -98,7 +85,7 @@ class Simulator(Table):
         poses[:, :2] = places
         with self.unmoved():
             self.place(poses, self.target)
-            for first, second in self._overlaps(0.0):
+            for first, second in self._overlaps():
                 if {first, second} <= set(self.object_names):
                     raise SceneError(f'{first} and {second} would overlap; put them farther apart')
         self._show_goal(poses, None)
@@ -127,54 +114,15 @@ class Simulator(Table):
         """Return 'success' or 'failure', see Task.succeeds."""
         return 'success' if self.task.succeeds(self) else 'failure'
 
-    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike = (0,) * 6) -> None:
-        """
-        Put an object elsewhere, as a hand would; no time passes, `scene` and goal stay.
-
-        :param name: one of object_names.
-        :param pose: (7,) x, y, z in m, quaternion x, y, z, w.
-        :param velocity: (6,) m/s and rad/s along the axes of the world.
-        :raises PoseError: for a pose that is none or out of reach, and where the object would
-            reach into something; then it stays where it was.
-        :raises SceneError: for a velocity that is not finite or too fast; likewise.
-        """
-        if name not in self.object_names:
-            raise SceneError(f'{escaped(name)} is not in the scene')
-        pose, velocity = _check_pose(pose), _check_velocity(velocity)
-        # Of a free joint MuJoCo turns the angular velocity with the body.
-        turning = np.empty(3)
-        mujoco.mju_rotVecQuat(turning, velocity[3:], pose[[6, 3, 4, 5]] * (1, -1, -1, -1))
-        where, rates = pose[[0, 1, 2, 6, 3, 4, 5]], [*velocity[:3], *turning]
-        with self.unmoved():
-            self._put(name, where, rates)
-            for pair in self._overlaps(TOUCH):
-                if name in pair:
-                    other = pair[pair[0] == name].replace('world', 'the table')
-                    raise PoseError(f'{name} would reach into {other}')
-        self._put(name, where, rates)
-
-    def object_motions(self) -> np.ndarray:
-        """Return (K, 6): velocities along the axes of the world, m/s and rad/s."""
-        motions = self.data.qvel[OBJECT_QPOS_START:].reshape(-1, 2, 3).copy()
-        for name, motion in zip(self.object_names, motions):
-            motion[1] = self.data.body(name).xmat.reshape(3, 3) @ motion[1]
-        return motions.reshape(-1, 6)
-
     def _show_goal(self, poses: np.ndarray, gripper: np.ndarray | None) -> None:
         """Take the pictures of a goal, (K, 7) and as Task.goal_gripper."""
         self._goal = [self.photograph(poses, gripper, hide_arm) for hide_arm in (False, True)]
         self.goal_poses = self.goal().object_poses
 
-    def _put(self, name: str, where: np.ndarray, rates: ArrayLike) -> None:
-        """Set the free joint of an object."""
-        joint = self.data.joint(name)
-        joint.qpos, joint.qvel = where, rates
-        mujoco.mj_forward(self.model, self.data)
-
-    def _overlaps(self, depth: float) -> Iterator[tuple[str, str]]:
-        """Yield the names of bodies that reach into each other by more than so many m."""
+    def _overlaps(self) -> Iterator[tuple[str, str]]:
+        """Yield the names of bodies that reach into each other."""
         for geoms, distance in zip(self.data.contact.geom, self.data.contact.dist):
-            if distance < -depth:
+            if distance < 0:
                 first, second = self.model.geom_bodyid[geoms].tolist()
                 yield self.model.body(first).name, self.model.body(second).name
 
@@ -195,33 +143,3 @@ class Simulator(Table):
                     f'{name}: its goal would be at x {place[0]:.3f} m, y {place[1]:.3f} m, out '
                     f'of reach; in {task.name} objects are pushed to |x| and |y| of at most '
                     f'{limit:g} m')
-
-
-def _check_pose(pose: ArrayLike) -> np.ndarray:
-    """Return a pose (7,) with a quaternion of length 1; PoseError for one that cannot be."""
-    pose = np.asarray(pose, np.float64)
-    if pose.shape != (7,) or not np.isfinite(pose).all():
-        raise PoseError(f'pose ({_shown(pose)}): expected 7 finite numbers')
-    length = math.hypot(*pose[3:])  # which takes numbers of any size
-    if abs(length - 1) > 0.01:
-        raise PoseError(f'orientation ({_shown(pose[3:])}): expected a quaternion of length 1')
-    if (pose[:3] < ROOM_LOW).any() or (pose[:3] > ROOM_HIGH).any():
-        raise PoseError(
-            f'position ({_shown(pose[:3])}) m is out of reach; expected |x| and |y| of at most '
-            f'{ROOM_HIGH[0]:g} m, z from 0 to {ROOM_HIGH[2]:g} m')
-    return np.append(pose[:3], pose[3:] / length)
-
-
-def _check_velocity(velocity: ArrayLike) -> np.ndarray:
-    """Return a velocity (6,) in m/s and rad/s; SceneError for one that cannot be."""
-    velocity = np.asarray(velocity, np.float64)
-    if velocity.shape != (6,) or not np.less_equal(
-            (math.hypot(*velocity[:3]), math.hypot(*velocity[3:])), MAX_SPEED).all():
-        raise SceneError(
-            f'velocity ({_shown(velocity)}): expected 6 finite numbers, at most '
-            f'{MAX_SPEED[0]:g} m/s and {MAX_SPEED[1]:g} rad/s')
-    return velocity
-
-
-def _shown(numbers: np.ndarray) -> str:
-    return ', '.join(f'{number:.4g}' for number in numbers.ravel()[:7])

@@ -4,7 +4,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,15 +28,6 @@ class Observation:
     arm_joints: np.ndarray  # (J,) float64 rad, as Arm.joints; empty where there is no arm
 
 
-class RunState(IntEnum):
-    """What a simulation does; the numbers are those of simulation_interfaces/SimulationState."""
-
-    STOPPED = 0  # paused at the start of a scene
-    PLAYING = 1
-    PAUSED = 2
-    QUITTING = 3
-
-
 class World(Protocol):
     """
     A simulated world with one robot, one camera and tasks.
@@ -47,10 +37,10 @@ class World(Protocol):
 
     Some worlds can do more; who needs that asks by `ability`, which raises SceneError if the
     world lacks the method. The MuJoCo table, simulator.Simulator, has all of them:
-    `observer_picture()`, `move_goal(names, pixels)`, `put_object(name, pose, velocity)`,
-    `object_motions()`. Others may have `demonstrate(seed, num_frames)`, which lets an expert act
-    and returns a demonstrations.Demonstration, for `collect`. Keyword
-    arguments look=, appearance= and arm= are the table's, too.
+    `observer_picture()`, `move_goal(names, pixels)`. Others may have
+    `demonstrate(seed, num_frames)`, which lets an expert act and returns a
+    demonstrations.Demonstration, for `collect`. Keyword arguments look=, appearance= and arm= are
+    the table's, too.
 
     :ivar task_name: of the present task.
     :ivar arm: the Arm that is seen, None where it is not known.

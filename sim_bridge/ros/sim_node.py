@@ -3,21 +3,17 @@
 """The simulator as a ROS node: camera, objects and clock out, twist commands in."""
 
 from collections.abc import Callable
-from importlib.util import find_spec
 import math
 import time
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Twist, TwistStamped
 import numpy as np
-from numpy.typing import ArrayLike
-from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from sim_bridge.ros.publishers import ScenePublishers
 from sim_bridge.world.looks import CHOICES, DEFAULT_LOOK, LOOKS
-from sim_bridge.world_protocol import ability, make_world, Observation, RunState, World
+from sim_bridge.world_protocol import ability, make_world, Observation, World
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from tap_msgs.msg import CommandRefused, Episode
@@ -30,6 +26,7 @@ from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.services import answering
+from tap_ros.nodes.subscriptions import steady_timer
 from tap_ros.nodes.topics import LATCHED, SERVICE_QOS, STREAM, to_stamp
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM
@@ -55,7 +52,7 @@ class SimNode(Node):
     the arm stands still.
     A zero twist without a stamp means stop in both modes and lets no time pass. Whoever sends a
     command that is not carried out learns it from arm/refused.
-    Paused or stopped: commands are refused, and what came before or meanwhile is not made up for.
+    Paused: commands are refused, and what came before or meanwhile is not made up for.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -76,10 +73,8 @@ class SimNode(Node):
         self._goal_ns = 0  # stamp of the newest goal
         self._num_steps = 0
         self._in_episode = False
-        self.state = RunState.PLAYING
-        self._played_at = 0.0  # monotonic time at which it was set so
-        self._diagnostics = Diagnostics(
-            self, {'arm/delta_twist_cmds': math.inf, 'gripper/command': math.inf})
+        self._paused, self._played_at = False, 0.0  # monotonic time at which it went on
+        self._diagnostics = Diagnostics(self, (), ['arm/delta_twist_cmds', 'gripper/command'])
         self._topics = ScenePublishers(
             self, self._sim, self.params['observer'], self.params['objects'] == 'tracked')
         self._refused = self.create_publisher(CommandRefused, 'arm/refused', STREAM)
@@ -97,16 +92,12 @@ class SimNode(Node):
                                    (StepScene, 'sim/step', self._on_step),
                                    (SetBool, 'sim/pause', self._on_pause)):
             self.create_service(kind, name, answering(self, answer), qos_profile=SERVICE_QOS)
-        if find_spec('simulation_interfaces') is not None:  # no wheel has it
-            from sim_bridge.ros.standard_services import StandardServices
-            StandardServices(self)
-        clock = Clock(clock_type=ClockType.STEADY_TIME)
         if self.params['lock_step']:
             mode = 'lock-step'
-            self.create_timer(RESEND_S, self._topics.send_newest, clock=clock)
+            steady_timer(self, RESEND_S, self._topics.send_newest)
         else:
             factor = self.params['real_time_factor']
-            self.create_timer(CONTROL_PERIOD / factor, self._on_timer, clock=clock)
+            steady_timer(self, CONTROL_PERIOD / factor, self._on_timer)
             mode = f'{factor:g} x real time'
         self.get_logger().info(
             f'ready: task {task}, seed {self.params["seed"]}, {mode}')
@@ -169,7 +160,7 @@ class SimNode(Node):
 
     def _refuse_paused(self, info: dict[str, Any]) -> str:
         """Say why a command that came now cannot be used; an empty string if it can."""
-        if self.state is not RunState.PLAYING:
+        if self._paused:
             return 'the simulation is paused; call sim/pause with data false'
         if reception_time(info) < self._played_at:
             return 'it came while the simulation was paused'
@@ -199,7 +190,7 @@ class SimNode(Node):
         return ''
 
     def _on_timer(self) -> None:
-        if self.state is RunState.PLAYING:
+        if not self._paused:
             move, self._twist = self._twist, None
             if move is None or time.monotonic() > self._valid_until:
                 move = np.zeros(3)
@@ -230,69 +221,25 @@ class SimNode(Node):
         if periods > MAX_PERIODS:
             response.message = (
                 f'num_periods is {periods}; expected 1 to {MAX_PERIODS}, call more often')
-        elif self.state is RunState.PLAYING and not self.params['lock_step']:
+        elif not (self._paused or self.params['lock_step']):
             response.message = (
                 'time passes by itself; pause with sim/pause first, or start with lock_step')
         else:
             for _ in range(periods):
-                self.wait_period()
+                self._step(np.zeros(3))
             response.success = True
             response.message = f'{periods} control periods passed'
-        response.stamp = self.stamp
+        response.stamp = to_stamp(self._stamp_ns)
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self.set_state(RunState.PAUSED if request.data else RunState.PLAYING)
+        if request.data != self._paused:  # what was commanded and is not done yet is forgotten
+            self._twist, self._opening = None, self._done_opening
+            self._paused = request.data
+            self._played_at = math.inf if self._paused else time.monotonic()
         response.success = True
         response.message = 'paused' if request.data else 'running'
         return response
-
-    # What all services are made of
-
-    @property
-    def sim(self) -> World:
-        """Return the world of the present scene."""
-        return self._sim
-
-    @property
-    def stamp(self) -> Time:
-        """Return the stamp of the newest picture."""
-        return to_stamp(self._stamp_ns)
-
-    def set_state(self, state: RunState) -> None:
-        """Let time pass or not; what was commanded before and is not done yet is forgotten."""
-        if state is not self.state:
-            self._twist = None
-            self._opening = self._done_opening
-            self._played_at = time.monotonic() if state is RunState.PLAYING else math.inf
-            self.state = state
-
-    def wait_period(self) -> None:
-        """Let one control period pass in which the arm stands still."""
-        self._leave_start()
-        self._step(np.zeros(3))
-
-    def _leave_start(self) -> None:
-        """Leave the state STOPPED, in which the first scene is at its start."""
-        if self.state is RunState.STOPPED:
-            self.state = RunState.PAUSED
-
-    def restart(self) -> None:
-        """Start the first scene again, as when the node was started."""
-        state = self.state
-        self._reset(self.params['task'], self.params['seed'], False)
-        self.state = state  # stopped stays stopped: it is the first scene
-
-    def repeat(self) -> None:
-        """Start the present scene again."""
-        self._reset(self._sim.task_name, self._seed, self._hide_arm)
-
-    def put_object(self, name: str, pose: ArrayLike, velocity: ArrayLike) -> None:
-        """Put an object elsewhere (see Simulator.put_object) and publish what is seen then."""
-        ability(self._sim, 'put_object')(name, pose, velocity)
-        self._leave_start()
-        self._stamp_ns += 1  # each picture has a stamp of its own
-        self._publish(self._sim.observe())
 
     # Simulation
 
@@ -312,14 +259,13 @@ class SimNode(Node):
         if sim is not self._sim:
             self._sim.close()
         self._sim, self._hide_arm, self._seed = sim, hide_arm, seed
-        self._leave_start()
         self._opening, self._done_opening, self._twist = 0.0, 0.0, None
         self._stamp_ns += PERIOD_NS
         self._reset_ns = self._stamp_ns
         self._num_steps = 0
         self._in_episode = True
         self._publish_episode(Episode.START, '')
-        self._topics.frames(sim, self.stamp)
+        self._topics.frames(sim, to_stamp(self._stamp_ns))
         self._publish_goal()
         self._publish(observation)
 
@@ -344,7 +290,7 @@ class SimNode(Node):
     def _publish(self, observation: Observation) -> None:
         if self._hide_arm:
             observation = self._sim.observe(hide_arm=True)
-        self._topics.moment(self._sim, observation, self.stamp)
+        self._topics.moment(self._sim, observation, to_stamp(self._stamp_ns))
 
     def _publish_goal(self) -> None:
         # Each goal has a stamp of its own, also where no time has passed since the last one.

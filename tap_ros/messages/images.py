@@ -11,7 +11,7 @@ import numpy as np
 from tap_ros.contract import MAP_ENCODING, MASK_ENCODING, MAX_PICTURE_BYTES, PICTURE_ENCODING
 from tap_ros.errors import ImageError
 from tap_ros.images.encodings import decompress, find_encoding, to_rgb
-from tap_ros.images.pixels import check_image, check_mask, resize_image
+from tap_ros.images.pixels import check_image, check_mask
 from tap_ros.messages.stamps import header_fields, Stamp
 from tap_ros.text import escaped
 
@@ -25,8 +25,8 @@ def is_empty(message: Any) -> bool:
     return size == (0, 0) and len(message.data) == 0
 
 
-def decode_image(message: Any, name: str = '', size: Sequence[int] | None = None,
-                 resize: bool = False) -> np.ndarray:
+def decode_image(message: Any, name: str = '',
+                 size: Sequence[int] | None = None) -> np.ndarray:
     """
     Turn a message into a picture.
 
@@ -34,7 +34,6 @@ def decode_image(message: Any, name: str = '', size: Sequence[int] | None = None
         sensor_msgs/CompressedImage.
     :param name: how an error calls it, for example 'goal'.
     :param size: the (height, width) wanted, or None for any.
-    :param resize: resize to `size` instead of refusing another size.
     :return: uint8 (H, W, 3) rgb.
     :raises ImageError: for another encoding, size, step or length, and for more than
         MAX_PICTURE_BYTES.
@@ -49,8 +48,6 @@ def decode_image(message: Any, name: str = '', size: Sequence[int] | None = None
             encoding = find_encoding(message.encoding)
             image = to_rgb(_rows(message, encoding.pixel_bytes, encoding.planes).reshape(
                 -1, message.width, encoding.pixel_bytes), message.encoding)
-    if resize and size is not None and image.shape[:2] != tuple(size):
-        return resize_image(image, size)
     return check_image(image, name, size)
 
 

@@ -17,7 +17,7 @@ MAX_OBJECTS = 32  # in one list; every one costs a map of each picture that is p
 MAX_NAME = 100  # characters
 
 
-def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray,
+def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray | None,
                    stamp: Stamp | int, frame_id: str, source: str,
                    states: Sequence[str] = (),
                    confidence: Sequence[float] | np.ndarray = ()) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray,
 
     :param names: K strings.
     :param pixels: (K, 2) as (u, v).
-    :param poses: (K, 7) x, y, z in metres and quaternion x, y, z, w.
+    :param poses: (K, 7) x, y, z in metres and quaternion x, y, z, w; None: not known.
     :param stamp: of the image that the pixels belong to, a Stamp or ns.
     :param frame_id: frame of the poses.
     :param source: one of the SOURCE_ constants of ObjectStates.
@@ -34,6 +34,7 @@ def objects_fields(names: Iterable[str], pixels: np.ndarray, poses: np.ndarray,
     :param confidence: K, 0 to 1, or none.
     """
     objects = []
+    poses = np.full((len(pixels), 7), np.nan) if poses is None else poses
     for name, pixel, pose in zip(names, pixels, poses):
         numbers = [float(value) for value in pose]
         objects.append({

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 import threading
 import time
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
@@ -19,8 +19,6 @@ from rclpy.node import Node
 from rclpy.task import Future
 from tap_ros.errors import TapError
 from tap_ros.nodes.heartbeat import Liveness
-
-Found = TypeVar('Found')
 
 NEWBORN_S = 0.7  # until other nodes have discovered one that has just started
 POLL_S = 0.05  # between two looks at whether a server still lives
@@ -92,37 +90,6 @@ def call(client: Client, request: Any, timeout_s: float,
     finally:
         client.remove_pending_request(future)  # else a lost call stays pending for ever
     return future.result()
-
-
-def in_executor(node: Node, function: Callable[[], Found], timeout_s: float) -> Found:
-    """
-    Call a function in the thread that spins a node, where no answer is handled meanwhile.
-
-    rclpy's action client takes down a request only after it was sent: an answer that is handled in
-    between by another thread is lost.
-
-    :param node: rclpy Node that one other thread spins.
-    :param function: called without arguments.
-    :param timeout_s: most seconds to wait.
-    :return: what the function returns; what it raises is raised.
-    :raises CallError: when the node is not spun, or its thread is busy for too long.
-    """
-    outcome: futures.Future[Found] = futures.Future()
-
-    def run() -> None:
-        try:
-            outcome.set_result(function())
-        except Exception as error:  # it would end the executor
-            outcome.set_exception(error)
-
-    if node.executor is None:
-        raise CallError(f'node {node.get_name()} is not spun')
-    node.executor.create_task(run)
-    try:
-        return outcome.result(timeout_s)
-    except futures.TimeoutError as error:
-        raise CallError(f'node {node.get_name()}: its callbacks have kept it busy for '
-                        f'{timeout_s:g} s') from error
 
 
 @dataclass(frozen=True)
@@ -223,7 +190,30 @@ class Reaching:
                 or self._server is not None and self._server.dead)
 
     def _in_executor(self, function: Callable[[], Future], timeout_s: float) -> Future:
-        return in_executor(self._client._node, function, timeout_s)
+        """
+        Return what a function returns, called in the thread that spins the node.
+
+        rclpy's action client takes down a request only after it was sent: an answer that another
+        thread handles in between is lost.
+
+        :raises CallError: when the node is not spun, or its thread is busy for too long.
+        """
+        node, outcome = self._client._node, futures.Future[Future]()
+
+        def run() -> None:
+            try:
+                outcome.set_result(function())
+            except Exception as error:  # it would end the executor
+                outcome.set_exception(error)
+
+        if node.executor is None:
+            raise CallError(f'node {node.get_name()} is not spun')
+        node.executor.create_task(run)
+        try:
+            return outcome.result(timeout_s)
+        except futures.TimeoutError as error:
+            raise CallError(f'node {node.get_name()}: its callbacks have kept it busy for '
+                            f'{timeout_s:g} s') from error
 
 
 def _named(server: Liveness | None) -> str:

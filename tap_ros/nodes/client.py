@@ -59,7 +59,6 @@ READY = {'sim_node': 'reset', 'predictor_node': 'predict', 'tracker_node': 'sele
 PLANNER = 'visual_mpc_node'
 VIEWS = {'camera': {'image': (Image, 'camera/image_raw'), 'objects': (ObjectStates, 'objects')},
          'goal': {'image': (Image, 'goal/image'), 'objects': (ObjectStates, 'goal/objects')}}
-NOWHERE = (0, 0, 0, 0, 0, 0, 1)  # pose of an object of which only the pixel is known
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class View:
     :param image: (H, W, 3) uint8.
     :param names: of K objects.
     :param pixels: (K, 2) float32, (u, v) of each.
-    :param positions: (K, 3) m; zeros or NaN where nobody knows them.
+    :param positions: (K, 3) m; NaN where nobody knows them.
     :param stamp_ns: of the picture.
     """
 
@@ -359,8 +358,7 @@ def request_fields(names: Sequence[str] = (), /, **arrays: Any) -> dict[str, Any
         values = np.asarray(values)
         fields[name] = encode_image(values, to_stamp(0), CAMERA_FRAME) if values.ndim == 3 else (
             encode_objects(names or [f'object {k + 1}' for k in range(len(values))], values,
-                           np.array([NOWHERE] * len(values)), to_stamp(0), CAMERA_FRAME,
-                           ObjectStates.SOURCE_TRACKED))
+                           None, to_stamp(0), CAMERA_FRAME, ObjectStates.SOURCE_TRACKED))
     return fields
 
 

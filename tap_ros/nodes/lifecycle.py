@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -14,21 +14,12 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from tap_ros.errors import WeightsError
-from tap_ros.nodes.parameters import Parameters
 from tap_ros.nodes.services import log_error
 from tap_ros.nodes.topics import LATCHED
-from tap_ros.text import escaped, listing
+from tap_ros.text import escaped
 from tap_ros.training.weights import stored_digest
 
 MAX_CARD_BYTES = 2**18
-
-
-def declare_autostart(parameters: Parameters) -> None:
-    """Declare the parameter autostart of a lifecycle node."""
-    parameters.declare(
-        'autostart', True,
-        'Load the weights and be active at once; false: wait for the transitions configure and '
-        'activate.')
 
 
 class LifecycleBase(LifecycleNode):
@@ -38,15 +29,12 @@ class LifecycleBase(LifecycleNode):
     Heartbeat, diagnostics, topics and services exist in every state, so that a request is refused
     with the reason. The model cards of the weights are published on <node>/model_card. A subclass
     implements `load` and its like, and calls autostart('configure') and autostart('activate') in
-    its constructor; weights that cannot be used are fatal then.
+    its constructor; weights that cannot be used are fatal then. The parameter weights can be
+    changed while the node is unconfigured.
 
     :param options: of rclpy's Node.
-    :cvar loaded_by: names of the parameters that configure reads; they can be changed while the
-        node is unconfigured.
     :ivar active: whether the node works.
     """
-
-    loaded_by: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
@@ -55,7 +43,7 @@ class LifecycleBase(LifecycleNode):
         self._starting = False  # a failure of autostart is raised, and logged by run.main
         self._loaded = self._card = ''
         self._cards = self.create_publisher(String, '~/model_card', LATCHED)
-        self.add_on_set_parameters_callback(self._check_loaded)
+        self.add_on_set_parameters_callback(self._check_weights)
         self._service_change_state.callback = self._answering(self._service_change_state.callback)
 
     # What a subclass implements
@@ -184,16 +172,15 @@ class LifecycleBase(LifecycleNode):
         label: str = self._state_machine.current_state[1]
         return label
 
-    def _check_loaded(self, parameters: Iterable[Parameter]) -> SetParametersResult:
-        """Refuse to change what is loaded unless the node is unconfigured."""
-        changed = [parameter.name for parameter in parameters if parameter.name in self.loaded_by
-                   and self.has_parameter(parameter.name)
-                   and self.get_parameter(parameter.name).value != parameter.value]
-        if not changed or self._state() in ('unconfigured', 'finalized'):
+    def _check_weights(self, parameters: Iterable[Parameter]) -> SetParametersResult:
+        """Refuse other weights unless the node is unconfigured."""
+        same = all(one.name != 'weights' or not self.has_parameter('weights')
+                   or one.value == self.get_parameter('weights').value for one in parameters)
+        if same or self._state() in ('unconfigured', 'finalized'):
             return SetParametersResult(successful=True)
         steps = ['deactivate'] * self.active + ['cleanup']
         return SetParametersResult(successful=False, reason=(
-            f'{listing(changed)} cannot be changed while weights are loaded; first: '
+            'weights cannot be changed while some are loaded; first: '
             + ', then '.join(f'ros2 lifecycle set {self.get_fully_qualified_name()} {step}'
                              for step in steps)))
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CompressedImage
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.subscriptions import (
@@ -110,6 +111,10 @@ class Observations:
             self._subscriptions[topic] = subscribe(message_type, name)
             if self._latched and topic == 'image':
                 subscribe(CompressedImage, f'{name}/compressed')
+        if not (self._latched or on_demand):
+            node.create_subscription(
+                Clock, 'clock', lambda message: self.tell_time(to_nanoseconds(message.clock)),
+                qos_profile_sensor_data, callback_group=group)
         if not on_demand:
             adapt_regularly(node, [one for _, one in made], callback_group)
             return

@@ -17,9 +17,30 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from tap_ros.contract import ROBOT_MASKS
 from tap_ros.errors import ConfigError
 from tap_ros.plugins import names
 from tap_ros.robots.arm import Arm, DEFAULT_ARM, get_arm, Mount
+
+# Of several nodes: default, description, and what else Parameters.declare takes.
+SHARED: dict[str, tuple[Any, str, dict[str, Any]]] = {
+    'autostart': (
+        True, 'Load the weights and be active at once; false: wait for the transitions configure '
+        'and activate.', {}),
+    'device': (
+        'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
+        {'choices': ('cpu', 'cuda')}),
+    'image_transport': (
+        'raw', 'How the camera sends pictures: sensor_msgs/Image on camera/image_raw (raw), or '
+        'CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).',
+        {'choices': ('raw', 'compressed')}),
+    'robot_mask': (
+        'none', 'What camera/robot_mask takes out of the pictures: nothing (none), the arm with '
+        'its shadow (arm), or the whole robot (all). What was seen there free last takes its '
+        'place.', {'choices': ROBOT_MASKS}),
+    'joint_prefix': (
+        '', "What the names of the robot's joints begin with in joint_states, before "
+        'shoulder_pan_joint and so on.', {})}
 
 
 class Parameters:
@@ -70,6 +91,12 @@ class Parameters:
             raise ConfigError(
                 f'parameter {name}: {reason}. {description} Default: {default!r}') from error
 
+    def declare_shared(self, *names: str, **defaults: Any) -> None:
+        """Declare some of SHARED, with their usual or with other defaults."""
+        for name in (*names, *defaults):
+            default, description, limits = SHARED[name]
+            self.declare(name, defaults.get(name, default), description, **limits)
+
     def _check_choices(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Refuse strings that are none of the choices."""
         for parameter in parameters:
@@ -82,12 +109,6 @@ class Parameters:
         return SetParametersResult(successful=True)
 
 
-def declare_device(parameters: Parameters) -> None:
-    """Declare the parameter device."""
-    parameters.declare('device', 'cpu', 'Where the network runs, as torch names it: cpu, cuda.',
-                       choices=['cpu', 'cuda'])
-
-
 def check_device(device: str) -> None:
     """
     Raise ConfigError for a device that is not available.
@@ -97,15 +118,6 @@ def check_device(device: str) -> None:
     import torch  # here, since it takes seconds, and not every node has a device
     if device == 'cuda' and not torch.cuda.is_available():
         raise ConfigError('parameter device: torch finds no GPU for cuda; valid here: cpu')
-
-
-def declare_transport(parameters: Parameters) -> None:
-    """Declare the parameter image_transport of a node."""
-    parameters.declare(
-        'image_transport', 'raw',
-        'How the camera sends pictures: sensor_msgs/Image on camera/image_raw (raw), or '
-        'CompressedImage (JPEG, PNG, WebP) on camera/image_raw/compressed (compressed).',
-        choices=('raw', 'compressed'))
 
 
 def declare_arm(parameters: Parameters) -> None:
@@ -174,13 +186,6 @@ def pose_matrix(place: Sequence[float], quaternion: Sequence[float]) -> np.ndarr
     pose[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     pose[:3, 3] = place
     return pose
-
-
-def declare_joint_prefix(parameters: Parameters) -> None:
-    """Declare what names of joints begin with."""
-    parameters.declare('joint_prefix', '',
-                       "What the names of the robot's joints begin with in joint_states, "
-                       'before shoulder_pan_joint and so on.')
 
 
 def declared_arm(parameters: Parameters) -> Arm:

@@ -9,20 +9,9 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Image
-from tap_ros.contract import ROBOT_MASKS
 from tap_ros.messages.images import decode_image, decode_mask
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.parameters import Parameters
 from tap_ros.training.robot_mask import FreeView, RobotMask
-
-
-def declare_robot_mask(parameters: Parameters, usual: RobotMask = 'none') -> None:
-    """Declare the parameter robot_mask of a node."""
-    parameters.declare(
-        'robot_mask', usual,
-        'What camera/robot_mask takes out of the pictures: nothing (none), the arm with its '
-        'shadow (arm), or the whole robot (all). What was seen there free last takes its place.',
-        choices=ROBOT_MASKS)
 
 
 def warn_if_unlike(node: Node, robot_mask: str, trained: Sequence[str], what: str) -> None:

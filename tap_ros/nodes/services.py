@@ -22,33 +22,21 @@ def log_error(node: Node, what: str, error: BaseException) -> None:
         node.get_logger().error(f'{what}: {escaped(line)}')
 
 
-def internal_error(error: Exception) -> str:
-    """Return the message of a response to an unexpected error."""
+def reason(node: Node, what: str, error: Exception) -> str:
+    """Return why something failed, for whoever asked for it; log what was not expected."""
+    if isinstance(error, TapError):
+        return str(error)
+    log_error(node, what, error)
     return f'internal error: {type(error).__name__}: {escaped(error)}'
 
 
-def refusal(kind: type, reason: str, error: Exception) -> Any:
-    """Return a response of this type, with the fields success and message, that refuses."""
-    return kind(success=False, message=reason)
-
-
-def answering(node: Node, callback: Callable[[Any, Any], Any],
-              refuse: Callable[[type, str, Exception], Any] = refusal
-              ) -> Callable[[Any, Any], Any]:
-    """
-    Wrap the callback of a service so that any exception becomes a response.
-
-    :param node: rclpy Node, for its log.
-    :param refuse: makes a response of a type, a reason and the exception.
-    """
+def answering(node: Node, callback: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Wrap the callback of a service so that any exception becomes a refusal with its reason."""
     def answer(request: Any, response: Any) -> Any:
         try:
             return callback(request, response)
-        except TapError as error:
-            return refuse(type(response), str(error), error)
         except Exception as error:
-            log_error(node, 'service', error)
-            return refuse(type(response), internal_error(error), error)
+            return type(response)(success=False, message=reason(node, 'service', error))
 
     return answer
 

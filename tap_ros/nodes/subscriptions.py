@@ -7,7 +7,7 @@ A subscription that asks for more than is offered receives nothing, without an e
 for what its publishers offer.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 import copy
 from difflib import get_close_matches
 from typing import Any
@@ -111,8 +111,35 @@ def adapt_regularly(node: Node, subscriptions: Iterable[AdaptiveSubscription],
         for subscription in list(subscriptions):
             subscription.adapt()
 
-    node.create_timer(ADAPT_PERIOD, adapt, callback_group=callback_group,
+    steady_timer(node, ADAPT_PERIOD, adapt, callback_group)
+
+
+def steady_timer(node: Node, period_s: float, callback: Callable[[], object],
+                 callback_group: CallbackGroup | None = None) -> None:
+    """Call something regularly, also where /clock stands still."""
+    node.create_timer(period_s, callback, callback_group,
                       clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def publishers_of(node: Node, topics: Iterable[str]) -> dict[str, frozenset[bytes]]:
+    """Return who publishes each topic of which there may be but one publisher."""
+    return {topic: frozenset(
+        bytes(info.endpoint_gid[:12])  # the participant, which is known before all its topics
+        for info in node.get_publishers_info_by_topic(topic))
+        for topic in map(node.resolve_topic_name, topics)}
+
+
+def newcomers(node: Node, topics: Iterable[str], known: Mapping[str, frozenset[bytes]]) -> str:
+    """
+    Say how many publish a topic where one of them, such as a second camera, is new; else ''.
+
+    :param known: what publishers_of returned before.
+    """
+    before = frozenset().union(*known.values())
+    for topic, publishers in publishers_of(node, topics).items():
+        if len(publishers) > 1 and not publishers <= before:
+            return f'{len(publishers)} nodes publish on {topic} now'
+    return ''
 
 
 def why_silent(node: Node, topic: str, message_type: type | None) -> str:

@@ -59,20 +59,35 @@ def run_on_full_disk(*words):
     return time.monotonic() - begin
 
 
-@fault(FULL, CLEAR, 20, 's until it ended (median)', statistics.median)
-def test_disk_full_collect(trials, tmp_path):
-    random = np.random.default_rng(0)
+@pytest.mark.parametrize('what', [
+    pytest.param(what, id=f'disk-full-{what}', marks=fault(
+        FULL, CLEAR, 20, 's until it ended (median)', statistics.median))
+    for what in ('collect', 'train')])
+def test_(trials, tmp_path, what):
+    random, source = np.random.default_rng(0), tmp_path / 'source'
+    write_bag(source, episodes=8, length=8, size=64)
+    network, old = PredictorNetwork(PredictorConfig(base_width=1)), tmp_path / 'old.safetensors'
+    save_weights(old, network, 'predictor', network.config, {})
     for trial in trials:
-        disk, size = tmp_path / f'disk{trial}', int(random.integers(80_000, 400_000))
+        disk = tmp_path / f'disk{trial}'
+        size = old.stat().st_size + int(random.integers(80_000, 400_000))
         with trials.one(), small_disk(disk, size):
+            shutil.copy(old, disk)
             write_bag(disk / 'old', episodes=2, length=3)
-            trials.measured(run_on_full_disk(
-                'collect', '--out', disk / 'new', '--episodes', 30,
-                '--episodes-per-file', 2, '--workers', 1, '--seed', trial))
+            trials.measured(run_on_full_disk(*(
+                ('collect', '--out', disk / 'new', '--episodes', 30, '--episodes-per-file', 2,
+                 '--workers', 1, '--seed', trial) if what == 'collect' else
+                ('train', 'predictor', source, '--out', disk, '--steps', 20,
+                 '--batch-size', 4, '--base-width', 4, '--save-every', 5))))
+            assert (disk / old.name).exists(), 'the weights that were there before are gone'
+            for path in disk.rglob('*.safetensors'):
+                load_tensors(path)
             for folder in sorted({path.parent for path in disk.rglob('*.mcap')}):
                 episodes, told = read_bag(folder)
                 assert folder.name != 'old' or (len(episodes) == 2 and not told), (
                     'the recording that was there before is damaged')
+            litter = [*disk.rglob('*.part'), *disk.rglob('*.tmp')]
+            assert not litter, f'left behind: {litter}'
 
 
 def write_bag(folder, episodes, length, size=16):
@@ -89,28 +104,6 @@ def read_bag(folder):
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter('always')
         return list(open_recordings(folder)), told
-
-
-@fault(FULL, CLEAR, 20, 's until it ended (median)', statistics.median)
-def test_disk_full_train(trials, tmp_path):
-    random = np.random.default_rng(0)
-    source = tmp_path / 'source'
-    write_bag(source, episodes=8, length=8, size=64)
-    network, old = PredictorNetwork(PredictorConfig(base_width=1)), tmp_path / 'old.safetensors'
-    save_weights(old, network, 'predictor', network.config, {})
-    for trial in trials:
-        disk = tmp_path / f'disk{trial}'
-        size = old.stat().st_size + int(random.integers(20_000, 400_000))
-        with trials.one(), small_disk(disk, size):
-            shutil.copy(old, disk)
-            trials.measured(run_on_full_disk(
-                'train', 'predictor', source, '--out', disk, '--steps', 20,
-                '--batch-size', 4, '--base-width', 4, '--save-every', 5))
-            assert (disk / old.name).exists(), 'the weights that were there before are gone'
-            for path in disk.rglob('*.safetensors'):
-                load_tensors(path)
-            litter = [*disk.rglob('*.part'), *disk.rglob('*.tmp')]
-            assert not litter, f'left behind: {litter}'
 
 
 @pytest.mark.ros

@@ -5,7 +5,6 @@
 import array
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
 import re
 import time
 
@@ -52,11 +51,6 @@ SERVICES = {
     'predict_subgoal': 'tap_msgs/srv/PredictSubgoal', 'sim/reset': 'tap_msgs/srv/ResetScene',
     'sim/set_goal': 'tap_msgs/srv/SetGoal', 'sim/step': 'tap_msgs/srv/StepScene',
     'sim/pause': 'std_srvs/srv/SetBool', 'recorder/record': 'std_srvs/srv/SetBool'}
-if find_spec('simulation_interfaces') is not None:  # no wheel has it
-    SERVICES |= {f'sim_node/{name}': f'simulation_interfaces/srv/{kind}' for name, kind in (
-        ('get_entities', 'GetEntities'), ('get_entity_state', 'GetEntityState'),
-        ('set_entity_state', 'SetEntityState'), ('step_simulation', 'StepSimulation'),
-        ('reset_simulation', 'ResetSimulation'), ('set_simulation_state', 'SetSimulationState'))}
 
 NUMBERS = st.floats() | st.sampled_from((
     0.0, 1.0, -1.0, 31.5, 64.0, 5000.0, -7000.0, 5.4e8, 1e30, -1e308, 5e-324, float('nan')))
@@ -109,10 +103,7 @@ LIKELY = {
         'position': lambda: st.lists(NEAR, min_size=6, max_size=6) | st.lists(
             NEAR | NUMBERS, max_size=7)},
     'std_msgs/msg/String': {'data': lambda: descriptions() | TEXTS},
-    'geometry_msgs/msg/Point': {axis: lambda: NEAR | NUMBERS for axis in 'xyz'},
-    # But quitting, which ends the node as it should.
-    'simulation_interfaces/msg/SimulationState': {
-        'state': lambda: st.sampled_from((0, 1, 2, 4, 5, 255))}}
+    'geometry_msgs/msg/Point': {axis: lambda: NEAR | NUMBERS for axis in 'xyz'}}
 WHOLE = {'sensor_msgs/msg/Image': whole_images, 'tap_msgs/msg/ObjectStates': known_objects}
 
 

@@ -41,9 +41,8 @@ BEGIN, PERIOD, DRIVER = 10**10, 250 * MS, 40 * MS  # ns: of the pictures, of the
 COUNT, SIZE = 5, (48, 64)
 ARM = get_arm(DEFAULT_ARM)
 PARAMS = {
-    'robot_mask': 'none', 'image_transport': 'raw', 'resize_images': False, 'joint_prefix': '',
-    'fixed_opening': 0.0, 'max_silence': 0.35, 'arm': DEFAULT_ARM, 'mount_turn': ARM.mount.yaw,
-    'tool_length': ARM.mount.tool,
+    'joint_prefix': '', 'fixed_opening': 0.0, 'max_silence': 0.35, 'arm': DEFAULT_ARM,
+    'mount_turn': ARM.mount.yaw, 'tool_length': ARM.mount.tool,
     **{f'mount_{axis}': value for axis, value in zip('xyz', ARM.mount.position)}}
 
 
@@ -148,9 +147,10 @@ def traffic(picture, joints):
 
 def seen_live(node, other, crop, sent, compressed, robot_mask):
     """Publish messages; return {stamp: (Seen of the planner, Question to the predictor)}."""
-    params = PARAMS | {'image_transport': 'compressed' if compressed else 'raw'}
+    params = PARAMS | {'image_transport': 'compressed' if compressed else 'raw',
+                       'robot_mask': robot_mask}
     planner = PlannerInputs(node, params, lambda: crop, lambda name: None)
-    reader = RequestReader(node, params | {'robot_mask': robot_mask}, lambda name: None)
+    reader = RequestReader(node, params, lambda name: None)
     predictor = SimpleNamespace(camera_crop=crop, mode='bidirectional')
     publishers = {topic: other.create_publisher(
         type(message), topic, LATCHED if topic.startswith('goal') else STREAM)
@@ -200,7 +200,7 @@ def test_what_is_seen_live_is_what_is_read_from_the_recording(
     for t, stamp in enumerate(episode.stamps.tolist()):
         shown = view.update(episode.frames[t], episode.robot_masks[t])
         seen, question = live[stamp]
-        np.testing.assert_array_equal(seen.image, episode.frames[t])
+        np.testing.assert_array_equal(seen.image, shown)
         np.testing.assert_array_equal(seen.gripper, episode.grippers[t])
         assert seen.names == episode.object_names
         np.testing.assert_array_equal(seen.pixels, episode.object_pixels[t])

@@ -8,11 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tap_ros.errors import KinematicsError
-from tap_ros.messages.joints import (
-    GripperHistory,
-    JointHistory,
-    positions_at,
-)
+from tap_ros.messages.joints import GripperHistory, JointHistory, positions_at
 from tap_ros.messages.stamps import MAX_GAP, stamp_fields
 from tap_ros.robots.arm import Mount
 from tap_ros.robots.ur10e import UR10E
@@ -70,14 +66,14 @@ def test_recorded_joints_are_found_by_the_same_rule():
     assert np.isnan(positions_at(times[:0], values[:0], at, 10**9)).all()
 
 
-@pytest.mark.parametrize('ms, words', [
-    (90, 'the first state of a is 0.010 s newer than the picture'),
-    (290, 'the newest state of a is 0.090 s older than the picture'),
-    (140, 'the nearest newer state of a is 0.060 s from the picture; expected at most 0.05 s')])
-def test_a_picture_without_states_around_it_is_refused_with_the_reason(ms, words):
+def test_a_picture_without_states_around_it_is_refused_with_the_reason():
     known = history(*((at, {'a': 1.0}) for at in (100, 100, 200)), names='a')
-    with pytest.raises(KinematicsError, match=words):
-        known.at(ms * MS, 0.05)
+    for ms, words in (
+            (90, 'the first state of a is 0.010 s newer than the picture'),
+            (290, 'the newest state of a is 0.090 s older than the picture'),
+            (140, 'the nearest newer state of a is 0.060 s from the picture; .* at most 0.05 s')):
+        with pytest.raises(KinematicsError, match=words):
+            known.at(ms * MS, 0.05)
 
 
 def test_new_states_are_told_from_those_sent_again():
@@ -97,11 +93,11 @@ def test_a_clock_that_goes_back_is_believed_when_it_says_so_again():
     assert known.at(120 * MS, 1).positions == [2]
 
 
-@pytest.mark.parametrize('position', [np.nan, np.inf, 1e30])
-def test_a_position_that_no_joint_has_is_refused(position):
+def test_a_position_that_no_joint_has_is_refused():
     known = JointHistory(['a', 'b'])
-    with pytest.raises(KinematicsError, match='b is at '):
-        known.add(joints(100 * MS, a=1.0, b=position), 0)
+    for position in (np.nan, np.inf, 1e30):
+        with pytest.raises(KinematicsError, match='b is at '):
+            known.add(joints(100 * MS, a=1.0, b=position), 0)
     assert known.missing() == ['a', 'b']
 
 

@@ -9,7 +9,7 @@ from experiments.planning.episode import run_episode
 from experiments.planning.methods import parse_method
 from geometry_msgs.msg import TwistStamped
 import numpy as np
-from processes import Client, LocalNode, Newest, NodeProcess, until
+from processes import Client, Newest, NodeProcess, until
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
@@ -23,7 +23,6 @@ import tap_ros
 from tap_ros.messages.stamps import to_nanoseconds
 from tap_ros.nodes.calls import CallError, Reaching
 from tap_ros.nodes.heartbeat import Liveness
-from tap_ros.nodes.planner.node import VisualMpcNode
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.planning.mpc_config import with_preset
 from tap_ros.planning.visual_mpc import VisualMPC
@@ -128,24 +127,6 @@ class Loop:
         reaching = self.begin(lambda feedback: moving.set(), **{'mode': 'direct'} | fields)
         assert moving.wait(120)
         return reaching
-
-    @contextmanager
-    def other_planner(self, **parameters):
-        """Send goals to another planner, other_node, whose robot masks are those of own_mask."""
-        action = {f'{{}}/_action/{part}' for part in (
-            'send_goal', 'cancel_goal', 'get_result', 'feedback', 'status')}
-        planner = LocalNode(VisualMpcNode, num_threads=4, remaps={
-            '__node': 'other_node', 'camera/robot_mask': 'own_mask',
-            **{name.format('reach_goal'): name.format('other_goal') for name in action}},
-            solver='quick', **parameters)
-        before = self.reach_client
-        try:
-            self.reach_client = ActionClient(self.node, ReachGoal, 'other_goal')
-            assert self.reach_client.wait_for_server(30)
-            yield
-        finally:
-            self.reach_client = before
-            assert planner.end() == 0
 
     def moves(self):
         """Return the commands (N, 3) so far, without the stops."""

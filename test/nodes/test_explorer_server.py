@@ -4,12 +4,10 @@
 
 from contextlib import contextmanager, ExitStack
 import http.client
-from itertools import count
 import json
 import math
 import socket
 import threading
-import time
 
 import numpy as np
 from processes import Client, LocalNode, Newest, until
@@ -20,8 +18,7 @@ from tap_ros.contract import CAMERA_FRAME, WORLD_FRAME
 from tap_ros.errors import ConfigError
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.explorer.browser_commands import CommandError, parse_command
-from tap_ros.nodes.explorer.display import Distances
-from tap_ros.nodes.explorer.goal import GoalByHand, simulated
+from tap_ros.nodes.explorer.goal import GoalByHand
 from tap_ros.nodes.explorer.node import ExplorerNode
 from tap_ros.nodes.explorer.server import ExplorerServer, is_loopback, MAX_BROWSERS, MAX_COMMAND
 from tap_ros.nodes.ros_messages import encode_image, encode_objects
@@ -129,8 +126,6 @@ def test_foreign_pages_and_foreign_names_that_lead_here_are_refused():
     assert not any(map(is_loopback, ('0.0.0.0', '192.168.0.1', 'localhost.evil.example', '')))
 
 
-
-
 def test_a_token_is_asked_for_by_page_and_socket_and_stands_in_the_address():
     for options in ({'token': 'a token'}, {'token': 'a&b c#d/?='}, {'host': '0.0.0.0'}):
         with serving(**options) as server:
@@ -148,7 +143,7 @@ def test_a_token_is_asked_for_by_page_and_socket_and_stands_in_the_address():
 def test_addresses_that_cannot_be_had_are_named_and_what_ends_frees_its_port():
     with serving() as server, pytest.raises(ConfigError, match=f'port.*{server.port}'):
         ExplorerServer(print, port=server.port)
-    for host in ('', 'a' * 70, 'a\0b', '256.0.0.1', 'no.such.host.invalid'):
+    for host in ('', 'a\0b', 'no.such.host.invalid'):
         with pytest.raises(ConfigError, match='host'):
             ExplorerServer(print, host=host, port=0)
     with ExitStack() as stack:
@@ -159,32 +154,18 @@ def test_addresses_that_cannot_be_had_are_named_and_what_ends_frees_its_port():
     ExplorerServer(print, port=server.port).close()
 
 
-# Commands and distances, without sockets
+# Commands, without sockets
 
-NUMBERS = {'samples': 3, 'levels': 2, 'seed': 1}
-PREDICT, REACH = {'do': 'predict', **NUMBERS}, {'do': 'reach', 'mode': 'direct', **NUMBERS}
+REACH = {'do': 'reach', 'mode': 'direct'}
 RESET = {'do': 'reset', 'task': 'push2', 'seed': 7}
 MOVE = {'do': 'move', 'name': 'object_0', 'u': 3, 'v': 4.5}
 CUP = {'name': 'cup', 'u': 3, 'v': 4.5}
 SELECT = {'do': 'select', 'objects': [CUP, {**CUP, 'name': 'ring'}]}
 
 
-
-
-def test_distances_are_centimetres_or_pixels_where_a_pose_is_unknown():
-    goals = {'a': (0.0, 0.0, 0.0, 10.0, 10.0)}
-    distances = Distances()
-    for moment, x in ((1.0, 0.2), (1.5, 0.3), (1.5, 0.1)):  # equal time replaces
-        distances.add(moment, {'a': (x, 0.0, 0.0, 12.0, 10.0)}, goals)
-    assert distances.shown() == {
-        'unit': 'cm', 'names': ['a'], 'times': [1.0, 1.5], 'values': [[20.0, 10.0]]}
-    distances.add(0.5, {'a': (*3 * [math.nan], 12.0, 10.0)}, goals)  # time goes back
-    assert distances.shown() == {'unit': 'px', 'names': ['a'], 'times': [0.5], 'values': [[2.0]]}
-
-
 def test_a_command_reads_as_it_is_meant_and_what_makes_no_sense_is_refused_by_the_fields_name():
-    for command in (PREDICT, REACH, RESET, MOVE, SELECT,
-                    *({'do': do} for do in ('cancel', 'photograph', 'propose'))):
+    for command in (REACH, RESET, MOVE, SELECT, *({'do': do} for do in (
+            'cancel', 'photograph', 'predict', 'propose'))):
         do, fields = parse_command(json.dumps({**command, 'other': 1}).encode())
         assert {'do': do, **fields} == command
     for text in ('', '[]', b'\xff\xfe', '[' * 5000):
@@ -194,7 +175,7 @@ def test_a_command_reads_as_it_is_meant_and_what_makes_no_sense_is_refused_by_th
     for command, name, values in (
             (RESET, 'do', ('shutdown', ['reach'], '\ud800')),
             (RESET, 'task', (3, 'x' * 101, 'a\nb')),
-            (RESET, 'seed', (-1, True, 1e300, large)), (PREDICT, 'levels', (0, 5)),
+            (RESET, 'seed', (-1, True, 1e300, large)), (REACH, 'mode', ('', 3)),
             (MOVE, 'u', (math.nan, large)), (MOVE, 'v', ('1',)),
             (MOVE, 'name', ('a\udc80', '\ud83d')),
             (SELECT, 'objects', (
@@ -208,12 +189,6 @@ def test_a_command_reads_as_it_is_meant_and_what_makes_no_sense_is_refused_by_th
 # Beside a real camera, where no simulator takes goal pictures
 
 
-def cup(stamp):
-    return encode_objects(
-        ['cup'], np.array([[3.0, 4.0]]), np.full((1, 7), np.nan), to_stamp(stamp), WORLD_FRAME,
-        ObjectStates.SOURCE_TRACKED)
-
-
 def problem_of(browser):
     """Return the newest thing that could not be done, once there is one."""
     problem = {'count': 0}
@@ -224,44 +199,27 @@ def problem_of(browser):
     return problem['text']
 
 
-def test_a_photograph_of_a_real_camera_becomes_the_goal_with_its_own_objects_alone():
+def test_a_photograph_of_a_real_camera_becomes_the_goal():
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
     with ExitStack() as stack:
         explorer = LocalNode(ExplorerNode, port=0, token='secret')
         stack.callback(explorer.end)
         node = stack.enter_context(Client('camera'))
         pictures = node.create_publisher(Image, 'camera/image_raw', STREAM)
-        objects = node.create_publisher(ObjectStates, 'objects', STREAM)
         goal_image = Newest(node, Image, 'goal/image', LATCHED)
         goal_objects = Newest(node, ObjectStates, 'goal/objects', LATCHED)
         url = explorer.node.url.replace('http', 'ws').replace('/?', '/socket?')
         assert url.endswith('?token=secret')
         browser = stack.enter_context(connect(url, open_timeout=10))
-        stamps = count(10**9, 10**9)
-
-        def photograph(older):
-            """Publish a picture and objects that are so much older (ns), and ask for a goal."""
-            stamp = next(stamps)
-            image[0, 0] = stamp // 10**9
-            pictures.publish(encode_image(image, to_stamp(stamp), CAMERA_FRAME))
-            # Objects come after their picture, when there is a newer one already.
-            objects.publish(cup(stamp - older))
-            time.sleep(0.1)
-            browser.send('{"do": "photograph"}')
-
         browser.send('{"do": "photograph"}')
         assert 'the camera is silent' in problem_of(browser)
-        # A picture without any objects would be a goal.
-        assert until(lambda: all(p.get_subscription_count() for p in (pictures, objects)))
-        assert until(lambda: photograph(1) or 'no objects have the stamp' in problem_of(browser))
-        assert not goal_image.count
-        assert until(lambda: photograph(10**9) or goal_image.count)
+        assert until(pictures.get_subscription_count)
+        pictures.publish(encode_image(image, to_stamp(10**9), CAMERA_FRAME))
         while not (isinstance(text := browser.recv(10), bytes) and text.startswith(b'camera\0')):
             pass
-        assert until(lambda: goal_image.wait(5).header.stamp == goal_objects.wait(5).header.stamp)
-        assert bytes(goal_image.wait(5).data)[3:] == image.tobytes()[3:]
-        place, = goal_objects.wait(5).objects
-        assert (place.name, place.u, place.v) == ('cup', 3.0, 4.0)
+        browser.send('{"do": "photograph"}')
+        assert bytes(goal_image.wait(10).data) == image.tobytes()
+        assert not goal_objects.wait(10).objects, 'not those of another goal'
 
 
 def test_goals_placed_by_hand_leave_the_others_and_belong_to_their_picture():
@@ -294,12 +252,3 @@ def test_goals_placed_by_hand_leave_the_others_and_belong_to_their_picture():
         assert place('ring', 5.0, 5.0)['cup'] == (1.0, 2.0, 'lost'), 'was not found there'
         with pytest.raises(CallError, match='cup, ring'):
             hand.place('plate', (1.0, 1.0), newest)
-
-
-def test_the_simulator_moves_what_is_where_the_dragged_object_was_found():
-    goals = {'left': (*3 * [math.nan], 10.0, 10.0), 'right': (*3 * [math.nan], 40.0, 10.0)}
-    truth = {'object_0': (*3 * [0.0], 41.0, 10.0), 'object_1': (*3 * [0.0], 10.0, 11.0)}
-    assert simulated('right', (20.0, 5.0), goals, truth, 64) == {'object_0': (21.0, 5.0)}
-    assert simulated('right', (20.0, 5.0), goals, {}, 64) == {'right': (20.0, 5.0)}
-    assert simulated('cup', (20.0, 5.0), goals, truth, 64) == {}
-    assert simulated('left', (20.0, 5.0), goals, {'object_0': truth['object_0']}, 64) == {}

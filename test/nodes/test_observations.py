@@ -132,8 +132,8 @@ def test_time_in_a_queue_makes_a_message_older():
     now = time.monotonic()
     late = reception_time({'received_timestamp': time.time_ns() - 3 * 10**9})
     assert now - 3.5 < late <= time.monotonic() - 3
-    assert reception_time({}) >= now
-    assert reception_time({'received_timestamp': time.time_ns() + 10**12}) >= now
+    assert min(reception_time({'received_timestamp': stamp})
+               for stamp in (0, time.time_ns() + 10**12)) >= now
 
 
 def test_topics_are_put_together_as_they_come_or_on_demand(client):

@@ -90,12 +90,7 @@ def test_all_ways_the_targets_and_the_gripper_are_where_they_belong():
     assert 0.01 < touched < 0.1, 'most of the picture stays as it is'
     wide = draw_plan(np.zeros((160, 320, 3), np.uint8), ABOVE, plan_of(*ways), HAND, TARGETS)
     assert wide.shape[1] == LARGEST
-
-
-def test_what_cannot_be_seen_is_not_drawn_and_does_no_harm():
-    absurd = ForwardModelConfig(table=(0.0,) * 9, arm=(1e30,) * 12)
     far = ForwardModelConfig(table=(60, 0, 1e9, 0, -60, 32, 0, 0, 1), arm=ABOVE.arm)
     nowhere = np.array([[np.nan, 3], [1e30, -1e30]], np.float32)
-    for config in (absurd, far):
-        canvas = draw_plan(GREY, config, plan_of(straight(0.1, 0.1)), HAND, nowhere)
-        np.testing.assert_array_equal(canvas, 90)
+    canvas = draw_plan(GREY, far, plan_of(*ways), HAND, nowhere)
+    np.testing.assert_array_equal(canvas, 90)

@@ -12,7 +12,6 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from tap_msgs.msg import ObjectStates, Subgoal
 from tap_msgs.srv import PredictSubgoal
-from tap_ros.contract import ROBOT_MASK_ARM
 from tap_ros.messages.images import decode_image
 from tap_ros.nodes.calls import call
 from tap_ros.nodes.predictor.node import PredictorNode
@@ -180,41 +179,12 @@ def test_why_there_are_no_maps_is_said_of_each_picture(services):
     assert response.subgoals == plain.answer(**WITH_GOAL).subgoals
 
 
-def test_the_robot_is_taken_out_of_the_newest_picture(services):
+def test_a_picture_whose_robot_mask_is_missing_is_refused(services):
     masked = services['masked']
-    scene, _ = PICTURES
-    mask = np.zeros((32, 32), np.uint8)
-    mask[5:20, 8:24] = ROBOT_MASK_ARM
-    robot = np.where(mask[..., None] > 0, 255 - scene, scene)
-    expected, differing = (
-        pictures(masked.answer(start=encode_image(picture, STAMP, 'eye'), goal=GOAL))
-        for picture in (scene, robot))  # what a request brings along stays as it is
-    assert differ(expected, differing) > 1
+    masked.answer(start=START, goal=GOAL)  # what a request brings along stays as it is
     images = masked.publisher(Image, 'camera/image_raw', STREAM)
-    masks = masked.publisher(Image, 'camera/robot_mask', STREAM)
-
-    def publish(picture, hidden, stamp):
-        images.publish(encode_image(picture, to_stamp(stamp), 'eye'))
-        if hidden is not None:
-            message = Image(height=32, width=32, step=32, encoding='mono8', data=hidden.tobytes())
-            message.header.stamp = to_stamp(stamp)
-            masks.publish(message)
-
-    def seen(stamp):
-        """Return the picture of the answer if it is of this stamp (ns)."""
-        response = masked.ask(goal=GOAL)
-        found = response.success and response.subgoals[0].header.stamp == to_stamp(stamp)
-        return pictures(response) if found else None
-
-    assert until(lambda: publish(scene, mask * 0, 10**9) or seen(10**9) is not None)
-    assert (seen(10**9) == expected).all()
-    for stamp in (2 * 10**9, 3 * 10**9):
-        publish(robot, mask, stamp)
-    assert until(lambda: seen(3 * 10**9) is not None)
-    assert (seen(3 * 10**9) == expected).all()
-    publish(robot, None, 4 * 10**9)
-    message = masked.until('camera/robot_mask', goal=GOAL).message
-    assert '4.000000000 s' in message
+    message = masked.until('camera/robot_mask', [(images, START)], goal=GOAL).message
+    assert '2.500000000 s' in message
 
 
 def test_many_requests_at_once_get_their_own_answer_and_beyond_the_queue_busy(services):

@@ -163,39 +163,16 @@ def test_when_the_predictor_hangs_or_dies_the_arm_stays_and_the_planner_lives(lo
     loop.wait_until_seen()
 
 
-def test_a_planner_with_a_robot_mask_waits_for_masks_and_stops_when_it_is_deactivated(loop):
-    masks = loop.node.create_publisher(Image, 'own_mask', STREAM)
-    sending = threading.Event()
-
-    def answer(image):
-        """Publish a mask for a picture: the robot hides nothing."""
-        if sending.is_set():
-            masks.publish(Image(header=image.header, height=image.height, width=image.width,
-                                step=image.width, encoding='mono8',
-                                data=bytes(image.height * image.width)))
-
-    images = loop.node.create_subscription(Image, 'camera/image_raw', answer, STREAM)
-    card = Newest(loop.node, String, 'other_node/model_card', LATCHED)
-    try:
-        with loop.other_planner(robot_mask='all', image_timeout=3.0):
-            states = Lifecycle(loop.node, 'other_node')
-            assert stored_digest(FORWARD_MODEL) in card.wait(20).data
-            loop.reset()
-            aborted(loop, '/own_mask', mode='direct', step_budget=2)
-            sending.set()
-            reaching = loop.begin_moving()
-            assert states.to('deactivate')
-            loop.ended(reaching, 'aborted', 'deactivated')
-            aborted(loop, 'ros2 lifecycle set /other_node activate', mode='direct', step_budget=1)
-            assert 'cleanup' in states.set('weights', loop.folder / 'none.safetensors')
-            assert states.to('cleanup') and states.set('weights', FORWARD_MODEL) == ''
-            assert states.to('configure') and states.to('activate')
-            loop.reset()
-            served(loop, 2)
-            reaching = loop.begin_moving()
-            assert states.to('active_shutdown')
-            loop.ended(reaching, 'aborted', 'deactivated')
-            aborted(loop, 'start it again', mode='direct', step_budget=1)
-    finally:
-        loop.node.destroy_subscription(images)
-        loop.node.destroy_publisher(masks)
+def test_a_planner_that_is_deactivated_stops_the_arm_and_serves_again_later(loop):
+    states = Lifecycle(loop.node, 'visual_mpc_node')
+    card = Newest(loop.node, String, 'visual_mpc_node/model_card', LATCHED)
+    assert stored_digest(FORWARD_MODEL) in card.wait(20).data
+    reaching = loop.begin_moving()
+    assert states.to('deactivate')
+    loop.ended(reaching, 'aborted', 'deactivated')
+    aborted(loop, 'ros2 lifecycle set /visual_mpc_node activate', mode='direct', step_budget=1)
+    assert 'cleanup' in states.set('weights', loop.folder / 'none.safetensors')
+    assert states.to('cleanup') and states.set('weights', FORWARD_MODEL) == ''
+    assert states.to('configure') and states.to('activate')
+    loop.reset()
+    served(loop, 2)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lines of docs/ros.md, word for word, with the real ros2 command: apt, or `make ros2`."""
 
-from importlib.util import find_spec
 import os
 from pathlib import Path
 import re
@@ -18,8 +17,7 @@ LINES = [line.split('   #')[0].strip() for block in re.findall(
     r'^```bash\n(.*?)^```$', (ROOT / 'docs' / 'ros.md').read_text(), re.M | re.S)
     for line in block.splitlines() if line.startswith('ros2 ')]
 RUNS = [line for line in LINES if line.startswith('ros2 run ') and 'runs/' not in line]
-CALLS = [line for line in LINES if line.startswith(('ros2 service', 'ros2 action'))
-         and ('simulation_interfaces' not in line or find_spec('simulation_interfaces'))]
+CALLS = [line for line in LINES if line.startswith(('ros2 service', 'ros2 action'))]
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(
     shutil.which('ros2') is None, reason='the ros2 command is not there: make ros2')]

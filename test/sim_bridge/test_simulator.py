@@ -1,22 +1,20 @@
 # Copyright 2026 The tap_ros authors
 # SPDX-License-Identifier: Apache-2.0
-"""Laws of the simulator: determinism, limits, goals and objects that are put elsewhere."""
+"""Laws of the simulator: determinism, limits, and goals that are put elsewhere."""
 
 from concurrent.futures import ThreadPoolExecutor
 
-import mujoco
 import numpy as np
 import pytest
-from sim_bridge.simulator import PoseError, Simulator
+from sim_bridge.simulator import Simulator
 from sim_bridge.tasks.tasks import run_episode
-from sim_bridge.world.scene import FINGER_TRAVEL, HALF_HEIGHT
+from sim_bridge.world.scene import FINGER_TRAVEL
 from sim_bridge.world.table import GRIPPER_MARGIN
 from tap_ros.contract import CONTROL_PERIOD, ROBOT_MASK_FREE, WORKSPACE_HIGH
 from tap_ros.errors import SceneError
 from tap_ros.planning.mpc_inputs import GRIPPER_HIGH, GRIPPER_LOW
 
 PLACES = np.array([[0.2, 0.1], [-0.15, -0.2]])
-FREE = (-0.3, 0.3, HALF_HEIGHT, 0, 0, 0, 1)
 
 
 @pytest.fixture(scope='module')
@@ -112,10 +110,8 @@ def test_nothing_moves_to_the_bit_also_while_the_arm_pushes(simulator):
             if moved:
                 simulator.set_goal(PLACES)
                 simulator.photograph(simulator.goal_poses)
-                for unfit in (lambda: simulator.set_goal(np.zeros((2, 2))),
-                              lambda: simulator.put_object('object_0', np.zeros(7))):
-                    with pytest.raises(SceneError):
-                        unfit()
+                with pytest.raises(SceneError):
+                    simulator.set_goal(np.zeros((2, 2)))
                 np.testing.assert_array_equal(simulator.observe().image, run[-1].image)
         runs.append(run)
     assert np.abs(runs[0][-1].object_poses - runs[0][0].object_poses).max() > 0.03, 'it pushes'
@@ -141,36 +137,3 @@ def test_a_goal_that_cannot_be_is_refused_and_the_old_one_stays(simulator):
             simulator.move_goal(unfit, np.zeros((len(unfit), 2)))
     assert simulator.goal() is before
     np.testing.assert_array_equal(simulator.state(), state)
-
-
-def test_an_object_is_put_and_nothing_else_moves(simulator):
-    before, goal = simulator.reset(3), simulator.goal()
-    simulator.put_object('object_1', FREE)
-    after = simulator.observe()
-    np.testing.assert_array_equal(after.object_poses, [before.object_poses[0], FREE])
-    np.testing.assert_array_equal(after.gripper, before.gripper)
-    assert after.stamp_ns == before.stamp_ns and simulator.goal() is goal
-    later = simulator.step(np.zeros(4))  # it rests there
-    np.testing.assert_allclose(later.object_poses[1], FREE, atol=1e-3)
-
-
-def test_an_object_is_not_put_where_it_cannot_be(simulator):
-    simulator.reset(3)
-    other = simulator.object_poses()[1]
-    simulator.data.qpos[2] = 0.01  # the gripper comes down
-    mujoco.mj_forward(simulator.model, simulator.data)
-    hand = np.array([*simulator.data.qpos[:2], HALF_HEIGHT, *FREE[3:]])
-    before = simulator.state()
-    for pose, words in (
-            *((np.where(np.arange(7) == i, number, FREE), words) for i, number, words in (
-                (5, np.inf, 'finite'), (6, 2.0, 'quaternion'), (1, -1e308, 'out of reach'),
-                (2, 0.01, 'the table'))),
-            (other, 'object_1'), (hand, 'finger'), (FREE[:6], '7')):
-        with pytest.raises(PoseError, match=words):
-            simulator.put_object('object_0', pose)
-    for velocity in ((0, 0, 0), (np.nan, 0, 0, 0, 0, 0), (0, 0, 0, 0, 0, -21)):
-        with pytest.raises(SceneError, match='velocity'):
-            simulator.put_object('object_0', FREE, velocity)
-    with pytest.raises(SceneError, match='not in the scene'):
-        simulator.put_object('gripper_x', FREE)
-    np.testing.assert_array_equal(simulator.state(), before)

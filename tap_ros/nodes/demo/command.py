@@ -44,6 +44,7 @@ from tap_ros.nodes.client import Client, positions_of, View
 from tap_ros.nodes.demo.film import GOAL, Run, Scene
 from tap_ros.nodes.demo.report import MODES, results_table, shown, summary, write_report
 from tap_ros.nodes.node_processes import NodeProcesses
+from tap_ros.nodes.recorder.bags import free_folder
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.options import Folder, one_of
 from tap_ros.plugins import names
@@ -421,11 +422,6 @@ def run_scenes(args: Options, folder: Path) -> Iterator[Scene | Refused]:
 
 def new_folder(wanted: str | Path) -> Path:
     """Make a folder of this name, or with the next free number behind it."""
-    for number in range(1, 10000):
-        folder = Path(wanted if number == 1 else f'{wanted}-{number}')
-        try:
-            folder.mkdir(parents=True)
-            return folder
-        except FileExistsError:
-            continue
-    raise TapError(f'{wanted}: thousands of folders of that name; remove some')
+    folder = free_folder(wanted)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -15,7 +15,7 @@ from tap_ros.messages.objects import MAX_NAME, MAX_OBJECTS
 from tap_ros.nodes.calls import CallError, Reaching
 from tap_ros.nodes.client import Client
 from tap_ros.nodes.explorer.goal import simulated
-from tap_ros.nodes.services import internal_error, log_error
+from tap_ros.nodes.services import reason
 from tap_ros.text import escaped, listing
 from tap_ros.weights import PREDICTORS
 
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 TIMEOUT_S = 20.0  # of a service
 GOAL_TIMEOUT_S = 600.0  # of a goal: 75 steps take half a minute
 END_S = 2.0  # that a cancel may take when the node ends
-WAITING = 8  # commands that may wait; more are refused
-MAX_SAMPLES, MAX_LEVELS = 16, 4  # of the page's sliders; the services allow more
 LARGEST = 1e6  # of a pixel
 
 
@@ -34,23 +32,15 @@ class CommandError(TapError):
     """A browser asked for what cannot be done."""
 
 
-def _whole(low: int, high: int) -> tuple[str, Callable[[Any], bool]]:
-    return (f'a whole number from {low} to {high}',
-            lambda value: type(value) is int and low <= value <= high)
-
-
 _TEXT = (f'a text of at most {MAX_NAME} characters that print', lambda value: (
     isinstance(value, str) and len(value) <= MAX_NAME and value.isprintable()))
 _PIXEL = ('a number', lambda value: type(value) in (int, float) and abs(value) < LARGEST)
 _PLACE = {'name': _TEXT, 'u': _PIXEL, 'v': _PIXEL}
-_SEED = _whole(0, 2**62)
-_NUMBERS = {
-    'samples': _whole(1, MAX_SAMPLES), 'levels': _whole(1, MAX_LEVELS), 'seed': _SEED}
+_SEED = ('a whole number, 0 or more', lambda value: type(value) is int and 0 <= value <= 2**62)
 COMMANDS: dict[str, dict[str, tuple[str, Callable[[Any], bool]]]] = {  # do: {field: what is valid}
     'reset': {'task': _TEXT, 'seed': _SEED},  # an empty task is that of now
-    'predict': _NUMBERS,
-    'reach': {'mode': ("'direct' or 'subgoal'", lambda value: value in ('direct', 'subgoal')),
-              **_NUMBERS},
+    'predict': {},
+    'reach': {'mode': ("'direct' or 'subgoal'", lambda value: value in ('direct', 'subgoal'))},
     'cancel': {},
     'select': {'objects': (
         f'1 to {MAX_OBJECTS} objects, each with name, u and v', lambda value: (
@@ -67,8 +57,7 @@ def parse_command(text: str | bytes) -> tuple[str, dict[str, Any]]:
     """
     Read what a browser sent.
 
-    :param text: JSON such as {"do": "reach", "mode": "direct", "samples": 1, "levels": 1,
-        "seed": 0}.
+    :param text: JSON such as {"do": "reach", "mode": "direct"}.
     :return: one of COMMANDS and its fields.
     :raises CommandError: if it is none; the message names the field and what would be right.
     """
@@ -102,7 +91,6 @@ class ExplorerCalls:
         self._node = node
         self._client = Client(node=node, timeout_s=TIMEOUT_S)
         self._lock = threading.Lock()
-        self._waiting = 0
         self._goal: Reaching | None = None
         self.running = self._cancelled = self._ending = False
         self.stage = ''
@@ -127,13 +115,10 @@ class ExplorerCalls:
                 if self._goal is not None and self._node.executor is not None:
                     self._node.executor.create_task(self._goal.handle.cancel_goal_async)
                 return
-            if self._waiting >= WAITING:
-                raise CommandError('busy: earlier commands wait for their answers; try again')
             if do == 'reach':
                 if self.running:
                     raise CommandError('a goal is in progress; cancel it or wait for its end')
                 self.running, self._cancelled = True, False
-            self._waiting += 1
         self._pool.submit(self._carry_out, do, fields)
 
     def close(self) -> None:
@@ -152,21 +137,20 @@ class ExplorerCalls:
     def _carry_out(self, do: str, fields: dict[str, Any]) -> None:
         try:
             getattr(self, f'_{do}')(**fields)
-        except TapError as error:
-            self._node.complain(escaped(error, 1000), False)
         except Exception as error:
-            if self._ending:  # the node is being taken down
-                return
-            log_error(self._node, do, error)
-            self._node.complain(internal_error(error), True)
+            if isinstance(error, TapError) or not self._ending:  # else it is being taken down
+                self._node.complain(escaped(reason(self._node, do, error), 1000),
+                                    not isinstance(error, TapError))
         finally:
-            with self._lock:
-                self._waiting -= 1
-                if do == 'reach':
+            if do == 'reach':
+                with self._lock:
                     self.running, self._goal, self.stage = False, None, ''
 
+    def _call(self, service: str, **fields: Any) -> Any:
+        return self._client.call(service, give_up=lambda: self._ending, **fields)
+
     def _reset(self, task: str, seed: int) -> None:
-        response = self._client.call('reset', give_up=lambda: self._ending, task=task, seed=seed)
+        response = self._call('reset', task=task, seed=seed)
         self._node.tell(f'reset: {escaped(response.message)}')
         if task in PREDICTORS and self._client.is_ready('predict'):
             weights = self._client.weights()
@@ -178,23 +162,22 @@ class ExplorerCalls:
                 self._node.tell(f'the predictor has the weights of {task} now')
 
     def _select(self, objects: list[dict[str, Any]]) -> None:
-        response = self._client.call(
-            'select', give_up=lambda: self._ending, names=[one['name'] for one in objects],
-            u=[float(one['u']) for one in objects], v=[float(one['v']) for one in objects])
+        response = self._call('select', names=[one['name'] for one in objects],
+                              u=[float(one['u']) for one in objects],
+                              v=[float(one['v']) for one in objects])
         self._node.show_selection(response, followed=True)
         self._node.tell(f'following {listing(one.name for one in response.objects)}')
 
     def _propose(self) -> None:
-        response = self._client.call('select', give_up=lambda: self._ending, propose=True)
+        response = self._call('select', propose=True)
         self._node.show_selection(response, followed=False)
         self._node.tell(f'{len(response.objects)} objects proposed')
 
     def _move(self, name: str, u: float, v: float) -> None:
         node = self._node
-        moved: dict[str, tuple[float, float]] = {}
-        if self.offered('set_goal'):
-            moved = simulated(name, (u, v), node.places('goal_objects'),
-                              node.places('true_goals'), node.size('goal')['width'])
+        moved = simulated(
+            name, (u, v), node.places('goal_objects'), node.places('true_goals'),
+            node.size('goal')['width']) if self.offered('set_goal') else {}
         if moved:
             self._client.set_goal(moved)
         else:
@@ -205,26 +188,22 @@ class ExplorerCalls:
     def _photograph(self) -> None:
         if self.offered('reset'):
             raise CallError('photograph: the simulator takes its goal pictures itself')
-        told = bool({'objects', 'goal_objects'} & set(self._node.newest))
-        self._node.goal.photograph(told and not self.offered('select'))
+        self._node.goal.photograph(
+            self._node.newest.get('camera'), followed=self.offered('select'))
         self._node.tell('goal: what the camera sees now')
 
-    def _predict(self, samples: int, levels: int, seed: int) -> None:
-        response = self._client.call('predict', give_up=lambda: self._ending, num_samples=samples,
-                                     recursion_depth=levels, seed=seed)
-        self._node.show_answer(response)
+    def _predict(self) -> None:
+        response = self._call('predict')
         self._node.tell(f'predicted in {response.model_time_ms:.0f} ms: '
-                   f'{escaped(response.message, 300)}')
+                        f'{escaped(response.message, 300)}')
 
-    def _reach(self, mode: str, samples: int, levels: int, seed: int) -> None:
+    def _reach(self, mode: str) -> None:
         words = 'via subgoal' if mode == 'subgoal' else 'direct'
         self.stage = f'{words}: waiting for the planner'
-        cancelled = self._cancelled
-        if cancelled:
+        if self._cancelled:
             raise CallError(f'{words}: cancelled before it began')
         goal = self._client.reach(
-            mode=mode, num_samples=samples, recursion_depth=levels, seed=seed,
-            on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
+            mode=mode, on_feedback=self._on_feedback, timeout_s=GOAL_TIMEOUT_S)
         with self._lock:
             self._goal, cancelled = goal, self._cancelled
         if cancelled:  # meanwhile

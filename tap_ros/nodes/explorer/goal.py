@@ -13,7 +13,6 @@ from sensor_msgs.msg import Image
 from tap_msgs.msg import ObjectStates
 from tap_ros.nodes.calls import CallError
 from tap_ros.nodes.explorer.display import Place, SILENT_S
-from tap_ros.nodes.observations import Observations
 from tap_ros.nodes.ros_messages import encode_objects
 from tap_ros.nodes.topics import LATCHED
 from tap_ros.text import escaped, listing
@@ -27,38 +26,32 @@ class GoalByHand:
     Publishes goal pictures and goal objects.
 
     :param node: rclpy Node.
-    :ivar moments: Observations of 'camera' and 'objects'; the node puts them there.
     """
 
     def __init__(self, node: Node) -> None:
-        self.moments = Observations('camera', 'objects')
         self._node = node
         self._made: dict[type, Any] = {}  # publishers; a goal that is not ours has none
 
-    def photograph(self, with_objects: bool) -> None:
+    def photograph(self, camera: tuple[Any, float] | None, followed: bool) -> None:
         """
-        Publish the camera's newest picture as the goal.
+        Publish a picture of the camera as the goal.
 
-        :param with_objects: and the objects in it; without, whoever follows them finds them there.
-        :raises CallError: when there is none, or none with objects.
+        :param camera: its newest message and when that was received, if there is one.
+        :param followed: whether a node follows objects, and finds them there; else no object is
+            where it was in the goal before.
+        :raises CallError: where that is of no use.
         """
-        since = time.monotonic() - SILENT_S
-        # Objects of another moment would be taken for the goal.
-        found = self.moments.newest(
-            'camera', *['objects'] if with_objects else [], since=since)
-        if found is None:
-            raise CallError("photograph: no objects have the stamp of one of the camera's newest "
-                            'pictures; publish them with it' if self.moments.newest(
-                                'camera', since=since) else
-                            'photograph: the camera is silent; no picture to take')
-        if not isinstance(found['camera'], Image):
+        message, received = camera or (None, -math.inf)
+        if time.monotonic() - received > SILENT_S:
+            raise CallError('photograph: the camera is silent; no picture to take')
+        if not isinstance(message, Image):
             raise CallError('photograph: a goal picture is sensor_msgs/Image; start with '
                             'image_transport:=raw')
-        if with_objects:
-            self._publish(found['objects'], 'goal/objects')
-        self._publish(found['camera'], 'goal/image')
+        if not followed:
+            self._publish(ObjectStates(header=message.header), 'goal/objects')
+        self._publish(message, 'goal/image')
 
-    def place(self, name: str, pixel: tuple[float, float], newest: Mapping[str, Any]) -> None:
+    def place(self, name: str, pixel: Place, newest: Mapping[str, Any]) -> None:
         """
         Publish goal objects of which one is elsewhere.
 
@@ -81,8 +74,8 @@ class GoalByHand:
         goals[name] = *pixel, SEEN, 1.0
         u, v, states, confidence = zip(*goals.values())
         self._publish(encode_objects(
-            goals, np.column_stack([u, v]), np.full((len(goals), 7), np.nan), of.header.stamp,
-            of.header.frame_id, ObjectStates.SOURCE_TRACKED, states, confidence), 'goal/objects')
+            goals, np.column_stack([u, v]), None, of.header.stamp, of.header.frame_id,
+            ObjectStates.SOURCE_TRACKED, states, confidence), 'goal/objects')
 
     def _publish(self, message: Any, topic: str) -> None:
         kind = type(message)
@@ -91,8 +84,8 @@ class GoalByHand:
         self._made[kind].publish(message)
 
 
-def simulated(name: str, pixel: tuple[float, float], goals: Mapping[str, Place],
-              truth: Mapping[str, Place], width: int) -> dict[str, tuple[float, float]]:
+def simulated(name: str, pixel: Place, goals: Mapping[str, Place],
+              truth: Mapping[str, Place], width: int) -> dict[str, Place]:
     """
     Return what the simulator calls an object, and where it is to put its goal; {} if nowhere.
 
@@ -104,10 +97,9 @@ def simulated(name: str, pixel: tuple[float, float], goals: Mapping[str, Place],
     """
     if name not in goals or not truth:
         return {name: pixel} if name in goals else {}
-    (u, v), place = pixel, goals[name][-2:]
-    nearest = min(truth, key=lambda each: math.dist(truth[each][-2:], place))
-    du, dv = (truth[nearest][k] - goals[name][k] for k in (-2, -1))
-    return {nearest: (u + du, v + dv)} if math.hypot(du, dv) < NEAR * width else {}
+    nearest = min(truth, key=lambda each: math.dist(truth[each], goals[name]))
+    du, dv = np.subtract(truth[nearest], goals[name]).tolist()
+    return {nearest: (pixel[0] + du, pixel[1] + dv)} if math.hypot(du, dv) < NEAR * width else {}
 
 
 def _by_name(message: ObjectStates | None) -> dict[str, tuple[float, float, str, float]]:

@@ -5,53 +5,46 @@
 from collections import deque
 from collections.abc import Mapping
 import json
-import math
 import threading
 import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Episode, ObjectStates, Subgoal
-from tap_msgs.srv import PredictSubgoal, SelectObjects
+from tap_msgs.srv import SelectObjects
 from tap_ros.errors import TapError
-from tap_ros.images.drawing import grid, overlay, png_bytes
 from tap_ros.messages.images import is_empty
+from tap_ros.messages.objects import decode_objects
 from tap_ros.messages.stamps import to_nanoseconds
-from tap_ros.nodes.client import subgoals_of
 from tap_ros.nodes.diagnostics import Diagnostics
 from tap_ros.nodes.explorer.browser_commands import ExplorerCalls
 from tap_ros.nodes.explorer.display import (
-    Distances,
     grips,
     listed,
-    NodeStates,
     picture_bytes,
     picture_of,
     Place,
-    places_of,
     silence,
     SILENT_S,
 )
 from tap_ros.nodes.explorer.goal import GoalByHand
 from tap_ros.nodes.explorer.server import ExplorerServer
 from tap_ros.nodes.observations import reception_time
-from tap_ros.nodes.parameters import declare_transport, Parameters
-from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
+from tap_ros.nodes.parameters import Parameters
+from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription, steady_timer
 from tap_ros.nodes.topics import camera_image, LATCHED, STREAM
 from tap_ros.plugins import names
 from tap_ros.text import escaped
 
 PERIOD_S = 0.1  # between two looks at what is to be shown
 LOG_LINES = 50
+STALE = 3  # of diagnostic_msgs/DiagnosticStatus
 OBSERVER = 'observer/image_raw'
 PICTURES = ('camera', 'goal', 'subgoal', 'plan', 'observer')
 NOTHING_SELECTED = json.dumps(
     {'kind': 'selection', 'count': 0, 'followed': True, 'objects': []})
-COLUMNS, MAX_SHOWN = 4, 12  # subgoals of one answer in the page
 
 
 class ExplorerNode(Node):
@@ -72,13 +65,11 @@ class ExplorerNode(Node):
         self.newest: dict[str, tuple[Any, float]] = {}  # kind -> message, when it came
         self._changed: set[str] = set()  # kinds whose newest message was not shown yet
         self._sizes: dict[str, tuple[int, int]] = {}  # (width, height) before it is made smaller
-        self._distances = Distances()
-        self._nodes = NodeStates()
+        self._states: dict[str, tuple[int, str, float]] = {}  # level, text, when it came
         self._log: deque[str] = deque(maxlen=LOG_LINES)
         self._log_count = 0
-        self._task, self._note = self.params['task'], ''
+        self._task = self.params['task']
         self._problem: dict[str, Any] = {'count': 0, 'text': ''}
-        self._sheet_stamp: Any = None  # of the picture whose subgoals are shown side by side
         self._scene_ns = 0  # subgoals and plans of pictures before that are of an old scene
         self._selections = 0  # answers of select_objects
         self.goal = GoalByHand(self)
@@ -87,8 +78,8 @@ class ExplorerNode(Node):
             self._calls.do, self.params['host'], self.params['port'], self.params['token'])
         self._server.put('selection', NOTHING_SELECTED)
         kind, topic = camera_image(self.params)
-        self._diagnostics = Diagnostics(self, {topic: SILENT_S, 'objects': SILENT_S,
-                                           'goal/image': math.inf, 'goal/objects': math.inf})
+        self._diagnostics = Diagnostics(
+            self, [topic, 'objects'], ['goal/image', 'goal/objects'])
         adapt_regularly(self, [
             self._keep(Image, OBSERVER, 'observer', STREAM, counted=False),
             self._keep(Image, 'plan/overlay', 'plan', STREAM, counted=False),
@@ -99,8 +90,9 @@ class ExplorerNode(Node):
             self._keep(ObjectStates, 'goal/objects', 'goal_objects', LATCHED),
             self._keep(ObjectStates, 'truth/goal/objects', 'true_goals', LATCHED, counted=False),
             AdaptiveSubscription(self, Episode, 'episode', self._on_episode, STREAM),
-            AdaptiveSubscription(self, DiagnosticArray, '/diagnostics', self._nodes.add, STREAM)])
-        self.create_timer(PERIOD_S, self._show, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            AdaptiveSubscription(
+                self, DiagnosticArray, '/diagnostics', self._on_diagnostics, STREAM)])
+        steady_timer(self, PERIOD_S, self._show)
         self.get_logger().info(f'ready: open {self.url}')
 
     @property
@@ -133,8 +125,6 @@ class ExplorerNode(Node):
                     return
                 self.newest[name] = message, reception_time(info)
                 self._changed.add(name)
-            if name in ('camera', 'objects'):
-                self.goal.moments.put(name, message, reception_time(info))
         return AdaptiveSubscription(self, kind, topic, keep, qos)
 
     def _forget_plans(self) -> None:
@@ -143,7 +133,6 @@ class ExplorerNode(Node):
             self.newest.pop(kind, None)
             self._changed.discard(kind)
             self._server.put(kind, b'')
-        self._note = ''
 
     def _is_old(self, message: Any) -> bool:
         """Tell whether what was made of a picture belongs to an old scene; stamp 0: of a file."""
@@ -152,27 +141,16 @@ class ExplorerNode(Node):
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:
             self._task = escaped(message.task, 40)
-            self._distances.clear()
             self._server.put('selection', NOTHING_SELECTED)
             with self._lock:
                 if self._calls.offered('reset'):  # stamps are the simulator's
                     self._scene_ns = to_nanoseconds(message.header.stamp)
                 self._forget_plans()
 
-    def show_answer(self, response: PredictSubgoal.Response) -> None:
-        """Show all subgoals of an answer side by side; runs in a thread of the calls."""
-        if self._is_old(response.subgoals[0]):
-            return
-        subgoals = subgoals_of(response)
-        self._sheet_stamp = None
-        if len(subgoals) > 1:
-            panels = [overlay(one.image, one.object_maps) for one in subgoals[:MAX_SHOWN]]
-            width = min(COLUMNS, len(panels))
-            panels += [np.full_like(panels[0], 255)] * (-len(panels) % width)
-            sheet = grid([panels[i:i + width] for i in range(0, len(panels), width)])
-            self._sheet_stamp = response.subgoals[0].header.stamp
-            self._server.put('subgoal', png_bytes(sheet))
-        self._note = f'{len(subgoals)} subgoals' if len(subgoals) > 1 else ''
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._states[escaped(status.name, 100)] = (
+                status.level[0], escaped(status.message, 200), time.monotonic())
 
     def show_selection(self, response: SelectObjects.Response, followed: bool) -> None:
         """
@@ -213,20 +191,15 @@ class ExplorerNode(Node):
             changed = self._changed if watched else self._changed - {*PICTURES}
             self._changed = self._changed - changed
             log, log_count, problem = list(self._log), self._log_count, self._problem
-        objects, goals = self.places('objects'), self.places('goal_objects')
-        if 'goal_objects' in changed:
-            self._distances.clear()
-        if 'objects' in changed and objects and goals:
-            stamp = to_nanoseconds(newest['objects'][0].header.stamp)
-            self._distances.add(stamp / 1e9, objects, goals)
         if not watched:
             return
+        objects, goals = self.places('objects'), self.places('goal_objects')
         for kind in PICTURES:
-            # The first subgoal of an answer comes by topic, too.
-            if kind in changed and not (
-                    kind == 'subgoal' and newest[kind][0].header.stamp == self._sheet_stamp):
+            if kind in changed:
                 try:
-                    self._show_picture(kind, picture_of(newest[kind][0], kind))
+                    image = picture_of(newest[kind][0], kind)
+                    self._sizes[kind] = image.shape[1], image.shape[0]
+                    self._server.put(kind, picture_bytes(image, kind == 'plan'))
                 except TapError as error:
                     self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
         now, simulator = time.monotonic(), self._calls.offered('reset')
@@ -238,24 +211,28 @@ class ExplorerNode(Node):
             'observer': self.count_publishers(OBSERVER) > 0,
             'movable': self._movable(bool(objects), bool(goals), 'goal' in newest),
             'camera': {**self.size('camera'),
-                       'objects': listed(objects, newest.get('objects')),
+                       'objects': listed(objects, newest.get('objects', [None])[0]),
                        'targets': listed({n: goals[n] for n in objects if n in goals}),
                        'note': silence(now, newest.get('camera'))},
-            'goal': {**self.size('goal'), 'objects': listed(goals, newest.get('goal_objects')),
+            'goal': {**self.size('goal'),
+                     'objects': listed(goals, newest.get('goal_objects', [None])[0]),
                      'pictured': 'goal' in newest,
                      'note': '' if 'goal' in newest else 'none yet'},
-            'subgoal_note': self._note, 'problem': problem,
+            'problem': problem,
             'run': {'running': running, 'stage': self._calls.stage if running else '',
                     'text': self._calls.stage or 'starting' if running else 'idle'},
-            'diagnostics': self._nodes.shown(now),
+            'diagnostics': [
+                {'name': name, 'level': level, 'message': text} if now - came <= SILENT_S + 1 else
+                {'name': name, 'level': STALE, 'message': 'silent'}
+                for name, (level, text, came) in sorted(self._states.items())],
             'log': log, 'log_count': log_count}))
-        self._server.put('history', json.dumps({'kind': 'history', **self._distances.shown()}))
 
     def places(self, name: str) -> dict[str, Place]:
         """Return the places of objects by name; empty where they cannot be used."""
         message, _ = self.newest.get(name, (ObjectStates(), 0.0))
         try:
-            return places_of(message, name)
+            found, pixels = decode_objects(message, name)
+            return {each: (u, v) for each, (u, v) in zip(found, pixels.tolist())}
         except TapError as error:
             self.get_logger().warning(escaped(error, 300), throttle_duration_sec=10.0)
             return {}
@@ -269,13 +246,6 @@ class ExplorerNode(Node):
         if not objects or (self._calls.offered('reset') and not self._calls.offered('select')):
             return ''
         return 'goal' if pictured else 'camera'
-
-    def _show_picture(self, kind: str, image: np.ndarray) -> None:
-        height, width = image.shape[:2]
-        self._sizes[kind] = width, height
-        if kind == 'subgoal':
-            self._note = ''
-        self._server.put(kind, picture_bytes(image, kind == 'plan'))
 
     def size(self, kind: str) -> dict[str, int]:
         """Return width and height of the newest picture of a kind; 0 without one."""
@@ -294,5 +264,5 @@ def declare_parameters(node: Node) -> Parameters:
         'token', '', 'That browsers must give as ?token=...; empty: none is needed where host is '
         'of this machine alone, else one is made up and printed.')
     parameters.declare('task', '', "Of the simulator's first scene; resets are heard.")
-    declare_transport(parameters)
+    parameters.declare_shared('image_transport')
     return parameters

@@ -37,7 +37,7 @@ MAX_COMMAND = 4096  # bytes
 MAX_BROWSERS = 64
 _PAGE = {'/': ('index.html', 'text/html'), '/explorer.css': ('explorer.css', 'text/css'), **{
     f'/{name}.js': (f'{name}.js', 'text/javascript')
-    for name in ('explorer', 'pictures', 'hands', 'chart')}}
+    for name in ('explorer', 'pictures', 'hands')}}
 _POLICY = ("default-src 'none'; script-src 'self'; style-src 'self'; img-src blob: data:; "
            "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
 _START_S, _END_S = 10.0, 5.0

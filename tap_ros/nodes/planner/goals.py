@@ -111,8 +111,8 @@ def ask_subgoals(client: Client, inputs: PlannerInputs, request: ReachGoal.Goal,
     """
     stamp, frame_id = to_stamp(seen.stamp_ns), inputs.frame_id
     objects, goal_objects = (encode_objects(
-        seen.names, pixels, np.full((len(pixels), 7), np.nan), stamp, frame_id,
-        ObjectStates.SOURCE_TRACKED) for pixels in (seen.pixels, goal_pixels))
+        seen.names, pixels, None, stamp, frame_id, ObjectStates.SOURCE_TRACKED)
+        for pixels in (seen.pixels, goal_pixels))
     response = client.call(
         'predict', timeout_s, give_up, start=encode_image(seen.image, stamp, frame_id),
         goal=encode_image(inputs.cut(goal, 'goal'), stamp, frame_id),

@@ -5,7 +5,6 @@
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-import math
 from pathlib import Path
 import threading
 import time
@@ -39,7 +38,7 @@ from tap_ros.nodes.planner.settings import (
 )
 from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
-from tap_ros.nodes.services import internal_error, log_error
+from tap_ros.nodes.services import reason
 from tap_ros.nodes.topics import camera_topics, goal_topics, STREAM, to_stamp
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.forward_model import LearnedForwardModel
@@ -51,7 +50,6 @@ from tap_ros.text import escaped
 
 BUSY = 'another goal is in progress; cancel it or wait for its end'
 ENDING = 'the node is ending'
-STALE_S = 2.0  # s without a message after which diagnostics call an input stale
 RESULT_S = 60  # s that a result, and the pictures of its request, are kept for who asks for it
 
 
@@ -67,7 +65,6 @@ class VisualMpcNode(LifecycleBase):
     While the node is not active, goals are aborted with the reason.
     """
 
-    loaded_by = 'weights',
     num_threads = 4
     _mpc: VisualMPC  # while configured
 
@@ -82,11 +79,9 @@ class VisualMpcNode(LifecycleBase):
         self._worker = ThreadPoolExecutor(1, 'planning')
         self.autostart('configure')
         robot_mask = self.params['robot_mask']
-        self._diagnostics = Diagnostics(self, {
-            JOINT_STATES.name: STALE_S,
-            **{name: STALE_S for _, name in camera_topics(self.params).values()},
-            **{name: math.inf for _, name in goal_topics(robot_mask).values()}},
-            idle=self.why_not)
+        self._diagnostics = Diagnostics(
+            self, [JOINT_STATES.name, *(name for _, name in camera_topics(self.params).values())],
+            [name for _, name in goal_topics(robot_mask).values()], idle=self.why_not)
         received = self._diagnostics.received
         self._inputs = PlannerInputs(self, self.params, lambda: self._model.camera_crop, received)
         self._goal = GoalSource(self, self._inputs.robot, received)
@@ -201,10 +196,7 @@ class VisualMpcNode(LifecycleBase):
         except Exception as error:
             if not isinstance(error, ConfigError):  # else who sent the goal was wrong
                 self._diagnostics.error(error)
-            result.message = str(error)
-            if not isinstance(error, TapError):
-                result.message = internal_error(error)
-                log_error(self, 'reach_goal', error)
+            result.message = reason(self, 'reach_goal', error)
             handle.abort()
         finally:
             try:

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from tap_msgs.msg import Episode, ObjectStates
 from tap_ros.errors import ImageError, KinematicsError, PlanningError, TapError
@@ -26,6 +24,7 @@ from tap_ros.messages.topics import JOINT_STATES
 from tap_ros.nodes.observations import JUMP_NS, Observations, reception_time
 from tap_ros.nodes.parameters import declared_arm, Parameters
 from tap_ros.nodes.robot_view import RobotView
+from tap_ros.nodes.subscriptions import newcomers, publishers_of
 from tap_ros.nodes.topics import camera_topics, of_topic, STREAM
 from tap_ros.planning.reach import Seen
 
@@ -57,13 +56,13 @@ class PlannerInputs:
         self.robot = RobotView(params['robot_mask'])
         self._types = {**camera_topics(params), 'joints': of_topic(JOINT_STATES)}
         self.topics = tuple(self._types)
+        self._names = [name for _, name in self._types.values()]
         self._tell = on_message
         self.sensors = Observations(*self._types)
         self._gripper = GripperHistory(
             declared_arm(params), params['joint_prefix'], params['fixed_opening'])
         self._useless = ''  # why the joint states cannot be used
         self.begin(0.0)
-        node.create_subscription(Clock, 'clock', self._on_clock, qos_profile_sensor_data)
         self.sensors.subscribe(node, self._types, STREAM, on_message=self._on_message,
                                others={'joints': self._on_joints})
         node.create_subscription(Episode, 'episode', self._on_episode, STREAM)
@@ -73,7 +72,7 @@ class PlannerInputs:
         self._since = since
         self._seen: Seen | None = None
         self.frame_id = ''
-        self._publishers = self._count_publishers()
+        self._publishers = publishers_of(self._node, self._names)
 
     def look(self) -> tuple[Seen | None, str]:
         """
@@ -82,7 +81,10 @@ class PlannerInputs:
         :return: Seen, or None when nothing was; which sensors are silent, '' if none is.
         :raises TapError: for messages that cannot be used.
         """
-        self._check_publishers()
+        rival = newcomers(self._node, self._names, self._publishers)
+        if rival:
+            raise PlanningError(
+                f'the scene has changed: {rival}; leave one, and send the goal again')
         topics = self.topics
         moment = self.sensors.moment(topics, since=self._since)
         lacking = self._lacking(topics)
@@ -220,22 +222,6 @@ class PlannerInputs:
         what = 'nothing' if missing else 'nothing new'
         return (f'{what} has come on {self.sensors.names(silent, explained=True)}'
                 if silent else '')
-
-    def _count_publishers(self) -> dict[str, int]:
-        return {topic: self._node.count_publishers(name)
-                for topic, (_, name) in self._types.items()}
-
-    def _check_publishers(self) -> None:
-        """Raise PlanningError if another node began to publish, such as a second camera."""
-        for topic, count in self._count_publishers().items():
-            if count > max(self._publishers[topic], 1):
-                raise PlanningError(
-                    'the scene has changed: '
-                    f'{count} nodes publish on {self.sensors.names([topic])} now; '
-                    'leave one, and send the goal again')
-
-    def _on_clock(self, message: Clock) -> None:
-        self.sensors.tell_time(to_nanoseconds(message.clock))
 
     def _on_episode(self, message: Episode) -> None:
         if message.event == Episode.START:

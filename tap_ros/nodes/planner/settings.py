@@ -16,16 +16,7 @@ from tap_ros.contract import (
     WORLD_FRAME,
 )
 from tap_ros.errors import ConfigError
-from tap_ros.nodes.lifecycle import declare_autostart
-from tap_ros.nodes.parameters import (
-    check_device,
-    declare_arm,
-    declare_device,
-    declare_joint_prefix,
-    declare_transport,
-    Parameters,
-)
-from tap_ros.nodes.robot_view import declare_robot_mask
+from tap_ros.nodes.parameters import check_device, declare_arm, Parameters
 from tap_ros.planning.action_sequences import Limits
 from tap_ros.planning.mpc_config import PLANNING_TASKS, PRESETS, SWITCHES, with_preset
 from tap_ros.planning.mpc_inputs import Scene
@@ -44,20 +35,18 @@ MAX_CHOICE = 64  # plans to choose among samples, of up to a second each on two 
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    declare_autostart(parameters)
+    parameters.declare_shared(
+        'autostart', 'device', 'image_transport', 'robot_mask', 'joint_prefix')
     parameters.declare('weights', 'push',
                        f'A forward model: the shipped one, by its name or a task ({SHIPPED}), or '
                        'a file (.safetensors). Can be changed while the node is unconfigured.',
                        read_only=False)
-    declare_device(parameters)
     parameters.declare('preset', 'default', 'Settings of the planner: what does best, the same '
                        'with more samples, or what the paper says.', choices=list(PRESETS))
     parameters.declare('solver', 'cem', 'What searches the actions: the cross-entropy method '
                        '(cem), the improved one (icem), or a solver of another package.',
                        choices=names('tap_ros.solvers'))
     parameters.declare('arm_hidden', False, 'The arm is not in the pictures.')
-    declare_transport(parameters)
-    declare_robot_mask(parameters)
     parameters.declare('control_period', CONTROL_PERIOD,
                        'Seconds (of image stamps) that the arm takes for one command.',
                        low=0.01, high=10.0)
@@ -96,7 +85,6 @@ def declare_parameters(node: Node) -> Parameters:
                        'Seconds; what was received longer ago is not acted upon, so a plan that '
                        'takes longer is discarded.', low=0.1, high=600.0, read_only=False)
     declare_arm(parameters)
-    declare_joint_prefix(parameters)
     parameters.declare('image_timeout', 5.0,
                        'Seconds without a usable observation after which a goal is aborted.',
                        low=0.1, high=600.0, read_only=False)

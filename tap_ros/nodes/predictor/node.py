@@ -5,12 +5,10 @@
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-import math
 from pathlib import Path
 import time
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import Image
 from tap_msgs.msg import Subgoal
@@ -19,13 +17,8 @@ from tap_ros.errors import ConfigError, TapError
 from tap_ros.images.drawing import overlay
 from tap_ros.messages.subgoals import Subgoal as PredictedSubgoal
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.lifecycle import declare_autostart, LifecycleBase
-from tap_ros.nodes.parameters import (
-    check_device,
-    declare_device,
-    declare_transport,
-    Parameters,
-)
+from tap_ros.nodes.lifecycle import LifecycleBase
+from tap_ros.nodes.parameters import check_device, Parameters
 from tap_ros.nodes.predictor.request_queue import Busy, RequestQueue
 from tap_ros.nodes.predictor.requests import (
     encode_answer,
@@ -35,14 +28,15 @@ from tap_ros.nodes.predictor.requests import (
     PendingRequest,
     RequestReader,
 )
-from tap_ros.nodes.robot_view import declare_robot_mask, warn_if_unlike
+from tap_ros.nodes.robot_view import warn_if_unlike
 from tap_ros.nodes.ros_messages import encode_image
 from tap_ros.nodes.services import (
     create_deferred_service,
-    internal_error,
     log_error,
+    reason,
     take_pending_requests,
 )
+from tap_ros.nodes.subscriptions import steady_timer
 from tap_ros.nodes.topics import camera_topics, goal_topics, LATCHED
 from tap_ros.prediction.protocol import load_predictor, Predictor, predictor_files
 from tap_ros.training.robot_mask import trained_robot_mask
@@ -53,7 +47,6 @@ Send = Callable[[PredictSubgoal.Response], object]
 
 OVERLAY_SCALE = 4  # pixels of subgoal/overlay per pixel of the picture
 SHOW_PERIOD = 0.1  # s between two checks for a subgoal to publish
-STALE_S = 2.0  # s without a message after which diagnostics call an input stale
 
 
 class PredictorNode(LifecycleBase):
@@ -65,8 +58,6 @@ class PredictorNode(LifecycleBase):
     answers.
     """
 
-    loaded_by = 'weights',
-
     def __init__(self, **options: Any) -> None:
         super().__init__('predictor_node', **options)
         self.params = declare_parameters(self)
@@ -75,8 +66,8 @@ class PredictorNode(LifecycleBase):
         self.autostart('configure')
         goal = goal_topics(self.params['robot_mask'])
         self._diagnostics = Diagnostics(
-            self, {**{name: STALE_S for _, name in camera_topics(self.params).values()},
-                   **{name: math.inf for _, name in goal.values()}},
+            self, [name for _, name in camera_topics(self.params).values()],
+            [name for _, name in goal.values()],
             queue=lambda: len(self._queue or ()), idle=self.why_not)
         self._reader = RequestReader(self, self.params, self._diagnostics.received)
         self._subgoal = self.create_publisher(Subgoal, 'subgoal', LATCHED)
@@ -84,8 +75,7 @@ class PredictorNode(LifecycleBase):
         self._overlay = self.create_publisher(Image, 'subgoal/overlay', LATCHED)
         # The newest subgoal until it is published, by a timer: the answer does not wait for it.
         self._unshown: deque[tuple[PendingRequest, PredictedSubgoal, Subgoal]] = deque(maxlen=1)
-        self.create_timer(
-            SHOW_PERIOD, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(self, SHOW_PERIOD, self._on_timer)
         self._service = create_deferred_service(
             self, PredictSubgoal, 'predict_subgoal', self._on_request)
         self.autostart('activate')
@@ -188,9 +178,8 @@ class PredictorNode(LifecycleBase):
             self.get_logger().warning(f'predict_subgoal refused: {error}')
         else:
             self._diagnostics.error(error)
-            log_error(self, 'predict_subgoal', error)
-            error = TapError(internal_error(error))
-        return PredictSubgoal.Response(success=False, message=str(error))
+        return PredictSubgoal.Response(
+            success=False, message=reason(self, 'predict_subgoal', error))
 
     def _send(self, send: Send, response: PredictSubgoal.Response) -> None:
         """Send a response; its client may have gone."""
@@ -211,7 +200,7 @@ def predict(predictor: Predictor, tasks: list[PendingRequest]) -> list[Found]:
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
-    declare_autostart(parameters)
+    parameters.declare_shared('autostart', 'device', 'image_transport', 'robot_mask')
     shipped = ', '.join(PREDICTORS)
     parameters.declare('weights', DEFAULT_PREDICTOR,
                        f'A subgoal predictor: shipped weights ({shipped}), a file '
@@ -219,7 +208,4 @@ def declare_parameters(node: Node) -> Parameters:
                        'nearest_keyframe:bags/push2. Can be changed while the node is '
                        'unconfigured.',
                        read_only=False)
-    declare_device(parameters)
-    declare_transport(parameters)
-    declare_robot_mask(parameters)
     return parameters

@@ -5,6 +5,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+import math
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -233,16 +234,12 @@ def check_mode(request: PredictSubgoal.Request, mode: str) -> None:
 
 def check_work(num_samples: int, depth: int, num_objects: int) -> None:
     """Raise ConfigError if one answer would take too long or be too large."""
-    for name, value, highest in (('num_samples', num_samples, MAX_SAMPLES),
-                                 ('recursion_depth', depth, MAX_DEPTH)):
-        if value > highest:
-            raise ConfigError(f'{name} is {value}; expected 1 to {highest}, or 0 for 1')
-    subgoals = num_samples * depth
-    if subgoals > MAX_SUBGOALS:
-        raise ConfigError(
-            f'num_samples x recursion_depth is {num_samples} x {depth} = {subgoals}; '
-            f'at most {MAX_SUBGOALS} subgoals are predicted for one request')
-    if subgoals * num_objects > MAX_MAPS:
-        raise ConfigError(
-            f'num_samples x recursion_depth x objects is {num_samples} x {depth} x {num_objects} '
-            f'= {subgoals * num_objects}; at most {MAX_MAPS} maps are predicted for one request')
+    for name, factors, most in (
+            ('num_samples', (num_samples,), MAX_SAMPLES), ('recursion_depth', (depth,), MAX_DEPTH),
+            ('num_samples x recursion_depth', (num_samples, depth), MAX_SUBGOALS),
+            ('num_samples x recursion_depth x objects', (num_samples, depth, num_objects),
+             MAX_MAPS)):
+        count = math.prod(factors)
+        if count > most:
+            shown = ' x '.join(map(str, factors)) + f' = {count}' * (len(factors) > 1)
+            raise ConfigError(f'{name} is {shown}; expected 1 to {most}')

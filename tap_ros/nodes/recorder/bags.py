@@ -46,9 +46,10 @@ class Bags:
         """
         if self._writer is not None:
             return self._writer.folder
-        self.failure, self.count = None, 0
+        self.failure, self.count = 'the recording could not be begun', 0  # until it is
         folder = free_folder(self._params['folder'])
         self._writer = BagWriter(folder, compression=self._params['compression'])
+        self.failure = None
         now = time.time_ns()
         for topic, (type_name, data, qos) in self._last.items():
             try:
@@ -57,11 +58,11 @@ class Bags:
                 self._report(f'{escaped(topic)}: a message was not recorded: {escaped(error)}')
         arm = ArmMount(
             declared_mount(self._params), self._params['fixed_opening'], self._params['arm'])
-        if self._writer is not None and arm != ArmMount():  # which readers assume
-            try:
+        try:
+            if arm != ArmMount():  # which readers assume
                 write_mount(folder, arm)
-            except StorageError as error:
-                self._give_up(error)
+        except StorageError as error:
+            self._give_up(error)
         self._unflushed = True
         self.flush()  # a full disk is to be known now, not at the first message
         if self.failure is not None:

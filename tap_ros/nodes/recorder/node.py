@@ -3,27 +3,24 @@
 """Records topics into an MCAP bag, as serialized messages."""
 
 from functools import partial
-import math
 import time
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 from tap_ros.errors import ConfigError
 from tap_ros.messages.topics import BY_NAME, COMPRESSED_TYPE, IMAGE, Qos, Topic
 from tap_ros.nodes.diagnostics import Diagnostics
-from tap_ros.nodes.parameters import declare_arm, declare_transport, Parameters
+from tap_ros.nodes.parameters import declare_arm, Parameters
 from tap_ros.nodes.recorder.bags import Bags
 from tap_ros.nodes.ros_messages import message_class
-from tap_ros.nodes.subscriptions import AdaptiveSubscription
+from tap_ros.nodes.services import answering
+from tap_ros.nodes.subscriptions import AdaptiveSubscription, steady_timer
 from tap_ros.nodes.topics import camera_image, SERVICE_QOS
 from tap_ros.text import escaped
 
 DEPTH = 100  # messages that may wait while the disk is slow
-MAX_AGE = 2.0  # s that a periodic topic may be silent until /diagnostics calls it stale
-LONG = 1000  # characters of an answer
 TRANSIENT_LOCAL = DurabilityPolicy.TRANSIENT_LOCAL
 
 
@@ -43,17 +40,17 @@ class RecorderNode(Node):
         self._wanted = [image if name == IMAGE.name else name for name in self.params['topics']]
         if not self._wanted:
             raise ConfigError('parameter topics: is empty; name at least one topic')
-        self._diagnostics = Diagnostics(self, {
-            name: MAX_AGE if (known := _known(name)) and known.periodic else math.inf
-            for name in self._wanted},
+        streams = {name for name in self._wanted if (known := _known(name)) and known.periodic}
+        self._diagnostics = Diagnostics(
+            self, streams, set(self._wanted) - streams,
             expected=self._wanted if 'topics' in self._parameter_overrides else ())
         self._bags = Bags(self.params, self._report)
         if self.params['record_on_start']:
             self._bags.start()
         self._subscribe_known()
-        self.create_service(
-            SetBool, 'recorder/record', self._on_record, qos_profile=SERVICE_QOS)
-        self.create_timer(0.5, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_service(SetBool, 'recorder/record', answering(self, self._on_record),
+                            qos_profile=SERVICE_QOS)
+        steady_timer(self, 0.5, self._on_timer)
         self.get_logger().info(
             f'ready: recording to {escaped(self._bags.folder)}' if self._bags.folder
             else 'ready: call recorder/record with data true to start')
@@ -65,24 +62,17 @@ class RecorderNode(Node):
 
     def _finish(self) -> str:
         """Record what has arrived, such as the end of an episode, and finish the bag."""
-        try:
-            for subscription in self._recorded.values():
-                for taken in subscription.take(DEPTH):
-                    subscription.subscription.callback(*taken)
-        except Exception as error:  # the bag is finished all the same
-            self._tell('the last messages were not recorded', error)
+        for subscription in self._recorded.values():
+            for message, info in subscription.take(DEPTH):
+                subscription.subscription.callback(message, info)
         recorded, text = self._bags.folder, self._bags.finish()
         if recorded and self._bags.failure is None:
             self.get_logger().info(f'recorded {text}')
         return text
 
     def _on_record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        try:
-            response.message = (f'recording to {escaped(self._bags.start())}' if request.data
-                                else self._finish())
-        except Exception as error:  # whatever it is, the caller gets an answer
-            self._bags.failure = response.message = escaped(error, LONG)
-            self.get_logger().error(f'recorder/record: {response.message}')
+        response.message = (f'recording to {escaped(self._bags.start())}' if request.data
+                            else self._finish())
         response.success = self._bags.failure is None
         return response
 
@@ -129,23 +119,17 @@ class RecorderNode(Node):
             self._bags.take(topic, type_name, data, qos, received,
                             info['source_timestamp'] or received)
         except Exception as error:  # no message ends the node
-            self._tell(f'{escaped(topic)}: a message was not recorded', error)
+            self.get_logger().error(
+                f'{escaped(topic)}: a message was not recorded: {type(error).__name__}: '
+                f'{escaped(error)}', throttle_duration_sec=1.0)
 
     def _on_timer(self) -> None:
         """Write buffered messages to the disk; subscribe to topics that appear or change."""
-        try:
-            self._bags.flush()
-            for subscription in self._recorded.values():
-                subscription.adapt()
-            if self._wanted:
-                self._subscribe_known()
-        except Exception as error:
-            self._tell('the topics could not be updated', error)
-
-    def _tell(self, what: str, error: Exception) -> None:
-        """Log an error of a callback, at most once a second."""
-        self.get_logger().error(
-            f'{what}: {type(error).__name__}: {escaped(error)}', throttle_duration_sec=1.0)
+        self._bags.flush()
+        for subscription in self._recorded.values():
+            subscription.adapt()
+        if self._wanted:
+            self._subscribe_known()
 
 
 def _known(name: str) -> Topic | None:
@@ -161,7 +145,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('topics', list(BY_NAME), 'Topics to record.')
     parameters.declare('compression', 'zstd', 'Compression of chunks.',
                        choices=['zstd', 'lz4', 'none'])
-    declare_transport(parameters)
+    parameters.declare_shared('image_transport')
     declare_arm(parameters)
     parameters.declare('record_on_start', True,
                        'Record from the start; else from the call of recorder/record on.')

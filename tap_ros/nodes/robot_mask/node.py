@@ -3,13 +3,11 @@
 """Publishes masks of a real robot: its URDF, projected into each picture of the camera."""
 
 from collections import deque
-import math
 from pathlib import Path
 import time
 from typing import Any
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
@@ -23,13 +21,12 @@ from tap_ros.nodes.observations import reception_time
 from tap_ros.nodes.parameters import (
     camera_pose,
     declare_camera,
-    declare_joint_prefix,
     declare_mount,
     declared_mount,
     Parameters,
 )
 from tap_ros.nodes.ros_messages import encode_mask
-from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
+from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription, steady_timer
 from tap_ros.nodes.topics import LATCHED, STREAM
 from tap_ros.plugins import names
 from tap_ros.robots.arm import DEFAULT_ARM, get_arm, TIP_FRAME
@@ -38,7 +35,6 @@ from tap_ros.robots.silhouette import Body, draw_mask, Light, PinholeCamera
 from tap_ros.robots.urdf import MOST_CHARACTERS, read_urdf, Robot
 from tap_ros.text import escaped
 
-STALE_S = 2.0  # diagnostics call an input stale that has been silent for so long
 WAITING = 10  # pictures that may wait for their joint states
 
 
@@ -59,9 +55,8 @@ class RobotMaskNode(Node):
         # CameraInfo of pictures that have no mask yet, and when they were received.
         self._waiting: deque[tuple[CameraInfo, float]] = deque(maxlen=WAITING)
         self._robot: Robot | None = None
-        self._diagnostics = Diagnostics(self, {
-            'camera/camera_info': STALE_S, 'joint_states': STALE_S,
-            'robot_description': math.inf},
+        self._diagnostics = Diagnostics(
+            self, ['camera/camera_info', 'joint_states'], ['robot_description'],
             expected=[] if self.params['urdf'] else ['robot_description'])
         self._masks = self.create_publisher(Image, 'camera/robot_mask', STREAM)
         subscriptions = [
@@ -75,8 +70,7 @@ class RobotMaskNode(Node):
             subscriptions.append(AdaptiveSubscription(
                 self, String, 'robot_description', self._on_description, LATCHED))
         adapt_regularly(self, subscriptions)
-        self.create_timer(
-            0.2, self._give_up_waiting, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady_timer(self, 0.2, self._give_up_waiting)
         self.get_logger().info(f'ready: {self.params["urdf"] or "waits for robot_description"}')
 
     def close(self) -> None:
@@ -182,7 +176,7 @@ def declare_parameters(node: Node) -> Parameters:
     parameters.declare('urdf', '',
                        'Shape of the robot: a URDF file; the name of an arm: that arm, at '
                        'mount_x and so on; empty: the topic robot_description.')
-    declare_joint_prefix(parameters)
+    parameters.declare_shared('joint_prefix')
     parameters.declare('hand_link', '',
                        'Link that is the hand, with all that it carries; empty: there is none, or '
                        'with a named arm its own.')

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Follows objects that were clicked once in the camera's pictures: objects and goal/objects."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
@@ -13,8 +13,6 @@ from typing import Any
 from geometry_msgs.msg import Point32, Polygon, PoseStamped
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, JointState
 from tap_msgs.msg import Episode, ObjectStates
 from tap_msgs.srv import SelectObjects
@@ -31,16 +29,18 @@ from tap_ros.nodes.parameters import (
     camera_pose,
     declare_arm,
     declare_camera,
-    declare_joint_prefix,
-    declare_transport,
     declared_arm,
     Parameters,
     pose_matrix,
 )
-from tap_ros.nodes.robot_view import declare_robot_mask
 from tap_ros.nodes.ros_messages import encode_objects
 from tap_ros.nodes.services import answering, log_error
-from tap_ros.nodes.subscriptions import adapt_regularly, AdaptiveSubscription
+from tap_ros.nodes.subscriptions import (
+    adapt_regularly,
+    AdaptiveSubscription,
+    newcomers,
+    publishers_of,
+)
 from tap_ros.nodes.topics import (
     camera_topics,
     goal_topics,
@@ -57,7 +57,6 @@ from tap_ros.tracking.protocols import HIDDEN, LOST, SEEN, Tracked, Tracker, Vie
 from tap_ros.tracking.registration import propose
 from tap_ros.training.robot_mask import hidden_pixels
 
-STALE_S = 2.0  # s without a message after which diagnostics call an input stale
 PATIENCE_S = 0.1  # s that the joints of a picture, or the robot mask of a goal, may come after it
 
 
@@ -71,7 +70,7 @@ class Selection:
     size: tuple[int, int]  # (height, width) of its pictures
     selected_ns: int  # stamp of the picture in which they were clicked
     jumps: int  # of the clock of the stamps until then
-    publishers: frozenset[bytes]  # participants that published the camera's topics then
+    publishers: Mapping[str, frozenset[bytes]]  # of each topic then
     stamp_ns: int  # of the newest picture in which they were followed
     received: float  # s, monotonic: when that picture was received
     tracked: Tracked
@@ -100,20 +99,20 @@ class TrackerNode(Node):
         self._told_goal = False  # goal/objects has objects
         self._gripper = GripperHistory(
             declared_arm(self.params), self.params['joint_prefix'], self.params['fixed_opening'])
-        camera = {name: topic for name, topic in camera_topics(self.params).items()
-                  if name != 'objects'}
-        goal = {name: topic for name, topic in goal_topics(self.params['robot_mask']).items()
-                if name != 'objects'}
-        self._diagnostics = Diagnostics(self, {
-            **{name: STALE_S for _, name in camera.values()},
-            CAMERA_INFO.name: math.inf, JOINT_STATES.name: math.inf,
-            **{name: math.inf for _, name in goal.values()}}, idle=self._why_not)
+        camera = camera_topics(self.params)
+        self._own_topics = [name for _, name in camera.values()]  # of one publisher each
+        del camera['objects']
+        goal = goal_topics(self.params['robot_mask'])
+        del goal['objects']
+        self._diagnostics = Diagnostics(
+            self, [name for _, name in camera.values()],
+            [CAMERA_INFO.name, JOINT_STATES.name, *(name for _, name in goal.values())],
+            idle=self._why_not)
         received = self._diagnostics.received
         self._topics = tuple(camera)
         self._sensors, self._goals = Observations(*camera), Observations(*goal, latched=True)
         self._objects = self.create_publisher(ObjectStates, 'objects', STREAM)
         self._goal_objects = self.create_publisher(ObjectStates, 'goal/objects', LATCHED)
-        self.create_subscription(Clock, 'clock', self._on_clock, qos_profile_sensor_data)
         self._sensors.subscribe(self, camera, STREAM, on_message=received)
         self._goals.subscribe(self, goal, LATCHED, on_message=self._on_goal)
         adapt_regularly(self, [
@@ -135,9 +134,6 @@ class TrackerNode(Node):
         self._thread.join(5.0)
 
     # What comes
-
-    def _on_clock(self, message: Clock) -> None:
-        self._sensors.tell_time(to_nanoseconds(message.clock))
 
     def _on_goal(self, topic: str) -> None:
         self._diagnostics.received(topic)
@@ -203,8 +199,8 @@ class TrackerNode(Node):
         message = self._encode(found, tracked, plane, moment.messages['image'].header)
         self._selection = Selection(
             found, tracker, plane, view.image.shape[:2], moment.stamp_ns, self._sensors.jumps,
-            frozenset().union(*self._camera_publishers().values()), moment.stamp_ns,
-            moment.received, tracked, message)
+            publishers_of(self, self._own_topics), moment.stamp_ns, moment.received,
+            tracked, message)
         self._objects.publish(message)
         self._sensors.wake()  # for the goal
         self.get_logger().info(f'following {listing(found)}')
@@ -235,8 +231,7 @@ class TrackerNode(Node):
                 f'names, u and v have {len(request.names)}, {len(request.u)} and '
                 f'{len(request.v)} entries; expected as many of each, at least one')
         clicks = np.column_stack([request.u, request.v])
-        asked = encode_objects(request.names, clicks, unknown_poses(len(clicks)), 0, '',
-                               ObjectStates.SOURCE_TRACKED)
+        asked = encode_objects(request.names, clicks, None, 0, '', ObjectStates.SOURCE_TRACKED)
         return decode_objects(asked, 'select_objects', size)
 
     # What is known of a picture
@@ -383,18 +378,7 @@ class TrackerNode(Node):
         """Say in what way the camera shows another scene than that of a selection, '' if not."""
         if self._sensors.jumps != selection.jumps:
             return 'the clock of its pictures has jumped: another camera, simulator or recording'
-        for topic, publishers in self._camera_publishers().items():
-            if len(publishers) > 1 and not publishers <= selection.publishers:
-                return (f'{len(publishers)} nodes publish on '
-                        f'{self.resolve_topic_name(topic)} now')
-        return ''
-
-    def _camera_publishers(self) -> dict[str, frozenset[bytes]]:
-        """Return who publishes each topic of which there may be but one publisher."""
-        return {topic: frozenset(
-            bytes(info.endpoint_gid[:12])  # the participant, which is known before all its topics
-            for info in self.get_publishers_info_by_topic(self.resolve_topic_name(topic)))
-            for _, topic in camera_topics(self.params).values()}
+        return newcomers(self, self._own_topics, selection.publishers)
 
     def _forget(self, why: str) -> None:
         """Follow nothing any more."""
@@ -424,8 +408,9 @@ class TrackerNode(Node):
     def _encode(self, found: Sequence[str], tracked: Tracked, plane: Plane | None,
                 header: Any) -> ObjectStates:
         """Return the message about objects in a picture of this header."""
-        poses = unknown_poses(len(found))
+        poses = None
         if plane is not None:
+            poses = np.full((len(found), 7), np.nan)
             poses[:, :2] = plane.of_middle(plane.shrink(tracked.pixels))
             poses[:, 2] = MIDDLE
             poses[np.array(tracked.states) == LOST] = np.nan
@@ -435,22 +420,15 @@ class TrackerNode(Node):
             tracked.states, tracked.confidence)
 
 
-def unknown_poses(count: int) -> np.ndarray:
-    """Return poses (count, 7) of which nothing is known."""
-    return np.full((count, 7), np.nan)
-
-
 def declare_parameters(node: Node) -> Parameters:
     """Declare the parameters of the node."""
     parameters = Parameters(node)
     parameters.declare('tracker', 'rigid', 'What follows the objects: their shapes on the table '
                        '(rigid), the forward model that plans (carried), or a tracker of another '
                        'package.', choices=names('tap_ros.trackers'))
-    declare_transport(parameters)
-    declare_robot_mask(parameters, 'all')
+    parameters.declare_shared('image_transport', 'joint_prefix', robot_mask='all')
     declare_camera(parameters, f'{WORLD_FRAME}; with camera_z 0: as camera/pose tells')
     declare_arm(parameters)
-    declare_joint_prefix(parameters)
     parameters.declare('max_silence', 0.35,
                        'Seconds; of a picture without joint states nearer to it than this the '
                        'gripper is not known.', low=0.05, high=60.0, read_only=False)

@@ -36,8 +36,6 @@ function take(message) {
     showState();
   } else if (message.kind === 'selection') {
     takeSelection(message);
-  } else if (message.kind === 'history') {
-    drawChart(message);
   } else if (message.kind === 'error') {
     complain(message.text);
   }
@@ -76,7 +74,6 @@ function showState() {
   enable(true);
   $('camera-note').textContent = camera.note;
   $('goal-note').textContent = goal.note;
-  $('subgoal-note').textContent = state.subgoal_note;
   $('scene').hidden = !state.simulator;
   $('photograph').hidden = state.simulator;
   $('select').hidden = !state.tracker;
@@ -160,21 +157,13 @@ function byNode(diagnostics) {
 
 // Buttons and keys
 
-const choices = () => ({
-  samples: Number($('samples').value), levels: Number($('levels').value), seed: 0});
-
-for (const id of ['samples', 'levels']) {
-  $(id).addEventListener('input', () => {
-    document.querySelector(`output[for=${id}]`).value = $(id).value;
-  });
-}
 $('scene').addEventListener('submit', (event) => {
   event.preventDefault();
   send({do: 'reset', task: $('task').value, seed: Math.max(0, Math.round(Number($('seed').value)))});
 });
-$('predict').addEventListener('click', () => send({do: 'predict', ...choices()}));
-$('direct').addEventListener('click', () => send({do: 'reach', mode: 'direct', ...choices()}));
-$('subgoal-run').addEventListener('click', () => send({do: 'reach', mode: 'subgoal', ...choices()}));
+$('predict').addEventListener('click', () => send({do: 'predict'}));
+$('direct').addEventListener('click', () => send({do: 'reach', mode: 'direct'}));
+$('subgoal-run').addEventListener('click', () => send({do: 'reach', mode: 'subgoal'}));
 $('cancel').addEventListener('click', () => send({do: 'cancel'}));
 $('photograph').addEventListener('click', () => send({do: 'photograph'}));
 $('select').addEventListener('click', () => choose(!selecting));
