@@ -191,39 +191,11 @@ def test_other_ways_to_write_mcap(tmp_path, chunked):
         assert not texts, options
 
 
-def test_damage_that_no_checksum_shows_costs_its_chunk(tmp_path, chunked):
-    path, episodes = chunked
-    other = rewrite(path, tmp_path / 'other.mcap', chunk_size=3000,
-                    compression=CompressionType.NONE, enable_crcs=False)
-    whole = other.read_bytes()
-    where = whole.index(episodes[4].frames[1].tobytes())
-    start = whole.rindex(b'camera_optical_frame\0', 0, where) - 47  # 31 + 16 bytes
-    assert whole[start] == 5
-    for kind, length, words in (
-            (5, 21, 'too short'), (5, 2**40, 'wrong length'), (0x33, None, 'opcode 51')):
-        data = bytearray(whole)
-        data[start] = kind
-        if length is not None:
-            data[start + 1:start + 9] = struct.pack('<Q', length)
-        other.write_bytes(data)
-        assert check_damaged(other, episodes) == 'part'
-        assert any(re.search(f'chunk at byte .*it holds a damaged .*{words}', text)
-                   for text in read(other)[1])
-
-
-def pack(content, claimed=None):
-    """Return a zstd chunk that unpacks to some content, or claims another size."""
-    packed, claimed = zstandard.compress(content), len(content) if claimed is None else claimed
-    record = struct.pack('<QQQII', 0, 0, claimed, 0, 4) + b'zstd' + struct.pack(
-        '<Q', len(packed)) + packed
-    return struct.pack('<BQ', CHUNK, len(record)) + record
-
-
-def test_files_that_unpack_to_what_no_recording_holds_are_refused_in_time(tmp_path):
-    for chunks, words in (
-            (pack(bytes(100), mcap_file.MAX_CHUNK_BYTES + 1), 'claims to unpack to'),
-            (pack(bytes(50 * 2**20), 1000), 'more than it claims')):
-        (tmp_path / 'a.mcap').write_bytes(b'\x89MCAP0\r\n' + chunks)
-        assert (tmp_path / 'a.mcap').stat().st_size < 10**5
-        with pytest.raises(RecordingError, match=f'a.mcap: .*chunk .*{words}'):
-            open_recordings(tmp_path)
+def test_a_chunk_that_claims_to_hold_what_no_recording_holds_is_refused(tmp_path):
+    packed = zstandard.compress(bytes(100))
+    record = struct.pack('<QQQII', 0, 0, mcap_file.MAX_CHUNK_BYTES + 1, 0, 4) + b'zstd' + (
+        struct.pack('<Q', len(packed)) + packed)
+    (tmp_path / 'a.mcap').write_bytes(
+        b'\x89MCAP0\r\n' + struct.pack('<BQ', CHUNK, len(record)) + record)
+    with pytest.raises(RecordingError, match='a.mcap: .*chunk .*claims to unpack to'):
+        open_recordings(tmp_path)

@@ -10,7 +10,6 @@ and the instruction are taken; times are nominal, since records do not tell them
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from itertools import count
 import math
 from pathlib import Path
@@ -23,7 +22,7 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from google.protobuf.unknown_fields import UnknownFieldSet  # type: ignore[import-untyped]
 import google_crc32c
 import numpy as np
-from tap_ros.errors import ConfigError, ImageError, RecordingError
+from tap_ros.errors import ConfigError, RecordingError
 from tap_ros.images.encodings import decompress
 from tap_ros.recording.episode import Episode
 from tap_ros.recording.formats.pictures import (
@@ -80,20 +79,10 @@ def _choose(features: dict[str, list[bytes]], camera: str) -> str:
     names = {match[1] or match[2] for name, value in features.items()
              if (match := re.fullmatch(r'steps/observation/(.+)|0/(.+)/encoded', name))
              and _is_picture(value[0] if value else b'')}
-    if camera in names:
-        return camera
-    found = []
-    for name in sorted(names):
-        with suppress(ImageError):  # of depth
-            _picture(_pictures(features, name)[0])
-            found.append(name)
-    if camera or not found:
-        raise ConfigError(f'--camera {escaped(camera)}: expected one of '
-                          f'{listing(found) or "those with pictures, but there are none"}')
-    seen = [name for name in found if not _is_blank(_picture(_pictures(features, name)[0]))]
-    if len(seen) > 1:
-        raise ConfigError(f'--camera: expected one of {listing(seen)}')
-    return (seen or found)[0]
+    if camera not in names and (camera or len(names) != 1):
+        raise ConfigError(f'--camera: {escaped(camera)}; expected one of '
+                          f'{listing(sorted(names)) or "those with pictures, but there are none"}')
+    return camera or names.pop()
 
 
 def _pictures(features: dict[str, list[bytes]], camera: str) -> list[bytes]:
